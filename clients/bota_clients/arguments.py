@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from pathlib import Path
+from typing import TypeVar
 
 from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
@@ -12,6 +12,8 @@ from bota_ethercat.program import server_choice
 from bota_ethercat.program.completion import add_completion
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor_choice import MOST_PLACES
+
+_Value = TypeVar("_Value")
 
 
 def parser(prog: str, description: str, epilog: str, usage: str | None = None) -> argparse.ArgumentParser:
@@ -40,73 +42,51 @@ def server_of(parser: argparse.ArgumentParser, given: Address | None, argument: 
         parser.error(str(error))
 
 
-def file_and_server(parser: argparse.ArgumentParser, names: list[str]) -> tuple[Path, str | None]:
-    """The file among the arguments FILE [HOST:PORT], in either order, and the address."""
-    if len(names) > 1 and server_choice.is_address(names[0]) and not server_choice.is_address(names[1]):
-        names = [names[1], names[0], *names[2:]]
-    if server_choice.is_address(names[0]):
-        parser.error(
-            f"{names[0]} is a server's address, no file: write FILE.mcap --server {names[0]}, "
-            f"or ./{names[0]} if a file is called so"
-        )
-    if len(names) > 2:
-        parser.error(f"unexpected argument {names[2]!r}")
-    return Path(names[0]), names[1] if len(names) == 2 else None
-
-
 def add_force(parser: argparse.ArgumentParser) -> None:
     """`--force`: nothing is overwritten without it."""
     parser.add_argument("--force", action="store_true", help="replace an existing file")
 
 
-def add_imu_units(parser: argparse.ArgumentParser, purpose: str = "") -> None:
-    """Units in which the firmware sends acceleration and angular rate; `purpose` is for the help."""
+def add_imu_units(parser: argparse.ArgumentParser) -> None:
+    """Units in which the firmware sends acceleration and angular rate."""
+    values = [units.value for units in ImuUnits]
     parser.add_argument(
-        "--imu-raw-units", type=_units, default=ImuUnits.G_DPS, dest="imu_units",
-        metavar=f"{{{','.join(units.value for units in ImuUnits)}}}",
-        help=f"units in which the sensor sends acceleration and angular rate{purpose and f', for {purpose}'} "
+        "--imu-raw-units", type=typed(ImuUnits, " or ".join(values)), default=ImuUnits.G_DPS,
+        dest="imu_units", metavar=f"{{{','.join(values)}}}",
+        help="units in which the sensor sends acceleration and angular rate "
         f"(default {ImuUnits.G_DPS.value})",
     )  # fmt: skip
 
 
-def _units(text: str) -> ImuUnits:
-    try:
-        return ImuUnits(text)
-    except ValueError:
-        known = " or ".join(units.value for units in ImuUnits)
-        raise argparse.ArgumentTypeError(f"{text!r}: it must be {known}") from None
+def typed(convert: Callable[[str], _Value], what: str = "") -> Callable[[str], _Value]:
+    """The type of an argument; for a ValueError argparse says `what` it must be, or else the error."""
 
+    def converted(text: str) -> _Value:
+        try:
+            return convert(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{text!r}: it must be {what}" if what else str(error)) from None
 
-def address(text: str) -> Address:
-    """A server's address."""
-    try:
-        return Address.parse(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    return converted
 
 
 def number(low: float, high: float, what: str = "") -> Callable[[str], float]:
     """The type of an argument that is a number from `low` to `high`; `what` is said if it is not."""
 
-    def convert(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = low - 1
-        if low <= value <= high:
+    def within(text: str) -> float:
+        if low <= (value := float(text)) <= high:
             return value
-        raise argparse.ArgumentTypeError(f"{text!r}: it must be {what or f'from {low:g} to {high:g}'}")
+        raise ValueError
 
-    return convert
-
-
-seconds = number(1e-9, 1e9, "a number of seconds, such as 60")
+    return typed(within, what or f"from {low:g} to {high:g}")
 
 
-def position(text: str) -> int:
-    """A sensor's position on the bus."""
+def _position(text: str) -> int:
     if text.isascii() and text.isdecimal() and int(text) < MOST_PLACES:
         return int(text)
-    raise argparse.ArgumentTypeError(
-        f"{text!r}: it must be a position on the bus, from 0 to {MOST_PLACES - 1}"
-    )
+    raise ValueError
+
+
+address = typed(Address.parse)
+seconds = number(1e-9, 1e9, "a number of seconds, such as 60")
+position = typed(_position, f"a position on the bus, from 0 to {MOST_PLACES - 1}")

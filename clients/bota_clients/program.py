@@ -9,18 +9,21 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Final
 from urllib.parse import unquote, urlsplit
 
+from bota_clients.errors import ClientError
+from bota_ethercat.errors import ProtocolError
+
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
 
 _PROJECT: Final = "bota-ethercat-bridge"
-_CHECKOUT: Final = Path(__file__).parent.parent
-"""The project's folder if this runs from there."""
+_CHECKOUT: Final = Path(__file__).parents[2]  # the project's folder if this runs from there
 
 
 def say(program: str, sentence: str) -> None:
@@ -31,12 +34,10 @@ def say(program: str, sentence: str) -> None:
 
 def missing(name: str) -> str:
     """That a package or program is not installed, and how to install it from where this was installed."""
-    name = name.partition(".")[0]
-    pip = [sys.executable, "-m", "pip", "install"]
     source = _source()
-    if source is None:
-        return f"{name} is not installed: in this project's folder run {shlex.join([*pip, '.[client]'])}"
-    return f"{name} is not installed: {shlex.join([*pip, source])}"
+    where = "" if source else "in this project's folder run "
+    command = shlex.join([sys.executable, "-m", "pip", "install", source or ".[client]"])
+    return f"{name.partition('.')[0]} is not installed: {where}{command}"
 
 
 def _source() -> str | None:
@@ -52,6 +53,21 @@ def _source() -> str | None:
         path = unquote(urlsplit(url).path)
         return f"{path}[client]" if Path(path).exists() else None
     return f"{_PROJECT}[client] @ {vcs}+{url}" if vcs else f"{_PROJECT}[client] @ {url}"
+
+
+def start(program: str, module: str, *arguments: object) -> int:
+    """The exit code of `run` in a module that is imported only now: `--help` needs nothing of the extra.
+
+    What it raises of ours is said in its sentence.
+    """
+    try:
+        code: int = import_module(f"bota_clients.{module}").run(*arguments)
+    except ImportError as error:
+        code = not_installed(program, error)
+    except (ClientError, ProtocolError) as error:
+        say(program, str(error))
+        code = 1
+    return code
 
 
 def not_installed(program: str, error: ImportError) -> int:
@@ -85,22 +101,13 @@ class Signals:
     """SIGINT and SIGTERM, remembered from the first moment until there is something to stop.
 
     Attributes:
-        asked: whether one has arrived.
+        asked: whether one has arrived; set it to stop without one.
     """
 
     def __init__(self) -> None:
         self.asked = False
-        self._stop: Callable[[], None] | None = None
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
 
-    def call(self, stop: Callable[[], None]) -> None:
-        """From now on a signal calls `stop`; at once if one has arrived already."""
-        self._stop = stop
-        if self.asked:
-            stop()
-
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         self.asked = True
-        if self._stop is not None:
-            self._stop()

@@ -26,24 +26,15 @@ Values = Mapping[str, float]
 
 def description(names: Sequence[str] = ("BFT-SENS-ECAT-M8",), **settings: Any) -> dict[str, Any]:
     """A reply to `describe`."""
-    return {
-        "protocol": 1,
-        "version": "1.0.0",
-        "sensors": [
-            {
-                "sensor": position,
-                "name": name,
-                "serial": 1234 + position,
-                "hardware": "RM200V4_6adc",
-                "firmware": "1.3.8",
-                "pdo_size": 77,
-                "rate_hz": RATE_HZ,
-                "state": "OP",
-                "settings": {**start_up_defaults(), **settings},
-            }
-            for position, name in enumerate(names)
-        ],
-    }
+    rows = [
+        {
+            "sensor": position, "name": name, "serial": 1234 + position, "hardware": "RM200V4_6adc",
+            "firmware": "1.3.8", "pdo_size": 77, "rate_hz": RATE_HZ, "state": "OP",
+            "settings": {**start_up_defaults(), **settings},
+        }
+        for position, name in enumerate(names)
+    ]  # fmt: skip
+    return {"protocol": 1, "version": "1.0.0", "sensors": rows}
 
 
 def status(sensors: int = 1, mode: str = "locked", sent: int = 0) -> dict[str, Any]:
@@ -53,18 +44,15 @@ def status(sensors: int = 1, mode: str = "locked", sent: int = 0) -> dict[str, A
         "fresh": 300_000, "repeated": 0, "invalid": 0, "lost_samples": 2, "recoveries": 0,
         "clock": {"mode": mode, "period_us": 1250.01, "offset_ppm": -4.2, "uncertainty_us": 38.0},
     }  # fmt: skip
+    clients = [
+        {"peer": "127.0.0.1:51234", "sent": 4 * sent, "withheld": 12},
+        {"peer": OWN_PEER, "sent": sent, "withheld": 0},
+    ]
     return {
-        "cycles": 800_000,
-        "missed_deadlines": 3,
-        "lost_frames": 1,
-        "uptime_s": 4567.0,
+        "cycles": 800_000, "missed_deadlines": 3, "lost_frames": 1, "uptime_s": 4567.0,
         "last_10s": {"wake_us": spread, "exchange_us": spread, "age_us": [spread] * sensors},
-        "sensors": [{"sensor": position, **row} for position in range(sensors)],
-        "clients": [
-            {"peer": "127.0.0.1:51234", "sent": 4 * sent, "withheld": 12},
-            {"peer": OWN_PEER, "sent": sent, "withheld": 0},
-        ],
-    }
+        "sensors": [{"sensor": position, **row} for position in range(sensors)], "clients": clients,
+    }  # fmt: skip
 
 
 def process_data(values: Values) -> bytes:

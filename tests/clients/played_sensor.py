@@ -78,7 +78,11 @@ class PlayedSensor:
 
     def reconfigure(self, **changed: Any) -> None:
         self.sensor = described(**changed)
-        self.send(event(Event.RECONFIGURED, sensor=0, settings=self.sensor["settings"]))
+        self.send(
+            event(
+                Event.RECONFIGURED, sensor=0, settings=self.sensor["settings"], rate_hz=self.sensor["rate_hz"]
+            )
+        )
 
     def close(self) -> None:
         with contextlib.suppress(OSError):
@@ -98,7 +102,12 @@ def played(port: int = 0, **sensor: Any) -> Iterator[PlayedSensor]:
         server.close()
 
 
-def frame(sequence: int, flags: int = 0, **values: float) -> bytes:
-    """A DATA message of a sample taken now; its force along x is its number."""
-    data = encode(61, {"force.x": sequence, **{name.replace("_", "."): v for name, v in values.items()}})
-    return encode_data(sequence, time.time_ns(), time.monotonic_ns(), 0, flags, 3, data)
+def frame(
+    sequence: int, flags: int = 0, *, sensor: int = 0, age_s: float = 0.0, size: int = 61, **values: float
+) -> bytes:
+    """A DATA message; its force along x is its number. `values` by name, with `__` for the dot."""
+    # A machine that has been up for less than `age_s` has no such instant yet.
+    time.sleep(max(0.0, age_s - time.monotonic()))
+    instant = time.monotonic_ns() - int(age_s * 1e9)
+    data = encode(size, {"force.x": sequence, **{k.replace("__", "."): v for k, v in values.items()}})
+    return encode_data(sequence, 5, instant, sensor, flags, 3, data)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from bota_clients.recording.disk import DiskFile
 from bota_clients.recording.file_format import FORMAT_VERSION
-from bota_clients.recording.writer import RecordingWriter
+from bota_clients.recording.writer import DiskFile, RecordingWriter
 from bota_ethercat import pdo
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.text.json_text import JsonObject
@@ -43,11 +42,15 @@ def writer(path: Path, **notes: str) -> RecordingWriter:
 
 
 def record(
-    path: Path, frames: Iterable[DataMessage], chunk: int = 100, sensors: tuple[int, ...] = (0,)
+    path: Path,
+    frames: Iterable[DataMessage],
+    chunk: int = 100,
+    sensors: tuple[int, ...] = (0,),
+    **settings: object,
 ) -> list[DataMessage]:
     """A whole recording of `frames`, with a chunk for so many of them; returns them."""
     made = writer(path)
-    made.describe(START_NS, describe(*sensors))
+    made.describe(START_NS, describe(*sensors, **settings))
     written = []
     for count, item in enumerate(frames, 1):
         written.append(item)

@@ -6,34 +6,24 @@ a process is for what others do to it.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
+import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from argparse import Namespace
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 from unittest import mock
 
-from bota_clients.program import Signals
-from bota_clients.record import program as record
+from bota_clients import program as programs
+from bota_clients.program import Signals, start
+from bota_clients.record.cli import parse_options as record_options
 from bota_clients.recording.reader import RecordingError, open_recording
-from bota_clients.replay import program
+from bota_clients.replay import program as replay
+from bota_clients.replay.cli import parse_options as replay_options
 from bota_ethercat.client import Client as StreamClient
 from tests.server.running import PATIENCE_S, Program, free_port, wait_until
-
-
-class NoSignals(Signals):
-    """Signals that a test gives."""
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._stop: Callable[[], None] | None = None
-
-    def give(self) -> None:
-        self.asked = True
-        if self._stop is not None:
-            self._stop()
 
 
 def signalled(
@@ -56,34 +46,70 @@ def signalled(
             signal.signal(each, handler)
 
 
-class Replay:
-    """`ethercat-replay` of a file on a free port, in a thread."""
+class NoSignals(Signals):
+    """Signals that a test gives."""
 
-    def __init__(self, *arguments: str | Path, port: int = 0) -> None:
-        self.port = port or free_port()
-        self._argv = [*map(str, arguments), str(self.port)]
-        self._sentences: list[str] = []
+    def __init__(self) -> None:
+        self.asked = False
+
+
+class Running:
+    """A program in a thread, until the end of the block, or until it is stopped."""
+
+    def __init__(self, name: str, options: Namespace) -> None:
+        self._name, self._options = name, options
         self._signals = NoSignals()
         self._codes: list[int] = []
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
+
+    def _run(self) -> None:
+        self._codes.append(
+            start(f"ethercat-{self._name}", f"{self._name}.program", self._options, self._signals)
+        )
+
+    def wait(self) -> int:
+        """The exit code, once it has ended."""
+        self._thread.join(PATIENCE_S)
+        return self._codes[0]
+
+    def stop(self) -> int:
+        """As by a signal; the exit code."""
+        self._signals.asked = True
+        return self.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+class Replay(Running):
+    """`ethercat-replay` on a free port; the last argument is the file."""
+
+    def __init__(self, *arguments: str | Path, port: int = 0) -> None:
+        self.port = port or free_port()
+        self._sentences: list[str] = []
+        super().__init__("replay", replay_options([*map(str, arguments), str(self.port)]))
         wait_until(self._is_listening, "a replay that listens")
 
     def said(self) -> str:
         return "\n".join(self._sentences)
 
-    def wait(self) -> int:
-        self._thread.join(PATIENCE_S)
-        return self._codes[0]
-
-    def close(self) -> None:
-        self._signals.give()
-        self._thread.join(PATIENCE_S)
-        assert not self._thread.is_alive()
-
     def _run(self) -> None:
-        with mock.patch.object(program, "_say", self._sentences.append):
-            self._codes.append(program.run(self._argv, self._signals))
+        with (
+            mock.patch.object(replay, "_say", self._sentences.append),
+            mock.patch.object(programs, "say", self._say),
+        ):
+            super()._run()
+
+    def _say(self, name: str, sentence: str) -> None:
+        """The recorder says its own, on standard error."""
+        if name == "ethercat-replay":
+            self._sentences.append(sentence)
+        else:
+            sys.stderr.write(f"{name}: {sentence}\n")
 
     def _is_listening(self) -> bool:
         assert self._thread.is_alive() or "replaying" in self.said(), self.said()
@@ -95,54 +121,17 @@ def listen(port: int, **options: Any) -> StreamClient:
     return StreamClient(port, raw=True, reconnect=False, **options).connect()
 
 
-@contextlib.contextmanager
-def replaying(*arguments: str | Path, port: int = 0) -> Iterator[Replay]:
-    """A replay of `arguments`, the last of which is the file, until the end of the block."""
-    running = Replay(*arguments, port=port)
-    try:
-        yield running
-    finally:
-        running.close()
-
-
-class Recorder:
-    """`ethercat-record` of what is on `port`, in a thread."""
+class Recorder(Running):
+    """`ethercat-record` of what is on `port`."""
 
     def __init__(self, path: Path, port: int, *arguments: str) -> None:
         self.path = path
-        self._argv = [*arguments, str(path), str(port)]
-        self._signals = NoSignals()
-        self._codes: list[int] = []
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        self._codes.append(record.run(self._argv, self._signals))
+        super().__init__("record", record_options([*arguments, str(path), str(port)]))
 
     def wait_for_frames(self, count: int) -> None:
         """Until so many more are in the file."""
         enough = frames_in(self.path) + count
         wait_until(lambda: frames_in(self.path) >= enough, "frames")
-
-    def wait(self) -> int:
-        """The exit code, once it has ended."""
-        self._thread.join(PATIENCE_S)
-        return self._codes[0]
-
-    def stop(self) -> int:
-        """As by a signal; the exit code."""
-        self._signals.give()
-        return self.wait()
-
-
-@contextlib.contextmanager
-def recording(path: Path, port: int, *arguments: str) -> Iterator[Recorder]:
-    """A recorder until the end of the block, or until it is stopped."""
-    running = Recorder(path, port, *arguments)
-    try:
-        yield running
-    finally:
-        running.stop()
 
 
 def frames_in(path: Path) -> int:

@@ -24,8 +24,8 @@ from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.clock import Clock
 from ethercat_server.ethercat.exchange import Exchange
 from ethercat_server.virtual_sensor.bus import Bus
-from ethercat_server.virtual_sensor.faults.table import obey
-from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
+from ethercat_server.virtual_sensor.faults import obey
+from ethercat_server.virtual_sensor.options import SensorOptions
 
 START_NS = 3_600 * 10**9
 STARTED_AT_NS = 1_767_225_600 * 10**9
@@ -51,7 +51,7 @@ def simulate(
     `options` are `SensorOptions`'. In the signal `scene` there is a contact 5 s after power-on.
     """
     sensor = SensorOptions(**{"sinc_length": 64, **options})
-    bus = Bus(BusOptions((sensor,)), START_NS)
+    bus = Bus([sensor], START_NS)
     todo = sorted([*((0.0, line) for line in commands), *script.commands])
     chance = random.Random(sensor.seed)
     now = start = START_NS + round(begin * 1e9)

@@ -10,10 +10,8 @@ from typing import Any
 
 import pytest
 
-from bota_clients.export.cli import main
-from bota_clients.export.program import COLUMNS
-from bota_clients.record.options import parse_options as record_options
-from bota_clients.record.program import Progress
+from bota_clients import export as program
+from bota_clients.export import COLUMNS, main
 from bota_ethercat.framing import DataFlag
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
 from tests.ended import Result, run_here
@@ -107,8 +105,6 @@ def test_what_cannot_be_done_is_said_and_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from bota_clients.export import program
-
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -124,18 +120,3 @@ def test_the_columns_are_described() -> None:
     for name in COLUMNS:
         stem = re.match(r"(force|torque|acceleration|angular_rate|orientation)_[xyzw]", name)
         assert f"`{name}`" in text or (stem and f"`{stem[1]}_x" in text), name
-
-
-@pytest.mark.parametrize(
-    ("text", "seconds"), [("30s", 30), ("30", 30), ("1.5min", 90), ("2h", 7200), ("0.5 s", 0.5)]
-)
-def test_a_recording_for_a_time(text: str, seconds: float) -> None:
-    assert record_options(["x.mcap", "--for", text]).seconds == seconds
-    assert f" of {seconds:g} s" == Progress("x", seconds)._of or seconds != 30
-
-
-@pytest.mark.parametrize("text", ["0s", "-1s", "30x", "s", "nan", "1e3s"])
-def test_a_wrong_time_is_said(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        record_options(["x.mcap", f"--for={text}"])
-    assert "it must be a time such as 30s, 5min or 2h" in capsys.readouterr().err

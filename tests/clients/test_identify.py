@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import math
 import os
 import random
@@ -16,17 +15,23 @@ from typing import Any
 
 import pytest
 
-from bota_clients.identify.program import run
-from bota_clients.identify.stationary_periods import find_stationary_periods
+from bota_clients.identify.cli import main
+from bota_clients.identify.stationary_periods import StationaryPeriod, find_stationary_periods
 from bota_clients.program import missing
 from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
-from ethercat_server.virtual_sensor.measurement import scene
-from ethercat_server.virtual_sensor.measurement.motion import POSE_LENGTH, POSES
+from bota_ethercat.pdo import STANDARD_GRAVITY, encode
+from bota_ethercat.settings import start_up_defaults
+from ethercat_server.virtual_sensor import signals
+from ethercat_server.virtual_sensor.signals import POSE_LENGTH, POSES
+from ft_compensation.quantities import Payload
 from tests.clients.recordings import START_NS, describe, record, writer
+from tests.compensation import motion
 from tests.compensation.making import written_parameters
 from tests.compensation.streaming import CYCLE, OFFSET, POSES_TAKE, process_data
+from tests.ended import run_here
+from tests.json_schema import problems
 
 SINC = 512
 
@@ -53,79 +58,65 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def asked(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, Any, str]:
+def asked(*arguments: object) -> tuple[int, Any, str]:
     """Exit code, JSON and what was said, of a run with --json."""
-    code = run([*map(str, arguments), "--json"])
-    said = capsys.readouterr()
-    return code, json.loads(said.out), said.err
+    ended = run_here(main, *arguments, "--json")
+    return ended.code, ended.json, ended.err
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+def refused(*arguments: object) -> str:
     """The one sentence of a run that fails."""
-    assert run([*map(str, arguments)]) == 1
-    said = capsys.readouterr().err.splitlines()
+    ended = run_here(main, *arguments)
+    assert ended.code == 1
+    said = ended.err.splitlines()
     assert all(line.startswith("ethercat-identify: ") for line in said)
     return said[-1]
 
 
+def periods(path: Path, least_seconds: float = 1.0) -> list[StationaryPeriod]:
+    with open_recording(path) as opened:
+        found, rejected = find_stationary_periods(columns(opened), least_seconds)
+    assert rejected == []
+    return found
+
+
 def test_it_finds_the_poses_by_itself(recording: Path) -> None:
-    with open_recording(recording) as opened:
-        found = find_stationary_periods(columns(opened))
-    assert len(found.periods) == len(POSES)
-    assert found.rejected == ()
-    for number, still in enumerate(found.periods):
+    found = periods(recording)
+    assert len(found) == len(POSES)
+    for number, still in enumerate(found):
         assert number * CYCLE <= still.begin_s <= number * CYCLE + 0.3
         assert POSE_LENGTH - 0.5 <= still.seconds <= POSE_LENGTH + 0.2
 
 
-def test_it_finds_the_tool_and_the_bias(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, answer, said = asked(capsys, recording)
+def test_it_finds_the_tool_and_the_bias(recording: Path) -> None:
+    code, answer, said = asked(recording)
     assert (code, answer["ok"], said) == (0, True, "")
-    assert answer["tool_mass"] == pytest.approx(scene.TOOL_MASS, rel=0.01)
-    assert math.dist(answer["tool_center_of_gravity"], scene.TOOL_CENTRE) < 0.002
+    assert answer["tool_mass"] == pytest.approx(signals.TOOL_MASS, rel=0.01)
+    assert math.dist(answer["tool_center_of_gravity"], signals.TOOL_CENTRE) < 0.002
     assert answer["bias"] == pytest.approx(OFFSET, abs=0.05)
-    assert abs(answer["tool_mass"] - scene.TOOL_MASS) < 3 * answer["tool_mass_interval"]
+    assert abs(answer["tool_mass"] - signals.TOOL_MASS) < 3 * answer["tool_mass_interval"]
     assert [len(pose["residual_force"]) for pose in answer["poses"]] == [3] * 6
     assert {answer["force_fit"]["verdict"], answer["torque_fit"]["verdict"]} <= {"noise", "small"}
     assert answer["accelerometer"]["offset"] == pytest.approx([0.0] * 3, abs=0.02)
 
 
-def test_a_person_sees_tables(
-    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "100")
-    assert run([str(recording)]) == 0
-    shown = capsys.readouterr().out
-    for words in (
-        "poses",
-        "residual N",
-        "mass",
-        "center of gravity z",
-        "mm",
-        "± (95 %)",
-        "bias torque x",
-        "accelerometer offset z",
-    ):
-        assert words in shown
-    assert max(map(len, shown.splitlines())) <= 100
+def test_a_person_sees_tables_and_no_number_cut_off(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for width, widest in (("100", 100), ("60", 80)):
+        monkeypatch.setenv("COLUMNS", width)
+        code, shown, _ = run_here(main, recording)
+        assert code == 0
+        for words in (
+            "poses", "residual N", "mass", "center of gravity z", "mm", "± (95 %)", "bias torque x",
+            "accelerometer offset z", "0.00016",
+        ):  # fmt: skip
+            assert words in shown
+        assert "…" not in shown
+        assert max(map(len, shown.splitlines())) <= widest
 
 
-def test_no_number_is_cut_off_on_a_narrow_terminal(
-    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "60")
-    assert run([str(recording)]) == 0
-    said = capsys.readouterr().out
-    assert "…" not in said
-    assert "0.00016" in said
-    assert max(map(len, said.splitlines())) <= 80
-
-
-def test_the_yaml_is_what_the_node_takes(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_yaml_is_what_the_node_takes(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "tool.yaml"
-    _, answer, said = asked(capsys, recording, "--yaml", out)
+    _, answer, said = asked(recording, "--yaml", out)
     assert f"written to {out}" in said
     assert "serial number 100, from poses.mcap" in out.read_text().splitlines()[0]
     parameters = written_parameters(out)
@@ -134,17 +125,13 @@ def test_the_yaml_is_what_the_node_takes(
     assert parameters["accelerometer.offset"] == pytest.approx(answer["accelerometer"]["offset"], abs=1e-8)
     assert parameters["accelerometer.scale"] == pytest.approx(answer["accelerometer"]["scale"], abs=1e-8)
     assert "gravity" not in parameters
-    assert "tool.yaml exists: choose another name, or use --force" in refused(
-        capsys, recording, "--yaml", out
-    )
-    asked(capsys, recording, "--yaml", out, "--force", "--gravity", "9.81")
+    assert "tool.yaml exists: choose another name, or use --force" in refused(recording, "--yaml", out)
+    asked(recording, "--yaml", out, "--force", "--gravity", "9.81")
     assert written_parameters(out)["gravity"] == [0.0, 0.0, -9.81]
-    assert "cannot be written" in refused(capsys, recording, "--yaml", tmp_path / "no" / "x.yaml")
+    assert "cannot be written" in refused(recording, "--yaml", tmp_path / "no" / "x.yaml")
 
 
-def test_other_frames_and_bad_samples_do_not_matter(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_other_frames_and_bad_samples_do_not_matter(tmp_path: Path) -> None:
     """Repeated frames, another sensor, and a saturated sample within a pose."""
     noise = random.Random(1)
     mixed = []
@@ -159,70 +146,52 @@ def test_other_frames_and_bad_samples_do_not_matter(
         mixed.append(frame._replace(sensor=1))
     path = tmp_path / "mixed.mcap"
     record(path, mixed, sensors=(0, 1))
-    assert "several sensors (0, 1): choose one with --sensor" in refused(capsys, path)
-    assert "no samples of sensor 7" in refused(capsys, path, "--sensor", 7)
-    code, answer, _ = asked(capsys, path, "--sensor", 0)
+    assert "several sensors (0, 1): choose one with --sensor" in refused(path)
+    assert "no samples of sensor 7" in refused(path, "--sensor", 7)
+    code, answer, _ = asked(path, "--sensor", 0)
     assert code == 0
-    assert answer["tool_mass"] == pytest.approx(scene.TOOL_MASS, rel=0.01)
+    assert answer["tool_mass"] == pytest.approx(signals.TOOL_MASS, rel=0.01)
     for pose in answer["poses"]:
         end = pose["begin_s"] + pose["seconds"]
         assert not pose["begin_s"] <= 150 * SINC / 51200 <= end
 
 
-def test_too_few_poses_are_refused_with_what_to_do_and_the_poses_are_shown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_too_few_poses_are_refused_with_what_to_do_and_the_poses_are_shown(tmp_path: Path) -> None:
     path = tmp_path / "few.mcap"
     record(path, [frame for frame in posed() if frame.monotonic_ns < 4 * CYCLE * 1e9])
-    code, answer, said = asked(capsys, path)
+    code, answer, said = asked(path)
     assert code == 1
     assert len(answer["poses"]) == 4
     assert "about one axis only: gravity never changed along the sensor's x axis" in answer["error"]
     assert "x axis points up" in said
-    code, answer, _ = asked(capsys, path, "--one-axis")
+    code, answer, _ = asked(path, "--one-axis")
     assert code == 0
-    assert answer["tool_mass"] == pytest.approx(scene.TOOL_MASS, rel=0.01)
+    assert answer["tool_mass"] == pytest.approx(signals.TOOL_MASS, rel=0.01)
 
 
-def test_a_recording_that_never_rests_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "scene.mcap"
-    record(path, frames(process_data("scene", 4.0, sinc=SINC)))
-    assert "never stationary for 1 s" in refused(capsys, path)
-
-
-def test_a_gap_or_a_restarted_server_ends_a_rest(tmp_path: Path) -> None:
+def test_a_gap_or_a_restarted_server_ends_a_rest_but_not_the_wall_clock(tmp_path: Path) -> None:
     one = [frame for frame in posed() if frame.monotonic_ns < 1.2e9]
     later = [frame._replace(monotonic_ns=frame.monotonic_ns + 10 * 10**9) for frame in one]
     before = [frame._replace(monotonic_ns=frame.monotonic_ns + 5 * 10**9) for frame in one]
-    path = tmp_path / "gaps.mcap"
-    record(path, [*one, *later, *before])
-    with open_recording(path) as opened:
-        found = find_stationary_periods(columns(opened), least_seconds=0.5)
-    assert len(found.periods) == 3
-
-
-def test_setting_the_wall_clock_ends_no_rest(tmp_path: Path) -> None:
-    one = [frame for frame in posed() if frame.monotonic_ns < 1.2e9]
+    record(path := tmp_path / "gaps.mcap", [*one, *later, *before])
+    assert len(periods(path, 0.5)) == 3
     half = len(one) // 2
-    record(path := tmp_path / "set.mcap", [
-        *one[:half], *(frame._replace(stamp_ns=frame.stamp_ns + 3600 * 10**9) for frame in one[half:]),
-    ])  # fmt: skip
-    with open_recording(path) as opened:
-        (found,) = find_stationary_periods(columns(opened), least_seconds=0.5).periods
+    set_back = [frame._replace(stamp_ns=frame.stamp_ns + 3600 * 10**9) for frame in one[half:]]
+    record(path := tmp_path / "set.mcap", [*one[:half], *set_back])
+    (found,) = periods(path, 0.5)
     assert found.seconds == pytest.approx(1.0, abs=0.05)
 
 
-def test_the_wrong_units_are_noticed(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_used_is_one_sentence(recording: Path, tmp_path: Path) -> None:
     wide = ("--limit", "angular_rate=10", "--limit", "angular_rate_spread=10")
-    assert "check imu_raw_units" in refused(capsys, recording, "--imu-raw-units", "si", *wide)
-
-
-def test_what_is_no_recording_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "cannot be read: No such file" in refused(capsys, tmp_path / "none.mcap")
+    assert "check imu_raw_units" in refused(recording, "--imu-raw-units", "si", *wide)
+    record(path := tmp_path / "scene.mcap", frames(process_data("scene", 4.0, sinc=SINC)))
+    assert "never stationary for 1 s" in refused(path)
+    assert "cannot be read: No such file" in refused(tmp_path / "none.mcap")
     (tmp_path / "text.mcap").write_text("hello")
-    assert "text.mcap" in refused(capsys, tmp_path / "text.mcap")
+    assert "text.mcap" in refused(tmp_path / "text.mcap")
     record(tmp_path / "empty.mcap", [])
-    assert "has no samples" in refused(capsys, tmp_path / "empty.mcap")
+    assert "has no samples" in refused(tmp_path / "empty.mcap")
 
 
 @pytest.mark.parametrize(
@@ -230,11 +199,10 @@ def test_what_is_no_recording_is_one_sentence(tmp_path: Path, capsys: pytest.Cap
     [[], ["a.mcap", "b.mcap"], ["a.mcap", "--gravity", "1"], ["a.mcap", "--limit", "speed=1"],
      ["a.mcap", "--limit", "force_spread=x"], ["a.mcap", "--confidence", "1"], ["a.mcap", "--sensor", "-1"]],
 )  # fmt: skip
-def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        run(arguments)
-    assert caught.value.code == 2
-    assert "usage: ethercat-identify" in capsys.readouterr().err
+def test_wrong_usage_is_exit_code_2(arguments: list[str]) -> None:
+    ended = run_here(main, *arguments)
+    assert ended.code == 2
+    assert "usage: ethercat-identify" in ended.err
 
 
 def start(path: Path) -> subprocess.Popen[str]:
@@ -275,9 +243,7 @@ def test_what_is_not_installed_is_said(tmp_path: Path) -> None:
     assert hidden.stderr == f"ethercat-identify: {missing('numpy')}\n"
 
 
-def test_a_sensor_that_was_exchanged_meanwhile_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sensor_that_was_exchanged_meanwhile_is_refused(tmp_path: Path) -> None:
     path, half = tmp_path / "swapped.mcap", len(posed()) // 2
     made = writer(path)
     description = describe(0)
@@ -289,4 +255,54 @@ def test_a_sensor_that_was_exchanged_meanwhile_is_refused(
     for frame in posed()[half:]:
         made.frame(frame)
     made.finish({})
-    assert "sensor 0 was replaced during it (serial numbers 100, 7)" in refused(capsys, path)
+    assert "sensor 0 was replaced during it (serial numbers 100, 7)" in refused(path)
+
+
+@pytest.fixture(scope="module")
+def shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """By hand for 10 s, with FIR on."""
+    path = tmp_path_factory.mktemp("identify") / "shaken.mcap"
+    settings: dict[str, Any] = {**start_up_defaults(), "fir": True}
+    felt = motion.filtered(
+        motion.guided(1, metres=0.06, radians=0.3, hertz=(1.5, 4.0)), Payload(0.7), 10.0, settings
+    )
+    made = []
+    for number, (time_s, *vectors) in enumerate(zip(*felt, strict=True)):
+        names = ("force", "torque", "acceleration", "angular_rate")
+        scales = (1.0, 1.0, 1 / STANDARD_GRAVITY, 180 / math.pi)
+        values = {
+            f"{name}.{axis}": value * scale
+            for name, scale, vector in zip(names, scales, vectors, strict=True)
+            for axis, value in zip("xyz", vector, strict=True)
+        }
+        made.append((time_s + 1.0, number, encode(61, values)))
+    record(path, frames(made), **settings)
+    return path
+
+
+def test_the_lag_of_the_force_is_told_beside_what_the_filters_imply(shaken: Path) -> None:
+    code, found, _ = asked("delay", shaken)
+    assert code == 0
+    assert not problems("identify-delay", found)
+    assert found["expected_ms"] == pytest.approx(15 - 1.94)
+    assert found["lag_ms"] == pytest.approx(found["expected_ms"], abs=0.2)
+    ended = run_here(main, "delay", shaken)
+    assert "after the accelerometer; by the filters that were set: 13.06 ms" in ended.out
+
+
+def test_a_recording_at_rest_shows_no_lag(tmp_path: Path) -> None:
+    record(tmp_path / "rest.mcap", frames(process_data("rest", 6.0, sinc=SINC)))
+    assert "shake the sensor" in refused("delay", tmp_path / "rest.mcap")
+    code, found, _ = asked("delay", tmp_path / "rest.mcap")
+    assert (code, found["ok"]) == (1, False)
+    assert not problems("identify-delay", found)
+
+
+def test_settings_of_a_recording_that_cannot_be_are_ignored(tmp_path: Path, shaken: Path) -> None:
+    with open_recording(shaken) as opened:
+        every = list(opened.frames())
+    odd: dict[str, Any] = {"sinc_length": "long", "fir": [], "acceleration_filter": {}, "chop": None}
+    record(tmp_path / "odd.mcap", every, **odd)
+    code, found, _ = asked("delay", tmp_path / "odd.mcap")
+    assert (code, found["expected_ms"]) == (0, None)
+    assert "by the filters that were set: unknown" in run_here(main, "delay", tmp_path / "odd.mcap").out

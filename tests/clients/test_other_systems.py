@@ -13,7 +13,9 @@ from tests.server.running import free_port
 
 ROOT: Final = Path(__file__).parents[2]
 PROJECT: Final = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-CLIENTS: Final = {name: entry for name, entry in PROJECT["scripts"].items() if entry.startswith("clients.")}
+CLIENTS: Final = {
+    name: entry for name, entry in PROJECT["scripts"].items() if entry.startswith("bota_clients.")
+}
 
 ELSEWHERE: Final = """
 import importlib, sys, threading
@@ -43,15 +45,17 @@ for name, entry in CLIENTS.items():
     except SystemExit as ended:
         assert ended.code == 0, name
 
-import bota_clients.export.program, bota_clients.identify.program
-import bota_clients.record.program, bota_clients.replay.program
+import bota_clients.identify.program
+from bota_clients import export
 from bota_clients.monitor import cli
 from bota_clients.program import Signals, call_on
+from bota_clients.record import cli as record, program as recording
+from bota_clients.replay import cli as replay, program as replaying
 from bota_ethercat.client import connect
 
-replay, recorder = Signals(), Signals()
+stop, recorder = Signals(), Signals()
 where = "--server", f"localhost:{port}"
-run = lambda: bota_clients.replay.program.run([played, *where, "--loop"], replay)
+run = lambda: replaying.run(replay.parse_options([played, *where, "--loop"]), stop)
 thread = threading.Thread(target=run, daemon=True)
 thread.start()
 while True:
@@ -62,12 +66,12 @@ while True:
         break
     except Exception as error:
         assert "refused" in str(error), error
-assert bota_clients.record.program.run([recorded, *where, "--seconds", "0.2"], recorder) == 0
+assert recording.run(record.parse_options([recorded, *where, "--seconds", "0.2"]), recorder) == 0
 cli._ONCE_S = 0.1
 assert cli.run(cli.parse(["--once", *where])) in (0, 1)
-replay._on_signal(0, None)
+stop._on_signal(0, None)
 thread.join()
-assert bota_clients.export.program.run(bota_clients.export.options.parse_options([recorded, table])) == 0
+assert export.main([recorded, table]) == 0
 
 class Loop:
     def add_signal_handler(self, number, stop):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -11,9 +12,9 @@ from typing import Any
 import pytest
 import zstandard
 
+from bota_clients.recording import file_format
 from bota_clients.recording.columns import columns
 from bota_clients.recording.container import MAX_CHUNK, McapFile
-from bota_clients.recording.file_format import DESCRIPTION_TOPIC, FORMAT_VERSION
 from bota_clients.recording.reader import (
     DamagedError,
     Description,
@@ -26,18 +27,20 @@ from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import SampleDecoder
 from tests.clients.recordings import START_NS, describe, frame, record, writer
 
+DOCS = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
 CHUNKS = 10
 PER_CHUNK = 30
 
 
+FRAMES = [frame(number) for number in range(CHUNKS * PER_CHUNK)]
+
+
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
-
-
-@pytest.fixture
-def frames(path: Path) -> list[DataMessage]:
-    return record(path, (frame(number) for number in range(CHUNKS * PER_CHUNK)), PER_CHUNK)
+    """Of a recording of FRAMES."""
+    path = tmp_path / "run.mcap"
+    record(path, FRAMES, PER_CHUNK)
+    return path
 
 
 def chunk_ends(path: Path) -> list[int]:
@@ -51,15 +54,11 @@ def chunk_ends(path: Path) -> list[int]:
     return ends
 
 
-def test_frames_come_back_byte_for_byte(path: Path, frames: list[DataMessage]) -> None:
+def test_frames_come_back_byte_for_byte(path: Path) -> None:
     with open_recording(path) as recording:
-        assert list(recording.frames()) == frames
-        assert recording.frame_count == len(frames)
-        assert recording.cut_off is None
-        assert recording.end == {}
-
-
-def test_all_of_a_frame_is_kept(path: Path) -> None:
+        assert list(recording.frames()) == FRAMES
+        assert recording.frame_count == len(FRAMES)
+        assert (recording.cut_off, recording.end) == (None, {})
     extreme = DataMessage(2**64 - 1, 2**64 - 1, 2**64 - 1, 255, 255, 65535, bytes(range(77)))
     record(path, [extreme], sensors=(255,))
     with open_recording(path) as recording:
@@ -74,28 +73,21 @@ def test_sensors_are_told_apart(path: Path) -> None:
         assert list(recording.frames(7)) == []
 
 
-def test_every_serial_number_is_read(path: Path) -> None:
-    made = writer(path)
-    described = describe(0)
-    described["sensors"][0]["serial"] = 2**32 - 1
-    made.describe(START_NS, described)
-    made.finish({})
-    with open_recording(path) as recording:
-        assert [s.serial for s in recording.sensors] == [2**32 - 1]
-
-
 def test_settings_are_known_over_time(path: Path) -> None:
     made = writer(path)
-    made.describe(START_NS, describe(0, chop=False))
+    first = describe(0, chop=False)
+    first["sensors"][0]["serial"] = 2**32 - 1
+    made.describe(START_NS, first)
     made.frame(frame(0))
     made.event(START_NS + 10, {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}})
     reply = describe(0)
-    reply["sensors"][0] |= {"settings": {"sinc_length": 32}, "rate_hz": 1600}
+    reply["sensors"][0] |= {"settings": {"sinc_length": 32}, "rate_hz": 1600, "serial": 2**32 - 1}
     made.describe(START_NS + 20, reply)
     made.frame(frame(1))
     made.finish({"reason": "asked to"})
     with open_recording(path) as recording:
         (sensor,) = recording.sensors
+        assert sensor.serial == 2**32 - 1
         assert sensor.settings == {"sinc_length": 64, "chop": False}
         assert [(s.stamp_ns - START_NS, s.values["sinc_length"], s.rate_hz) for s in sensor.history] == [
             (0, 64, 800), (10, 32, 1600),
@@ -131,26 +123,20 @@ def test_columns_are_what_the_decoder_gives(path: Path) -> None:
         assert table.force_torque_saturated[row] == sample.force_torque_saturated
         assert table.acceleration_saturated[row] == sample.acceleration_saturated
         assert (table.sequence[row], table.stamp_ns[row]) == (item.sequence, item.stamp_ns)
-    assert list(table.orientation[:, 3] == 1.0) == [False, True, False]
+    assert str(table.orientation[:, 3].tolist()) == "[nan, 1.0, nan]"
     assert list(table.fresh) == [True, False, True]
     assert list(table.where(table.fresh).sequence) == [0, 2]
 
-
-def test_columns_of_nothing_are_empty(path: Path) -> None:
     record(path, [])
     with open_recording(path) as recording:
         table = columns(recording)
-    assert len(table) == 0
-    assert table.force.shape == (0, 3)
-    assert table.orientation.shape == (0, 4)
+    assert (len(table), table.force.shape, table.orientation.shape) == (0, (0, 3), (0, 4))
 
 
 # -- cut off
 
 
-def test_cut_anywhere_everything_up_to_the_last_whole_chunk_is_read(
-    path: Path, frames: list[DataMessage], tmp_path: Path
-) -> None:
+def test_cut_anywhere_everything_up_to_the_last_whole_chunk_is_read(path: Path, tmp_path: Path) -> None:
     data, ends = path.read_bytes(), chunk_ends(path)
     assert len(ends) == CHUNKS
     source = random.Random(2)
@@ -162,27 +148,26 @@ def test_cut_anywhere_everything_up_to_the_last_whole_chunk_is_read(
         whole = sum(end <= cut for end in ends)
         with open_recording(part) as recording:
             found = list(recording.frames())
-            assert found == frames[: len(found)], cut
+            assert found == FRAMES[: len(found)], cut
             assert whole * PER_CHUNK <= len(found) <= (whole + 1) * PER_CHUNK, cut
             assert recording.cut_off, cut
             assert recording.end is None or cut > ends[-1]
 
 
-def test_an_empty_tail_after_a_power_failure_is_left_out(path: Path, frames: list[DataMessage]) -> None:
+def test_an_empty_tail_after_a_power_failure_is_left_out(path: Path) -> None:
     data, ends = path.read_bytes(), chunk_ends(path)
     path.write_bytes(data[: ends[4]] + bytes(4096))
     with open_recording(path) as recording:
-        assert list(recording.frames()) == frames[: 5 * PER_CHUNK]
+        assert list(recording.frames()) == FRAMES[: 5 * PER_CHUNK]
         assert "4096 bytes" in str(recording.cut_off)
     # The length is there, the blocks behind it are not.
     path.write_bytes(data[: ends[4] + 100] + bytes(ends[5] - ends[4] - 100))
     with open_recording(path) as recording:
-        assert list(recording.frames()) == frames[: 5 * PER_CHUNK]
+        assert list(recording.frames()) == FRAMES[: 5 * PER_CHUNK]
         assert recording.cut_off
 
 
-def test_what_was_cut_off_before_the_first_chunk_is_said(path: Path, frames: list[DataMessage]) -> None:
-    del frames
+def test_what_was_cut_off_before_the_first_chunk_is_said(path: Path) -> None:
     data = path.read_bytes()
     for size in (0, 7, 8, 20):
         path.write_bytes(data[:size])
@@ -200,28 +185,24 @@ def test_other_files_are_refused(path: Path, what: bytes) -> None:
         open_recording(path)
 
 
-def test_what_is_not_there_is_said(path: Path) -> None:
-    with pytest.raises(RecordingError, match="No such file"):
-        open_recording(path)
-    with pytest.raises(RecordingError, match="directory"):
-        open_recording(path.parent)
-
-
-def test_another_format_is_refused(path: Path) -> None:
-    made = writer(path, format="99")
-    made.finish({})
+def test_what_is_not_there_or_another_format_is_said(path: Path) -> None:
+    writer(path, format="99").finish({})
     with pytest.raises(NotARecordingError, match="'99'"):
         open_recording(path)
-    assert FORMAT_VERSION == "1"
+    with pytest.raises(RecordingError, match="No such file"):
+        open_recording(path.with_name("no.mcap"))
+    with pytest.raises(RecordingError, match="directory"):
+        open_recording(path.parent)
+    assert file_format.FORMAT_VERSION == "1"
 
 
-def test_a_flipped_bit_in_a_chunk_is_found(path: Path, frames: list[DataMessage]) -> None:
+def test_a_flipped_bit_in_a_chunk_is_found(path: Path) -> None:
     data, ends = bytearray(path.read_bytes()), chunk_ends(path)
     data[ends[3] + 200] ^= 0x10
     path.write_bytes(data)
     with open_recording(path) as recording:
         found = recording.frames()
-        assert [next(found) for _ in range(4 * PER_CHUNK)] == frames[: 4 * PER_CHUNK]
+        assert [next(found) for _ in range(4 * PER_CHUNK)] == FRAMES[: 4 * PER_CHUNK]
         with pytest.raises(DamagedError, match="damaged at byte"):
             next(found)
 
@@ -270,7 +251,7 @@ def test_a_chunk_that_claims_more_than_it_may_is_refused(path: Path, size: int, 
 def test_a_text_that_is_no_json_is_refused(path: Path) -> None:
     record(path, [frame(0)])
     file = McapFile(path)
-    number = next(n for n, channel in file.channels.items() if channel.topic == DESCRIPTION_TOPIC)
+    number = next(n for n, topic in file.topics.items() if topic == file_format.DESCRIPTION_TOPIC)
     file.close()
     body = struct.pack("<HIQQ", number, 0, 0, 0) + b"\x00\x01\x00\x00" + struct.pack("<I", 2) + b"[\0"
     body = struct.pack("<BQ", 5, len(body)) + body
@@ -278,3 +259,36 @@ def test_a_text_that_is_no_json_is_refused(path: Path) -> None:
     path.write_bytes(data[:end] + chunk(body, len(body), zstandard.compress(body)) + data[end:])
     with pytest.raises(DamagedError, match="not JSON"):
         open_recording(path)
+
+
+# -- docs/recording.md
+
+
+def test_every_topic_and_schema_is_described() -> None:
+    for name in (
+        file_format.frame_topic(0).replace("0", "N"), file_format.DESCRIPTION_TOPIC, file_format.EVENTS_TOPIC,
+        *file_format.DEFINITIONS, file_format.METADATA, file_format.END_METADATA,
+    ):  # fmt: skip
+        assert f"`{name}`" in DOCS, name
+
+
+def test_the_bytes_of_a_frame_are_as_described() -> None:
+    rows = re.findall(r"^\| (\d+) \| (\w+) \| `(\w+)`", DOCS, re.MULTILINE)
+    formats = {"u8": "<B", "u16": "<H", "u64": "<Q"}
+    item = frame(7, sensor=3, flags=5)
+    body = file_format.pack_frame(item)
+    seen = {
+        name: struct.unpack_from(formats[kind], body, int(at))[0]
+        for at, kind, name in rows
+        if kind in formats
+    }
+    assert seen == dict(zip(DataMessage._fields[:6], item[:6], strict=True))
+    assert body.startswith(bytes.fromhex("00010000"))
+    assert struct.unpack_from("<I", body, 32) == (len(item.process_data),)
+    assert body[36:] == item.process_data
+
+
+def test_the_example_reads_a_recording(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(path.parent)
+    (example,) = re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL)
+    exec(compile(example, "docs/recording.md", "exec"), {})

@@ -14,7 +14,7 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,30 +23,23 @@ import pytest
 from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
-from bota_clients.record import cli, program, recorder
-from bota_clients.record import recorder as record_parts
-from bota_clients.record.recorder import FLUSH_S, Parts, Recorder
-from bota_clients.record.source import BATCH_S, Batch, Source
+from bota_clients.errors import DiskError
+from bota_clients.record import cli, recorder
+from bota_clients.record.program import Progress
+from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch, Parts, Source, Tally
 from bota_clients.recording.file_format import FORMAT_VERSION, frame_topic
-from bota_clients.recording.reader import open_recording
+from bota_clients.recording.reader import Description, open_recording
+from bota_clients.recording.writer import DiskFile
 from bota_ethercat.address import Address
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.recordings import frame, record
-from tests.clients.running import (
-    NoSignals,
-    RecorderProcess,
-    Replay,
-    frames_in,
-    recording,
-    replaying,
-    signalled,
-)
+from tests.clients.running import Recorder, RecorderProcess, Replay, frames_in, signalled
+from tests.ended import run_here
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port, needs_bus, server, wait_until
 
-Run = Callable[..., tuple[int, str]]
 SECOND = 800
 """Frames of one sensor in a second."""
 OLD = DataFlag.REPEATED | DataFlag.INVALID
@@ -62,7 +55,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def endless(source: Path) -> Iterator[Replay]:
-    with replaying("--loop", source) as running:
+    with Replay("--loop", source) as running:
         yield running
 
 
@@ -76,18 +69,18 @@ def read(path: Path) -> list[DataMessage]:
         return list(opened.frames())
 
 
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
+def end(path: Path) -> Mapping[str, str]:
+    """What it has at its end, which was not cut off."""
+    with open_recording(path) as opened:
+        assert opened.cut_off is None
+        assert opened.end is not None
+        return opened.end
+
+
+def run(*arguments: object) -> tuple[int, str]:
     """Runs the program here; its exit code and what it said."""
-
-    def running(*arguments: object) -> tuple[int, str]:
-        try:
-            code = program.run([*map(str, arguments)], NoSignals())
-        except SystemExit as ended:
-            code = int(str(ended.code))
-        return code, capsys.readouterr().err
-
-    return running
+    ended = run_here(cli.main, *arguments)
+    return ended.code, ended.err
 
 
 def is_whole(frames: list[DataMessage]) -> bool:
@@ -103,10 +96,8 @@ def is_whole(frames: list[DataMessage]) -> bool:
 
 
 @pytest.mark.parametrize("stamps", [(), ("--original-stamps",)])
-def test_record_replay_record_gives_the_same_frames(
-    source: Path, out: Path, stamps: tuple[str, ...], run: Run
-) -> None:
-    with replaying(*stamps, "--speed", "max", source) as served:
+def test_record_replay_record_gives_the_same_frames(source: Path, out: Path, stamps: tuple[str, ...]) -> None:
+    with Replay(*stamps, "--speed", "max", source) as served:
         code, said = run(out, served.port, "--no-reconnect")
         assert served.wait() == 0
     assert code == 0, said
@@ -119,60 +110,35 @@ def test_record_replay_record_gives_the_same_frames(
     assert original == again
 
 
-def test_it_ends_by_itself_and_says_what_it_has(endless: Replay, out: Path, run: Run) -> None:
+def test_it_ends_by_itself_and_says_what_it_has(endless: Replay, out: Path) -> None:
     code, said = run(out, endless.port, "--seconds", "0.5")
     assert code == 0
+    assert end(out)["reason"] == "time is up"
     with open_recording(out) as opened:
-        assert opened.cut_off is None
-        assert opened.end is not None
-        assert opened.end["reason"] == "time is up"
         assert [sensor.serial for sensor in opened.sensors] == [100, 101]
         assert opened.metadata["server"] == f"localhost:{endless.port}"
         assert f"{opened.frame_count} frames of 2 sensors" in said
         assert is_whole(list(opened.frames()))
 
 
-def test_one_sensor_of_two(endless: Replay, out: Path, run: Run) -> None:
-    code, _ = run(out, endless.port, "--sensor", "1", "--seconds", "0.3")
-    assert code == 0
-    with open_recording(out) as opened:
-        assert {item.sensor for item in opened.frames()} == {1}
-        assert opened.chosen == {1}
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_cleanly(
     endless: Replay, out: Path, number: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert signalled(cli.main, number, lambda: frames_in(out) > 50, out, endless.port) == 0
+    ready = lambda: frames_in(out) > 50  # noqa: E731
+    assert signalled(cli.main, number, ready, out, endless.port, "--sensor", 1) == 0
     assert "nothing was lost" in capsys.readouterr().err
+    assert end(out)["reason"] == "asked to stop"
     with open_recording(out) as opened:
-        assert opened.cut_off is None
-        assert opened.end is not None
-        assert opened.end["reason"] == "asked to stop"
+        assert {item.sensor for item in opened.frames()} == opened.chosen == {1}
 
 
-def test_it_records_across_the_restart_of_the_server(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with served(sinc_length=512) as first, recording(out, first.port) as recorder:
-        recorder.wait_for_frames(20)
-        first.close()
-        with served(port=first.port, sinc_length=512):
-            recorder.wait_for_frames(20)
-            assert recorder.stop() == 0
-    assert "nothing was lost" in capsys.readouterr().err
-    with open_recording(out) as opened:
-        names = [event.name for event in opened.events]
-        assert names == ["connected", "shutting_down", "disconnected", "connected"]
-        assert [event.by_recorder for event in opened.events] == [True, False, True, True]
-        assert len(opened.descriptions) == 2
-
-
-def test_it_records_on_without_a_sensor_that_the_restarted_server_lacks(
+def test_it_records_on_across_restarts_even_without_a_sensor_that_the_server_lacks(
     out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with (
         served(SensorOptions(), SensorOptions(), sinc_length=512) as first,
-        recording(out, first.port, "--sensor", "0", "--sensor", "1") as recorder,
+        Recorder(out, first.port, "--sensor", "0", "--sensor", "1") as recorder,
     ):
         recorder.wait_for_frames(20)
         first.close()
@@ -182,14 +148,20 @@ def test_it_records_on_without_a_sensor_that_the_restarted_server_lacks(
         with served(SensorOptions(), SensorOptions(), port=first.port, sinc_length=512):
             wait_until(lambda: read(out)[-1].sensor == 1, "a frame of the sensor that is back")
             assert recorder.stop() == 0
-    assert "connected: without sensor 1" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "connected: without sensor 1" in said
+    assert "nothing was lost" in said
     with open_recording(out) as opened:
-        said = [event.event.get("message") for event in opened.events if event.name == "connected"]
-        assert said == [None, "without sensor 1", None]
+        names = ["connected", *("shutting_down", "disconnected", "connected") * 2]
+        assert [event.name for event in opened.events] == names
+        assert [event.by_recorder for event in opened.events] == [name != "shutting_down" for name in names]
+        about = [event.event.get("message") for event in opened.events if event.name == "connected"]
+        assert about == [None, "without sensor 1", None]
+        assert sum(isinstance(item, Description) for item in opened.everything()) == 3
 
 
 def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with ScriptedServer() as server, recording(out, server.port) as recorder:
+    with ScriptedServer() as server, Recorder(out, server.port) as recorder:
         assert server.subscribed.wait(PATIENCE_S)
         server.answers["subscribe"] = lambda _: {"ok": False, "error": {"code": "busy", "message": "not now"}}
         server.drop()
@@ -204,14 +176,29 @@ def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.
 # -- what is lost
 
 
-def test_what_the_server_withheld_is_said(out: Path, tmp_path: Path, run: Run) -> None:
-    gappy = tmp_path / "gappy.mcap"
-    missing = {50, 51, 120}
-    record(gappy, (frame(n, flags=4 if n - 1 in missing else 0) for n in range(200) if n not in missing))
-    with replaying("--speed", "max", gappy) as served:
-        code, said = run(out, served.port, "--no-reconnect")
-    assert code == 0
-    assert "3 frames of sensor 0 not read in time" in said
+@pytest.mark.parametrize(
+    ("frames", "words", "sentence"),
+    [
+        ([frame(1), frame(2), frame(1, 1)], "nothing lost", ""),
+        (
+            [frame(1), frame(2, 0, DataFlag.GAP), frame(3, 0, DataFlag.GAP), frame(1, 1)],
+            "2+0 gaps",
+            "sensor 0: 2 times samples were or may have been lost on the bus (GAP)",
+        ),
+        (
+            [frame(1), frame(5, 0, DataFlag.GAP), frame(1, 1, DataFlag.INVALID)],
+            "3 lost, 0+1 invalid",
+            "3 frames of sensor 0 not read in time, 1 frame of sensor 1 invalid",
+        ),
+    ],
+)
+def test_the_line_says_nothing_lost_only_if_the_end_would(
+    frames: list[DataMessage], words: str, sentence: str
+) -> None:
+    tally = Tally()
+    for each in frames:
+        tally.count(each)
+    assert (tally.brief(), ", ".join(tally.losses())) == (words, sentence)
 
 
 def test_a_moment_without_running_and_the_end_of_its_input(out: Path) -> None:
@@ -237,23 +224,21 @@ def test_a_moment_without_running_and_the_end_of_its_input(out: Path) -> None:
             recorder.signal(signal.SIGCONT)
             recorder.close()
     assert is_whole(read(out))
-    with open_recording(out) as opened:
-        assert opened.end is not None
-        assert opened.end["reason"] == "asked to stop"
+    assert end(out)["reason"] == "asked to stop"
 
 
 def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
     source = Source(Address("localhost", endless.port), None)
     source.connect()
-    with socket.socket(fileno=os.dup(source._client.fileno())) as same:
+    with socket.socket(fileno=os.dup(source.fileno())) as same:
         room = same.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     source.close()
     most = int(Path("/proc/sys/net/core/rmem_max").read_text())
     assert room >= min(4 * 1024 * 1024, 2 * most)
 
 
-def new_recorder(out: Path) -> Recorder:
-    return Recorder(Parts(out, size=None, seconds=None, overwrite=False), "test", {"format": FORMAT_VERSION})
+def new_recorder(out: Path) -> recorder.Recorder:
+    return recorder.Recorder(Parts(out, None, None, overwrite=False), "test", {"format": FORMAT_VERSION})
 
 
 def test_frames_get_into_the_file_before_it_ends(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -292,10 +277,8 @@ def test_a_backlog_does_not_delay_its_end(out: Path, monkeypatch: pytest.MonkeyP
     assert slow.error is None
     with open_recording(out) as opened:
         assert len(list(opened.frames())) == slow.saved < 16_000
-        assert opened.cut_off is None
         lost = sum(event.event["frames"] for event in opened.events)
-        assert opened.end is not None
-        assert str(lost) == opened.end["dropped"]
+        assert str(lost) == end(out)["dropped"]
     assert slow.saved + lost == 32_000
 
 
@@ -310,46 +293,27 @@ def test_of_a_file_that_is_removed_nothing_is_said_to_be_there(out: Path) -> Non
     assert (removed.saved, removed.tally.dropped) == (0, 11)
 
 
-def test_a_part_that_was_taken_away_is_none_of_its_business(
-    endless: Replay, out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        record_parts, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic(), time_ns=time.time_ns)
-    )
-    part = out.with_name("out_0.mcap")
-    with recording(out, endless.port, "--rotate-seconds", "1") as recorder:
-        wait_until(out.with_name("out_1.mcap").exists, "the second file")
-        part.unlink()
-        wait_until(out.with_name("out_3.mcap").exists, "the fourth file")
-        assert recorder.stop() == 0
+TWENTY = pytest.param(20, marks=[pytest.mark.long, pytest.mark.timeout(600)])
 
 
-def killed(endless: Replay, out: Path, frames: int) -> None:
-    """Kill a recorder once there are so many frames; all of them are there."""
-    recorder = RecorderProcess(out, endless.port, "--force")
-    try:
-        recorder.wait_for("Ctrl-C ends it")
-        wait_until(lambda: frames_in(out) > frames, "frames")
-        before = frames_in(out)
-        recorder.signal(signal.SIGKILL)
-        recorder.wait()
-    finally:
-        recorder.close()
-    assert len(read(out)) >= before
-    assert is_whole(read(out))
-    assert {item.sensor for item in read(out)} == {0, 1}
-
-
-def test_killed_it_leaves_what_was_there(endless: Replay, out: Path) -> None:
-    killed(endless, out, 500)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(600)
-def test_killed_twenty_times_it_leaves_everything_twenty_times(endless: Replay, out: Path) -> None:
+@pytest.mark.parametrize("times", [1, TWENTY])
+def test_killed_it_leaves_what_was_there(times: int, endless: Replay, out: Path) -> None:
     source = random.Random(4)
-    for _ in range(20):
-        killed(endless, out, source.randrange(200, 5000))
+    for _ in range(times):
+        frames = source.randrange(200, 5000) if times > 1 else 500
+        recorder = RecorderProcess(out, endless.port, "--force")
+        try:
+            recorder.wait_for("Ctrl-C ends it")
+            wait_until(lambda: frames_in(out) > frames, "frames")  # noqa: B023
+            before = frames_in(out)
+            recorder.signal(signal.SIGKILL)
+            recorder.wait()
+        finally:
+            recorder.close()
+        left = read(out)
+        assert len(left) >= before
+        assert is_whole(left)
+        assert {item.sensor for item in left} == {0, 1}
 
 
 @pytest.fixture
@@ -370,7 +334,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", folder], check=True)
 
 
-def test_a_full_disk_ends_it_with_what_was_written_whole(endless: Replay, small_disk: Path, run: Run) -> None:
+def test_a_full_disk_ends_it_with_what_was_written_whole(endless: Replay, small_disk: Path) -> None:
     out = small_disk / "out.mcap"
     code, said = run(out, endless.port, "--seconds", "30")
     assert code == 1
@@ -388,39 +352,99 @@ def test_a_full_disk_ends_it_with_what_was_written_whole(endless: Replay, small_
 def test_rotation_loses_nothing_between_the_files(
     endless: Replay, out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Not even if a file that is finished is taken away."""
     monkeypatch.setattr(
-        record_parts, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic(), time_ns=time.time_ns)
+        recorder, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic(), time_ns=time.time_ns)
     )
-    with recording(out, endless.port, "--rotate-seconds", "1") as recorder:
-        wait_until(lambda: len(list(out.parent.glob("out_*.mcap"))) >= 3, "three files")
-        assert recorder.stop() == 0
+    first = out.with_name("out_0.mcap")
+    with Recorder(out, endless.port, "--rotate-seconds", "1") as running:
+        wait_until(out.with_name("out_1.mcap").exists, "the second file")
+        first.rename(out.with_name("moved"))
+        wait_until(out.with_name("out_3.mcap").exists, "the fourth file")
+        assert running.stop() == 0
     said = capsys.readouterr().err
-    parts = sorted(out.parent.glob("out_*.mcap"))
     assert not out.exists()
     frames: list[DataMessage] = []
-    for number, part in enumerate(parts):
+    for number, part in enumerate([out.with_name("moved"), *sorted(out.parent.glob("out_*.mcap"))]):
         with open_recording(part) as opened:
-            assert opened.metadata["part"] == str(number)
-            assert opened.cut_off is None
+            assert (opened.metadata["part"], opened.cut_off) == (str(number), None)
             assert [sensor.serial for sensor in opened.sensors] == [100, 101]
             frames += opened.frames()
     assert is_whole(frames)
     assert f"{len(frames)} frames" in said
 
 
-def test_nothing_is_overwritten_unasked(endless: Replay, out: Path, run: Run) -> None:
+def parts(path: Path, size: float | None = 1000, *, overwrite: bool = False) -> Parts:
+    return Parts(path, size, None, overwrite=overwrite)
+
+
+def test_files_have_the_name_that_was_given_or_numbers(tmp_path: Path) -> None:
+    one = parts(tmp_path / "a.mcap", None)
+    one.open().close()
+    assert [path.name for path in one.made] == ["a.mcap"]
+    assert not one.is_full(10**12)
+    row = parts(tmp_path / "a.mcap")
+    for _ in range(3):
+        row.open().close()
+    assert [path.name for path in row.made] == ["a_0.mcap", "a_1.mcap", "a_2.mcap"]
+    assert [row.is_full(size) for size in (999, 1000)] == [False, True]
+
+
+def test_a_row_is_not_mixed_with_an_older_one(tmp_path: Path) -> None:
+    for number in range(4):
+        (tmp_path / f"a_{number}.mcap").write_text("old")
+    (tmp_path / "a_b.mcap").write_text("other")
+    with pytest.raises(DiskError, match="exists"):
+        parts(tmp_path / "a.mcap").check()
+    made = parts(tmp_path / "a.mcap", overwrite=True)
+    made.check()
+    made.open().close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a_0.mcap", "a_b.mcap"]
+
+
+def test_a_row_that_is_being_written_is_not_replaced(tmp_path: Path) -> None:
+    first = parts(tmp_path / "a.mcap")
+    first.open().close()
+    writing = first.open()
+    with pytest.raises(DiskError, match=r"a_1.mcap .* another ethercat-record is writing to it"):
+        parts(tmp_path / "a.mcap", overwrite=True).open()
+    assert [path.exists() for path in first.made] == [True, True], "none is gone"
+    writing.close()
+    parts(tmp_path / "a.mcap", overwrite=True).open().close()
+    assert [path.exists() for path in first.made] == [True, False]
+
+
+def test_what_the_disk_does_not_take_is_taken_off_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = DiskFile(tmp_path / "a", overwrite=False)
+    disk.write(b"first")
+    disk.flush()
+    real, room = os.write, 3
+
+    def full(fd: int, data: bytes) -> int:
+        nonlocal room
+        if not room:
+            raise OSError(28, "No space left on device")
+        count, room = min(room, len(data)), 0
+        return int(real(fd, data[:count]))
+
+    disk.write(b"second")
+    monkeypatch.setattr("os.write", full)
+    with pytest.raises(DiskError, match="No space left"):
+        disk.flush()
+    monkeypatch.undo()
+    disk.close()
+    assert (tmp_path / "a").read_bytes() == b"first"
+
+
+def test_nothing_is_overwritten_unasked_or_by_two(endless: Replay, out: Path) -> None:
     out.write_text("precious")
     code, said = run(out, endless.port, "--seconds", "0.3")
     assert code == 1
     assert "exists: choose another name, or use --force to replace it" in said
     assert out.read_text() == "precious"
-    code, _ = run(out, endless.port, "--seconds", "0.3", "--force")
-    assert code == 0
-    assert read(out)
-
-
-def test_two_recorders_do_not_write_to_one_file(endless: Replay, out: Path, run: Run) -> None:
-    with recording(out, endless.port) as recorder:
+    with Recorder(out, endless.port, "--force") as recorder:
         recorder.wait_for_frames(1)
         code, said = run(out, endless.port, "--force", "--seconds", "0.3")
         assert code == 1
@@ -433,70 +457,62 @@ def test_two_recorders_do_not_write_to_one_file(endless: Replay, out: Path, run:
 
 @pytest.mark.parametrize("rotate", [(), ("--rotate-size", "1M")])
 def test_a_refusal_is_one_sentence_and_leaves_no_file(
-    endless: Replay, out: Path, rotate: tuple[str, ...], run: Run
+    endless: Replay, out: Path, rotate: tuple[str, ...]
 ) -> None:
     code, said = run(out, endless.port, "--sensor", "3", "--seconds", "30", *rotate)
     assert code == 1
-    last = said.splitlines()[-1]
-    assert last == "ethercat-record: the server has no sensor 3 (it has: 0, 1)"
+    assert said.splitlines()[-1] == "ethercat-record: the server has no sensor 3 (it has: 0, 1)"
     assert "nothing was lost" not in said
     assert not list(out.parent.glob("out*.mcap"))
-    code, said = run(out, endless.port, "--sensor", "1", "--seconds", "0.3", *rotate)
-    assert code == 0, said
+    assert run(out, endless.port, "--sensor", "1", "--seconds", "0.3", *rotate)[0] == 0
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("code", "arguments", "sentence"),
     [
-        ((), "required"),
-        (("x.mcap", "localhost:99999"), "99999 is no port: it must be from 1 to 65535"),
-        (("x.mcap", "--seconds", "-1"), "a number of seconds"),
-        (("x.mcap", "--seconds", "nan"), "a number of seconds"),
-        (("x.mcap", "--rotate-size", "10"), "at least 100k"),
-        (("x.mcap", "--rotate-seconds", "0.1"), "at least 1 s"),
-        (("x.mcap", "--sensor", "300"), "a position on the bus"),
+        (2, (), "required"),
+        (2, ("x.mcap", "localhost:99999"), "99999 is no port: it must be from 1 to 65535"),
+        (2, ("x.mcap", "--seconds", "-1"), "a number of seconds"),
+        (2, ("x.mcap", "--seconds", "nan"), "a number of seconds"),
+        (2, ("x.mcap", "--rotate-size", "10"), "at least 100k"),
+        (2, ("x.mcap", "--rotate-seconds", "0.1"), "at least 1 s"),
+        (2, ("x.mcap", "--sensor", "300"), "a position on the bus"),
+        *((2, ("x.mcap", f"--for={text}"), "it must be a time such as 30s, 5min or 2h")
+          for text in ("0s", "-1s", "30x", "s", "nan", "1e3s")),
+        (1, ("x.mcap", "--server", "localhost:1"), "start ethercat-server, or use --wait"),
+        (1, ("/no/x.mcap",), "there is no folder"),
     ],
+)  # fmt: skip
+def test_what_cannot_be_done_is_said(
+    code: int, arguments: tuple[str, ...], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = run(*arguments)
+    assert ended[0] == code
+    assert sentence in ended[1]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("30s", 30), ("30", 30), ("1.5min", 90), ("2h", 7200), ("0.5 s", 0.5)]
 )
-def test_wrong_arguments_are_exit_code_2(arguments: tuple[str, ...], sentence: str, run: Run) -> None:
-    code, said = run(*arguments)
-    assert code == 2
-    assert sentence in said
+def test_a_recording_for_a_time(text: str, seconds: float) -> None:
+    assert cli.parse_options(["x.mcap", "--for", text]).seconds == seconds
+    assert f" of {seconds:g} s" == Progress("x", seconds)._of or seconds != 30
 
 
-def test_without_a_server_it_makes_no_file(out: Path, run: Run) -> None:
-    code, said = run(out, free_port())
-    assert code == 1
-    assert "start ethercat-server, or use --wait" in said
-    assert not out.exists()
-
-
-def test_it_waits_for_a_server_if_it_is_told_to(
+def test_it_waits_for_a_server_if_it_is_told_to_until_it_is_stopped(
     source: Path, out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     port = free_port()
-    with recording(out, port, "--wait", "--no-reconnect") as recorder:
+    with Recorder(out, port, "--wait", "--no-reconnect") as recorder:
         wait_until(lambda: "waiting for a server" in capsys.readouterr().err, "a word")
-        with replaying("--speed", "max", source, port=port):
+        with Replay("--speed", "max", source, port=port):
             assert recorder.wait() == 0
     assert len(read(out)) == SECOND
-
-
-def test_the_wait_can_be_ended(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with recording(out, free_port(), "--wait") as recorder:
+    with Recorder(out.with_name("no.mcap"), free_port(), "--wait") as recorder:
         assert recorder.stop() == 0
     assert "nothing was recorded" in capsys.readouterr().err
-
-
-def test_a_sensor_that_is_not_there_is_said(endless: Replay, out: Path, run: Run) -> None:
-    code, said = run(out, endless.port, "--sensor", "5")
-    assert code == 1
-    assert "the server has no sensor 5 (it has: 0, 1)" in said
-
-
-def test_a_folder_that_is_not_there_is_said(out: Path, run: Run) -> None:
-    code, said = run(out.parent / "no" / "x.mcap", free_port())
-    assert code == 1
-    assert "there is no folder" in said
 
 
 # -- with a server
@@ -508,11 +524,7 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
             (sensor,) = opened.sensors
             return sensor.history[-1].values["sinc_length"], sensor.history[-1].rate_hz
 
-    with (
-        served(sinc_length=512) as server,
-        server.client() as client,
-        recording(out, server.port) as recorder,
-    ):
+    with served(sinc_length=512) as server, server.client() as client, Recorder(out, server.port) as recorder:
         recorder.wait_for_frames(1)
         assert client.ask("configure", sensor=0, settings={"sinc_length": 256})["ok"]
         wait_until(lambda: last_setting() == (256, 200), "the new settings")

@@ -11,7 +11,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,85 +18,73 @@ from typing import Any
 import pytest
 
 from bota_clients.recording.reader import Description, Event, open_recording
-from bota_clients.replay import cli, program
+from bota_clients.replay import cli
 from bota_clients.replay.sensors import ReplayedSensors
+from bota_clients.replay.timeline import Timeline
 from bota_ethercat.client import Client, connect
 from bota_ethercat.control import ErrorCode
 from bota_ethercat.errors import RefusedError
-from bota_ethercat.framing import DataMessage
+from bota_ethercat.framing import DataFlag, DataMessage
 from bridge.stream.link import find_sensor
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
-from tests.clients.running import NoSignals, listen, replaying, signalled
+from tests.clients.running import Replay, listen, signalled
+from tests.ended import run_here
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port, wait_until
 from tests.server.running import Client as Requests
 
 COUNT = 400
+FRAMES = [frame(n // 2, sensor=n % 2, flags=4 if n == 50 else 0) for n in range(COUNT)]
+NOW_NS = 50 * 10**9
+REAL_NS = 1_800_000_000 * 10**9
 EMERGENCY = {"code": 0xFF01, "text": "device specific", "register": 0x81, "data": "0102030405"}
-
-Run = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
-
-
-@pytest.fixture
-def frames(path: Path) -> list[DataMessage]:
-    return record(
-        path, (frame(n // 2, sensor=n % 2, flags=4 if n == 50 else 0) for n in range(COUNT)), sensors=(0, 1)
-    )
+    path = tmp_path / "run.mcap"
+    record(path, FRAMES, sensors=(0, 1))
+    return path
 
 
 def play(path: Path, *arguments: str) -> list[DataMessage]:
     """All that a client gets from a replay that runs once."""
-    with replaying(*arguments, path) as served, listen(served.port, fresh_only=False) as client:
+    with Replay(*arguments, path) as served, listen(served.port, fresh_only=False) as client:
         frames = list(client.frames())
         assert served.wait() == 0
     return frames
 
 
 def samples(path: Path, *arguments: str) -> list[object]:
-    with replaying(*arguments, path) as served, Client(served.port, reconnect=False).connect() as client:
+    with Replay(*arguments, path) as served, Client(served.port, reconnect=False).connect() as client:
         return [client.decode(frame) for frame in client.frames()]
 
 
-def test_the_first_client_gets_everything_from_the_first_frame_on(
-    path: Path, frames: list[DataMessage]
-) -> None:
-    assert play(path, "--original-stamps") == frames
+def test_the_first_client_gets_everything_from_the_first_frame_on(path: Path) -> None:
+    assert play(path, "--original-stamps") == FRAMES
 
 
-def test_moved_stamps_are_near_now_and_keep_their_spacing(path: Path, frames: list[DataMessage]) -> None:
+def test_moved_stamps_are_near_now_and_keep_their_spacing(path: Path) -> None:
     began = time.time_ns(), time.monotonic_ns()
     played = play(path)
-    offset = played[0].stamp_ns - frames[0].stamp_ns
-    assert all(new.stamp_ns - old.stamp_ns == offset for old, new in zip(frames, played, strict=True))
+    offset = played[0].stamp_ns - FRAMES[0].stamp_ns
+    assert all(new.stamp_ns - old.stamp_ns == offset for old, new in zip(FRAMES, played, strict=True))
     assert began[0] < played[0].stamp_ns < time.time_ns()
     assert began[1] < played[0].monotonic_ns < time.monotonic_ns()
-    for old, new in zip(frames, played, strict=True):
+    for old, new in zip(FRAMES, played, strict=True):
         assert new._replace(stamp_ns=0, monotonic_ns=0) == old._replace(stamp_ns=0, monotonic_ns=0)
 
 
-def test_the_same_recording_gives_the_same_values_always(path: Path, frames: list[DataMessage]) -> None:
-    del frames
-    first, again, fast = samples(path), samples(path), samples(path, "--speed", "20")
-    assert first == again == fast
+def test_the_same_recording_gives_the_same_values_always_in_its_original_timing(path: Path) -> None:
+    began = time.monotonic()
+    first = samples(path)
+    assert time.monotonic() - began >= (COUNT / 2 - 1) * PERIOD_NS / 1e9
+    assert first == samples(path, "--speed", "20")
     assert len(first) == COUNT
 
 
-def test_it_keeps_the_original_timing(path: Path, frames: list[DataMessage]) -> None:
-    del frames
-    with replaying(path) as served, listen(served.port) as client:
-        began = time.monotonic()
-        list(client.frames())
-        assert time.monotonic() - began >= (COUNT / 2 - 1) * PERIOD_NS / 1e9
-
-
-def test_it_loops_with_numbers_that_go_on(path: Path, frames: list[DataMessage]) -> None:
-    del frames
-    with replaying("--loop", "--speed", "50", path) as served, listen(served.port, sensors=[1]) as client:
+def test_it_loops_with_numbers_that_go_on(path: Path) -> None:
+    with Replay("--loop", "--speed", "50", path) as served, listen(served.port, sensors=[1]) as client:
         played = []
         for item in client.frames():
             played.append(item)
@@ -113,30 +100,27 @@ def test_several_recordings_are_played_one_after_the_other(tmp_path: Path) -> No
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
     record(first, (frame(n) for n in range(10)))
     record(second, (frame(n, **{"force.z": 1}) for n in range(10)))
-    with replaying("--speed", "max", first, second) as served, listen(served.port) as client:
+    with Replay("--speed", "max", first, second) as served, listen(served.port) as client:
         played = list(client.frames())
         assert client.description["replay"]["files"] == ["a.mcap", "b.mcap"]
     assert [item.sequence for item in played] == list(range(20))
 
 
-def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(
-    path: Path, frames: list[DataMessage]
-) -> None:
+def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
-    with replaying("--original-stamps", path) as served, listen(served.port, fresh_only=False) as client:
+    with Replay("--original-stamps", path) as served, listen(served.port, fresh_only=False) as client:
         played = list(client.frames())
         assert "was cut off" in served.said()
     assert 0 < len(played) < COUNT
-    assert played == frames[: len(played)]
+    assert played == FRAMES[: len(played)]
 
 
 # -- what clients may ask
 
 
-def test_describe_says_that_it_is_a_replay(path: Path, frames: list[DataMessage]) -> None:
-    del frames
-    with replaying("--speed", "2", "--loop", path) as served, Requests(served.port) as client:
+def test_describe_says_that_it_is_a_replay(path: Path) -> None:
+    with Replay("--speed", "2", "--loop", path) as served, Requests(served.port) as client:
         reply = client.ask("describe")
     assert reply["replay"] == {
         "files": ["run.mcap"], "recorded": "?", "recorded_version": "?", "pace": 2.0, "loop": True,
@@ -165,7 +149,7 @@ def test_status_has_all_that_a_server_s_has(path: Path) -> None:
         client.receive(PATIENCE_S)
         wait_until(lambda: client.ask("status")["sensors"][0]["emergency"], "the emergency")
         expected = client.ask("status")
-    with replaying("--loop", path) as running, connect(running.port) as client:
+    with Replay("--loop", path) as running, connect(running.port) as client:
         next(client.frames())
         status = client.ask("status")
     assert keys(status) == keys(expected)
@@ -187,27 +171,20 @@ def test_status_has_all_that_a_server_s_has(path: Path) -> None:
     ],
 )
 def test_what_needs_a_sensor_is_refused_in_a_sentence(
-    path: Path, frames: list[DataMessage], action: str, values: dict[str, Any]
+    path: Path, action: str, values: dict[str, Any]
 ) -> None:
-    del frames
-    with replaying("--loop", path) as served, connect(served.port) as client:
+    with Replay("--loop", path) as served, connect(served.port) as client:
         with pytest.raises(RefusedError, match="this is a replay of a recording") as refused:
             client.ask(action, **values)
         assert refused.value.code == ErrorCode.NOT_READY
         assert client.receive(PATIENCE_S)
 
 
-def test_the_node_takes_it_for_a_server(path: Path, frames: list[DataMessage]) -> None:
-    del frames
-    with replaying("--loop", path) as served, connect(served.port, sensors=[1]) as client:
+def test_the_node_takes_it_for_a_server_and_shutdown_ends_it(path: Path) -> None:
+    with Replay("--loop", path) as served, connect(served.port, sensors=[1]) as client:
         info = find_sensor(client.description, 1)
         assert (info.sensor, info.serial, info.rate, info.settings) == (1, "101", 800, {"sinc_length": 64})
         assert client.receive(PATIENCE_S)
-
-
-def test_shutdown_ends_it(path: Path, frames: list[DataMessage]) -> None:
-    del frames
-    with replaying("--loop", path) as served, connect(served.port) as client:
         client.ask("shutdown")
         assert served.wait() == 0
         assert "stopped after" in served.said()
@@ -224,14 +201,13 @@ def test_what_happened_happens_again(path: Path) -> None:
     made.event(START_NS, {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}})
     made.frame(frame(2))
     made.finish({})
-    with replaying(path) as served, listen(served.port, fresh_only=False) as client:
+    with Replay(path) as served, listen(served.port, fresh_only=False) as client:
         assert len(list(client.frames())) == 3
         events = [event["event"] for event in client.events if isinstance(event, dict)]
         assert events == ["sensor_lost", "reconfigured", "shutting_down"]
 
 
-def test_describe_follows_the_events(path: Path, frames: list[DataMessage]) -> None:
-    del frames
+def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
     with open_recording(path) as recording:
         sensors = ReplayedSensors(recording.sensors)
     for event, state in (("sensor_lost", "lost"), ("sensor_back", "OP")):
@@ -243,83 +219,156 @@ def test_describe_follows_the_events(path: Path, frames: list[DataMessage]) -> N
             ("OP", 64),
             (state, 32),
         ]
-
-
-def test_no_sensor_settles_for_ever(path: Path, frames: list[DataMessage]) -> None:
-    """It did when it was described; the node's tare waits for the end of it."""
-    del frames
-    with open_recording(path) as recording:
-        sensors = ReplayedSensors(recording.sensors)
-    described = describe(0)
-    described["sensors"][0]["settling"] = True
-    sensors.describe(Description(0, described))
+    reply = describe(0)
+    reply["sensors"][0]["settling"] = True  # it did when it was described; the node's tare waits for the end
+    sensors.describe(Description(0, reply))
     assert not sensors.sensors[0].describe()["settling"]
+    for flags in (0, 0, 0, DataFlag.REPEATED, DataFlag.INVALID, DataFlag.INVALID | DataFlag.REPEATED):
+        sensors.count(frame(0, flags=flags), due_ns=1, now_ns=20_000_001)
+    status = sensors.status()
+    counts = [status["sensors"][0][name] for name in ("fresh", "repeated", "invalid")]
+    assert (counts, status["cycles"], status["missed_deadlines"]) == ([3, 1, 2], 6, 6)
+    assert status["wake_us"] == dict.fromkeys(("p50", "p99", "p999", "max"), 20_000.0)
+
+
+# -- when a frame goes out, under which number and stamps
+
+
+class Clock:
+    """Both clocks of this machine, as a test sets them."""
+
+    def __init__(self) -> None:
+        self.passed_ns = 0
+
+    def monotonic_ns(self) -> int:
+        return NOW_NS + self.passed_ns
+
+    def realtime_ns(self) -> int:
+        return REAL_NS + self.passed_ns
+
+
+def timeline(speed: float = 1.0, *, original: bool = False, clock: Clock | None = None) -> Timeline:
+    clock = clock or Clock()
+    return Timeline(speed, original=original, monotonic_ns=clock.monotonic_ns, realtime_ns=clock.realtime_ns)
+
+
+def test_moved_stamps_keep_every_nanosecond_between_frames() -> None:
+    line = timeline()
+    frames = [
+        frame(n)._replace(stamp_ns=START_NS + n * 1_250_001 + n % 3, monotonic_ns=n * 1_249_999)
+        for n in range(9)
+    ]
+    for item in frames:
+        passed_ns = item.monotonic_ns
+        stamp_ns = REAL_NS + item.stamp_ns - START_NS
+        moved = item._replace(stamp_ns=stamp_ns, monotonic_ns=NOW_NS + passed_ns)
+        assert line.due(item) == (NOW_NS + passed_ns, moved)
+
+
+def test_original_stamps_leave_the_frame_alone() -> None:
+    line = timeline(original=True)
+    for number in range(3):
+        assert line.due(frame(number + 7)) == (NOW_NS + number * PERIOD_NS, frame(number + 7))
+    assert line.now(frame(7)) == frame(7)
+
+
+def test_speed_divides_all_times() -> None:
+    line = timeline(speed=4)
+    first, second = line.due(frame(0)), line.due(frame(4))
+    assert second.at_ns - first.at_ns == PERIOD_NS
+    assert second.frame.stamp_ns - first.frame.stamp_ns == PERIOD_NS
+
+
+def test_a_frame_before_its_turn_is_not_held_back_and_holds_none_back() -> None:
+    line = timeline()
+    late = frame(1)._replace(monotonic_ns=5 * PERIOD_NS)  # an INVALID one has the time of the exchange
+    due = [line.due(item).at_ns - NOW_NS for item in (frame(0), late, frame(2), frame(6))]
+    assert due == [0, 5 * PERIOD_NS, 5 * PERIOD_NS, 6 * PERIOD_NS]
+
+
+def test_again_numbers_go_on_and_there_is_one_period_between() -> None:
+    clock = Clock()
+    line = timeline(clock=clock)
+    for number in range(10, 13):
+        last = line.due(frame(number))
+    clock.passed_ns = 2 * PERIOD_NS
+    line.begin_again()
+    first = line.due(frame(10))
+    assert first.frame.sequence == last.frame.sequence + 1 == 13
+    assert first.at_ns - last.at_ns == PERIOD_NS
+    assert first.frame.stamp_ns - last.frame.stamp_ns == PERIOD_NS
+    assert line.due(frame(12)).frame.sequence == 15
+
+
+def test_a_jump_of_the_numbers_is_kept_when_it_begins_again() -> None:
+    line = timeline()
+    line.due(frame(10))
+    line.due(frame(15))
+    line.begin_again()
+    assert [line.due(frame(n)).frame.sequence for n in (10, 15)] == [16, 21]
+
+
+def test_across_a_restart_of_the_machine_the_pause_is_that_of_the_stamps() -> None:
+    line = timeline()
+    line.due(frame(0)._replace(monotonic_ns=900 * 10**9))
+    line.reconnected()
+    after = frame(0)._replace(monotonic_ns=10**9, stamp_ns=START_NS + 3 * 10**9)
+    assert line.due(after).at_ns - NOW_NS == 3 * 10**9
+    later = after._replace(monotonic_ns=10**9 + PERIOD_NS, stamp_ns=after.stamp_ns + PERIOD_NS)
+    assert line.due(later).at_ns - NOW_NS == 3 * 10**9 + PERIOD_NS
+
+
+def test_numbers_and_times_stay_in_their_fields() -> None:
+    line = timeline()
+    line.due(frame(0)._replace(monotonic_ns=2**64 - 1, stamp_ns=2**64 - 1, sequence=2**64 - 1))
+    line.begin_again()
+    moved = line.due(frame(5)._replace(monotonic_ns=0, stamp_ns=0)).frame
+    assert all(0 <= value < 2**64 for value in moved[:3])
+    low = line.due(frame(6)._replace(monotonic_ns=2**64 - 1, stamp_ns=2**64 - 1)).frame
+    assert low.stamp_ns == low.monotonic_ns == 2**64 - 1
 
 
 # -- arguments and what is not there
 
 
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs the program here; its exit code and what it said."""
-
-    def running(*arguments: object) -> tuple[int, str]:
-        try:
-            code = program.run([*map(str, arguments)], NoSignals())
-        except SystemExit as ended:
-            code = int(str(ended.code))
-        return code, capsys.readouterr().err
-
-    return running
-
-
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("code", "arguments", "sentence"),
     [
-        ((), "required"),
-        (("x.mcap", "99999"), "99999 is no port: it must be from 1 to 65535"),
-        (("x.mcap", "--speed", "0"), "it must be a number"),
-        (("x.mcap", "--speed", "nan"), "it must be a number"),
-        (("x.mcap", "--host", "nowhere"), "an IP address of this machine"),
+        (2, (), "required"),
+        (2, ("x.mcap", "99999"), "99999 is no port: it must be from 1 to 65535"),
+        (2, ("x.mcap", "--speed", "0"), "it must be a number"),
+        (2, ("x.mcap", "--speed", "nan"), "it must be a number"),
+        (2, ("x.mcap", "--host", "nowhere"), "an IP address of this machine"),
+        (1, ("/no/x.mcap",), "No such file"),
+        (1, (__file__,), "is not an MCAP file"),
     ],
 )
-def test_wrong_arguments_are_exit_code_2(arguments: tuple[str, ...], sentence: str, run: Run) -> None:
-    code, said = run(*arguments)
-    assert code == 2
-    assert sentence in said
+def test_what_cannot_be_played_is_said(code: int, arguments: tuple[str, ...], sentence: str) -> None:
+    ended = run_here(cli.main, *arguments)
+    assert ended.code == code
+    assert sentence in ended.err
 
 
-def test_a_file_that_is_no_recording_is_said(path: Path, run: Run) -> None:
-    code, said = run(path)
-    assert (code, "No such file" in said) == (1, True)
-    path.write_text("hello")
-    code, said = run(path)
-    assert (code, "is not an MCAP file" in said) == (1, True)
-
-
-def test_a_port_that_is_taken_is_said(path: Path, frames: list[DataMessage], run: Run) -> None:
-    del frames
+def test_a_port_that_is_taken_is_said(path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        code, said = run(path, taken.getsockname()[1])
-    assert code == 1
-    assert "is in use by another program" in said
+        ended = run_here(cli.main, path, taken.getsockname()[1])
+    assert ended.code == 1
+    assert "is in use by another program" in ended.err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_before_anybody_came(
-    path: Path, frames: list[DataMessage], number: int, capsys: pytest.CaptureFixture[str]
+    path: Path, number: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    del frames
     assert signalled(cli.main, number, lambda: "replaying" in capsys.readouterr().err, path, free_port()) == 0
 
 
-def test_a_damaged_recording_ends_it_with_a_sentence(path: Path, frames: list[DataMessage]) -> None:
-    del frames
+def test_a_damaged_recording_ends_it_with_a_sentence(path: Path) -> None:
     data = bytearray(path.read_bytes())
     position = data.index(b"zstd", 4000) + 100
     data[position] ^= 0xFF
     path.write_bytes(data)
-    with replaying("--speed", "max", path) as served, listen(served.port) as client:
+    with Replay("--speed", "max", path) as served, listen(served.port) as client:
         list(client.frames())
         assert served.wait() == 1
         assert "is damaged at byte" in served.said()

@@ -7,21 +7,20 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, Final
 
 import pytest
 
 from bota_clients.program import missing
-from bota_clients.report import cli, program, subjects
-from bota_clients.report.subjects import Received
+from bota_clients.report import cli, page, plots, subjects
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import writer
-from tests.clients.report_capture import undrawn
 from tests.clients.simulated import STARTED_AT_NS, described, simulate
 from tests.server.running import PATIENCE_S, free_port
-from tests.simulated_links import simulated_bus, simulated_server
+from tests.simulation import simulated_bus, simulated_server
 
 SINC, SPLIT = 128, 600
 
@@ -30,65 +29,100 @@ def describe(*rows: object) -> dict[str, object]:
     return {"reply": "describe", "ok": True, "protocol": 1, "sensors": list(rows)}
 
 
-def record(path: Path, frames: Sequence[DataMessage], *rows: object, end: bool = True) -> Path:
-    made = writer(path)
-    made.describe(STARTED_AT_NS, describe(*rows))
-    for number, frame in enumerate(frames):
-        made.frame(frame)
-        if number % 1000 == 999:
-            made.flush()
+Frames = Sequence[DataMessage]
+
+
+def record(path: Path, *items: Frames | dict[str, object], end: bool = True, **options: str) -> Path:
+    """A recording of frames, descriptions and events, in this order; each is received with the last frame."""
+    made, now_ns = writer(path, **options), STARTED_AT_NS
+    for item in items:
+        if isinstance(item, dict):
+            (made.event if "event" in item else made.describe)(now_ns, item)
+            continue
+        for number, frame in enumerate(item):
+            made.frame(frame)
+            if number % 1000 == 999:
+                made.flush()
+        now_ns = item[-1].stamp_ns
     if end:
         made.finish({})
     return path
 
 
+def reconfigured(row: dict[str, Any]) -> dict[str, object]:
+    return {"event": "reconfigured", "sensor": 0, "settings": row["settings"]}
+
+
 @pytest.fixture(autouse=True)
-def no_plots() -> Iterator[None]:
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """They are tested with the page."""
-    with undrawn():
-        yield
+    monkeypatch.setattr(plots, "draw", lambda *_: None)
 
 
-@pytest.fixture(scope="module")
+SENSOR: Final = describe(described(SINC))
+
+
+class Report:
+    """The program with one recording: what it prints, and the page."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder, self._capsys = folder, capsys
+        self.path, self.out = folder / "cell.mcap", folder / "cell.html"
+
+    def run(self, *arguments: object) -> tuple[int, str, str]:
+        """Exit code, output and errors."""
+        try:
+            code = cli.main([str(argument) for argument in arguments])
+        except SystemExit as exit_:
+            code = int(str(exit_.code))
+        said = self._capsys.readouterr()
+        assert "Traceback" not in said.err
+        return code, said.out, said.err
+
+    def of(self, *items: Frames | dict[str, object], **options: Any) -> tuple[int, str]:
+        """Exit code and output with a recording of these."""
+        record(self.path, *items, **options)
+        return self.run(self.path)[:2]
+
+    def again(self, *options: object) -> tuple[int, str, str]:
+        return self.run(self.path, "--force", *options)
+
+    def lacks(self, *words: str) -> list[str]:
+        """Those that are not in the page."""
+        page = self.out.read_text()
+        return [each for each in words if each not in page]
+
+
+@pytest.fixture
+def report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Report:
+    return Report(tmp_path, capsys)
+
+
 def frames() -> tuple[DataMessage, ...]:
     return simulate(6, sinc_length=SINC, seed=21)
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory, frames: tuple[DataMessage, ...]) -> Path:
-    return record(tmp_path_factory.mktemp("recorded") / "cell.mcap", frames, described(SINC))
+def number(frames: Frames) -> str:
+    return f"{len(frames):,} samples".replace(",", " ")
 
 
-def ended(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """Exit code, output and errors."""
-    try:
-        code = cli.main([str(argument) for argument in arguments])
-    except SystemExit as exit_:
-        code = int(str(exit_.code))
-    said = capsys.readouterr()
-    assert "Traceback" not in said.err
-    return code, said.out, said.err
-
-
-def test_a_recording_becomes_a_page_beside_it(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, err = ended(capsys, recording, "--note", "cell 3 <b>")
-    assert (code, err) == (0, f"ethercat-report: the report is in {recording.with_suffix('.html')}\n")
-    assert out == ("Sensor 0 (BFT-SENS-ECAT-M8, serial 4711): Good. All checks passed.\n")
-    page = recording.with_suffix(".html").read_text()
-    assert "`" not in page
-    for words in ("cell.mcap", "4711", "1.3.8", "2026-01-01 00:00:00 UTC", "cell 3 &lt;b&gt;", "✓ Good"):
-        assert words in page
-    assert not list(recording.parent.glob(".*")), "nothing is left behind"
+def test_a_recording_becomes_a_page_beside_it(report: Report) -> None:
+    record(report.path, SENSOR, frames())
+    code, out, err = report.run(report.path, "--note", "cell 3 <b>")
+    assert (code, err) == (0, f"ethercat-report: the report is in {report.out}\n")
+    assert out == "Sensor 0 (BFT-SENS-ECAT-M8, serial 4711): Good. All checks passed.\n"
+    assert "`" not in report.out.read_text()
+    words = "cell.mcap", "4711", "1.3.8", "2026-01-01 00:00:00 UTC", "cell 3 &lt;b&gt;", "✓ Good"
+    assert report.lacks(*words) == []
+    assert not list(report.folder.glob(".*")), "nothing is left behind"
 
 
 MADE = """
-import sys, types, bota_clients.report
-outcome = types.SimpleNamespace(words="Healthy", exit_code=0)
-bota_clients.report.program = types.SimpleNamespace(make=lambda *_: outcome)
-from bota_clients.report.cli import main
-sys.exit(main())
-"""
-"""The program, but what takes long has been done."""
+import sys
+from bota_clients.report import cli
+cli.make = lambda _: ("Healthy", 0)
+sys.exit(cli.main())
+"""  # the program, but what takes long has been done
 
 
 def test_a_reader_that_has_enough_is_no_traceback() -> None:
@@ -103,208 +137,143 @@ def test_a_reader_that_has_enough_is_no_traceback() -> None:
     assert (done.returncode, done.stderr) == (0, "ethercat-report: the report is in r.html\n")
 
 
-@pytest.mark.parametrize(
-    ("command", "code", "word"),
-    [("warn 0x20", 0, "look"), ("warn 0x40", 1, "trouble")],
-)
-def test_the_exit_code_is_the_verdict(
-    command: str, code: int, word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = record(tmp_path / "bad.mcap", simulate(6, command, seed=3, sinc_length=256), described(256))
-    out = tmp_path / "r.html"
-    found, said, _ = ended(capsys, made, "-o", out, "--json")
-    assert found == code
+@pytest.mark.parametrize(("command", "code", "word"), [("warn 0x20", 0, "look"), ("warn 0x40", 1, "trouble")])
+def test_the_exit_code_is_the_verdict(report: Report, command: str, code: int, word: str) -> None:
+    report.of(describe(described(256)), simulate(6, command, seed=3, sinc_length=256))
+    found, said, _ = report.again("--json")
     [sensor] = json.loads(said)
-    assert sensor["verdict"] == word
+    assert (found, sensor["verdict"]) == (code, word)
     assert [check["check"] for check in sensor["checks"] if check["outcome"] != "good"] == ["Warnings"]
-    assert out.exists()
 
 
-def test_too_short_a_recording_is_not_conclusive(
-    frames: tuple[DataMessage, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = record(tmp_path / "short.mcap", frames[:500], described(SINC))
-    code, out, _ = ended(capsys, made)
-    assert code == 0
-    assert "Not conclusive" in out
-    assert "Record for at least 10 s" in out
+def test_too_short_a_recording_is_not_conclusive(report: Report) -> None:
+    code, out = report.of(SENSOR, frames()[:500])
+    assert (code, "Not conclusive" in out, "Record for at least 10 s" in out) == (0, True, True)
 
 
-def test_the_longest_stretch_of_the_same_settings_counts(
-    frames: tuple[DataMessage, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = writer(tmp_path / "changed.mcap")
-    other = described(256, fir=True)
-    made.describe(STARTED_AT_NS, describe(other))
-    event = {"event": "reconfigured", "sensor": 0, "settings": described(SINC)["settings"]}
-    for frame in frames[:SPLIT]:
-        made.frame(frame)
+def test_the_longest_stretch_of_the_same_settings_counts(report: Report) -> None:
     # When it was received says nothing about when a sample was taken: the clocks differ, and it came late.
-    made.event(frames[SPLIT + 60].stamp_ns, event)
-    for frame in frames[SPLIT:]:
-        made.frame(frame)
-    made.describe(frames[-1].stamp_ns, describe(described(SINC)))
-    made.finish({})
-    code, _, _ = ended(capsys, tmp_path / "changed.mcap", "-o", tmp_path / "r.html")
-    page = (tmp_path / "r.html").read_text()
+    before = describe(described(256, fir=True))
+    code, _ = report.of(before, frames()[:SPLIT], reconfigured(described(SINC)), frames()[SPLIT:], SENSOR)
     assert code == 0, "the settings are those that were in force"
-    assert "The settings were changed 1 time while" in page
-    assert "reconfigured (1)" in page
-    assert f"{len(frames) - SPLIT:,} samples".replace(",", " ") in page
+    words = "The settings were changed 1 time while", "reconfigured (1)", number(frames()[SPLIT:])
+    assert report.lacks(*words) == []
 
 
-def test_a_change_of_settings_is_no_fault_of_the_sensor(
-    frames: tuple[DataMessage, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = writer(tmp_path / "changed.mcap")
-    made.describe(STARTED_AT_NS, describe(described(SINC)))
-    changing = len(frames) - 20  # 50 ms, in which the sensor is not in OP
-    for number, frame in enumerate(frames):
-        made.frame(frame if number < changing else frame._replace(flags=DataFlag.INVALID))
+def test_a_change_of_settings_is_no_fault_of_the_sensor(report: Report) -> None:
+    changing = len(frames()) - 20  # 50 ms, in which the sensor is not in OP
+    lost = [frame._replace(flags=DataFlag.INVALID) for frame in frames()[changing:]]
+    later = 10**9 + frames()[-1].stamp_ns - frames()[0].stamp_ns
+    after = [
+        frame._replace(stamp_ns=frame.stamp_ns + later, monotonic_ns=frame.monotonic_ns + later)
+        for frame in simulate(3, sinc_length=256, seed=4)
+    ]
+    after[0] = after[0]._replace(flags=DataFlag.GAP)
     other = described(256)
-    made.event(frames[-1].stamp_ns, {"event": "reconfigured", "sensor": 0, "settings": other["settings"]})
-    later = 10**9 + frames[-1].stamp_ns - frames[0].stamp_ns
-    for number, frame in enumerate(simulate(3, sinc_length=256, seed=4)):
-        moved = frame.stamp_ns + later, frame.monotonic_ns + later
-        made.frame(
-            frame._replace(stamp_ns=moved[0], monotonic_ns=moved[1], flags=0 if number else DataFlag.GAP)
-        )
-        if number == 10:
-            made.describe(moved[0], describe(other))
-    made.finish({})
-    code, out, _ = ended(capsys, tmp_path / "changed.mcap", "-o", tmp_path / "r.html")
+    code, out = report.of(
+        SENSOR, frames()[:changing], lost, reconfigured(other), after[:10], describe(other), after[10:]
+    )
     assert (code, "Good" in out) == (0, True)
-    page = (tmp_path / "r.html").read_text()
-    assert "The settings were changed 1 time while" in page
-    assert f"{changing:,} samples".replace(",", " ") in page
+    assert report.lacks("The settings were changed 1 time while", number(frames()[:changing])) == []
 
 
-def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(
-    frames: tuple[DataMessage, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = writer(tmp_path / "swapped.mcap")
-    made.describe(STARTED_AT_NS, describe(described(SINC)))
-    for frame in frames[:SPLIT]:
-        made.frame(frame)
-    made.describe(frames[SPLIT].stamp_ns, describe({**described(SINC), "serial": 99, "firmware": "2.0.0"}))
-    for frame in frames[SPLIT:]:
-        made.frame(frame)
-    made.finish({})
-    path, page = tmp_path / "swapped.mcap", tmp_path / "r.html"
-    code, out, _ = ended(capsys, path, "-o", page)
+def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(report: Report) -> None:
+    new = describe({**described(SINC), "serial": 99, "firmware": "2.0.0"})
+    code, out = report.of(SENSOR, frames()[:SPLIT], new, frames()[SPLIT:])
     assert (code, "serial 99): Good" in out) == (0, True)
-    for words in ("The sensor was exchanged while", "serial 4711, firmware 1.3.8;", "2.0.0"):
-        assert words in page.read_text()
-    assert f"{len(frames) - SPLIT:,} samples".replace(",", " ") in page.read_text()
-    assert "The settings were changed" not in page.read_text()
-    _, out, _ = ended(capsys, path, "-o", page, "--force", "--sensor", "serial:4711")
-    assert "serial 4711): Not conclusive" in out
-    assert f"{SPLIT} samples" in page.read_text()
-    _, _, err = ended(capsys, path, "-o", page, "--force", "--sensor", "serial:7")
-    assert "serial 4711), 0 (BFT-SENS-ECAT-M8, serial 99)" in err
+    words = (
+        "The sensor was exchanged while",
+        "serial 4711, firmware 1.3.8;",
+        "2.0.0",
+        number(frames()[SPLIT:]),
+    )
+    assert report.lacks(*words, "The settings were changed") == ["The settings were changed"]
+    assert "serial 4711): Not conclusive" in report.again("--sensor", "serial:4711")[1]
+    assert report.lacks(number(frames()[:SPLIT])) == []
+    assert "serial 4711), 0 (BFT-SENS-ECAT-M8, serial 99)" in report.again("--sensor", "serial:7")[2]
 
 
-def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(
-    frames: tuple[DataMessage, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, page = tmp_path / "one.mcap", tmp_path / "r.html"
-    made = writer(path, sensors="0 4")
+def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(report: Report) -> None:
     rows = [{**described(SINC), "sensor": position, "serial": 100 + position} for position in (0, 1, 2)]
-    made.describe(STARTED_AT_NS, describe(*rows))
-    for frame in frames:
-        made.frame(frame)
-    made.finish({})
-    code, out, _ = ended(capsys, path, "-o", page)
+    code, out = report.of(describe(*rows), frames(), sensors="0 4")
     assert (code, out.count("serial")) == (0, 1)
-    assert "Not recorded, because others were chosen: sensor 1 and 2." in page.read_text()
-    code, _, err = ended(capsys, path, "-o", page, "--force", "--sensor", "1")
+    assert report.lacks("Not recorded, because others were chosen: sensor 1 and 2.") == []
+    code, _, err = report.again("--sensor", "1")
     assert (code, "has no sensor 1: it has 0 (BFT-SENS-ECAT-M8, serial 100)\n" in err) == (1, True)
 
 
-def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(
-    frames: tuple[DataMessage, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = record(tmp_path / "cut.mcap", frames, described(SINC), end=False)
-    code, out, _ = ended(capsys, made)
+def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(report: Report) -> None:
+    code, out = report.of(SENSOR, frames(), end=False)
     assert code == 0
-    for said in (out, made.with_suffix(".html").read_text(), ended(capsys, made, "--json", "--force")[1]):
+    for said in (out, report.out.read_text(), report.again("--json")[1]):
         assert "The recording was cut off: it has no footer" in said
 
 
-def test_sensors_are_chosen_by_place_serial_or_name(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "r.html"
-    code, _, err = ended(capsys, recording, "-o", out, "--sensor", "serial:9")
-    assert (code, out.exists()) == (1, False)
+def test_sensors_are_chosen_by_place_serial_or_name(report: Report) -> None:
+    record(report.path, SENSOR, frames())
+    code, _, err = report.run(report.path, "--sensor", "serial:9")
+    assert (code, report.out.exists()) == (1, False)
     assert "has no sensor serial:9: it has 0 (BFT-SENS-ECAT-M8, serial 4711)" in err
-    assert ended(capsys, recording, "-o", out, "--sensor", "serial:4711")[0] == 0
+    for choice in ("serial:4711", "0", "BFT-SENS-ECAT-M8"):
+        assert report.again("--sensor", choice)[0] == 0
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["localhost:12001"], "is a server's address, no recording: write --server localhost:12001"),
-        (["a.mcap", "--server", "localhost:1"], "give a recording, or --server"),
-        (["a.mcap", "--seconds", "5"], "--seconds is for listening"),
-        (["--server", "localhost:x"], "HOST:PORT"),
-        (["--server", "localhost", "--seconds", "0"], "from 1 to"),
-        (["--server", "localhost", "--seconds", "nan"], "from 1 to"),
-        (["a.mcap", "-o", "a.mcap"], "would overwrite the recording"),
-        (["a.mcap", "--sensor", ""], "must be"),
+        ("localhost:12001", "is a server's address, no recording: write --server localhost:12001"),
+        ("a.mcap --server localhost:1", "give a recording, or --server"),
+        ("a.mcap --seconds 5", "--seconds is for listening"),
+        ("--server localhost:x", "HOST:PORT"),
+        ("--server localhost --seconds 0", "from 1 to"),
+        ("--server localhost --seconds nan", "from 1 to"),
+        ("a.mcap -o a.mcap", "would overwrite the recording"),
+        ("a.mcap --sensor=", "must be"),
     ],
 )
-def test_wrong_usage(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = ended(capsys, *arguments)
-    assert code == 2
-    assert words in err
+def test_wrong_usage(report: Report, arguments: str, words: str) -> None:
+    code, _, err = report.run(*arguments.split())
+    assert (code, words in err) == (2, True)
 
 
-def test_what_cannot_be_read_or_written_is_said_in_a_sentence(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = tmp_path / "text.mcap"
+def test_what_cannot_be_read_or_written_is_said_in_a_sentence(report: Report) -> None:
+    record(report.path, SENSOR, frames())
+    text, kept = report.folder / "text.mcap", report.folder / "kept.html"
     text.write_text("no recording")
+    kept.mkdir()
+    nowhere = report.folder / "no" / "r.html"
     for arguments in (
-        [tmp_path / "no.mcap"],
-        [text],
-        [tmp_path],
-        [recording, "-o", tmp_path / "no" / "r.html"],
-    ):
-        code, out, err = ended(capsys, *arguments)
+        [report.folder / "no.mcap"], [text], [report.folder], [report.path, "-o", nowhere],
+        [report.path, "-o", kept],
+    ):  # fmt: skip
+        code, out, err = report.run(*arguments)
         assert (code, out) == (1, "")
         assert re.fullmatch(r"ethercat-report: [^\n]+\n", err)
-    kept = tmp_path / "kept.html"
-    kept.mkdir()
-    assert ended(capsys, recording, "-o", kept)[0] == 1
-    assert not list(tmp_path.glob(".*")), "nothing half-written is left"
-    assert "text.mcap exists: choose another name, or use --force" in ended(capsys, recording, "-o", text)[2]
+    assert not list(report.folder.glob(".*")), "nothing half-written is left"
+    _, _, err = report.run(report.path, "-o", text)
+    assert "text.mcap exists: choose another name, or use --force" in err
     assert text.read_text() == "no recording"
 
 
-def test_no_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = ended(capsys, "--server", f"localhost:{free_port()}", "-o", tmp_path / "r.html")
-    assert code == 1
-    assert "start ethercat-server" in err
+def test_no_server(report: Report) -> None:
+    code, _, err = report.run("--server", f"localhost:{free_port()}", "-o", report.out)
+    assert (code, "start ethercat-server" in err) == (1, True)
 
 
-def test_ctrl_c_leaves_nothing(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_leaves_nothing(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(program, "render", interrupted)
-    code, _, err = ended(capsys, recording, "-o", tmp_path / "r.html")
-    assert (code, err) == (1, "ethercat-report: stopped: no report was written\n")
-    assert not list(tmp_path.iterdir())
+    record(report.path, SENSOR, frames())
+    monkeypatch.setattr(page, "render", interrupted)
+    assert report.run(report.path) == (1, "", "ethercat-report: stopped: no report was written\n")
+    assert list(report.folder.iterdir()) == [report.path]
 
 
-def test_what_is_not_installed_is_said(recording: Path) -> None:
+def test_what_is_not_installed_is_said() -> None:
     script = (
         "import sys; sys.modules['matplotlib'] = None; "
-        "from bota_clients.report.cli import main; "
-        f"sys.exit(main([{str(recording)!r}]))"
+        "from bota_clients.report.cli import main; sys.exit(main(['a.mcap']))"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 1
@@ -312,25 +281,17 @@ def test_what_is_not_installed_is_said(recording: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_received_frames_are_told_apart_by_sensor(frames: tuple[DataMessage, ...]) -> None:
-    received = Received()
-    received.all.extend([frames[0], frames[1]._replace(sensor=1), frames[2]])
-    assert [frame.sequence for frame in received.frames(0)] == [frames[0].sequence, frames[2].sequence]
-    assert len(list(received.frames())) == 3
-
-
-def test_a_live_sensor_is_reported_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "live.html"
-    with simulated_bus("--sinc", "512") as bus, simulated_server(bus) as server:
+def test_live_sensors_are_reported_on(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+    with simulated_bus("--serial", "10,20", "--sinc", "512") as bus, simulated_server(bus) as server:
         monkeypatch.setattr(subjects, "time", SimpleNamespace(monotonic=lambda: bus.clock.now_ns * 1e-9))
-        code, said, err = ended(capsys, "--server", server.address, "--seconds", "5", "-o", out, "--json")
+        live = "--server", server.address, "--seconds", "5", "-o", report.out
+        code, said, err = report.run(*live, "--json")
         assert code == 0, err
-        [sensor] = json.loads(said)
-        assert sensor["source"] == server.address
-        assert {check["outcome"] for check in sensor["checks"]} == {"good"}
-        assert "BFT-SENS-ECAT-M8" in out.read_text()
-        code, _, err = ended(capsys, "--server", server.address, "--sensor", "7", "-o", tmp_path / "no.html")
-    assert code == 1
-    assert "has no sensor 7: it has 0 (BFT-SENS-ECAT-M8" in err
+        sensors = json.loads(said)
+        assert [(each["serial"], each["source"]) for each in sensors] == [
+            (n, server.address) for n in (10, 20)
+        ]
+        assert {check["outcome"] for each in sensors for check in each["checks"]} == {"good"}
+        assert report.lacks("BFT-SENS-ECAT-M8") == []
+        code, _, err = report.run(*live, "--force", "--sensor", "7")
+    assert (code, "has no sensor 7: it has 0 (BFT-SENS-ECAT-M8" in err) == (1, True)

@@ -16,16 +16,15 @@ import pytest
 from PIL import Image
 
 from bota_clients.numbers import figure, seconds
-from bota_clients.recording.columns import Columns
+from bota_clients.recording.columns import Columns, Floats
 from bota_clients.report import page as page_module
-from bota_clients.report import plots
-from bota_clients.report.checks import Examination, examine
+from bota_clients.report.checks import Examination
 from bota_clients.report.page import as_json, render
 from bota_clients.report.plots import envelope, stretches
-from bota_clients.report.series import FORCE, GROUPS, Floats, subject
-from tests.clients import report_capture
+from bota_clients.report.series import GROUPS
+from bota_ethercat.framing import DataFlag
+from tests.clients import pictures
 from tests.clients.chromium import DARK, needs_chromium, run, screenshot
-from tests.clients.report_capture import undrawn
 from tests.clients.simulated import decoded, described, sensor, simulate, subject_of
 
 MADE = "2026-01-01 00:01 UTC"
@@ -43,6 +42,8 @@ class Reader(HTMLParser):
         self.feed(page)
         self.close()
         assert not self._open
+        self.identifiers = [attributes["id"] for _, attributes in self.tags if "id" in attributes]
+        assert len(self.identifiers) == len(set(self.identifiers))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
@@ -67,7 +68,7 @@ class Reader(HTMLParser):
 @pytest.fixture(scope="module")
 def page() -> str:
     """A report on a sensor with a noisy axis."""
-    return report_capture.fixed_page()
+    return pictures.report_page()
 
 
 def test_it_is_one_file_with_nothing_outside_it(page: str) -> None:
@@ -89,13 +90,11 @@ def test_it_is_one_file_with_nothing_outside_it(page: str) -> None:
 def test_it_can_be_read_without_seeing_it(page: str) -> None:
     reader = Reader(page)
     assert "`" not in "".join(reader.words), "commands are set as code"
-    identifiers = [attributes["id"] for _, attributes in reader.tags if "id" in attributes]
-    assert len(identifiers) == len(set(identifiers))
     plots = reader.of("svg")
     assert len(plots) == 9
     for plot in plots:
         assert plot["role"] == "img"
-        assert set(str(plot["aria-labelledby"]).split()) <= set(identifiers)
+        assert set(str(plot["aria-labelledby"]).split()) <= set(reader.identifiers)
     descriptions = re.findall(r"<desc [^>]*>([^<]+)</desc>", page)
     assert len(descriptions) == 9
     assert all(re.search(r"\d", words) for words in descriptions), "they say what is in the plot"
@@ -140,9 +139,8 @@ def two() -> tuple[str, str]:
         "settings": {**described()["settings"], EVIL: 1, "sinc_length": EVIL},
     }  # fmt: skip
     first = subject_of(simulate(1), row, source=EVIL)
-    examined = [examine(first), examine(replace(first, position=1, serial=9, columns=decoded([])))]
-    with undrawn():
-        return render(examined, made=MADE, program="p", note=EVIL), as_json(examined)
+    examined = [Examination(first), Examination(replace(first, position=1, serial=9, columns=decoded([])))]
+    return render(examined, made=MADE, program="p", note=EVIL), as_json(examined)
 
 
 def test_what_a_device_says_is_text_and_nothing_else(two: tuple[str, str]) -> None:
@@ -156,57 +154,46 @@ def test_what_a_device_says_is_text_and_nothing_else(two: tuple[str, str]) -> No
     assert json.loads(as_text)[0]["name"].startswith("</title>")
 
 
-SPOILS: list[Callable[[Columns], dict[str, Any]]] = [
+LAST = 2**63 - 1
+HOSTILE: list[Callable[[Columns], dict[str, Any]]] = [
     lambda c: {"force": c.force * 1e38, "torque": c.torque * np.nan, "temperature": c.temperature * np.inf},
     lambda c: {
-        "monotonic_ns": np.where(np.arange(len(c)) == 7, 2**63 - 1, c.monotonic_ns),
+        "monotonic_ns": np.where(np.arange(len(c)) == 7, LAST, c.monotonic_ns),
         "warnings": c.warnings + 0xFFFFFFFF,
         "force_torque_saturated": c.warnings + 0xFFFF,
         "flags": np.random.default_rng(1).integers(0, 256, len(c)),
     },
+    lambda c: {"torque": -c.torque * 1e38, "acceleration": c.force * np.inf},
+    lambda c: {"monotonic_ns": c.monotonic_ns[::-1].copy()},
+    lambda c: {"monotonic_ns": c.monotonic_ns * 0, "stamp_ns": c.stamp_ns * 0 + LAST},
+    lambda c: {"monotonic_ns": np.where(np.arange(len(c)) == 7, LAST, c.monotonic_ns)},
+    lambda c: {"sequence": c.sequence[::-1].copy(), "flags": c.flags + DataFlag.GAP},
+    lambda c: {"flags": np.random.default_rng(1).integers(0, 256, len(c))},
+    lambda c: {"warnings": c.warnings + 0xFFFFFFFF, "force_torque_saturated": c.warnings + 0xFFFF},
+    lambda c: {"temperature": c.temperature * 1e30, "angular_rate": c.force * 0},
 ]
 
 
-@pytest.mark.parametrize("spoil", SPOILS)
-def test_nonsense_is_drawn_without_an_error(
+@pytest.mark.parametrize("spoil", HOSTILE)
+def test_nonsense_is_examined_and_drawn_without_an_error(
     spoil: Callable[[Columns], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike
-    given = subject_of(simulate(2, sinc_length=128))
-    page = render(
-        [examine(replace(given, columns=replace(given.columns, **spoil(given.columns))))],
-        made=MADE,
-        program="p",
-    )
+    given = subject_of(simulate(3, sinc_length=128), described(128))
+    examination = Examination(replace(given, columns=replace(given.columns, **spoil(given.columns))))
+    assert examination.headline != "Good"
+    assert all(check.found.endswith(".") for check in examination.checks)
+    page = render([examination], made=MADE, program="p")
     Reader(page)
     assert "✓ Good" not in page
 
 
-def test_no_frames_make_a_page_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_module, "GROUPS", GROUPS[:1])  # the others are drawn alike
-    page = render([examine(subject(described(), None, decoded([]), "s", 0))], made=MADE, program="p")
-    assert "nothing was received" in " ".join(Reader(page).words)
-    assert "Not conclusive" in page
-
-
-def test_two_sensors_stand_on_one_page(two: tuple[str, str]) -> None:
+def test_two_sensors_stand_on_one_page_also_one_that_sent_nothing(two: tuple[str, str]) -> None:
     reader = Reader(two[0])
     assert [a["href"] for a in reader.of("a")] == ["#sensor-0", "#sensor-1"]
-    identifiers = [attributes["id"] for _, attributes in reader.tags if "id" in attributes]
-    assert len(identifiers) == len(set(identifiers))
-
-
-def plots_of(examination: Examination) -> dict[str, str]:
-    """One of each kind, of those with a point for a sample."""
-    series = examination.series
-    assert examination.spectrum is not None
-    made = {
-        "s0-force": plots.over_time(series, FORCE, "s0-force"),
-        "s0-spectrum": plots.spectra(series, examination.spectrum, "s0-spectrum"),
-        "s0-drift": plots.drifts(examination.drift, series.duration, "s0-drift"),
-        "s0-stamps": plots.intervals(examination.timing, "s0-stamps"),
-    }
-    return {name: plot or "" for name, plot in made.items()}
+    assert {"sensor-0", "sensor-1"} <= set(reader.identifiers)
+    assert "nothing was received" in " ".join(reader.words)
+    assert "Not conclusive" in " ".join(reader.words)
 
 
 def test_more_samples_make_no_larger_a_page(page: str) -> None:
@@ -216,31 +203,23 @@ def test_more_samples_make_no_larger_a_page(page: str) -> None:
     many["monotonic_ns"], many["stamp_ns"] = many["monotonic_ns"] + shift, many["stamp_ns"] + shift
     many["sequence"] = np.arange(len(shift))
     many["force"][12345, 2] = 77.0
-    given = replace(sensor(0.1), columns=Columns(**many))
-    examination = examine(given)
+    examination = Examination(replace(sensor(0.1), columns=Columns(**many)))
     assert examination.series.count > 30_000
-    long = plots_of(examination)
-    short = sum(len(plot) for plot in re.findall(r"<svg.*?</svg>", page, re.DOTALL) if plot_id(plot) in long)
-    assert short < sum(map(len, long.values())) < 1.4 * short
+    long = render([examination], made=MADE, program="p")
+    assert len(long) < 1.1 * len(page)
     spike = f"z from {figure(float(tile.force[:, 2].min()))} to 77.0"
-    assert spike in long["s0-force"], "the spike is in the plot"
-
-
-def plot_id(svg: str) -> str:
-    found = re.search(r'aria-labelledby="(\S+)-title', svg)
-    assert found is not None
-    return found[1]
+    assert spike in long, "the spike is in the plot"
 
 
 def test_a_spike_is_never_averaged_away() -> None:
     time: Floats = np.linspace(0.0, 99.999, 100_000)
     values = np.zeros(100_000)
     values[31_415], values[27_182] = 5.0, np.nan
-    band = envelope(time, values, 0.0, 100.0)
-    assert np.nanmax(band.high) == 5.0
-    assert band.high[int(31.415 / 100 * len(band.time))] == 5.0
-    assert np.nanmin(band.low) == 0.0
-    assert 0 < np.nanmax(band.mean) < 0.1
+    middles, low, high, mean = envelope(time, values, 100.0)
+    assert np.nanmax(high) == 5.0
+    assert high[int(31.415 / 100 * len(middles))] == 5.0
+    assert np.nanmin(low) == 0.0
+    assert 0 < np.nanmax(mean) < 0.1
 
 
 def test_stretches_join_neighbours() -> None:
@@ -248,23 +227,14 @@ def test_stretches_join_neighbours() -> None:
     assert stretches(np.array([0.5, 1.5, 1.6, 5.5, 99.0]), 10.0, 10).tolist() == [[0, 2], [5, 6], [9, 10]]
 
 
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [(0, "0"), (1234567, "1234567"), (0.000123456, "0.000123"), (1e-9, "1.00e-09"), (-3.14159, "-3.14"),
-     (float("nan"), "not a number"), (float("inf"), "infinite"), (3e38, "3.00e+38")],
-)  # fmt: skip
-def test_figures(value: float, words: str) -> None:
-    assert figure(value) == words
-
-
-def test_spans_of_time() -> None:
-    assert [seconds(s) for s in (0, 2e-6, 0.25, 12, 1200)] == [
-        "0 s",
-        "2.00 µs",
-        "250 ms",
-        "12.0 s",
-        "20.0 min",
-    ]
+def test_figures_and_spans_of_time() -> None:
+    figures = {
+        0: "0", 1234567: "1234567", 0.000123456: "0.000123", 1e-9: "1.00e-09", -3.14159: "-3.14",
+        float("nan"): "not a number", float("inf"): "infinite", 3e38: "3.00e+38",
+    }  # fmt: skip
+    assert list(map(figure, figures)) == list(figures.values())
+    spans = {0: "0 s", 2e-6: "2.00 µs", 0.25: "250 ms", 12: "12.0 s", 1200: "20.0 min"}
+    assert list(map(seconds, spans)) == list(spans.values())
 
 
 # In a browser.
@@ -326,7 +296,5 @@ def test_chromium_prints_it(page: str, tmp_path: Path) -> None:
 
 
 def test_the_picture_in_the_docs_is_of_this_page(page: str) -> None:
-    assert report_capture.digest_in(report_capture.PICTURE) == report_capture.digest(page), (
-        report_capture.AGAIN
-    )
-    assert report_capture.PICTURE.stat().st_size < 300_000
+    assert pictures.digest_in("report.png") == pictures.report_digest(page), pictures.AGAIN
+    assert (pictures.DOCS / "report.png").stat().st_size < 300_000

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from bota_clients.monitor import cli as monitor
-from bota_clients.record import options as record
-from bota_clients.replay import options as replay
-from bota_clients.report import options as report
+from bota_clients.record import cli as record
+from bota_clients.replay import cli as replay
+from bota_clients.report import cli as report
 from bota_ethercat.program.server_choice import default_server, is_address, own_server
 from ethercat_server.access import sensors
 
@@ -19,6 +19,7 @@ Read = Callable[[list[str]], tuple[str, str]]
 
 def recorded(argv: list[str]) -> tuple[str, str]:
     found = record.parse_options(argv)
+    assert found.seconds in (None, 5)
     return str(found.path), str(found.address)
 
 
@@ -28,6 +29,7 @@ def monitored(argv: list[str]) -> tuple[str, str]:
 
 def replayed(argv: list[str]) -> tuple[str, str]:
     found = replay.parse_options(argv)
+    assert found.loop == ("--loop" in argv)
     return " ".join(map(str, found.paths)), f"{','.join(found.hosts)} {found.port}"
 
 
@@ -46,12 +48,13 @@ def reported(argv: list[str]) -> tuple[str, str]:
         (recorded, "a.mcap localhost:14101", "a.mcap", "localhost:14101"),
         (recorded, "localhost:14101 a.mcap", "a.mcap", "localhost:14101"),
         (recorded, "./14101", "14101", "localhost:12001"),
+        (recorded, "a.mcap --seconds 5 localhost:14101", "a.mcap", "localhost:14101"),
         (monitored, "", "", "localhost:12001"),
         (monitored, "--server robot", "", "robot:12001"),
         (monitored, "[::1]:14101", "", "[::1]:14101"),
         (monitored, "robot", "", "robot:12001"),
         (replayed, "a.mcap b.mcap", "a.mcap b.mcap", "127.0.0.1,::1 12001"),
-        (replayed, "a.mcap 14101", "a.mcap", "127.0.0.1,::1 14101"),
+        (replayed, "a.mcap --loop b.mcap 14101", "a.mcap b.mcap", "127.0.0.1,::1 14101"),
         (replayed, "a.mcap [::1]:14101", "a.mcap", "::1 14101"),
         (replayed, "a.mcap --server 0.0.0.0:14101", "a.mcap", "0.0.0.0 14101"),
         (replayed, "a.mcap --server localhost:14101", "a.mcap", "127.0.0.1,::1 14101"),

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from bota_clients.monitor.web.hub import MOST_BEHIND
 from tests.clients import monitor_states as made
 from tests.clients.chromium import needs_chromium
 from tests.clients.devtools import Page, browser
@@ -138,8 +139,11 @@ def test_labels_are_as_large_on_a_screen_of_three_pixels_in_one(page: Page) -> N
 def test_what_a_slow_page_missed_is_told_from_what_was_lost(page: Page, web: Web) -> None:
     feed(web, 160)
     page.wait_for("document.querySelector('#force').plot.data[0].length > 30")
-    web.now_s = made.now(400)
-    next(iter(web.hub._pages)).missed = True
+    lagging = next(iter(web.hub._pages))
+    lagging.unseen.extend([1 << 30] * MOST_BEHIND)
+    web.feed(*(frame(k) for k in range(160, 400)))
+    wait_until(lambda: lagging.missed, "points that are not sent")
+    lagging.unseen.clear()
     web.feed(*(frame(k) for k in range(400, 560)))
     page.wait_for("document.querySelector('#force').plot.skipped?.length > 0")
     web.feed(*(frame(k) for k in range(720, 880)))

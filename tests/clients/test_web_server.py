@@ -45,8 +45,7 @@ def stream_of(port: int, origin: str | None = "") -> Iterator[ClientConnection]:
 def message(stream: ClientConnection, key: str) -> dict[str, Any]:
     """The next message with this key; states are acknowledged, as the page does."""
     while True:
-        text = stream.recv(PATIENCE_S)
-        found = {} if isinstance(text, bytes) else json.loads(text)
+        found = json.loads(stream.recv(PATIENCE_S))
         if "state" in found:
             stream.send(json.dumps({"seen": found["state"]}))
         if key in found:
@@ -73,19 +72,17 @@ def test_the_page_is_served_on_both_loopback_addresses_and_nothing_is_kept(web: 
         asking.close()
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "http://localhost:1", "null", None])
+@pytest.mark.parametrize("origin", ["http://evil.example", None])
 def test_the_stream_is_refused_to_a_foreign_origin(web: Web, origin: str | None) -> None:
-    with pytest.raises(InvalidStatus) as refused, stream_of(web.port, origin):
+    with pytest.raises(InvalidStatus, match="403"), stream_of(web.port, origin):
         pass
-    assert refused.value.response.status_code == 403
 
 
 def test_states_and_points_come_and_a_wish_is_answered(web: Web) -> None:
     with stream_of(web.port) as stream:
         assert message(stream, "state")["sensor"]["identity"].startswith("Sensor 0")
         web.feed(*(frame(k) for k in range(40)))
-        while isinstance(stream.recv(PATIENCE_S), str):
-            pass
+        assert message(stream, "points")["points"] == 0
         stream.send('{"do":"tare"}')
         assert "printed" in message(stream, "control")["refused"]
         assert web.tared == []

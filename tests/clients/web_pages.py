@@ -18,25 +18,19 @@ from tests.server.running import PATIENCE_S
 
 
 class Web:
-    """A monitor that is connected to a server with one sensor, at START_S.
+    """A monitor that is connected to a server with one sensor, or with sensors of these names, at START_S."""
 
-    Attributes:
-        tared: the positions that were to be tared, and the way.
-        tare_answer: what taring says.
-    """
-
-    def __init__(self) -> None:
+    def __init__(self, *names: str) -> None:
         self.model = WebModel(made.ADDRESS)
-        self.model.connected(made.description(), made.OWN_PEER, START_S)
-        self.hub = Hub(self.model, self._tare)
+        self.model.connected(made.description(*[names] * bool(names)), made.OWN_PEER, START_S)
+        self.hub = Hub(self.model, self.tare)
         self.now_s = START_S
         self.port = 0
-        self.tared: list[tuple[int, str]] = []
-        self.tare_answer = ("Sensor 0 was tared", False)
+        self.tared: list[tuple[int, str]] = []  # the positions that were to be tared, and the way
 
-    def _tare(self, position: int, say: Say, way: str) -> threading.Thread:
+    def tare(self, position: int, say: Say, way: str) -> threading.Thread:
         self.tared.append((position, way))
-        say(*self.tare_answer)
+        say(f"Sensor {position} was tared", False)
         return threading.Thread()
 
     @property

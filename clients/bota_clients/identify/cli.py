@@ -1,25 +1,105 @@
-"""`ethercat-identify`: entry point; everything else is imported after Ctrl-C is handled."""
+"""`ethercat-identify` and its `delay`: command lines; all else is imported after Ctrl-C is handled."""
 
 from __future__ import annotations
 
+import argparse
 import signal
 import sys
 from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Final
 
-from bota_clients.identify.options import parse_options
-from bota_clients.program import not_installed
+from bota_clients.arguments import add_force, add_imu_units, number, parser, position
+from bota_clients.program import start
+from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
+from ft_compensation.stationary_limits import StationaryLimits
+
+_LIMITS: Final = tuple(field.name for field in fields(StationaryLimits))
+
+
+class IdentifyOptions(argparse.Namespace):
+    """What to read, and how."""
+
+    path: Path
+    sensor: int | None
+    imu_units: ImuUnits
+    gravity: float | None  # m/s², if given
+    least_seconds: float
+    limits: StationaryLimits
+    confidence: float
+    one_axis: bool
+    yaml: Path | None
+    force: bool
+    json: bool
+
+
+def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
+    """Read the command line; argparse exits with 2 if it is wrong."""
+    made = parser(
+        "ethercat-identify",
+        "Identifies mass and center of gravity of the tool and the bias of the sensor from a recording in "
+        "which the sensor was held stationary in several poses.",
+        "Record with ethercat-record: hold the sensor stationary for two seconds with each axis once up "
+        "and once down, touching nothing. The motion in between does not matter. 'ethercat-identify delay' "
+        "tells how much later force and torque are than the accelerometer.",
+    )
+    add = made.add_argument
+    _add_recording(made)
+    add("--gravity", type=number(9.0, 10.0), metavar="M/S2",
+        help=f"acceleration of gravity, m/s² ({STANDARD_GRAVITY}); written to OUT.yaml if given")  # fmt: skip
+    add("--least-seconds", type=number(0.3, 3600.0), default=1.0, metavar="S",
+        help="shortest stationary period that is a pose (default 1)")  # fmt: skip
+    add("--limit", type=_limit, action="append", default=[], metavar="NAME=VALUE",
+        help=f"change a limit of what counts as stationary: {', '.join(_LIMITS)}")  # fmt: skip
+    add("--confidence", type=number(0.5, 0.9999), default=0.95, metavar="P",
+        help="confidence level of the intervals (default 0.95)")  # fmt: skip
+    add("--one-axis", action="store_true",
+        help="accept poses that turn about one axis only; the result along it is unchecked")  # fmt: skip
+    add("--yaml", type=Path, metavar="OUT", help="write the result as parameters of the ROS 2 node")
+    add_force(made)
+    add("--json", action="store_true", help="print everything as JSON instead of a table")
+    options = made.parse_args(argv, IdentifyOptions())
+    options.limits = replace(StationaryLimits(), **dict(options.limit))
+    return options
+
+
+def parse_delay(argv: Sequence[str]) -> IdentifyOptions:
+    """Read the command line after `delay`."""
+    made = parser(
+        "ethercat-identify delay",
+        "Tells from a recording how much later force and torque are than the accelerometer.",
+        "Record with ethercat-record for 10 s: shake the sensor with its tool by hand, two to five times a "
+        "second in all directions, touching nothing with the tool.",
+    )
+    _add_recording(made)
+    made.add_argument("--json", action="store_true", help="print JSON instead of a sentence")
+    return made.parse_args(argv, IdentifyOptions())
+
+
+def _add_recording(made: argparse.ArgumentParser) -> None:
+    made.add_argument("path", type=Path, metavar="FILE.mcap", help="a recording of ethercat-record")
+    made.add_argument("--sensor", type=position, metavar="N",
+        help="position on the bus (default: the only one in the recording)")  # fmt: skip
+    add_imu_units(made)
+
+
+def _limit(text: str) -> tuple[str, float]:
+    name, _, given = text.partition("=")
+    if name not in _LIMITS:
+        raise argparse.ArgumentTypeError(f"{text!r}: it must be NAME=VALUE, NAME one of {', '.join(_LIMITS)}")
+    value = number(0.0, 1e6)(given)
+    return name, int(value) if name == "least_samples" else value
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Identify; returns the exit code."""
     # It only reads, so Ctrl-C may end it at any time.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    parse_options(argv)  # --help and wrong usage need nothing of the extra
-    try:
-        from bota_clients.identify.program import run  # noqa: PLC0415 - NumPy takes a while to load
-    except ImportError as error:
-        return not_installed("ethercat-identify", error)
-    return run(argv)
+    given = sys.argv[1:] if argv is None else argv
+    if given[:1] == ["delay"]:
+        return start("ethercat-identify", "identify.delay", parse_delay(given[1:]))
+    return start("ethercat-identify", "identify.program", parse_options(given))
 
 
 if __name__ == "__main__":

@@ -12,36 +12,34 @@ from rich.console import Console
 from rich.table import Table
 
 from bota_clients.errors import RecordingError
-from bota_clients.identify.options import IdentifyOptions, parse_options
-from bota_clients.identify.stationary_periods import (
-    StationaryPeriod,
-    StationaryPeriods,
-    find_stationary_periods,
-)
+from bota_clients.identify.cli import IdentifyOptions
+from bota_clients.identify.stationary_periods import StationaryPeriod, find_stationary_periods
 from bota_clients.program import discard_output, say
 from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
-from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
 from ft_compensation.identification.parameter_file import write_yaml
-from ft_compensation.identification.payload import Fit, Identified, OffsetFit, identify, summary
+from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
-from ft_compensation.quantities import CompensationError, Wrench
+from ft_compensation.quantities import CompensationError, length
+
+_WIDTH: Final = 80  # every table fits
+Poses = Sequence[tuple[StationaryPeriod, Pose]]
+
+_say = partial(say, "ethercat-identify")
 
 
-def show_poses(
-    console: Console, periods: Sequence[StationaryPeriod], poses: Sequence[Pose], result: Identified | None
-) -> None:
+def show_poses(console: Console, poses: Poses, result: Identified | None) -> None:
     """The poses with their residuals."""
     table = Table(title="poses", title_justify="left")
     for head in ("", "at s", "for s", "samples", "up x", "up y", "up z", "residual N", "residual Nm"):
         table.add_column(head, justify="right")
-    for number, (period, pose) in enumerate(zip(periods, poses, strict=True)):
+    for number, (period, pose) in enumerate(poses):
         left = ["", ""]
         if result is not None:
             residual = result.residuals[number]
-            left = [f"{_length(residual.force):.3f}", f"{_length(residual.torque):.5f}"]
+            left = [f"{length(residual.force):.3f}", f"{length(residual.torque):.5f}"]
         table.add_row(
             str(number + 1), f"{period.begin_s:.1f}", f"{period.seconds:.1f}", str(pose.samples),
             *(f"{round(part, 2) + 0.0:.2f}" for part in pose.up), *left,
@@ -57,15 +55,20 @@ def show_result(console: Console, result: Identified) -> None:
     table.add_column(f"± ({100 * result.confidence:g} %)", justify="right")
     table.add_column("unit")
     table.add_row("mass", f"{result.payload.mass:.4f}", f"{result.mass_interval:.4f}", "kg")
-    for axis, value, interval in zip("xyz", result.payload.center, result.centre_interval, strict=True):
-        table.add_row(f"center of gravity {axis}", f"{1000 * value:.2f}", f"{1000 * interval:.2f}", "mm")
-    _add_bias(table, result.bias, result.bias_interval)
-    if (fit := result.accelerometer) is not None:
-        found = fit.calibration
-        for axis, value, half in zip("xyz", found.offset, found.offset_interval, strict=True):
-            table.add_row(f"accelerometer offset {axis}", f"{value:.3f}", f"{half:.3f}", "m/s²")
-        for axis, value, half in zip("xyz", found.scale, found.scale_interval, strict=True):
-            table.add_row(f"accelerometer scale {axis}", f"{value:.4f}", f"{half:.4f}", "")
+    center, interval = ([1000 * x for x in each] for each in (result.payload.center, result.centre_interval))
+    bias, half = result.bias, result.bias_interval
+    rows: list[tuple[str, Sequence[float], Sequence[float], int, str]] = [
+        ("center of gravity", center, interval, 2, "mm"),
+        ("bias force", bias.force, half.force, 3, "N"),
+        ("bias torque", bias.torque, half.torque, 5, "Nm"),
+    ]
+    if result.accelerometer is not None:
+        found = result.accelerometer.calibration
+        rows.append(("accelerometer offset", found.offset, found.offset_interval, 3, "m/s²"))
+        rows.append(("accelerometer scale", found.scale, found.scale_interval, 4, ""))
+    for name, values, halves, digits, unit in rows:
+        for axis, *numbers in zip("xyz", values, halves, strict=True):
+            table.add_row(f"{name} {axis}", *(f"{number:.{digits}f}" for number in numbers), unit)
     console.print(table)
     console.print(
         f"residual: {_fit(result.force_fit, 'N')}, {_fit(result.torque_fit, 'Nm')}; condition number "
@@ -75,29 +78,28 @@ def show_result(console: Console, result: Identified) -> None:
         console.print(f"note: {note}")
 
 
-def _add_bias(table: Table, bias: Wrench, interval: Wrench) -> None:
-    for axis, value, half in zip("xyz", bias.force, interval.force, strict=True):
-        table.add_row(f"bias force {axis}", f"{value:.3f}", f"{half:.3f}", "N")
-    for axis, value, half in zip("xyz", bias.torque, interval.torque, strict=True):
-        table.add_row(f"bias torque {axis}", f"{value:.5f}", f"{half:.5f}", "Nm")
+def _fit(fit: Fit, unit: str) -> str:
+    times = "" if fit.chi_square is None else f", {fit.chi_square**0.5:.1f} times the noise"
+    return f"{fit.rms:.3g} {unit} ({fit.verdict}{times})"
 
 
 def as_json(
-    found: StationaryPeriods, poses: Sequence[Pose], result: Identified | None, error: str | None
+    poses: Poses, rejected: Sequence[str], result: Identified | None, error: str | None
 ) -> dict[str, Any]:
     """Everything, in SI units; `ok` is whether there is a result."""
-    rows = [
+    rows: list[dict[str, Any]] = [
         {
             "begin_s": period.begin_s, "seconds": period.seconds, "samples": pose.samples,
             "force": pose.wrench.force, "torque": pose.wrench.torque, "gravity": pose.gravity,
             "force_spread": pose.force_spread, "torque_spread": pose.torque_spread,
         }
-        for period, pose in zip(found.periods, poses, strict=True)
+        for period, pose in poses
     ]  # fmt: skip
     if result is None:
-        return {"ok": False, "error": error, "poses": rows, "rejected": list(found.rejected)}
+        return {"ok": False, "error": error, "poses": rows, "rejected": rejected}
     for row, residual in zip(rows, result.residuals, strict=True):
-        row["residual_force"], row["residual_torque"] = residual.force, residual.torque
+        row["residual_force"], row["residual_torque"] = residual
+    fit = result.accelerometer
     return {
         "ok": True,
         "tool_mass": result.payload.mass,
@@ -111,77 +113,44 @@ def as_json(
         "torque_rms": result.torque_rms,
         "force_fit": result.force_fit._asdict(),
         "torque_fit": result.torque_fit._asdict(),
-        "accelerometer": _accelerometer(result.accelerometer),
+        "accelerometer": fit and {**fit.calibration._asdict(), "undetermined": fit.undetermined},
         "condition": result.condition,
         "gravity": result.gravity,
-        "notes": list(result.notes),
+        "notes": result.notes,
         "poses": rows,
-        "rejected": list(found.rejected),
+        "rejected": rejected,
     }
 
 
-def _fit(fit: Fit, unit: str) -> str:
-    times = "" if fit.chi_square is None else f", {fit.chi_square**0.5:.1f} times the noise"
-    return f"{fit.rms:.3g} {unit} ({fit.verdict}{times})"
-
-
-def _accelerometer(fit: OffsetFit | None) -> dict[str, Any] | None:
-    if fit is None:
-        return None
-    return {**fit.calibration._asdict(), "undetermined": fit.undetermined}
-
-
-def _length(values: Sequence[float]) -> float:
-    return float(sum(value * value for value in values) ** 0.5)
-
-
-_say = partial(say, "ethercat-identify")
-_WIDTH: Final = 80
-"""Every table fits."""
-
-
-class SensorChoiceError(CompensationError):
-    """The recording does not have the sensor asked for, or has several."""
-
-
-def run(argv: Sequence[str] | None = None) -> int:
+def run(options: IdentifyOptions) -> int:
     """Identify; returns the exit code."""
-    try:
-        return _identify(parse_options(argv))
-    except (CompensationError, RecordingError, FileError) as error:
-        _say(str(error))
-        return 1
-    except BrokenPipeError:
-        discard_output()
-        return 1
-
-
-def _identify(options: IdentifyOptions) -> int:
     if options.yaml is not None:
         refuse_existing(options.yaml, force=options.force)
     with open_recording(options.path) as recording:
-        sensor = _choose(recording, options.sensor)
+        sensor = choose(recording, options.sensor)
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
         data = columns(recording, sensor.sensor, options.imu_units)
-    found = find_stationary_periods(data, options.least_seconds, options.limits)
-    if len(found.periods) > MOST_POSES:
-        longest = sorted(found.periods, key=lambda period: -period.seconds)[:MOST_POSES]
-        found = found._replace(periods=tuple(sorted(longest)))
+    periods, rejected = find_stationary_periods(data, options.least_seconds, options.limits)
+    if len(periods) > MOST_POSES:
+        periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
         _say(f"there are more than {MOST_POSES} poses: the longest are used")
-    result, error, taken, poses = _solve(found, options)
-    if options.json:
-        answer = as_json(found._replace(periods=tuple(taken)), poses, result, error)
-        sys.stdout.write(json.dumps(answer, indent=1) + "\n")
-        sys.stdout.flush()
-    else:
-        # A narrower terminal wraps the lines: cells would be cut off.
-        console = Console(highlight=False, width=max(_WIDTH, Console().width))
-        if poses:
-            show_poses(console, taken, poses, result)
-        if result is not None:
-            show_result(console, result)
-    for sentence in found.rejected if result is None or not options.json else ():
+    poses, result, error = _solve(periods, options)
+    try:
+        if options.json:
+            sys.stdout.write(json.dumps(as_json(poses, rejected, result, error), indent=1) + "\n")
+            sys.stdout.flush()
+        else:
+            # A narrower terminal wraps the lines: cells would be cut off.
+            console = Console(highlight=False, width=max(_WIDTH, Console().width))
+            if poses:
+                show_poses(console, poses, result)
+            if result is not None:
+                show_result(console, result)
+    except BrokenPipeError:
+        discard_output()
+        return 1
+    for sentence in rejected if result is None or not options.json else ():
         _say(f"rejected: {sentence}")
     if result is None:
         _say(error or "no result")
@@ -194,46 +163,44 @@ def _identify(options: IdentifyOptions) -> int:
     return 0
 
 
-def _choose(recording: Recording, position: int | None) -> RecordedSensor:
-    there = [sensor for sensor in recording.sensors if sensor.frames]
+def choose(recording: Recording, position: int | None) -> RecordedSensor:
+    """The sensor at this position, or the only one; RecordingError."""
+    there = {sensor.sensor: sensor for sensor in recording.sensors if sensor.frames}
     if not there:
-        raise SensorChoiceError(f"{recording.path} has no samples")
+        raise RecordingError(f"{recording.path} has no samples")
     if position is None and len(there) > 1:
-        positions = ", ".join(str(sensor.sensor) for sensor in there)
-        raise SensorChoiceError(
-            f"{recording.path} has several sensors ({positions}): choose one with --sensor"
+        positions = ", ".join(map(str, there))
+        raise RecordingError(f"{recording.path} has several sensors ({positions}): choose one with --sensor")
+    sensor = there.get(next(iter(there)) if position is None else position)
+    if sensor is None:
+        raise RecordingError(f"{recording.path} has no samples of sensor {position}")
+    serials = list(dict.fromkeys(row.identity.serial for row in sensor.history))
+    if len(serials) > 1:
+        raise RecordingError(
+            f"{recording.path}: sensor {sensor.sensor} was replaced during it (serial numbers "
+            f"{', '.join(map(str, serials))}), and each has its own bias: record only one"
         )
-    for sensor in there:
-        if position in (None, sensor.sensor):
-            serials = list(dict.fromkeys(row.identity.serial for row in sensor.history))
-            if len(serials) > 1:
-                raise SensorChoiceError(
-                    f"{recording.path}: sensor {sensor.sensor} was replaced during it (serial numbers "
-                    f"{', '.join(map(str, serials))}), and each has its own bias: record only one"
-                )
-            return sensor
-    raise SensorChoiceError(f"{recording.path} has no samples of sensor {position}")
+    return sensor
 
 
 def _solve(
-    found: StationaryPeriods, options: IdentifyOptions
-) -> tuple[Identified | None, str | None, list[StationaryPeriod], list[Pose]]:
-    """The result or why there is none, and the stationary periods that are poses."""
-    taken, poses = [], []
-    reason = None
-    for period in found.periods:
+    periods: Sequence[StationaryPeriod], options: IdentifyOptions
+) -> tuple[Poses, Identified | None, str | None]:
+    """The periods that are poses, and the result or why there is none."""
+    poses: list[tuple[StationaryPeriod, Pose]] = []
+    error = (
+        f"the sensor is never stationary for {options.least_seconds:g} s: hold it still, or relax "
+        "the limits with --limit or --least-seconds"
+    )
+    for period in periods:
         try:
-            poses.append(pose_of(period.means, magnitude=options.gravity or STANDARD_GRAVITY))
-            taken.append(period)
-        except CompensationError as error:
-            reason = str(error)
+            poses.append((period, pose_of(period.means, magnitude=options.gravity or STANDARD_GRAVITY)))
+        except CompensationError as refusal:
+            error = str(refusal)
+    if not poses:
+        return poses, None, error
     try:
-        if not poses:
-            raise CompensationError(
-                reason
-                or f"the sensor is never stationary for {options.least_seconds:g} s: hold it still, or relax "
-                "the limits with --limit or --least-seconds"
-            )
-        return identify(poses, confidence=options.confidence, one_axis=options.one_axis), None, taken, poses
-    except CompensationError as error:
-        return None, str(error), taken, poses
+        confidence, one_axis = options.confidence, options.one_axis
+        return poses, identify([pose for _, pose in poses], confidence=confidence, one_axis=one_axis), None
+    except CompensationError as refusal:
+        return poses, None, str(refusal)

@@ -26,8 +26,7 @@ from ft_compensation.stationary import (
 from ft_compensation.stationary_limits import StationaryLimits
 
 _BLOCK_S: Final = 0.1
-_BLOCK_SAMPLES: Final = 8
-"""Minimum number of samples in a block, however slow the sensor is."""
+_BLOCK_SAMPLES: Final = 8  # at least, however slow the sensor is
 _LONGEST_GAP_S: Final = 0.5
 _SAME_POSE: Final = math.cos(math.radians(1.5))
 
@@ -38,33 +37,25 @@ Bools = npt.NDArray[np.bool_]
 class StationaryPeriod(NamedTuple):
     """A stationary period."""
 
-    begin_s: float
-    """s from the beginning of the recording."""
+    begin_s: float  # from the beginning of the recording
     seconds: float
     means: StationaryMeans
 
 
-class StationaryPeriods(NamedTuple):
-    """The stationary periods of a recording."""
-
-    periods: tuple[StationaryPeriod, ...]
-    rejected: tuple[str, ...]
-    """Sentences about periods that were nearly stationary, and why they were rejected."""
-
-
 def find_stationary_periods(
     columns: Columns, least_seconds: float = 1.0, limits: StationaryLimits | None = None
-) -> StationaryPeriods:
-    """The stationary periods of at least `least_seconds`, in order."""
+) -> tuple[list[StationaryPeriod], list[str]]:
+    """The stationary periods of at least `least_seconds`, in order; sentences about those that nearly are."""
     limits = limits or StationaryLimits()
     fresh = columns.where(columns.fresh)
+    periods: list[StationaryPeriod] = []
+    rejected: list[str] = []
     if len(fresh) < _BLOCK_SAMPLES:
-        return StationaryPeriods((), ())
+        return periods, rejected
     rows = np.hstack([fresh.force, fresh.torque, fresh.acceleration, fresh.angular_rate])
     good = _good(fresh, rows)
     times = (fresh.monotonic_ns - fresh.monotonic_ns[0]) * 1e-9
     rows = np.where(good[:, np.newaxis], rows, 0.0)
-    periods, rejected = [], []
     for part in _parts(times):
         for begin, end in _stretches(times[part], rows[part], good[part], limits):
             first, last = part.start + begin, part.start + end
@@ -77,7 +68,7 @@ def find_stationary_periods(
                 rejected.append(f"{times[first]:.1f} s to {times[last - 1]:.1f} s: {error}")
             else:
                 periods.append(StationaryPeriod(float(times[first]), seconds, means))
-    return StationaryPeriods(tuple(periods), tuple(rejected))
+    return periods, rejected
 
 
 def _good(columns: Columns, rows: Floats) -> Bools:
@@ -110,31 +101,23 @@ def _stretches(
     quiet = good[: count * size].reshape(count, size).all(axis=1)
     quiet &= (deviation <= limits.spreads).all(axis=1)
     quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= limits.angular_rate
+
+    def goes_on(start: int, number: int) -> bool:
+        """Whether block `number` belongs to the period that began with block `start`."""
+        if not (quiet[start] and quiet[number]):
+            return False
+        a, b = mean[start], mean[number]
+        sizes = float(np.linalg.norm(a[6:9]) * np.linalg.norm(b[6:9]))
+        if float(a[6:9] @ b[6:9]) < _SAME_POSE * sizes:
+            return False
+        by_chance = CHANCE * (deviation[start] + deviation[number]) / math.sqrt(size)
+        moved = np.abs(b - a) - by_chance
+        return bool((moved[:6] <= limits.wanders[:6]).all())  # of the acceleration the pose was compared
+
     start = 0
     for number in range(1, count + 1):
-        if number < count and _goes_on(mean, deviation, quiet, start, number, size, limits):
+        if number < count and goes_on(start, number):
             continue
         if quiet[start] and number - start >= 3:
             yield (start + 1) * size, (number - 1) * size
         start = number
-
-
-def _goes_on(
-    mean: Floats,
-    deviation: Floats,
-    quiet: Bools,
-    start: int,
-    number: int,
-    size: int,
-    limits: StationaryLimits,
-) -> bool:
-    """Whether block `number` belongs to the period that began with block `start`."""
-    if not (quiet[start] and quiet[number]):
-        return False
-    a, b = mean[start], mean[number]
-    sizes = float(np.linalg.norm(a[6:9]) * np.linalg.norm(b[6:9]))
-    if float(a[6:9] @ b[6:9]) < _SAME_POSE * sizes:
-        return False
-    by_chance = CHANCE * (deviation[start] + deviation[number]) / math.sqrt(size)
-    moved = np.abs(b - a) - by_chance
-    return bool((moved[:6] <= limits.wanders[:6]).all())  # of the acceleration the pose was compared

@@ -10,8 +10,8 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
@@ -46,10 +46,11 @@ class Range(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """A distribution in µs: its median, and p99 or the worst."""
+    """A distribution in µs: its median, and p99 or the worst, as `which` says."""
 
     p50: float
-    worst: float
+    high: float
+    which: str = "p99"
 
 
 class Clock(NamedTuple):
@@ -174,12 +175,12 @@ class _Sensor:
         self.lost: str | None = None  # why the server has lost it, if it has
         self.peaks: tuple[Range, ...] | None = None
         self._imu_units = imu_units
-        self._observer: StreamObserver | None = None  # None before the first description
+        self.observer = StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
         self._row: JsonObject = {}
         self._status: JsonObject = {}
         self._hand_out: Any = None
         self._newest: bytes | None = None
-        self._trace: dict[int, tuple[Range, ...]] = {}
+        self._trace: deque[tuple[int, tuple[Range, ...]]] = deque(maxlen=TRACE_STEPS)  # by step
         self._verdict = NOTHING_WRONG
         self._saturated: frozenset[str] = frozenset()
         self._now: list[Finding] = []
@@ -192,26 +193,21 @@ class _Sensor:
         """Reset peaks and past warnings."""
         self.peaks = None
         self._seen, self._grown, self._emergency = {}, {}, ("", 0.0)
-        if self._observer is not None:
-            self._observer.forget()
+        self.observer.forget()
 
-    def describe(self, row: JsonObject, now_s: float) -> None:
-        """Take its row of `describe`."""
+    def describe(self, row: JsonObject, now_s: float, *, anew: bool) -> None:
+        """Take its row of `describe`; `anew`: the monitor has connected. What lies between is no loss."""
         before, self._row = self._row, row
+        if anew:
+            self.lost, self._status, self.observer = None, {}, StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
+            if before:
+                self._grown["reconnects"] = 1, now_s
         if before and row.get("serial") != before.get("serial"):
             self.reset()
-            self._newest, self._trace = None, {}
-        rate_hz = number(row.get("rate_hz")) or 0.0
-        if self._observer is None:
-            self._observer = StreamObserver(rate_hz, _ns(now_s), window_ns=_WINDOW_NS)
-        elif any(row.get(name) != before.get(name) for name in ("rate_hz", "serial")):
-            self._observer.begin(rate_hz, _ns(now_s))
-
-    def restart(self, now_s: float, *, again: bool) -> None:
-        """The monitor has connected; `again`: not for the first time. What lies between is no loss."""
-        self.lost, self._status, self._observer = None, {}, None
-        if again:
-            self._grown["reconnects"] = 1, now_s
+            self._newest = None
+            self._trace.clear()
+        if anew or not before or any(row.get(name) != before.get(name) for name in ("rate_hz", "serial")):
+            self.observer.begin(number(row.get("rate_hz")) or 0.0, _ns(now_s))
 
     def take_status(self, row: JsonObject, hand_out: Any, missed_deadlines: Any, now_s: float) -> None:
         """Take its row of `status`, the distribution of ages at hand-out, and what its server missed."""
@@ -228,44 +224,39 @@ class _Sensor:
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
         """Frames of this sensor as they came, oldest first."""
-        if self._observer is None:
-            return
-        samples = self._observer.take(frames, _ns(now_s))
+        samples = self.observer.take(frames, _ns(now_s))
         self._judge(now_s)
         if not samples:
             return
-        self._newest = self._observer.newest
+        self._newest = self.observer.newest
         columns = list(zip(*samples, strict=True))
         found = tuple(_range(columns[index]) for index in _WRENCH)
         self.peaks = _widest(self.peaks or found, found)
         step = int(now_s / TRACE_STEP_S)
-        if step not in self._trace and len(self._trace) > 2 * TRACE_STEPS:
-            self._trace = {at: kept for at, kept in self._trace.items() if at > step - TRACE_STEPS}
-        self._trace[step] = _widest(self._trace.get(step, found), found)
-
-    def note_age(self, frame: DataMessage, now_ns: int) -> None:
-        """This frame arrived exactly at this CLOCK_MONOTONIC."""
-        if self._observer is not None:
-            self._observer.note_age(frame, now_ns)
+        if self._trace and self._trace[-1][0] == step:
+            found = _widest(self._trace.pop()[1], found)
+        self._trace.append((step, found))
 
     def _judge(self, now_s: float) -> None:
         seen = self._observation(now_s)
         self._verdict = judge(seen)
         self._saturated = frozenset(axis for axes in saturated_axes(seen).values() for axis in axes)
-        self._now = [_explained(finding, self.lost) for finding in self._verdict.findings]
-        for finding in self._now:
+        self._now = []
+        for finding in self._verdict.findings:
+            if self.lost is not None and finding.key == "silence":
+                # The server's words of why it has lost the sensor may say what to do.
+                why = self.lost if "check " in self.lost else f"{finding.remedy} ({self.lost})"
+                finding = finding._replace(remedy=why)  # noqa: PLW2901
+            self._now.append(finding)
             known, _ = self._seen.get(finding.key, (finding, 0.0))
             worst = max(finding, known, key=lambda one: (one.level, one.size))
             self._seen[finding.key] = worst, now_s
 
     def _observation(self, now_s: float) -> Observation:
-        if self._observer is None:
-            return Observation()
-        clock: Any = self._status.get("clock")
-        mode = clock.get("mode") if isinstance(clock, dict) else None
+        mode = _mapping(self._status.get("clock")).get("mode")
         said, at_s = self._emergency
         grown = {name: by for name, (by, then_s) in self._grown.items() if now_s - then_s < _JUDGED_S}
-        seen = self._observer.observation(_ns(now_s), _JUDGED_NS)
+        seen = self.observer.observation(_ns(now_s), _JUDGED_NS)
         return seen._replace(
             not_finite=seen.not_finite + ("not_finite" in grown),
             recoveries=int("recoveries" in grown),
@@ -278,25 +269,25 @@ class _Sensor:
             settings=_mapping(self._row.get("settings")),
         )
 
-    def _alerts(self, now_s: float, *, present: bool) -> Iterable[Alert]:
-        """What is there now, if `present`, the worst first; then what is past, the latest first."""
-        now = self._now if present else []
-        keys = {finding.key for finding in now}
-        for finding in now:
-            yield Alert(finding.level, finding.found, finding.remedy, None)
-        for key, (finding, at_s) in sorted(self._seen.items(), key=lambda entry: -entry[1][1]):
-            if key not in keys:
-                yield Alert(finding.level, finding.found, finding.remedy, now_s - at_s)
-
     def state(self, now_s: float, *, server_speaks: bool) -> SensorState:
         """The current state. Silence is the sensor's fault only if the server is not silent."""
         if server_speaks:
             self._judge(now_s)
+        now = self._now if server_speaks else []
+        keys = {finding.key for finding in now}
+        latest = sorted(self._seen.items(), key=lambda entry: -entry[1][1])
+        alerts = [Alert(finding.level, finding.found, finding.remedy, None) for finding in now]
+        alerts += [
+            Alert(finding.level, finding.found, finding.remedy, now_s - at_s)
+            for key, (finding, at_s) in latest
+            if key not in keys
+        ]
         row, status, clock = self._row, self._status, self._status.get("clock")
         settings = _mapping(row.get("settings"))
         sample = self._newest and SampleDecoder(len(self._newest), self._imu_units).decode(self._newest)
         last = int(now_s / TRACE_STEP_S)
-        steps = [self._trace.get(step) for step in range(last - TRACE_STEPS + 1, last + 1)]
+        past = dict(self._trace)
+        steps = [past.get(step) for step in range(last - TRACE_STEPS + 1, last + 1)]
         return SensorState(
             position=self.position,
             name=text(row.get("name")),
@@ -310,10 +301,8 @@ class _Sensor:
             traces=tuple(tuple(step[axis] if step else None for step in steps) for axis in range(len(AXES))),
             saturated=self._saturated,
             verdict=self._verdict,
-            alerts=tuple(self._alerts(now_s, present=server_speaks)),
-            clock=Clock(
-                text(clock.get("mode")), number(clock.get("offset_ppm")), number(clock.get("uncertainty_us"))
-            )
+            alerts=tuple(alerts),
+            clock=Clock(text(clock.get("mode")), *(number(clock.get(name)) for name in Clock._fields[1:]))
             if isinstance(clock, dict)
             else None,
             lost_on_bus=whole(status.get("lost_samples")),
@@ -324,10 +313,7 @@ class _Sensor:
 
     def _stream(self, now_ns: int) -> dict[str, Any]:
         """How its samples arrive."""
-        observer = self._observer
-        if observer is None:
-            return {}
-        counts = observer.counts
+        observer, counts = self.observer, self.observer.counts
         found: dict[str, Any] = {
             "samples": counts.new, "missed": counts.withheld, "gaps": counts.gaps,
             "repeated": counts.repeated, "invalid": counts.invalid,
@@ -341,7 +327,7 @@ class _Sensor:
         if jitter := observer.jitter_us(now_ns):
             found["jitter_us"], found["jitter_worst_us"] = jitter
         if ages := sorted(observer.ages_us(now_ns)):
-            found["age_us"] = Spread(ages[len(ages) // 2], ages[-1])
+            found["age_us"] = Spread(ages[len(ages) // 2], ages[-1], "worst")
         return found
 
 
@@ -350,12 +336,11 @@ class Model:
 
     def __init__(self, address: str, imu_units: ImuUnits = ImuUnits.G_DPS) -> None:
         self._lock = threading.Lock()
-        self._address = address
         self._imu_units = imu_units
         self._sensors: dict[int, _Sensor] = {}
-        self._connected = False
-        self._since: tuple[float, str] | None = None
-        self._reason = self._version = self._replay = self._own_peer = ""
+        self._server = ServerState(address=address)  # what does not depend on the time
+        self._since_s: float | None = None
+        self._own_peer = ""
         self._heard_s = 0.0
         self._status: JsonObject = {}
         self._status_s = 0.0
@@ -367,25 +352,22 @@ class Model:
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
         """Connected; `own_peer` is the address of this end, as in `status`."""
         with self._lock:
-            for sensor in self._sensors.values():
-                sensor.restart(now_s, again=self._since is not None)
-            self._connected, self._reason = True, ""
-            self._since = (now_s, clock_text())
-            self._heard_s, self._own_peer = now_s, own_peer
-            self._status, self._clients = {}, ()
-            self._describe(description, now_s)
+            self._server = replace(self._server, connected=True, reason="", since_clock=clock_text())
+            self._since_s = self._heard_s = now_s
+            self._own_peer, self._status, self._clients = own_peer, {}, ()
+            self._describe(description, now_s, anew=True)
 
     def described(self, description: JsonObject, now_s: float) -> None:
         """A later reply to `describe`."""
         with self._lock:
-            self._describe(description, now_s)
+            self._describe(description, now_s, anew=False)
 
     def gone(self, reason: str, now_s: float) -> None:
         """Disconnected, for this reason."""
         with self._lock:
-            if self._connected or self._since is None:
-                self._since = (now_s, clock_text())
-            self._connected, self._reason = False, text(reason)
+            if self._server.connected or self._since_s is None:
+                self._since_s, self._server = now_s, replace(self._server, since_clock=clock_text())
+            self._server = replace(self._server, connected=False, reason=text(reason))
             self._clients = ()
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
@@ -401,7 +383,7 @@ class Model:
         """This frame arrived exactly at this CLOCK_MONOTONIC."""
         with self._lock:
             if frame.sensor in self._sensors:
-                self._sensors[frame.sensor].note_age(frame, now_ns)
+                self._sensors[frame.sensor].observer.note_age(frame, now_ns)
 
     def take_status(self, status: JsonObject, now_s: float) -> None:
         """A reply to `status`."""
@@ -412,7 +394,14 @@ class Model:
                 if (sensor := self._sensor(row)) is not None:
                     hand_out = ages[place] if isinstance(ages, list) and place < len(ages) else None
                     sensor.take_status(row, hand_out, status.get("missed_deadlines"), now_s)
-            self._take_clients(rows(status.get("clients")), now_s - self._status_s)
+            seconds, before = now_s - self._status_s, {client.peer: client.sent for client in self._clients}
+            clients = []
+            for row in rows(status.get("clients")):
+                peer, sent = text(row.get("peer")), whole(row.get("sent")) or 0
+                rate = (sent - before[peer]) / seconds if peer in before and seconds > 0 else None
+                withheld = whole(row.get("withheld")) or 0
+                clients.append(Client(peer, peer == self._own_peer, rate, sent, withheld))
+            self._clients = tuple(sorted(clients, key=lambda c: (not c.this, -c.withheld, -c.sent)))
             self._status, self._status_s = status, now_s
 
     def take_event(self, event: JsonObject, now_s: float) -> None:
@@ -448,7 +437,20 @@ class Model:
             self._message_ends_s = self._message_ends_s or now_s + _MESSAGE_S
             if now_s > self._message_ends_s:
                 self._message = None
-            server = self._server(now_s)
+            status, connected = self._status, self._server.connected
+            timing = _mapping(status.get("last_10s")) or status
+            up_s = number(status.get("uptime_s"))
+            server = replace(
+                self._server,
+                since_s=None if self._since_s is None else now_s - self._since_s,
+                heard_s=now_s - self._heard_s if connected else None,
+                uptime_s=up_s + now_s - self._status_s if up_s is not None and connected else up_s,
+                cycles=whole(status.get("cycles")),
+                missed_deadlines=whole(status.get("missed_deadlines")),
+                lost_frames=whole(status.get("lost_frames")),
+                wake_us=_spread(timing.get("wake_us")),
+                exchange_us=_spread(timing.get("exchange_us")),
+            )
             speaks = server.connected and not server.silent
             sensors = [self._sensors[position] for position in sorted(self._sensors)]
             return State(
@@ -459,66 +461,27 @@ class Model:
                 tuple(self._events),
             )
 
-    def _describe(self, description: JsonObject, now_s: float) -> None:
-        self._version = text(description.get("version"))
+    def _describe(self, description: JsonObject, now_s: float, *, anew: bool) -> None:
         replay = description.get("replay")
         files = _mapping(replay).get("files")
-        names = [text(name) for name in files] if isinstance(files, list) else []
+        names = [text(name) for name in files] if isinstance(files, list) and files else ["a recording"]
         more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-        self._replay = "" if not isinstance(replay, dict) else f"{names[0]}{more}" if names else "a recording"
+        replayed = f"{names[0]}{more}" if isinstance(replay, dict) else ""
+        self._server = replace(self._server, version=text(description.get("version")), replay=replayed)
         before, self._sensors = self._sensors, {}
         for row in rows(description.get("sensors")):
             if (position := whole(row.get("sensor"))) is not None:
                 self._sensors[position] = before.get(position) or _Sensor(position, self._imu_units)
-                self._sensors[position].describe(row, now_s)
+                self._sensors[position].describe(row, now_s, anew=anew)
 
     def _sensor(self, row: JsonObject) -> _Sensor | None:
         position = whole(row.get("sensor"))
         return None if position is None else self._sensors.get(position)
 
-    def _take_clients(self, found: Iterable[JsonObject], seconds: float) -> None:
-        before = {client.peer: client.sent for client in self._clients}
-        clients = []
-        for row in found:
-            peer, sent = text(row.get("peer")), whole(row.get("sent")) or 0
-            rate = (sent - before[peer]) / seconds if peer in before and seconds > 0 else None
-            clients.append(Client(peer, peer == self._own_peer, rate, sent, whole(row.get("withheld")) or 0))
-        self._clients = tuple(sorted(clients, key=lambda c: (not c.this, -c.withheld, -c.sent)))
-
-    def _server(self, now_s: float) -> ServerState:
-        status = self._status
-        timing = _mapping(status.get("last_10s")) or status
-        uptime_s = number(status.get("uptime_s"))
-        if uptime_s is not None and self._connected:
-            uptime_s += now_s - self._status_s
-        return ServerState(
-            address=self._address,
-            connected=self._connected,
-            since_s=None if self._since is None else now_s - self._since[0],
-            since_clock="" if self._since is None else self._since[1],
-            reason=self._reason,
-            heard_s=now_s - self._heard_s if self._connected else None,
-            version=self._version,
-            replay=self._replay,
-            uptime_s=uptime_s,
-            cycles=whole(status.get("cycles")),
-            missed_deadlines=whole(status.get("missed_deadlines")),
-            lost_frames=whole(status.get("lost_frames")),
-            wake_us=_spread(timing.get("wake_us")),
-            exchange_us=_spread(timing.get("exchange_us")),
-        )
-
 
 def clock_text() -> str:
     """The time of day."""
     return time.strftime("%H:%M:%S")
-
-
-def _explained(finding: Finding, lost: str | None) -> Finding:
-    """With the server's words of why it has lost the sensor, which may say what to do."""
-    if lost is None or finding.key != "silence":
-        return finding
-    return finding._replace(remedy=lost if "check " in lost else f"{finding.remedy} ({lost})")
 
 
 def _range(column: Sequence[float]) -> Range:

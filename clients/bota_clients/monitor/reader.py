@@ -26,30 +26,27 @@ _MOST_PILED: Final = 1000  # more were not read in time: what comes next has wai
 _ANSWER_TIMEOUT_S: Final = 10.0  # timeout for a reply of the server
 
 
-class Reader:
+class Reader(threading.Thread):
     """Reads until closed."""
 
     def __init__(self, address: Address, model: Model, batch_s: float = BATCH_S) -> None:
         """`batch_s`: how long samples queue before they are taken."""
+        super().__init__(name="reader", daemon=True)
         # REPEATED frames too: then a jump of the sequence is a loss and nothing else.
         self._client = Client(address.port, address.host, fresh_only=False, raw=True)
         self._model = model
         self._batch_s = batch_s
         self._closing = threading.Event()
         self.tried = threading.Event()  # there was a reply to `status`, or a failed connection
-        self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
 
     def close(self) -> None:
         """End the connection and the thread."""
         self._closing.set()
         self._client.close()
-        self._thread.join(timeout=2.0)
+        self.join(timeout=2.0)
 
-    def _run(self) -> None:
+    def run(self) -> None:
+        """The thread."""
         status_at_s = 0.0
         with self._client as client, contextlib.suppress(ConnectionFailedError):
             while not self._closing.wait(self._batch_s):

@@ -63,22 +63,14 @@ _LEAST_TRACE: Final = 0.05  # of the bar's scale, so that noise does not look li
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """The user's choices.
+    """The user's choices."""
 
-    Attributes:
-        selected: which sensor, counted from 0 in the state's order.
-        paused: time of day of the pause; empty if not paused.
-        recording: the running recording, in words.
-        question: the pending question.
-        warnings: the page of all warnings that is shown, from 1; 0: none. After the last comes the first.
-    """
-
-    selected: int = 0
-    paused: str = ""
-    recording: str = ""
-    question: str = ""
+    selected: int = 0  # which sensor, counted from 0 in the state's order
+    paused: str = ""  # time of day of the pause; empty if not paused
+    recording: str = ""  # the running recording, in words
+    question: str = ""  # the pending question
     help: bool = False
-    warnings: int = 0
+    warnings: int = 0  # the page of all warnings, from 1; 0: none. After the last comes the first
     ascii: bool = False
 
 
@@ -135,7 +127,7 @@ def line(sensor: SensorState, now: str) -> str:
             shown = " ".join(numbers.quantity(value, words.DIGITS[unit]) for value in values)
             parts.append(f"{name} {shown} {unit}")
         parts.append(f"{sample.temperature:.1f} °C")
-    parts += [words.rate(sensor), f"age {words.times(sensor.age_us, 'worst')}"]
+    parts += [words.rate(sensor), f"age {words.times(sensor.age_us)}"]
     parts.append(f"lost {words.count(sensor.lost_on_bus)}+{sensor.missed} repeated {sensor.repeated}")
     parts += [f"{alert.level.words}: {alert.text}" for alert in sensor.alerts if alert.ago_s is None]
     return "  ".join(parts)
@@ -244,16 +236,14 @@ def _panel(
     sensor: SensorState, others: Iterable[SensorState], width: int, *, trace: bool = True
 ) -> list[Row]:
     """The rows of `sensor`, without its alerts."""
-    stream = (
-        f"{words.rate(sensor)}   age {words.times(sensor.age_us, 'worst')}   jitter {words.jitter(sensor)}"
-    )
+    stream = f"{words.rate(sensor)}   age {words.times(sensor.age_us)}   jitter {words.jitter(sensor)}"
     lost = _field("Lost", "")
     for number, (text, bad) in enumerate(words.losses(sensor)):
         lost.append("   " if number else "").append(text, PEAK if bad else "")
     unlocked = sensor.clock is not None and sensor.clock.mode != "locked"
     clock = _field("Clock", words.clock(sensor), NOTICE if unlocked else "")
     if sensor.hand_out_us is not None:
-        clock.append(f"   age at hand-out {words.times(sensor.hand_out_us, 'p99')}")
+        clock.append(f"   age at hand-out {words.times(sensor.hand_out_us)}")
     return [
         Row(2, _identity(sensor, others, width)),
         *_axes(sensor, 0, width, trace=trace),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from bota_clients.monitor.model import Alert, Client, Range, SensorState, ServerState, Spread, State
+from bota_clients.monitor.model import Alert, Client, SensorState, ServerState, Spread, State
 from bota_clients.numbers import duration, milliseconds
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.program.output import SPELLED
@@ -35,9 +35,11 @@ def link(server: ServerState) -> str:
         return "connecting"
     if not server.connected:
         return f"SERVER GONE {duration(server.since_s)}"
-    if server.silent and server.heard_s is not None:
-        return f"SERVER SILENT {duration(server.heard_s)}"
-    return f"connected {duration(server.since_s)}"
+    return (
+        f"SERVER SILENT {duration(server.heard_s or 0)}"
+        if server.silent
+        else f"connected {duration(server.since_s)}"
+    )
 
 
 def trouble(server: ServerState) -> str | None:
@@ -46,9 +48,8 @@ def trouble(server: ServerState) -> str | None:
         return None
     if not server.connected:
         return f"gone at {server.since_clock}: {server.reason}; reconnecting"
-    if server.silent and server.heard_s is not None:
-        return f"nothing came for {duration(server.heard_s)}: it may be stopped, or its machine too busy"
-    return None
+    silent = f"nothing came for {duration(server.heard_s or 0)}: it may be stopped, or its machine too busy"
+    return silent if server.silent else None
 
 
 def verdict(state: State) -> tuple[Level, str]:
@@ -77,8 +78,8 @@ def server_facts(server: ServerState) -> list[tuple[str, str]]:
         ("Up", duration(server.uptime_s)),
         ("Missed deadlines", count(server.missed_deadlines)),
         ("Lost frames", count(server.lost_frames)),
-        ("Exchange", times(server.exchange_us, "p99")),
-        ("Woke late by", times(server.wake_us, "p99")),
+        ("Exchange", times(server.exchange_us)),
+        ("Woke late by", times(server.wake_us)),
         ("Cycles", count(server.cycles)),
         ("Version", server.version or "?"),
     ]
@@ -136,11 +137,11 @@ def client(one: Client) -> str:
     return f"{text}, {one.withheld} withheld" if one.withheld else text
 
 
-def times(spread: Spread | None, worst: str) -> str:
-    """Median and worst of a distribution."""
+def times(spread: Spread | None) -> str:
+    """Median and p99 or worst of a distribution."""
     if spread is None:
         return "not known"
-    return f"{milliseconds(spread.p50)} ms, {worst} {milliseconds(spread.worst)}"
+    return f"{milliseconds(spread.p50)} ms, {spread.which} {milliseconds(spread.high)}"
 
 
 def count(value: int | None) -> str:
@@ -168,8 +169,8 @@ def json_line(state: State, unix_s: float) -> str:
         "replay": server.replay or None,
         "server": {
             **_plain(server, "version uptime_s cycles missed_deadlines lost_frames"),
-            "wake_us": _spread(server.wake_us, "p99"),
-            "exchange_us": _spread(server.exchange_us, "p99"),
+            "wake_us": _spread(server.wake_us),
+            "exchange_us": _spread(server.exchange_us),
         }
         if server.connected
         else None,
@@ -188,8 +189,8 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         **_plain(sensor, "name serial firmware nominal_hz units"),
         "force": sample and sample.force,
         "torque": sample and sample.torque,
-        "force_min_max": peaks and _ranges(peaks[:3]),
-        "torque_min_max": peaks and _ranges(peaks[3:]),
+        "force_min_max": peaks and peaks[:3],
+        "torque_min_max": peaks and peaks[3:],
         "acceleration": imu and imu.acceleration,
         "angular_rate": imu and imu.angular_rate,
         "temperature": sample and sample.temperature,
@@ -199,9 +200,9 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         "alerts": [alert(one) for one in sensor.alerts],
         **_plain(sensor, "samples rate_hz jitter_us jitter_worst_us missed gaps repeated invalid silent_s"),
         **_plain(sensor, "lost_on_bus recoveries"),
-        "age_us": _spread(sensor.age_us, "worst"),
+        "age_us": _spread(sensor.age_us),
         "clock": sensor.clock and sensor.clock._asdict(),
-        "hand_out_us": _spread(sensor.hand_out_us, "p99"),
+        "hand_out_us": _spread(sensor.hand_out_us),
     }
 
 
@@ -209,9 +210,5 @@ def _plain(thing: object, names: str) -> dict[str, Any]:
     return {name: getattr(thing, name) for name in names.split()}
 
 
-def _ranges(ranges: tuple[Range, ...]) -> list[list[float]]:
-    return [[r.low, r.high] for r in ranges]
-
-
-def _spread(spread: Spread | None, worst: str) -> dict[str, float] | None:
-    return None if spread is None else {"p50": spread.p50, worst: spread.worst}
+def _spread(spread: Spread | None) -> dict[str, float] | None:
+    return None if spread is None else {"p50": spread.p50, spread.which: spread.high}

@@ -1,64 +1,134 @@
-"""Counts batches and writes them into files in a thread of its own, so that a slow disk does not delay
-reading.
+"""Takes everything that the server sends, in order and across reconnects, counts it and writes it into files.
 
-The queue in between is bounded. What does not fit is counted, and an event marks where it is missing. With
-rotation there are several files, `run_0.mcap`, `run_1.mcap`, ...
+In batches, because waking up for each frame would cost more than all other work on it; and writing has a
+thread of its own, so that a slow disk does not delay reading. The queue in between is bounded. What does not
+fit is counted, and an event marks where it is missing. With rotation there are several files, `run_0.mcap`,
+`run_1.mcap`, ...
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import queue
 import re
 import threading
 import time
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
 from bota_clients.errors import DiskError
-from bota_clients.record.source import Batch, lost
-from bota_clients.recording.disk import DiskFile, remove
+from bota_clients.recording.file_format import RECORDER
 from bota_clients.recording.reader import Description, Event
-from bota_clients.recording.writer import RecordingWriter
+from bota_clients.recording.writer import DiskFile, RecordingWriter, remove
 from bota_ethercat.accounting import StreamAccounting, StreamCounts
+from bota_ethercat.address import Address
+from bota_ethercat.client import Client, Connected, Disconnected
+from bota_ethercat.control import Event as ServerEvent
+from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.new_file import EXISTS
 
+Batch = list[DataMessage | Description | Event]
 
-@dataclass(slots=True)
+BATCH_S: Final = 0.02  # two sensors at 1600 Hz make 64 frames in this time
+# Bytes that the kernel may buffer, as far as it allows: seconds in which nothing is lost.
+_RECEIVE_BUFFER: Final = 4 * 1024 * 1024
+# After these events the server is asked to describe itself again.
+_CHANGES: Final = frozenset({ServerEvent.RECONFIGURED, ServerEvent.SENSOR_BACK})
+FLUSH_S: Final = 0.4  # longest time until received frames are in the file
+# Maximum number of queued frames: a minute of two sensors at 1600 Hz, some 80 MB.
+MAX_BACKLOG: Final = 200_000
+# Longest time for writing what is queued when it is to stop: ros2 launch sends the next signal after 5 s.
+_END_S: Final = 3.0
+
+
+class Source(Client):
+    """A client that renews its subscription whenever the connection ends, to those sensors that are there."""
+
+    def __init__(self, address: Address, sensors: Sequence[int] | None) -> None:
+        """`sensors` are positions on the bus, None for all."""
+        # REPEATED frames too: they show that a sensor was silent.
+        super().__init__(
+            address.port, address.host, sensors=sensors, fresh_only=False, raw=True,
+            receive_buffer=_RECEIVE_BUFFER,
+        )  # fmt: skip
+        self._problem = ""
+
+    def batch(self) -> Batch:
+        """Everything received meanwhile; never blocks, but to have the server describe what has changed."""
+        batch: Batch = []
+        for item in self.poll_all():
+            if isinstance(item, DataMessage):
+                batch.append(item)
+            elif isinstance(item, Connected):
+                self._problem = ""
+                missing = ", ".join(map(str, item.missing))
+                said = {"message": f"without sensor {missing}"} if missing else {}
+                same_machine = self.session.same_machine
+                batch.append(_noted("connected", server=str(self.address), same_machine=same_machine, **said))
+                batch.append(Description(time.time_ns(), item.description))
+            elif isinstance(item, Disconnected):
+                if item.was_connected:
+                    batch.append(_noted("disconnected", reason=item.reason))
+                elif item.reachable and item.reason != self._problem:
+                    # A server that was started again without one of its sensors, say: it is tried again.
+                    self._problem = item.reason
+                    batch.append(_noted("refused", message=item.reason))
+            else:
+                if item.get("source") == RECORDER:
+                    del item["source"]  # reserved for the recorder's own events
+                batch.append(Event(time.time_ns(), item))
+                if item["event"] in _CHANGES:
+                    with contextlib.suppress(ProtocolError):
+                        batch.append(Description(time.time_ns(), self.ask("describe")))
+        return batch
+
+
+def _noted(name: str, **values: object) -> Event:
+    """An event of the recorder."""
+    return Event(time.time_ns(), {"event": name, "source": RECORDER, **values})
+
+
+def lost(frames: int, reason: str) -> Event:
+    """The event that `frames` frames were received but not recorded."""
+    return _noted("lost", frames=frames, reason=reason)
+
+
 class Tally:
-    """What came of all sensors."""
+    """What came of all sensors.
 
-    sensors: dict[int, StreamCounts] = field(default_factory=dict)
-    """By position on the bus."""
-    dropped: int = 0
-    """Frames that came but could not be written."""
-    _accounting: dict[int, StreamAccounting] = field(default_factory=dict)
+    Attributes:
+        dropped: frames that came but could not be written.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._streams: dict[int, StreamAccounting] = {}
 
     def count(self, frame: DataMessage) -> None:
         """Count a frame that is recorded."""
-        accounting = self._accounting.get(frame.sensor)
-        if accounting is None:
-            accounting = self._accounting[frame.sensor] = StreamAccounting(fresh_only=False)
-            self.sensors[frame.sensor] = accounting.counts
-        accounting.take(frame.sequence, frame.monotonic_ns, frame.flags)
+        stream = self._streams.get(frame.sensor)
+        if stream is None:
+            stream = self._streams[frame.sensor] = StreamAccounting(fresh_only=False)
+        stream.take(frame.sequence, frame.monotonic_ns, frame.flags)
 
     def start_again(self) -> None:
         """A new connection: the server may have been restarted, and its numbering with it."""
-        for accounting in self._accounting.values():
-            accounting.begin()
+        for stream in self._streams.values():
+            stream.begin()
 
     @property
-    def frames(self) -> int:
-        """Frames of all sensors."""
-        return sum(sensor.frames for sensor in self.sensors.values())
+    def sensors(self) -> dict[int, StreamCounts]:
+        """The counts by position on the bus, ascending; from any thread."""
+        return {position: stream.counts for position, stream in sorted(dict(self._streams).items())}
 
     def brief(self) -> str:
         """The same as `losses` in few words, the sensors' counts joined by +; from any thread."""
-        sensors = [sensor for _, sensor in sorted(dict(self.sensors).items())]
+        sensors = self.sensors.values()
         missing = self.dropped + sum(sensor.withheld for sensor in sensors)
         found = [f"{missing} lost"] if missing else []
         for name, counts in (
@@ -69,19 +139,10 @@ class Tally:
                 found.append(f"{'+'.join(map(str, counts))} {name}")
         return ", ".join(found) or "nothing lost"
 
-    def as_json(self) -> dict[str, dict[str, int]]:
-        """By position on the bus: `frames`, and the counts of `bota_ethercat.accounting`."""
-        return {
-            str(position): {"frames": sensor.frames, **asdict(sensor)}
-            for position, sensor in sorted(self.sensors.items())
-        }
-
     def losses(self) -> list[str]:
         """What is missing, in words; nothing if nothing is."""
-        found = []
-        if self.dropped:
-            found.append(f"{_frames(self.dropped)} came but could not be written")
-        for position, sensor in sorted(self.sensors.items()):
+        found = [f"{_frames(self.dropped)} came but could not be written"] if self.dropped else []
+        for position, sensor in self.sensors.items():
             if sensor.withheld:
                 found.append(f"{_frames(sensor.withheld)} of sensor {position} not read in time")
             if lost := sensor.lost:
@@ -100,19 +161,15 @@ def _frames(count: int) -> str:
 class Parts:
     """Names and opens the files, and decides when to start the next."""
 
-    def __init__(self, path: Path, *, size: int | None, seconds: float | None, overwrite: bool) -> None:
+    def __init__(self, path: Path, size: float | None, seconds: float | None, *, overwrite: bool) -> None:
         """A new file after `size` bytes or `seconds`, whichever is first; one file if both are None."""
         self.path = path
         self.made: list[Path] = []
-        self._size = size
-        self._seconds = seconds
+        self._rotate = (size, seconds) != (None, None)
+        self._size = math.inf if size is None else size
+        self._seconds = math.inf if seconds is None else seconds
         self._overwrite = overwrite
         self._opened = 0.0
-
-    @property
-    def rotate(self) -> bool:
-        """Whether there can be more than one."""
-        return self._size is not None or self._seconds is not None
 
     def check(self) -> None:
         """DiskError if a file exists and may not be overwritten, or the folder does not exist."""
@@ -126,10 +183,12 @@ class Parts:
 
     def open(self) -> DiskFile:
         """The next file; DiskError."""
-        if not self.made and self.rotate:
-            # Leftover files of an older, longer recording would seem to belong to this one.
-            remove(self._existing())
-        path = self._part(len(self.made)) if self.rotate else self.path
+        path = self.path
+        if self._rotate:
+            if not self.made:
+                # Leftover files of an older, longer recording would seem to belong to this one.
+                remove(self._existing())
+            path = path.with_name(f"{path.stem}_{len(self.made)}{path.suffix}")
         disk = DiskFile(path, overwrite=self._overwrite)
         self.made.append(path)
         self._opened = time.monotonic()
@@ -137,25 +196,13 @@ class Parts:
 
     def is_full(self, size: int) -> bool:
         """Whether the file, of `size` bytes, is full."""
-        full = self._size is not None and size >= self._size
-        return full or (self._seconds is not None and time.monotonic() - self._opened >= self._seconds)
-
-    def _part(self, number: int) -> Path:
-        return self.path.with_name(f"{self.path.stem}_{number}{self.path.suffix}")
+        return size >= self._size or time.monotonic() - self._opened >= self._seconds
 
     def _existing(self) -> list[Path]:
-        if not self.rotate:
+        if not self._rotate:
             return [self.path] if self.path.exists() else []
         name = re.compile(f"{re.escape(self.path.stem)}_[0-9]+{re.escape(self.path.suffix)}", re.ASCII)
         return sorted(path for path in self.path.parent.iterdir() if name.fullmatch(path.name))
-
-
-FLUSH_S: Final = 0.4
-"""Longest time until received frames are in the file."""
-MAX_BACKLOG: Final = 200_000
-"""Maximum number of queued frames: a minute of two sensors at 1600 Hz, some 80 MB."""
-_END_S: Final = 3.0
-"""Longest time for writing what is queued when it is to stop: ros2 launch sends the next signal after 5 s."""
 
 
 class Recorder:
@@ -165,7 +212,6 @@ class Recorder:
         tally: counters of what was recorded and lost.
         error: why nothing more can be written, or None.
         saved: number of frames in the files, including the next flush.
-        bytes_written: size of all files.
     """
 
     def __init__(self, parts: Parts, library: str, notes: Mapping[str, str]) -> None:
@@ -177,12 +223,9 @@ class Recorder:
         self._library = library
         self._notes = notes
         self._queue: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
-        self._backlog = 0
-        self._overflow = 0
+        self._backlog = self._overflow = 0
         self._description: Description | None = None
-        self._finished_bytes = 0
-        self._unflushed = 0
-        self._flush_at = 0.0
+        self._finished_bytes = self._unflushed = 0
         self._disk: DiskFile
         self._writer: RecordingWriter
         self._open_part()
@@ -206,24 +249,27 @@ class Recorder:
         if not batch:
             return
         if self._backlog + len(batch) > MAX_BACKLOG:
-            self._overflow += sum(isinstance(item, DataMessage) for item in batch)
+            self._overflow += _frames_in(batch)
             return
-        if self._overflow:
-            batch = [lost(self._overflow, "the disk did not keep up"), *batch]
-            self._overflow = 0
         self._backlog += len(batch)
+        self._put_overflow()
         self._queue.put(batch)
 
     def stop(self, reason: str) -> None:
         """Write what is queued, for a bounded time, and finish the file; `error` is set if that failed."""
-        if self._overflow:
-            self._queue.put([lost(self._overflow, "the disk did not keep up")])
+        self._put_overflow()
         self._reason = reason
         self._end_by = time.monotonic() + _END_S
         self._queue.put(None)
         self._thread.join()
         while not self._queue.empty():  # queued after a failure
-            self.tally.dropped += sum(isinstance(item, DataMessage) for item in self._queue.get() or ())
+            self.tally.dropped += _frames_in(self._queue.get() or ())
+
+    def _put_overflow(self) -> None:
+        if self._overflow:
+            self._backlog += 1
+            self._queue.put([lost(self._overflow, "the disk did not keep up")])
+            self._overflow = 0
 
     # -- the thread
 
@@ -241,11 +287,11 @@ class Recorder:
             self._disk.close()
 
     def _record(self) -> None:
-        self._flush_at = time.monotonic() + FLUSH_S
+        flush_at = time.monotonic() + FLUSH_S
         too_late = 0
         while True:
             try:
-                batch = self._queue.get(timeout=max(0.0, self._flush_at - time.monotonic()))
+                batch = self._queue.get(timeout=max(0.0, flush_at - time.monotonic()))
             except queue.Empty:
                 batch = []
             if batch is None:
@@ -254,12 +300,12 @@ class Recorder:
                 return
             self._backlog -= len(batch)
             if time.monotonic() >= self._end_by:
-                too_late += sum(isinstance(item, DataMessage) for item in batch)
+                too_late += _frames_in(batch)
                 batch = [item for item in batch if not isinstance(item, DataMessage)]
             for item in batch:
                 self._write(item)
-            if time.monotonic() >= self._flush_at:
-                self._flush_at = time.monotonic() + FLUSH_S
+            if time.monotonic() >= flush_at:
+                flush_at = time.monotonic() + FLUSH_S
                 self._writer.flush()
                 self._unflushed = 0
                 if self._parts.is_full(self._writer.size):
@@ -292,7 +338,11 @@ class Recorder:
             self._writer.describe(time.time_ns(), self._description.reply)
 
     def _end_part(self, reason: str) -> None:
-        sensors = json.dumps(self.tally.as_json())
-        self._writer.finish({"reason": reason, "dropped": str(self.tally.dropped), "sensors": sensors})
+        counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self.tally.sensors.items()}
+        dropped = str(self.tally.dropped)
+        self._writer.finish({"reason": reason, "dropped": dropped, "sensors": json.dumps(counts)})
         self._unflushed = 0
-        self._disk.close()
+
+
+def _frames_in(batch: Iterable[object]) -> int:
+    return sum(isinstance(item, DataMessage) for item in batch)

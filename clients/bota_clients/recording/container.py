@@ -14,47 +14,37 @@ from __future__ import annotations
 
 import os
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple, TypeVar
+from typing import BinaryIO, Final, NamedTuple, Self, TypeVar
 
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, Metadata, Schema
+from mcap.records import Channel, Chunk, Metadata
 from mcap.stream_reader import get_chunk_data_stream
 
-from bota_clients.errors import DamagedError, NotARecordingError
+from bota_clients.errors import DamagedError, NotARecordingError, RecordingError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
+# Largest chunk in bytes, compressed or not. Those of ethercat-record have some hundred kilobytes.
 MAX_CHUNK: Final = 64 * 1024 * 1024
-"""Largest chunk in bytes, compressed or not. Those of ethercat-record have some hundred kilobytes."""
-MAX_SMALL_RECORD: Final = 1024 * 1024
-"""Largest size in bytes of any other record that is read whole."""
+MAX_CHUNKS: Final = 2_000_000  # ten days at two a second
+MAX_METADATA: Final = 1024 * 1024  # bytes
 MAX_CHANNELS: Final = 4096
-MAX_CHUNKS: Final = 2_000_000
-"""Ten days at two a second."""
 
 _RECORD: Final = struct.Struct("<BQ")
-_MESSAGE: Final = struct.Struct("<HIQQ")
-"""Head of a message record: channel, sequence, log time, publish time."""
-_INDEX_HEAD: Final = struct.Struct("<HI")
-_INDEX_ENTRY: Final = 16
-_FOOTER_SIZE: Final = struct.calcsize("<BQQQI8s")
-"""Footer record and trailing magic: the last bytes of a complete file."""
+_MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_INDEX: Final = struct.Struct("<HI")  # channel, bytes that follow: 16 for each message
+_FOOTER_SIZE: Final = struct.calcsize(
+    "<BQQQI8s"
+)  # with the trailing magic: the last bytes of a complete file
 _UNREADABLE: Final = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
-_Record = TypeVar("_Record", Channel, Chunk, Header, Metadata, Schema)
-
-
-class RawMessage(NamedTuple):
-    """A message as it stands in the file."""
-
-    channel: int
-    log_time_ns: int
-    body: memoryview
+_Record = TypeVar("_Record", Channel, Chunk, Metadata)
 
 
 class _ChunkRecord(NamedTuple):
@@ -62,169 +52,167 @@ class _ChunkRecord(NamedTuple):
 
     offset: int
     length: int
-    counts: dict[int, int]
+    counts: Counter[int]
 
 
 class McapFile:
-    """An open MCAP file.
+    """An open MCAP file. Use it as a context manager, or `close` it.
 
     Attributes:
-        profile: the profile in the file's header.
-        metadata: the metadata records by name; the last one of several with the same name.
-        channels: every channel that has messages, by its number.
-        schemas: the schemas, by number.
+        path: its path.
+        notes: the metadata records by name; the last one of several with the same name.
+        topics: of every channel that has messages, by its number.
+        counts: the number of messages by channel.
         cut_off: None if the file is complete, else a clause that says how it ends.
     """
 
     def __init__(self, path: Path) -> None:
-        """NotARecordingError if it is no MCAP file, DamagedError, OSError."""
+        """RecordingError if it cannot be read."""
         self.path = path
-        self.profile = ""
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.channels: dict[int, Channel] = {}
-        self.schemas: dict[int, Schema] = {}
+        self.notes: dict[str, dict[str, str]] = {}
+        self.topics: dict[int, str] = {}
+        self.counts = Counter[int]()
         self.cut_off: str | None = None
         self._chunks: list[_ChunkRecord] = []
-        self._file: BinaryIO = path.open("rb")
         try:
-            self._size = os.fstat(self._file.fileno()).st_size
-            self._scan()
-            for chunk in self._chunks:
-                self._learn(chunk)
-        except BaseException:
-            self._file.close()
-            raise
+            self._file: BinaryIO = path.open("rb")
+            try:
+                self._size = os.fstat(self._file.fileno()).st_size
+                self._open()
+            except BaseException:
+                self.close()
+                raise
+        except OSError as error:
+            raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from None
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def count(self, channel: int) -> int:
-        """Number of messages on the channel."""
-        return sum(chunk.counts.get(channel, 0) for chunk in self._chunks)
+    def __enter__(self) -> Self:
+        return self
 
-    def messages(self, channels: Collection[int]) -> Iterator[RawMessage]:
-        """The messages of these channels in file order; DamagedError at the first corrupt chunk."""
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def messages(self, channels: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
+        """Channel, log time (ns) and body of the messages of these channels in file order.
+
+        DamagedError at the first corrupt chunk.
+        """
         wanted = frozenset(channels)
         for chunk in self._chunks:
             if wanted.isdisjoint(chunk.counts):
                 continue
-            data = self._unpack(chunk)
-            for opcode, start, end in self._records_in(data, chunk):
+            for opcode, body in self._records_in(chunk):
                 if opcode == Opcode.MESSAGE:
-                    channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, start)
+                    channel, _, log_time_ns, _ = _MESSAGE.unpack_from(body)
                     if channel in wanted:
-                        yield RawMessage(channel, log_time_ns, data[start + _MESSAGE.size : end])
+                        yield channel, log_time_ns, body[_MESSAGE.size :]
 
-    # -- the file
-
-    def _scan(self) -> None:
+    def _open(self) -> None:
         if self._file.read(len(MAGIC)) != MAGIC:
             raise NotARecordingError(f"{self.path} is not an MCAP file, so it is no recording")
         tail = self._read_at(max(0, self._size - _FOOTER_SIZE), _FOOTER_SIZE)
-        complete = len(tail) == _FOOTER_SIZE and tail[0] == Opcode.FOOTER and tail.endswith(MAGIC)
+        has_footer = len(tail) == _FOOTER_SIZE and tail[0] == Opcode.FOOTER and tail.endswith(MAGIC)
+        end, ended = self._scan()
+        if has_footer and not ended:
+            raise self._damaged(end, "a record is incomplete")
+        if not has_footer:
+            self._forgive(self._size - end)
+        for chunk in self._chunks:
+            if not chunk.counts or not chunk.counts.keys() <= self.topics.keys():
+                self._learn(chunk)
+            self.counts.update(chunk.counts)
+
+    def _scan(self) -> tuple[int, bool]:
+        """Take the records of the data section; the position behind the last, and whether its end is there.
+
+        The summary that follows repeats what was read.
+        """
         position = len(MAGIC)
-        while (record := self._record_at(position, complete=complete)) is not None:
-            opcode, body, length = record
+        while len(head := self._read_at(position, _RECORD.size)) == _RECORD.size and head[0]:
+            opcode, length = _RECORD.unpack(head)
+            body = position + _RECORD.size
+            if opcode == Opcode.DATA_END or body + length > self._size:
+                return position, opcode == Opcode.DATA_END
             if (opcode == Opcode.HEADER) != (position == len(MAGIC)):
                 raise NotARecordingError(
                     f"{self.path} is not an MCAP file: its header is missing or repeated"
                 )
             self._take(opcode, body, length)
             position = body + length
-        if complete:
-            return
-        if position == len(MAGIC):
-            raise NotARecordingError(f"{self.path} was cut off before anything was recorded")
-        left = self._size - position
-        self.cut_off = "it has no footer" + (
-            f", and the last {left} bytes, an incomplete record, were ignored" if left else ""
-        )
-        # After a power failure the last blocks of the file may be zeros.
-        while self._chunks and not self._is_sound(self._chunks[-1]):
-            self._chunks.pop()
-            self.cut_off = "it has no footer, and its last chunk, which is damaged, was ignored"
+        return position, False
 
-    def _record_at(self, position: int, *, complete: bool) -> tuple[int, int, int] | None:
-        """Opcode, position of the body and length of a record; None at the end of the data section."""
-        head = self._read_at(position, _RECORD.size)
-        if len(head) < _RECORD.size or (head[0] == 0 and not complete):
-            if complete:
-                raise self._damaged(position, "a record is incomplete")
-            return None
-        opcode, length = _RECORD.unpack(head)
-        if opcode == Opcode.DATA_END:
-            return None  # the summary that follows repeats what was read
-        body = position + _RECORD.size
-        if body + length > self._size:
-            if complete:
-                raise self._damaged(position, f"a record claims {length} bytes")
-            return None
-        return opcode, body, length
+    def _forgive(self, left: int) -> None:
+        """It was cut off: ignore the last bytes, so many, and damaged chunks before them."""
+        if left == self._size - len(MAGIC):
+            raise NotARecordingError(f"{self.path} was cut off before anything was recorded")
+        more = f", and the last {left} bytes, an incomplete record, were ignored" if left else ""
+        while self._chunks:
+            try:
+                self._unpack(self._chunks[-1])
+                break
+            except DamagedError:  # after a power failure the last blocks of the file may be zeros
+                self._chunks.pop()
+                more = ", and its last chunk, which is damaged, was ignored"
+        self.cut_off = f"it has no footer{more}"
 
     def _take(self, opcode: int, body: int, length: int) -> None:
-        if opcode == Opcode.HEADER:
-            self.profile = self._parse(Header, self._small(body, length), body).profile
-        elif opcode == Opcode.METADATA:
-            record = self._parse(Metadata, self._small(body, length), body)
-            self.metadata[record.name] = record.metadata
+        if opcode == Opcode.METADATA:
+            self._bound(body, length, MAX_METADATA)
+            record = self._parse(Metadata, self._read_at(body, length), body)
+            self.notes[record.name] = record.metadata
         elif opcode == Opcode.CHUNK:
             if len(self._chunks) >= MAX_CHUNKS:
                 raise self._damaged(body, f"it has more than {MAX_CHUNKS} chunks")
-            self._chunks.append(_ChunkRecord(body, length, {}))
+            self._chunks.append(_ChunkRecord(body, length, Counter()))
         elif opcode == Opcode.MESSAGE_INDEX:
-            head = self._read_at(body, min(length, _INDEX_HEAD.size))
-            channel, size = _INDEX_HEAD.unpack(head) if len(head) == _INDEX_HEAD.size else (0, -1)
-            if not self._chunks or not 0 <= size <= length - _INDEX_HEAD.size or size % _INDEX_ENTRY:
+            head = self._read_at(body, min(length, _INDEX.size))
+            channel, size = _INDEX.unpack(head) if len(head) == _INDEX.size else (0, -1)
+            if not self._chunks or not 0 <= size <= length - _INDEX.size or size % 16:
                 raise self._damaged(body, "a message index is malformed or belongs to no chunk")
-            self._chunks[-1].counts[channel] = size // _INDEX_ENTRY
+            self._chunks[-1].counts[channel] = size // 16
         elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
             raise NotARecordingError(f"{self.path} has messages outside of chunks: it is no recording")
 
-    # -- chunks
-
     def _learn(self, chunk: _ChunkRecord) -> None:
-        """Read the channels that `chunk` introduces, and count its messages if it has no index."""
-        if chunk.counts and all(channel in self.channels for channel in chunk.counts):
-            return
+        """Take the channels that a chunk introduces, and count its messages."""
         chunk.counts.clear()
-        data = self._unpack(chunk)
-        for opcode, start, end in self._records_in(data, chunk):
+        for opcode, body in self._records_in(chunk):
             if opcode == Opcode.MESSAGE:
-                channel = int.from_bytes(data[start : start + 2], "little")
-                chunk.counts[channel] = chunk.counts.get(channel, 0) + 1
-            elif opcode == Opcode.SCHEMA:
-                schema = self._parse(Schema, data[start:end], chunk.offset)
-                self.schemas[schema.id] = schema
+                chunk.counts[int.from_bytes(body[:2], "little")] += 1
             elif opcode == Opcode.CHANNEL:
-                found = self._parse(Channel, data[start:end], chunk.offset)
-                self.channels[found.id] = found
-            if len(self.schemas) + len(self.channels) > MAX_CHANNELS:
-                raise self._damaged(chunk.offset, f"it has more than {MAX_CHANNELS} channels and schemas")
-        for channel in chunk.counts:
-            if channel not in self.channels:
-                raise self._damaged(chunk.offset, f"a message is on channel {channel}, which does not exist")
+                found = self._parse(Channel, body, chunk.offset)
+                self.topics[found.id] = found.topic
+                if len(self.topics) > MAX_CHANNELS:
+                    raise self._damaged(chunk.offset, f"it has more than {MAX_CHANNELS} channels")
+        if unknown := chunk.counts.keys() - self.topics.keys():
+            raise self._damaged(chunk.offset, f"a message is on channel {min(unknown)}, which does not exist")
 
-    def _is_sound(self, chunk: _ChunkRecord) -> bool:
-        try:
-            self._unpack(chunk)
-        except DamagedError:
-            return False
-        return True
+    def _records_in(self, chunk: _ChunkRecord) -> Iterator[tuple[int, memoryview]]:
+        """Opcode and body of every record in a chunk."""
+        data = self._unpack(chunk)
+        position, size = 0, len(data)
+        while position < size:
+            if position + _RECORD.size > size:
+                raise self._damaged(chunk.offset, "a record in a chunk is incomplete")
+            opcode, length = _RECORD.unpack_from(data, position)
+            position += _RECORD.size
+            if length > size - position or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
+                raise self._damaged(chunk.offset, f"a record in a chunk claims {length} bytes")
+            yield opcode, data[position : position + length]
+            position += length
 
     def _unpack(self, chunk: _ChunkRecord) -> memoryview:
         """The decompressed records of a chunk."""
-        if chunk.length > MAX_CHUNK:
-            raise self._damaged(chunk.offset, f"a chunk claims {chunk.length} bytes, more than {MAX_CHUNK}")
+        self._bound(chunk.offset, chunk.length, MAX_CHUNK)
         found = self._parse(Chunk, self._read_at(chunk.offset, chunk.length), chunk.offset)
         size = found.uncompressed_size
-        if size > MAX_CHUNK:
-            raise self._damaged(chunk.offset, f"a chunk claims {size} bytes, more than {MAX_CHUNK}")
-        if found.compression not in ("", "zstd"):
-            raise self._damaged(
-                chunk.offset, f"a chunk is compressed with {found.compression[:16]!r}, not zstd"
-            )
+        self._bound(chunk.offset, size, MAX_CHUNK)
         try:
+            if found.compression not in ("", "zstd"):
+                raise ValueError(f"it is compressed with {found.compression[:16]!r}, not zstd")
             if found.compression and zstandard.frame_content_size(found.data) not in (-1, size):
                 raise ValueError("its sizes differ")
             stream, got = get_chunk_data_stream(found, validate_crc=True)
@@ -234,29 +222,9 @@ class McapFile:
         except _UNREADABLE as error:
             raise self._damaged(chunk.offset, f"a chunk cannot be decompressed: {error}") from None
 
-    def _records_in(self, data: memoryview, chunk: _ChunkRecord) -> Iterator[tuple[int, int, int]]:
-        """Opcode, start and end of every record in a chunk."""
-        position, size = 0, len(data)
-        while position < size:
-            if position + _RECORD.size > size:
-                raise self._damaged(chunk.offset, "a record in a chunk is incomplete")
-            opcode, length = _RECORD.unpack_from(data, position)
-            position += _RECORD.size
-            if length > size - position or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
-                raise self._damaged(chunk.offset, f"a record in a chunk claims {length} bytes")
-            yield opcode, position, position + length
-            position += length
-
-    # -- bytes
-
     def _read_at(self, offset: int, size: int) -> bytes:
         self._file.seek(offset)
         return self._file.read(size)
-
-    def _small(self, offset: int, length: int) -> bytes:
-        if length > MAX_SMALL_RECORD:
-            raise self._damaged(offset, f"a record claims {length} bytes, more than {MAX_SMALL_RECORD}")
-        return self._read_at(offset, length)
 
     def _parse(self, kind: type[_Record], body: bytes | memoryview, offset: int) -> _Record:
         try:
@@ -264,6 +232,10 @@ class McapFile:
         except _UNREADABLE:
             raise self._damaged(offset, f"a {kind.__name__} record cannot be read") from None
         return record
+
+    def _bound(self, offset: int, size: int, most: int) -> None:
+        if size > most:
+            raise self._damaged(offset, f"a record claims {size} bytes, more than {most}")
 
     def _damaged(self, offset: int, what: str) -> DamagedError:
         return DamagedError(f"{self.path} is damaged at byte {offset}: {what}")

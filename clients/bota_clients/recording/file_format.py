@@ -21,15 +21,17 @@ PROFILE: Final = "ros2"
 ENCODING: Final = "cdr"
 SCHEMA_ENCODING: Final = "ros2msg"
 
+# Names of metadata records: at the start, and at the end of a complete recording.
 METADATA: Final = "bota_ethercat"
-"""Name of the metadata record at the start: format, recorder, server, ..."""
 END_METADATA: Final = "bota_ethercat_end"
-"""Name of the metadata record at the end of a complete recording: what it has, what it lost."""
 
 DESCRIPTION_TOPIC: Final = "/ethercat/description"
 EVENTS_TOPIC: Final = "/ethercat/events"
 FRAME_SCHEMA: Final = "bota_ethercat/msg/Frame"
-FRAME_DEFINITION: Final = """\
+TEXT_SCHEMA: Final = "std_msgs/msg/String"
+DEFINITIONS: Final = {
+    TEXT_SCHEMA: "string data\n",
+    FRAME_SCHEMA: """\
 # A DATA message of ethercat-server as received, docs/protocol.md
 uint64 sequence         # counts this sensor's frames at the server
 uint64 stamp_ns         # CLOCK_REALTIME of the sample, ns since 1970
@@ -38,17 +40,13 @@ uint8 sensor            # position on the bus, from 0
 uint8 flags             # 1 REPEATED, 2 INVALID, 4 GAP
 uint16 wkc              # EtherCAT working counter
 uint8[] process_data    # as read from the bus: little-endian, 61 or 77 bytes
-"""
-TEXT_SCHEMA: Final = "std_msgs/msg/String"
-TEXT_DEFINITION: Final = "string data\n"
+""",
+}
 
-RECORDER: Final = "recorder"
-"""The value of `source` in the recorder's own events; the server's have none."""
+RECORDER: Final = "recorder"  # the value of `source` in the recorder's own events; the server's have none
 
-_CDR: Final = b"\x00\x01\x00\x00"
-"""CDR encapsulation header: little-endian, no options."""
-_FRAME: Final = struct.Struct("<4sQQQBBHI")
-"""Needs no padding: after the CDR header every field is aligned to its size."""
+_CDR: Final = b"\x00\x01\x00\x00"  # encapsulation header: little-endian, no options
+_FRAME: Final = struct.Struct("<4sQQQBBHI")  # without padding: after the header every field is aligned
 _TEXT: Final = struct.Struct("<4sI")
 _FRAME_TOPIC: Final = re.compile(r"/ethercat/sensor_(0|[1-9][0-9]{0,2})/frames", re.ASCII)
 MAX_SENSOR: Final = 255

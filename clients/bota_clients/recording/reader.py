@@ -10,142 +10,221 @@ chunk; `cut_off` says so. `columns.py` gives NumPy arrays.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, NamedTuple, cast
 
 from bota_clients.errors import DamagedError, NotARecordingError, RecordingError
-from bota_clients.recording.container import McapFile, RawMessage
-from bota_clients.recording.file_format import (
-    DESCRIPTION_TOPIC,
-    END_METADATA,
-    EVENTS_TOPIC,
-    FORMAT_VERSION,
-    METADATA,
-    sensor_of_topic,
-    unpack_frame,
-    unpack_json,
-)
-from bota_clients.recording.sensors import Description, Event, Histories, Identity, RecordedSensor, Settings
+from bota_clients.recording import file_format
+from bota_clients.recording.container import McapFile
+from bota_ethercat.errors import SettingError
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.settings import SETTINGS, sampling_rate_hz
+from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import rows, visible
 
-__all__ = ["DamagedError", "Description", "Event", "Identity", "NotARecordingError", "RecordedSensor",
-           "Recording", "RecordingError", "Settings", "open_recording"]  # fmt: skip
+__all__ = ["DamagedError", "Description", "Event", "Histories", "Identity", "NotARecordingError",
+           "RecordedSensor", "Recording", "RecordingError", "Settings", "open_recording"]  # fmt: skip
 
-_MAX_NOTES: Final = 1_000_000
-"""Maximum number of descriptions and events."""
-
-_LONGEST_CHOICE: Final = 1024
-"""Characters of the list of chosen positions."""
+_MAX_NOTES: Final = 1_000_000  # descriptions and events
+_LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions
 
 
-class Recording:
+class Description(NamedTuple):
+    """A reply to `describe`."""
+
+    stamp_ns: int  # when it was received, ns since 1970
+    reply: JsonObject
+
+
+class Event(NamedTuple):
+    """An event of the server, or of the recorder (`by_recorder`)."""
+
+    stamp_ns: int  # when it was received, ns since 1970
+    event: JsonObject
+
+    @property
+    def name(self) -> str:
+        """Name of the event."""
+        return str(self.event.get("event", "?"))
+
+    @property
+    def by_recorder(self) -> bool:
+        """Whether it is the recorder's own: connected, disconnected, lost."""
+        return self.event.get("source") == file_format.RECORDER
+
+
+class Identity(NamedTuple):
+    """Identity of a sensor."""
+
+    name: str = "?"
+    serial: int = 0
+    hardware: str = "?"
+    firmware: str = "?"
+    pdo_size: int = 0
+
+
+class Settings(NamedTuple):
+    """Settings, sampling rate and identity of a sensor from a time on."""
+
+    stamp_ns: int = 0
+    values: Mapping[str, Any] = {}
+    rate_hz: float = 0.0  # 0 if unknown
+    identity: Identity = Identity()
+
+
+class RecordedSensor(NamedTuple):
+    """A sensor of the recording, as first described."""
+
+    sensor: int  # position on the bus, from 0
+    name: str
+    serial: int
+    hardware: str
+    firmware: str
+    pdo_size: int
+    rate_hz: float  # nominal; 0 if unknown
+    settings: Mapping[str, Any]
+    history: tuple[
+        Settings, ...
+    ]  # settings and identity over time, oldest first; the first are the ones here
+    frames: int  # number of its frames in the recording
+
+
+class Histories:
+    """The histories of all sensors, built from descriptions and events in file order."""
+
+    def __init__(self) -> None:
+        self._of: dict[int, list[Settings]] = {}
+
+    def take(self, note: Description | Event) -> None:
+        """Take the next description or event of the file."""
+        described = isinstance(note, Description)
+        for row in rows(note.reply.get("sensors")) if isinstance(note, Description) else [note.event]:
+            position, values = row.get("sensor"), row.get("settings")
+            if isinstance(position, int) and not isinstance(position, bool) and isinstance(values, dict):
+                self._learn(position, note.stamp_ns, row, values, described=described)
+
+    def of(self, position: int) -> Sequence[Settings]:
+        """The history so far of the sensor at this position."""
+        return self._of.get(position, ())
+
+    def sensors(self, frames: Mapping[int, int]) -> tuple[RecordedSensor, ...]:
+        """All sensors that were described or that have `frames`, which are counts by position."""
+        found = []
+        for position in sorted(self._of.keys() | frames.keys()):
+            history = tuple(self.of(position))
+            first = history[0] if history else Settings()
+            about = (*first.identity, first.rate_hz, first.values, history)
+            found.append(RecordedSensor(position, *about, frames.get(position, 0)))
+        return tuple(found)
+
+    def _learn(
+        self, position: int, stamp_ns: int, row: JsonObject, values: dict[str, Any], *, described: bool
+    ) -> None:
+        known = self._of.setdefault(position, [])
+        last = known[-1] if known else Settings()
+        identity = last.identity
+        if described:
+            name, hardware, firmware = (_text(row.get(key)) for key in ("name", "hardware", "firmware"))
+            serial, size = (int(_number(row.get(key))) for key in ("serial", "pdo_size"))
+            identity = Identity(name, serial, hardware, firmware, size)
+        rate = _number(row.get("rate_hz"))
+        if known and last.values == values and last.identity in (identity, Identity()):
+            # The description that follows an event completes the same entry.
+            known[-1] = last._replace(rate_hz=rate or last.rate_hz, identity=identity)
+        else:
+            known.append(Settings(stamp_ns, values, rate or _rate(values, last), identity))
+
+
+def _rate(values: Mapping[str, Any], last: Settings) -> float:
+    """The rate that the settings imply where it is not given."""
+    try:
+        length = SETTINGS["sinc_length"].check(values.get("sinc_length"))
+    except SettingError:
+        return last.rate_hz
+    return last.rate_hz if length == last.values.get("sinc_length") else float(sampling_rate_hz(length))
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) and 0 < value < 2**32 else 0.0
+
+
+def _text(value: object) -> str:
+    """Text from a file, safe to print: no control characters, limited length."""
+    return visible(str(value)[:80]) if value is not None else "?"
+
+
+class Recording(McapFile):
     """An open recording. Use it as a context manager, or `close` it.
 
     Attributes:
         path: its path.
+        cut_off: None if the recording is complete, else a clause that says how it ends.
         metadata: what the recorder wrote at the start, by name (docs/recording.md).
         chosen: positions given with --sensor; empty for all.
         end: what the recorder wrote at the end, None if it was cut off.
-        cut_off: None if the recording is complete, else a clause that says how it ends.
         sensors: the sensors that the server described or that have frames, by position.
-        descriptions: every description, oldest first.
         events: every event, oldest first.
     """
 
-    def __init__(self, path: Path) -> None:
-        """RecordingError if it cannot be read."""
-        self.path = path
-        try:
-            self._file = McapFile(path)
-        except OSError as error:
-            raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from None
-        try:
-            self._open()
-        except BaseException:
-            self._file.close()
-            raise
-
     def _open(self) -> None:
-        self.cut_off = self._file.cut_off
-        found = self._file.metadata.get(METADATA)
+        super()._open()
+        found = self.notes.get(file_format.METADATA)
         if found is None:
             raise NotARecordingError(f"{self.path} is an MCAP file, but ethercat-record did not write it")
-        if found.get("format") != FORMAT_VERSION:
+        if found.get("format") != file_format.FORMAT_VERSION:
             raise NotARecordingError(
                 f"{self.path} has format {found.get('format', '?')[:20]!r} and this program reads "
-                f"{FORMAT_VERSION}: use the version that wrote it"
+                f"{file_format.FORMAT_VERSION}: use the version that wrote it"
             )
         self.metadata: Mapping[str, str] = found
         chosen = found.get("sensors", "")[:_LONGEST_CHOICE].split()
         self.chosen = {int(position) for position in chosen if position.isascii() and position.isdecimal()}
-        self.end: Mapping[str, str] | None = self._file.metadata.get(END_METADATA)
-        self._sensor_of: dict[int, int] = {}
-        self._topic_of: dict[int, str] = {}
-        for number, channel in self._file.channels.items():
-            sensor = sensor_of_topic(channel.topic)
-            if sensor is not None:
+        self.end: Mapping[str, str] | None = self.notes.get(file_format.END_METADATA)
+        counts, self._noted, self._sensor_of = Counter[int](), set[int](), dict[int, int]()
+        for number, topic in self.topics.items():
+            if (sensor := file_format.sensor_of_topic(topic)) is not None:
                 self._sensor_of[number] = sensor
-            elif channel.topic in (DESCRIPTION_TOPIC, EVENTS_TOPIC):
-                self._topic_of[number] = channel.topic
-        self.descriptions: list[Description] = []
+                counts[sensor] += self.counts[number]
+            elif topic in (file_format.DESCRIPTION_TOPIC, file_format.EVENTS_TOPIC):
+                self._noted.add(number)
+        self.frame_count = counts.total()
         self.events: list[Event] = []
         histories = Histories()
-        for message in self._file.messages(self._topic_of):
-            note = self._note(message)
-            histories.take(note)
-            if isinstance(note, Description):
-                self.descriptions.append(note)
-            else:
-                self.events.append(note)
-            if len(self.descriptions) + len(self.events) > _MAX_NOTES:
+        for taken, note in enumerate(self._read(self._noted)):
+            if taken == _MAX_NOTES:
                 raise DamagedError(f"{self.path} has more than {_MAX_NOTES} events")
-        counts: dict[int, int] = {}
-        for number, sensor in self._sensor_of.items():
-            counts[sensor] = counts.get(sensor, 0) + self._file.count(number)
+            if not isinstance(note, DataMessage):
+                histories.take(note)
+            if isinstance(note, Event):
+                self.events.append(note)
         self.sensors: tuple[RecordedSensor, ...] = histories.sensors(counts)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    @property
-    def frame_count(self) -> int:
-        """Number of frames of all sensors."""
-        return sum(self._file.count(number) for number in self._sensor_of)
 
     def frames(self, sensor: int | None = None) -> Iterator[DataMessage]:
         """The frames of the sensor at this position, or of all, in the order in which they came.
 
         DamagedError at the first corrupt part.
         """
-        positions = self._sensor_of
-        wanted = {number for number, position in positions.items() if sensor in (None, position)}
-        for channel, _, body in self._file.messages(wanted):
-            yield unpack_frame(body, positions[channel])
+        frames = self._read(self._channels(sensor))
+        return cast(Iterator[DataMessage], frames)
 
     def everything(self, sensor: int | None = None) -> Iterator[DataMessage | Description | Event]:
         """Descriptions, events and the frames of the sensor at this position, or of all, as they came."""
-        positions = self._sensor_of
-        wanted = {number for number, position in positions.items() if sensor in (None, position)}
-        for message in self._file.messages(wanted | self._topic_of.keys()):
-            position = positions.get(message.channel)
-            yield self._note(message) if position is None else unpack_frame(message.body, position)
+        return self._read(self._channels(sensor) | self._noted)
 
-    def _note(self, message: RawMessage) -> Description | Event:
-        topic = self._topic_of[message.channel]
-        note = unpack_json(message.body, topic)
-        kind = Description if topic == DESCRIPTION_TOPIC else Event
-        return kind(message.log_time_ns, note)
+    def _channels(self, sensor: int | None) -> set[int]:
+        return {number for number, position in self._sensor_of.items() if sensor in (None, position)}
+
+    def _read(self, channels: set[int]) -> Iterator[DataMessage | Description | Event]:
+        for channel, log_time_ns, body in self.messages(channels):
+            position, topic = self._sensor_of.get(channel), self.topics[channel]
+            if position is not None:
+                yield file_format.unpack_frame(body, position)
+            elif topic == file_format.DESCRIPTION_TOPIC:
+                yield Description(log_time_ns, file_format.unpack_json(body, topic))
+            else:
+                yield Event(log_time_ns, file_format.unpack_json(body, topic))
 
 
 def open_recording(path: Path) -> Recording:

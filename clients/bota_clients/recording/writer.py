@@ -1,41 +1,137 @@
 """Writes one recording file: frames, descriptions and events as MCAP messages.
 
-Call `flush` often: what was flushed survives this process. Not thread-safe.
+What was flushed stays intact, whatever happens to the process or the disk: a flush writes complete MCAP
+records, and if the disk takes only a part of them, the file is truncated again. Not thread-safe.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+import errno
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import IO, Any, Final, cast
 
 from mcap.writer import CompressionType, Writer
 
-from bota_clients.recording.disk import DiskFile
-from bota_clients.recording.file_format import (
-    DESCRIPTION_TOPIC,
-    ENCODING,
-    END_METADATA,
-    EVENTS_TOPIC,
-    FRAME_DEFINITION,
-    FRAME_SCHEMA,
-    METADATA,
-    PROFILE,
-    SCHEMA_ENCODING,
-    TEXT_DEFINITION,
-    TEXT_SCHEMA,
-    frame_topic,
-    pack_frame,
-    pack_json,
-)
+from bota_clients.errors import DiskError
+from bota_clients.recording import file_format
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.text.json_text import JsonObject
 
+try:
+    import fcntl
+except ImportError:  # Windows: it removes no open file, and has no such lock
+    _LOCKS = False
+else:
+    _LOCKS = True
+
+_BINARY: Final = getattr(os, "O_BINARY", 0)  # Windows would write other line ends
 _CHUNK_SIZE: Final = 1024 * 1024
 _U32: Final = 0xFFFFFFFF
 
 
+def _open_locked(path: Path, flags: int) -> int:
+    """A descriptor of the file, which is locked until it is closed, and empty if it may be new; OSError."""
+    fd = os.open(path, flags, 0o666)
+    try:
+        if _LOCKS:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if flags & os.O_CREAT:
+            os.ftruncate(fd, 0)
+    except OSError as error:
+        os.close(fd)
+        if isinstance(error, BlockingIOError):
+            raise OSError(error.errno, "another ethercat-record is writing to it") from None
+        raise
+    return fd
+
+
+def remove(paths: Iterable[Path]) -> None:
+    """Remove these files, or none if one of them is in use (on Windows, those before it); DiskError."""
+    for really in (False, True):
+        for path in paths:
+            try:
+                if _LOCKS:
+                    os.close(_open_locked(path, os.O_RDONLY | os.O_NONBLOCK))
+                if really:
+                    path.unlink()
+            except OSError as error:
+                raise DiskError(f"{path} cannot be replaced: {error.strerror}") from None
+
+
+class DiskFile:
+    """A new file for writing, with the part of a binary file's interface that `mcap.writer.Writer` needs.
+
+    Attributes:
+        removed: whether the file had no name any more when it was flushed last.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool) -> None:
+        """Create the file; DiskError if that fails, or if it exists and `overwrite` is False."""
+        self.path = path
+        self.removed = False
+        self._waiting: list[bytes] = []
+        self._position = self._written = 0  # with and without what is buffered
+        flags = os.O_WRONLY | os.O_CREAT | _BINARY | (0 if overwrite else os.O_EXCL)
+        try:
+            self._fd = _open_locked(path, flags)
+        except FileExistsError:
+            raise DiskError(f"{path} {EXISTS}") from None
+        except OSError as error:
+            raise self._failed(error) from None
+
+    def write(self, data: bytes) -> int:
+        """Buffer `data` until the next flush."""
+        self._waiting.append(bytes(data))
+        self._position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Position of the next byte."""
+        return self._position
+
+    def flush(self) -> None:
+        """Write what is buffered; DiskError if that fails, and then none of it is in the file, or no file."""
+        data = memoryview(b"".join(self._waiting))
+        self._waiting.clear()
+        done = 0
+        try:
+            os.lseek(self._fd, self._written, os.SEEK_SET)
+            while done < len(data):
+                done += os.write(self._fd, data[done:])
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, self._written)
+            self._position = self._written
+            raise self._failed(error, "; what was written before is intact") from None
+        self._written = self._position
+        self.removed = os.fstat(self._fd).st_nlink == 0
+        if self.removed:
+            raise DiskError(f"{self.path} was removed while it was written: nothing of it is left")
+
+    def sync(self) -> None:
+        """Synchronize the file to the disk; DiskError."""
+        try:
+            os.fsync(self._fd)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a pipe or a device has nothing to sync
+                raise self._failed(error) from None
+
+    def close(self) -> None:
+        """Close the file; what is buffered is discarded."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _failed(self, error: OSError, more: str = "") -> DiskError:
+        return DiskError(f"{self.path} cannot be written: {error.strerror}{more}")
+
+
 class RecordingWriter:
-    """A recording file that is being written.
+    """A recording file that is being written. Call `flush` often: what was flushed survives this process.
 
     Attributes:
         frames: number of frames written.
@@ -45,17 +141,13 @@ class RecordingWriter:
         """Start the file: `notes` become its metadata."""
         self.frames = 0
         self._disk = disk
-        self._mcap = Writer(
-            cast("IO[Any]", disk),
-            chunk_size=_CHUNK_SIZE,
-            compression=CompressionType.ZSTD,
-            enable_data_crcs=True,
-        )
-        self._mcap.start(PROFILE, library)
-        self._mcap.add_metadata(METADATA, dict(notes))
+        stream = cast("IO[Any]", disk)
+        self._mcap = Writer(stream, _CHUNK_SIZE, CompressionType.ZSTD, enable_data_crcs=True)
+        self._mcap.start(file_format.PROFILE, library)
+        self._mcap.add_metadata(file_format.METADATA, dict(notes))
         self._schemas: dict[str, int] = {}
-        self._descriptions = self._channel(DESCRIPTION_TOPIC, TEXT_SCHEMA, TEXT_DEFINITION)
-        self._events = self._channel(EVENTS_TOPIC, TEXT_SCHEMA, TEXT_DEFINITION)
+        self._descriptions = self._channel(file_format.DESCRIPTION_TOPIC, file_format.TEXT_SCHEMA)
+        self._events = self._channel(file_format.EVENTS_TOPIC, file_format.TEXT_SCHEMA)
         self._notes = 0
         self._frame_channels: dict[int, int] = {}
 
@@ -76,10 +168,12 @@ class RecordingWriter:
         """Write a frame."""
         channel = self._frame_channels.get(frame.sensor)
         if channel is None:
-            channel = self._channel(frame_topic(frame.sensor), FRAME_SCHEMA, FRAME_DEFINITION)
+            channel = self._channel(file_format.frame_topic(frame.sensor), file_format.FRAME_SCHEMA)
             self._frame_channels[frame.sensor] = channel
         stamp_ns = frame.stamp_ns
-        self._mcap.add_message(channel, stamp_ns, pack_frame(frame), stamp_ns, frame.sequence & _U32)
+        self._mcap.add_message(
+            channel, stamp_ns, file_format.pack_frame(frame), stamp_ns, frame.sequence & _U32
+        )
         self.frames += 1
 
     def flush(self) -> None:
@@ -87,21 +181,24 @@ class RecordingWriter:
         self._mcap.flush()  # type: ignore[no-untyped-call]
 
     def finish(self, notes: Mapping[str, str]) -> None:
-        """Write what is buffered, the index and the footer, and synchronize the disk; DiskError."""
+        """Write what is buffered, the index and the footer, synchronize the disk and close; DiskError."""
         self.flush()
-        self._mcap.add_metadata(END_METADATA, dict(notes))
+        self._mcap.add_metadata(file_format.END_METADATA, dict(notes))
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._disk.flush()
         self._disk.sync()
+        self._disk.close()
 
     def _note(self, channel: int, stamp_ns: int, message: JsonObject) -> None:
-        self._mcap.add_message(channel, stamp_ns, pack_json(message), stamp_ns, self._notes)
+        self._mcap.add_message(channel, stamp_ns, file_format.pack_json(message), stamp_ns, self._notes)
         self._notes += 1
 
-    def _channel(self, topic: str, schema: str, definition: str) -> int:
-        number = self._schemas.get(schema)
-        if number is None:
-            number = self._mcap.register_schema(schema, SCHEMA_ENCODING, definition.encode())
-            self._schemas[schema] = number
+    def _channel(self, topic: str, schema: str) -> int:
+        if schema not in self._schemas:
+            definition = file_format.DEFINITIONS[schema].encode()
+            self._schemas[schema] = self._mcap.register_schema(
+                schema, file_format.SCHEMA_ENCODING, definition
+            )
         # An empty profile: `ros2 bag play` uses its own, which is reliable, as the node's is.
-        return self._mcap.register_channel(topic, ENCODING, number, {"offered_qos_profiles": ""})
+        profiles = {"offered_qos_profiles": ""}
+        return self._mcap.register_channel(topic, file_format.ENCODING, self._schemas[schema], profiles)

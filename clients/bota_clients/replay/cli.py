@@ -1,23 +1,86 @@
-"""`ethercat-replay`: entry point; catches signals while the rest is imported."""
+"""`ethercat-replay`: the command line; catches signals while the rest is imported."""
 
 from __future__ import annotations
 
+import argparse
+import ipaddress
+import math
 import sys
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
 
-from bota_clients.program import Signals, not_installed
-from bota_clients.replay.options import parse_options
+from bota_clients.arguments import address, number, parser, typed
+from bota_clients.program import Signals, start
+from bota_ethercat.address import DEFAULT_HOST, Address
+from bota_ethercat.program.server_choice import is_address, own_server
+
+_HOSTS: Final = ["127.0.0.1", "::1"]
+
+
+class ReplayOptions(argparse.Namespace):
+    """What to play, and how."""
+
+    paths: list[Path]
+    port: int
+    hosts: list[str]
+    speed: float  # 1 = as recorded; infinite = as fast as the clients read
+    loop: bool
+    original: bool
+    at_once: bool
+    control_users: list[str]
+    control_groups: list[str]
+
+
+def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
+    """Read the command line; argparse exits with 2 if it is wrong."""
+    made = parser(
+        "ethercat-replay",
+        "Serves recordings, one after the other, over the same protocol as ethercat-server.",
+        "It starts with the first subscriber and ends as the server does. Ctrl-C ends it.",
+        usage="%(prog)s [options] FILE [FILE ...]",
+    )
+    add = made.add_argument
+    add("names", nargs="+", metavar="FILE", help="recordings")
+    add("--server", type=address, metavar="HOST:PORT",
+        help="serve at this address of this machine (default: as the clients' --server)")  # fmt: skip
+    add("--speed", type=_speed, default=1.0, metavar="X",
+        help="times the recorded speed; 'max': as fast as clients read, without loss")  # fmt: skip
+    add("--loop", action="store_true", help="start again at the end, until Ctrl-C")
+    add("--original-stamps", action="store_true", dest="original",
+        help="send sequence numbers and stamps as recorded, instead of moving them to now")  # fmt: skip
+    add("--at-once", action="store_true", help="start without waiting for a subscriber")
+    add("--host", type=_host, action="append", dest="hosts", metavar="ADDRESS",
+        help="address to listen on; repeatable (default 127.0.0.1 and ::1)")  # fmt: skip
+    add("--control-user", action="append", default=[], dest="control_users", metavar="NAME",
+        help="user who may shut it down, besides root and its own user")  # fmt: skip
+    add("--control-group", action="append", default=[], dest="control_groups", metavar="NAME",
+        help="group whose members may shut it down")  # fmt: skip
+    options = made.parse_intermixed_args(argv, ReplayOptions())
+    names: list[str] = options.names
+    old = names.pop() if len(names) > 1 and is_address(names[-1]) else None
+    if options.server is not None and old is not None:
+        made.error(f"the address is given twice: leave out {old}, or --server")
+    try:
+        server: Address = options.server or (own_server() if old is None else Address.parse(old))
+        hosts = _HOSTS if server.host == DEFAULT_HOST else [_host(server.host)]
+    except (ValueError, argparse.ArgumentTypeError) as error:
+        made.error(str(error))
+    options.paths, options.port, options.hosts = [*map(Path, names)], server.port, options.hosts or hosts
+    return options
+
+
+def _speed(text: str) -> float:
+    return math.inf if text == "max" else number(1e-6, 1e6, "a number, such as 2 or 0.5, or 'max'")(text)
+
+
+_host = typed(lambda text: str(ipaddress.ip_address(text)), "an IP address of this machine")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the program; returns its exit code."""
+    """Replay; returns the exit code."""
     signals = Signals()
-    parse_options(argv)  # --help and wrong usage need nothing of the extra
-    try:
-        from bota_clients.replay.program import run  # noqa: PLC0415 - after the signals
-    except ImportError as error:
-        return not_installed("ethercat-replay", error)
-    return run(argv, signals)
+    return start("ethercat-replay", "replay.program", parse_options(argv), signals)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What `ethercat-replay` does: opens the recordings, listens, plays, and turns errors into exit codes."""
+"""What `ethercat-replay` does: opens the recordings, listens and plays."""
 
 from __future__ import annotations
 
@@ -7,111 +7,175 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import Any, Final
 
+from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
-from bota_clients.recording.reader import RecordedSensor, Recording, RecordingError, open_recording
-from bota_clients.replay.options import ReplayOptions, parse_options
-from bota_clients.replay.player import Player, Timeline
+from bota_clients.recording.reader import Description, Event, Recording, open_recording
+from bota_clients.replay.cli import ReplayOptions
 from bota_clients.replay.sensors import ReplayedSensors
-from bota_ethercat.control import Event, event
+from bota_clients.replay.timeline import Timeline
+from bota_ethercat.control import Event as ServerEvent
+from bota_ethercat.control import event
+from bota_ethercat.framing import DataMessage, encode_data
 from ethercat_server.errors import ServerError
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.permissions import controlling_uids, local_names
 from ethercat_server.serving.transport import SocketTransport
 
+# Sockets are not served this shortly before a frame is due, because select may wake late.
+_MARGIN_NS: Final = 80_000
+# Longest time between two turns of the sockets, even if frames are late.
+_SERVE_EVERY_NS: Final = 10_000_000
+_SLICE_NS: Final = 50_000_000  # a signal is noticed within this time
+_DRAIN_NS: Final = 10_000_000_000  # timeout for clients that do not read the last frames
+
 _say = partial(say, "ethercat-replay")
 
 
-def run(argv: Sequence[str] | None, signals: Signals) -> int:
+def run(options: ReplayOptions, signals: Signals) -> int:
     """Replay; returns the exit code."""
-    options = parse_options(argv)
-    _set_up_logging()
+    logging.basicConfig(level=logging.INFO, format="ethercat-replay: %(message)s", stream=sys.stderr)
     try:
         with contextlib.ExitStack() as cleanup:
             recordings = [cleanup.enter_context(open_recording(path)) for path in options.paths]
             for recording in recordings:
                 if recording.cut_off:
                     _say(f"{recording.path} was cut off: {recording.cut_off}; the intact part is played")
-            _play(recordings, options, signals, cleanup)
-    except RecordingError as error:
-        _say(str(error))
-        return 1
+            player = Player(recordings, options, signals)
+            cleanup.callback(player.hub.close)
+            player.run()
     except ServerError as error:
         _say(str(error))
         return error.exit_code
     return 0
 
 
-def _play(
-    recordings: Sequence[Recording], options: ReplayOptions, signals: Signals, cleanup: contextlib.ExitStack
-) -> None:
-    sensors = ReplayedSensors(_all_sensors(recordings))
-    if not sensors.sensors:
-        raise RecordingError(f"{recordings[0].path} has neither frames nor sensors: there is nothing to play")
-    hub = Hub(SocketTransport(options.hosts, options.port))
-    cleanup.callback(hub.close)
-    hub.permissions.control_uids = controlling_uids(options.control_users, options.control_groups)
-    hub.permissions.names = local_names()
-    timeline = Timeline(
-        options.speed,
-        original=options.original,
-        monotonic_ns=time.monotonic_ns,
-        realtime_ns=time.time_ns,
-    )
-    player = Player(
-        hub,
-        recordings,
-        sensors,
-        timeline,
-        loop=options.loop,
-        waits=not options.at_once,
-        lossless=math.isinf(options.speed),
-    )
-    signals.call(player.stop)
-    hub.start(Actions(hub, player, sensors, {"replay": _describe(recordings, options)}).handle)
-    _say(f"replaying {_names(recordings)} on port {options.port}{_waiting(options)}; Ctrl-C ends it")
-    try:
-        player.run()
-    finally:
-        hub.broadcast(event(Event.SHUTTING_DOWN))
-    times = "" if player.passes < 2 else f", {player.passes} times to the end"
-    _say(f"{'stopped' if player.stopping else 'ended'} after {player.meter.sent} frames{times}")
+class Player:
+    """What produces the frames, in place of the server's `Cycle`."""
 
+    def __init__(self, recordings: Sequence[Recording], options: ReplayOptions, signals: Signals) -> None:
+        """RecordingError if there is nothing to play, ServerError if it cannot be served."""
+        # Each sensor as the first recording that has it describes it.
+        self.sensors = ReplayedSensors(sensor for recording in recordings for sensor in recording.sensors)
+        if not self.sensors.sensors:
+            path = recordings[0].path
+            raise RecordingError(f"{path} has neither frames nor sensors: there is nothing to play")
+        self.hub = Hub(SocketTransport(options.hosts, options.port))
+        self._recordings = recordings
+        self._options = options
+        self._signals = signals
+        self._timeline = Timeline(options.speed, original=options.original)
+        self._passes = 0  # how often the end of the recordings was reached
+        self._serve_by = 0
 
-def _all_sensors(recordings: Sequence[Recording]) -> list[RecordedSensor]:
-    """The sensors of all recordings, as the first recording with each describes it."""
-    found: dict[int, RecordedSensor] = {}
-    for recording in recordings:
-        for sensor in recording.sensors:
-            found.setdefault(sensor.sensor, sensor)
-    return list(found.values())
+    def stop(self) -> None:
+        """End `run` soon."""
+        self._signals.asked = True
 
+    def status(self) -> dict[str, Any]:
+        """Its part of the `status` reply."""
+        return self.sensors.status()
 
-def _describe(recordings: Sequence[Recording], options: ReplayOptions) -> dict[str, object]:
-    """The key `replay` in the reply to `describe`, by which a client can tell a replay."""
-    first = recordings[0].metadata
-    return {
-        "files": [recording.path.name for recording in recordings],
-        "recorded": first.get("started", "?"),
-        "recorded_version": first.get("server_version", "?"),
-        "pace": "max" if math.isinf(options.speed) else options.speed,
-        "loop": options.loop,
-        "stamps": "original" if options.original else "moved",
-    }
+    def run(self) -> None:
+        """Play, from the first subscriber on unless it is to start at once."""
+        hub, options, recordings = self.hub, self._options, self._recordings
+        hub.permissions.control_uids = controlling_uids(options.control_users, options.control_groups)
+        hub.permissions.names = local_names()
+        hub.start(Actions(hub, self, self.sensors, {"replay": self._about()}).handle)
+        more = f" and {len(recordings) - 1} more" if len(recordings) > 1 else ""
+        frames = sum(recording.frame_count for recording in recordings)
+        waiting = "" if options.at_once else ", waiting for a subscriber"
+        name = f"{recordings[0].path.name}{more}, {frames} frames,"
+        _say(f"replaying {name} on port {options.port}{waiting}; Ctrl-C ends it")
+        try:
+            while not (options.at_once or self._signals.asked or self._has_subscriber()):
+                hub.serve(time.monotonic_ns() + _SLICE_NS)
+            while self._play_once() and options.loop:
+                self._timeline.begin_again()
+            self._drain()
+        finally:
+            hub.broadcast(event(ServerEvent.SHUTTING_DOWN))
+        times = "" if self._passes < 2 else f", {self._passes} times to the end"
+        _say(f"{'stopped' if self._signals.asked else 'ended'} after {self.sensors.sent} frames{times}")
 
+    def _about(self) -> dict[str, object]:
+        """By this a client can tell a replay."""
+        first, options = self._recordings[0].metadata, self._options
+        return {
+            "files": [recording.path.name for recording in self._recordings],
+            "recorded": first.get("started", "?"),
+            "recorded_version": first.get("server_version", "?"),
+            "pace": "max" if math.isinf(options.speed) else options.speed,
+            "loop": options.loop,
+            "stamps": "original" if options.original else "moved",
+        }
 
-def _names(recordings: Sequence[Recording]) -> str:
-    more = f" and {len(recordings) - 1} more" if len(recordings) > 1 else ""
-    frames = sum(recording.frame_count for recording in recordings)
-    return f"{recordings[0].path.name}{more}, {frames} frames,"
+    def _play_once(self) -> bool:
+        """Play to the end; False if it was stopped or there is no frame."""
+        before = self.sensors.sent
+        for item in self._items():
+            if self._signals.asked:
+                return False
+            if isinstance(item, DataMessage):
+                self._send(item)
+            elif isinstance(item, Description):
+                self.sensors.describe(item)
+            else:
+                self._happen(item)
+        self._passes += 1
+        return self.sensors.sent > before
 
+    def _items(self) -> Iterator[DataMessage | Description | Event]:
+        for number, recording in enumerate(self._recordings):
+            if number and recording.metadata.get("part", "0") == "0":
+                self._timeline.begin_again()  # a new recording, not the next part of one
+            yield from recording.everything()
 
-def _waiting(options: ReplayOptions) -> str:
-    return "" if options.at_once else ", waiting for a subscriber"
+    def _has_subscriber(self) -> bool:
+        return any(c.subscription is not None for c in self.hub.connections.values())
 
+    def _happen(self, event: Event) -> None:
+        if event.by_recorder:
+            if event.name == "connected":
+                self._timeline.reconnected()
+            return
+        self.sensors.take(event)
+        # It was the recorded server that shut down, not this one.
+        if event.name != ServerEvent.SHUTTING_DOWN:
+            self.hub.broadcast(event.event)
 
-def _set_up_logging() -> None:
-    logging.basicConfig(level=logging.INFO, format="ethercat-replay: %(message)s", stream=sys.stderr)
+    def _send(self, frame: DataMessage) -> None:
+        due_ns = 0
+        if math.isinf(self._options.speed):  # as fast as the clients read: none has a frame queued
+            self._drain()
+            frame = self._timeline.now(frame)
+        else:
+            due_ns, frame = self._timeline.due(frame)
+        self._wait(due_ns)
+        if self._signals.asked:
+            return
+        now = time.monotonic_ns()
+        self.hub.publish(((encode_data(*frame), frame.sensor, frame.flags),), now)
+        self.sensors.count(frame, due_ns, now)
+
+    def _wait(self, due_ns: int) -> None:
+        """Serve the sockets until a frame is due."""
+        now = time.monotonic_ns()
+        while (due_ns - _MARGIN_NS > now or now > self._serve_by) and not self._signals.asked:
+            self.hub.serve(min(due_ns - _MARGIN_NS, now + _SLICE_NS))
+            now = time.monotonic_ns()
+            self._serve_by = now + _SERVE_EVERY_NS
+        if (left := due_ns - time.monotonic_ns()) > 0 and not self._signals.asked:
+            time.sleep(left * 1e-9)
+
+    def _drain(self) -> None:
+        """Let clients read what is queued for them."""
+        until_ns = time.monotonic_ns() + _DRAIN_NS
+        while any(c.outbox.waiting for c in self.hub.connections.values()):
+            if self._signals.asked or time.monotonic_ns() > until_ns:
+                return
+            self.hub.serve(time.monotonic_ns() + 1_000_000)

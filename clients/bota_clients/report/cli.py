@@ -1,62 +1,165 @@
-"""`ethercat-report`: entry point, progress and output."""
+"""`ethercat-report`: command line, progress and output. Reads or listens, examines, writes the page."""
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
-from bota_clients.errors import ReportError
-from bota_clients.program import discard_output, interrupt_on_signals, not_installed
-from bota_clients.report.options import parse_options
+from bota_clients.arguments import add_force, add_imu_units, add_server, number, parser, server_of
+from bota_clients.errors import RecordingError, ReportError
+from bota_clients.program import discard_output, interrupt_on_signals, not_installed, say
+from bota_ethercat.address import Address
+from bota_ethercat.errors import ConnectionFailedError, ProtocolError, UnreachableError
+from bota_ethercat.health.verdict import Level
+from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.program.new_file import NewFile
+from bota_ethercat.program.server_choice import is_address
+from bota_ethercat.program.version import VERSION
+from bota_ethercat.sensor_choice import MEANING, SensorChoice
+
+if TYPE_CHECKING:
+    from bota_clients.report.checks import Examination
+
+_PROGRAM: Final = "ethercat-report"
+_LONGEST_S: Final = 1800.0
+_DEFAULT_S: Final = 10.0
+
+
+class ReportOptions(argparse.Namespace):
+    """What to report on, and where to."""
+
+    recording: Path | None  # None: live
+    server: Address | None  # None: from a recording
+    seconds: float
+    output: Path
+    force: bool
+    sensor: SensorChoice | None
+    imu_units: ImuUnits
+    note: str
+    json: bool
+
+
+def parse_options(argv: Sequence[str] | None) -> ReportOptions:
+    """Read the command line; argparse exits with 2 if it is wrong."""
+    made = parser(
+        _PROGRAM,
+        "Writes a one-page sensor health report (HTML) from a recording or a live stream.",
+        "exit code: 0 good, worth a look or not conclusive, 1 trouble, or no report was made, 2 wrong usage",
+    )
+    add = made.add_argument
+    add("recording", type=Path, nargs="?", metavar="FILE.mcap",
+        help="a recording of ethercat-record (default: listen to the server)")  # fmt: skip
+    add_server(made, "listen to this server")
+    longest = f"a number of seconds from 1 to {_LONGEST_S:g}; for longer make a recording"
+    add("--seconds", type=number(1, _LONGEST_S, longest), metavar="S",
+        help=f"how long to listen (default {_DEFAULT_S:g})")  # fmt: skip
+    add("-o", "--output", type=Path, metavar="REPORT.html",
+        help="where to write the page (default: beside the recording, or report.html)")  # fmt: skip
+    add_force(made)
+    add("--sensor", type=_choice, metavar="S", help=f"only this sensor: {MEANING}")
+    add_imu_units(made)
+    add("--note", default="", metavar="TEXT", help="a remark for the head of the page")
+    add("--json", action="store_true", help="print the checks as JSON")
+    options = made.parse_args(argv, ReportOptions())
+    recording, listen_s = options.recording, vars(options)["seconds"]
+    if recording is not None and is_address(str(recording)) and not recording.exists():
+        made.error(f"{recording} is a server's address, no recording: write --server {recording}")
+    if recording is None:
+        options.server = server_of(made, options.server)
+    elif options.server is not None:
+        made.error("give a recording, or --server HOST:PORT, not both")
+    elif listen_s is not None:
+        made.error("--seconds is for listening to a server: the whole recording is examined")
+    options.seconds = listen_s or _DEFAULT_S
+    options.output = options.output or (recording.with_suffix(".html") if recording else Path("report.html"))
+    if recording is not None and options.output.absolute() == recording.absolute():
+        made.error("the report would overwrite the recording: give another name with -o")
+    return options
+
+
+def _choice(text: str) -> SensorChoice:
+    try:
+        return SensorChoice.parse(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} must be {error}") from None
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a report; returns the exit code."""
     options = parse_options(argv)
     try:
-        from bota_clients.report import program  # noqa: PLC0415 - needs the extra
-
-        interrupt_on_signals()
-        with _Progress(options.seconds) as progress:
-            outcome = program.make(options, progress)
-    except KeyboardInterrupt:
-        return _fail("stopped: no report was written")
+        words, exit_code = make(options)
     except ImportError as error:
-        return not_installed("ethercat-report", error)
-    except ReportError as error:
-        return _fail(str(error))
-    try:
-        print(outcome.words, flush=True)
-    except BrokenPipeError:
-        discard_output()  # the report is written all the same
-    print(f"ethercat-report: the report is in {options.output}", file=sys.stderr)
-    return outcome.exit_code
+        return not_installed(_PROGRAM, error)
+    except KeyboardInterrupt:
+        sentence = "stopped: no report was written"
+    except UnreachableError as error:
+        sentence = f"{error.at(options.server)}, or give its HOST:PORT"
+    except ConnectionFailedError as error:
+        sentence = f"the server at {options.server} cannot be used: {error}"
+    except (RecordingError, ReportError, ProtocolError) as error:
+        sentence = str(error)
+    else:
+        try:
+            print(words, flush=True)
+        except BrokenPipeError:
+            discard_output()  # the report is written all the same
+        say(_PROGRAM, f"the report is in {options.output}")
+        return exit_code
+    say(_PROGRAM, sentence)
+    return 1
 
 
-class _Progress:
+def make(options: ReportOptions) -> tuple[str, int]:
+    """Write the report; the words for the standard output, and the exit code."""
+    from bota_clients.report import checks, page, subjects  # noqa: PLC0415 - needs the extra
+
+    interrupt_on_signals()
+    with NewFile(options.output, force=options.force) as file:
+        which = options.sensor, options.imu_units
+        if options.recording is not None:
+            found = subjects.of_recording(options.recording, *which)
+        else:
+            assert options.server is not None
+            with _progress(options.seconds) as progress:
+                found = subjects.of_server(options.server, options.seconds, *which, progress)
+        examinations = [checks.Examination(each) for each in found]
+        now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+        file.write(page.render(examinations, made=now, program=f"{_PROGRAM} {VERSION}", note=options.note))
+        file.finish()
+    words = page.as_json(examinations) if options.json else "\n".join(map(_summary, examinations))
+    return words, int(any(each.level is Level.TROUBLE for each in examinations))
+
+
+@contextlib.contextmanager
+def _progress(seconds: float) -> Iterator[Callable[[float], None]]:
     """Shows the remaining time on a terminal, on a line that is cleared at the end."""
 
-    def __init__(self, seconds: float) -> None:
-        self._seconds, self._shown = seconds, -1
-        self._terminal = sys.stderr.isatty()
+    def show(text: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
-    def __enter__(self) -> Callable[[float], None]:
-        return self._show
-
-    def __exit__(self, *_: object) -> None:
-        if self._terminal and self._shown >= 0:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-
-    def _show(self, passed: float) -> None:
-        if self._terminal and int(passed) != self._shown:
-            self._shown = int(passed)
-            left = f"listening, {self._seconds - passed:.0f} s left"
-            print(f"\r\x1b[K{left}", end="", file=sys.stderr, flush=True)
+    try:
+        yield lambda passed: show(f"listening, {seconds - passed:.0f} s left")
+    finally:
+        show("")
 
 
-def _fail(sentence: str) -> int:
-    print(f"ethercat-report: {sentence}", file=sys.stderr)
-    return 1
+def _summary(examination: Examination) -> str:
+    subject = examination.subject
+    who = f"Sensor {subject.position} ({subject.who})"
+    lines = [f"{who}: {examination.headline}. {examination.sentence}"]
+    lines += [f"  {remark}" for remark in subject.remarks]
+    for check in examination.checks:
+        if check.level >= Level.NOT_POSSIBLE:
+            lines.append(f"  {check.level.words}: {check.name}: {check.found}")
+            lines += [f"    {check.remedy}"] if check.remedy else []
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

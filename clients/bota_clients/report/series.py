@@ -10,17 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from bota_clients.recording.columns import Columns
+from bota_clients.recording.columns import Columns, Floats, Ints
+from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.errors import SettingError
 from bota_ethercat.framing import DataFlag
+from bota_ethercat.health.verdict import LIMITS
+from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor
 from bota_ethercat.text.untrusted import printable, whole
+
+Bools = npt.NDArray[np.bool_]
 
 _LONGEST_TEXT: Final = 80
 _MOST_REMARKS: Final = 20
@@ -36,17 +40,12 @@ class Subject:
     serial: int | None
     hardware: str
     firmware: str
-    rate_hz: float
-    """Nominal, as described; 0 if unknown."""
-    settings: Mapping[str, SettingValue]
-    """Those that exist and have a valid value."""
+    rate_hz: float  # nominal, as described; 0 if unknown
+    settings: Mapping[str, SettingValue]  # those that exist and have a valid value
     columns: Columns
-    source: str
-    """A file name or a server's address."""
-    age_p99_us: float | None = None
-    """Of the samples on arrival; None from a recording, or another machine."""
-    remarks: tuple[str, ...] = ()
-    """Sentences about the recording for the reader of the report."""
+    source: str  # a file name or a server's address
+    age_p99_us: float | None = None  # of the samples on arrival; None from a recording, or another machine
+    remarks: tuple[str, ...] = ()  # sentences about the recording for the reader of the report
 
     @property
     def who(self) -> str:
@@ -75,113 +74,79 @@ class Subject:
         return replace(self, remarks=tuple(every))
 
 
-def known_settings(values: object) -> tuple[dict[str, SettingValue], list[str]]:
-    """The settings in `values` that exist, and a remark for each that does not."""
-    known: dict[str, SettingValue] = {}
-    remarks = []
-    if not isinstance(values, Mapping):
-        return {}, ["The settings are not known."]
-    for name, value in values.items():
-        setting = SETTINGS.get(name) if isinstance(name, str) else None
-        if setting is None:
-            remarks.append(f"The unknown setting {printable(name, 40)!r} was ignored.")
-            continue
-        try:
-            known[setting.name] = setting.check(value)
-        except SettingError as error:
-            remarks.append(f"A setting was ignored: {printable(error)}.")
-    return known, remarks
-
-
 def subject(
     description: Mapping[str, Any], settings: object, columns: Columns, source: str, position: int
 ) -> Subject:
     """The sensor that one row of a reply to `describe` describes."""
-    known, remarks = known_settings(settings)
+    known: dict[str, SettingValue] = {}
+    remarks = [] if isinstance(settings, Mapping) else ["The settings are not known."]
+    for name, value in settings.items() if isinstance(settings, Mapping) else ():
+        if name not in SETTINGS:
+            remarks.append(f"The unknown setting {printable(name, 40)!r} was ignored.")
+            continue
+        try:
+            known[name] = SETTINGS[name].check(value)
+        except SettingError as error:
+            remarks.append(f"A setting was ignored: {printable(error)}.")
+    rate = description.get("rate_hz")
     return Subject(
         position=position,
         name=_text(description.get("name")),
         serial=whole(description.get("serial")),
         hardware=_text(description.get("hardware")),
         firmware=_text(description.get("firmware")),
-        rate_hz=_rate(description.get("rate_hz")),
+        rate_hz=float(rate) if isinstance(rate, int | float) and 0 < rate <= _HIGHEST_RATE_HZ else 0.0,
         settings=known,
         columns=columns,
         source=printable(source),
     ).with_remarks(remarks)
 
 
-def _rate(value: object) -> float:
-    return float(value) if isinstance(value, int | float) and 0 < value <= _HIGHEST_RATE_HZ else 0.0
-
-
 def _text(value: object) -> str:
     return "not known" if value is None or value == "" else printable(value, _LONGEST_TEXT)
 
 
-SHORT_SINC: Final = 51
-LONG_SINC: Final = 1024
-"""The two lengths for which limits are published."""
-_IMU_LIMIT: Final = 0.1
-
-
 class Group(NamedTuple):
-    """Three channels of one kind; the name is that of the array in `columns.Columns`."""
+    """Three channels of one kind."""
 
-    name: str
+    name: str  # of the array in `columns.Columns`
     title: str
     unit: str
-    saturation: str
-    """The array with its saturation bits."""
+    saturation: str  # the array with its saturation bits
     first_bit: int
-
-    @property
-    def is_imu(self) -> bool:
-        """Whether the IMU measures it."""
-        return self.saturation != "force_torque_saturated"
+    limits_short: tuple[float, float, float]  # noise of a healthy sensor at SINC 51, standard deviation
+    limits_long: tuple[float, float, float]  # the same at SINC 1024
+    is_imu: bool = False
 
 
-GROUPS: Final[tuple[Group, ...]] = (
-    Group("force", "Force", "N", "force_torque_saturated", 0),
-    Group("torque", "Torque", "Nm", "force_torque_saturated", 3),
-    Group("acceleration", "Acceleration", "m/s²", "acceleration_saturated", 0),
-    Group("angular_rate", "Angular rate", "rad/s", "angular_rate_saturated", 0),
-)
-FORCE, TORQUE, ACCELERATION, ANGULAR_RATE = GROUPS
+_IMU: Final = (0.1, 0.1, 0.1)  # the only figure published, for all filters
+GROUPS: Final = (
+    Group("force", "Force", "N", "force_torque_saturated", 0, (0.6, 0.6, 0.6), (0.1, 0.1, 0.08)),
+    Group("torque", "Torque", "Nm", "force_torque_saturated", 3,
+          (0.014, 0.014, 0.005), (0.0015, 0.0015, 0.0007)),
+    Group("acceleration", "Acceleration", "m/s²", "acceleration_saturated", 0, _IMU, _IMU, is_imu=True),
+    Group("angular_rate", "Angular rate", "rad/s", "angular_rate_saturated", 0, _IMU, _IMU, is_imu=True),
+)  # fmt: skip
 
 
 class Channel(NamedTuple):
     """One measured quantity."""
 
     group: Group
-    axis: int
-    """0, 1, 2 for x, y, z."""
-    limit_short: float
-    """Noise of a healthy sensor at SINC 51, standard deviation in the group's unit."""
-    limit_long: float
-    """The same at SINC 1024."""
-
-    @property
-    def title(self) -> str:
-        """For people: Force z."""
-        return f"{self.group.title} {'xyz'[self.axis]}"
-
-    @property
-    def bit(self) -> int:
-        """Its bit in the saturation field of its group."""
-        return 1 << (self.group.first_bit + self.axis)
+    axis: int  # 0, 1, 2 for x, y, z
+    title: str  # for people: Force z
+    bit: int  # its bit in the saturation field of its group
 
 
-_LIMITS: Final = (
-    (FORCE, (0.6, 0.6, 0.6), (0.1, 0.1, 0.08)),
-    (TORQUE, (0.014, 0.014, 0.005), (0.0015, 0.0015, 0.0007)),
-    (ACCELERATION, (_IMU_LIMIT,) * 3, (_IMU_LIMIT,) * 3),
-    (ANGULAR_RATE, (_IMU_LIMIT,) * 3, (_IMU_LIMIT,) * 3),
+# In the order of `/sensone_sensor_data`: force, torque, acceleration, angular rate.
+CHANNELS: Final = tuple(
+    Channel(group, axis, f"{group.title} {'xyz'[axis]}", 1 << (group.first_bit + axis))
+    for group in GROUPS
+    for axis in range(3)
 )
-CHANNELS: Final[tuple[Channel, ...]] = tuple(
-    Channel(group, axis, short[axis], long[axis]) for group, short, long in _LIMITS for axis in range(3)
-)
-"""In the order of `/sensone_sensor_data`: force, torque, acceleration, angular rate."""
+# The two lengths for which limits are published.
+SHORT_SINC: Final = 51
+LONG_SINC: Final = 1024
 
 
 def noise_limit(channel: Channel, sinc_length: int) -> float:
@@ -190,10 +155,9 @@ def noise_limit(channel: Channel, sinc_length: int) -> float:
     Interpolated along the straight line through the two published limits in a log-log plot, as noise falls
     with a power of the averaging length; beyond the two lengths the same line is followed.
     """
-    if channel.group.is_imu:
-        return channel.limit_short  # the SINC filter is not the IMU's
-    power = math.log(channel.limit_long / channel.limit_short) / math.log(LONG_SINC / SHORT_SINC)
-    return float(channel.limit_short * (sinc_length / SHORT_SINC) ** power)
+    short, long = channel.group.limits_short[channel.axis], channel.group.limits_long[channel.axis]
+    power = math.log(long / short) / math.log(LONG_SINC / SHORT_SINC)  # 0 of the IMU: it has its own filter
+    return short * math.pow(sinc_length / SHORT_SINC, power)
 
 
 def limit_origin(sinc_length: int) -> str:
@@ -207,157 +171,124 @@ def limit_origin(sinc_length: int) -> str:
     )
 
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
-
-_LONGER: Final = 1.5
-"""An interval of more than this many periods has room for a lost sample."""
-_SURELY_LONGER: Final = 2.5
-"""One of more than this has lost some whether they are marked or not."""
-_SHORT: Final = 0.75
-"""An interval shorter than this follows one that a late stamp made too long."""
+_LONGER: Final = 1.5  # an interval of more than this many periods has room for a lost sample
+_SURELY_LONGER: Final = 2.5  # one of more than this has lost some whether they are marked or not
+_SHORT: Final = 0.75  # an interval shorter than this follows one that a late stamp made too long
+# A frame without a sample tells of a silence as far as this from a sample, ...
 _COVERED_PERIODS: Final = 4
 _COVERED_S: Final = 0.01
-"""A frame without a sample tells of a silence as far as this, or `_COVERED_PERIODS`, from a sample, ..."""
+# ... and as far as this from the next such frame: the server looks less often after a sensor it has lost.
 _COVERED_BETWEEN_S: Final = 0.1
-"""... and as far as this from the next such frame: the server looks less often after a sensor it has lost."""
+# CLOCK_REALTIME that moves against CLOCK_MONOTONIC by more than this between two samples was adjusted.
+_STEP_NS: Final = 1_000_000
 
 
-@dataclass(frozen=True)
 class Series:
-    """Samples of one subject; n samples."""
+    """The n samples of one subject on a time axis, their 12 channels as in `CHANNELS`, and how they came.
 
-    subject: Subject
+    Arrays of n - 1 are of what lies between one sample and the next.
+    """
 
-    @cached_property
-    def frames(self) -> Columns:
-        """Every frame, also those that are no samples."""
-        return self.subject.columns
-
-    @cached_property
-    def samples(self) -> Columns:
-        """The n samples."""
-        return self.frames.where(self.frames.fresh)
-
-    @property
-    def count(self) -> int:
-        """n."""
-        return len(self.samples)
-
-    @cached_property
-    def frame_time(self) -> Floats:
-        """Of every frame, s since the first."""
-        moments = self.frames.monotonic_ns
-        return np.asarray((moments - moments[:1]) * 1e-9, np.float64)
-
-    @cached_property
-    def time(self) -> Floats:
-        """(n,) s since the first frame."""
-        return self.frame_time[self.frames.fresh]
-
-    @cached_property
-    def duration(self) -> float:
-        """From the first frame to the last, s; 0 if there are fewer than two."""
-        return float(max(np.ptp(self.frame_time), 0.0)) if len(self.frame_time) else 0.0
-
-    @cached_property
-    def values(self) -> Floats:
-        """(n, 12): the channels in the order of `CHANNELS`."""
-        s = self.samples
-        return np.hstack([s.force, s.torque, s.acceleration, s.angular_rate])
-
-    @cached_property
-    def finite(self) -> Bools:
-        """(n, 12) where a value is a finite number."""
-        return np.isfinite(self.values)
-
-    @cached_property
-    def saturated(self) -> Bools:
-        """(n, 12) where the sensor says that a channel is saturated."""
-        return (
-            np.column_stack([getattr(self.samples, c.group.saturation) & c.bit != 0 for c in CHANNELS])
-            if self.count
-            else np.zeros((0, len(CHANNELS)), bool)
-        )
-
-    @cached_property
-    def intervals(self) -> Floats:
-        """(n - 1,) from one sample to the next, s."""
-        return np.diff(self.time)
-
-    @cached_property
-    def step(self) -> int:
-        """One sample in so many was asked of the server (`every`)."""
-        jumps = np.diff(self.frames.sequence)
-        return max(1, int(np.median(jumps))) if len(jumps) else 1
-
-    @cached_property
-    def nominal_period(self) -> float | None:
-        """What the settings say of the interval between two samples, s."""
-        period = self.subject.nominal_period_s
-        return None if period is None else period * self.step
-
-    @cached_property
-    def period(self) -> float:
-        """The usual interval between two samples, s; what the settings say if there are none."""
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+        frames = self.frames = subject.columns  # every frame, also those that are no samples
+        samples = self.samples = frames.where(frames.fresh)
+        self.count = len(samples)  # n
+        since_ns = frames.monotonic_ns - frames.monotonic_ns[:1]
+        self.frame_time: Floats = np.multiply(since_ns, 1e-9)  # of every frame, s
+        self.time: Floats = self.frame_time[frames.fresh]  # (n,) s
+        # From the first frame to the last, s; 0 if there are fewer than two.
+        self.duration = float(max(np.ptp(self.frame_time), 0.0)) if len(frames) else 0.0
+        self.values: Floats = np.hstack([getattr(samples, group.name) for group in GROUPS])  # (n, 12)
+        self.finite: Bools = np.isfinite(self.values)  # (n, 12)
+        fields = [getattr(samples, channel.group.saturation) & channel.bit != 0 for channel in CHANNELS]
+        self.saturated: Bools = np.column_stack(fields)  # (n, 12) as the sensor says
+        self.not_finite: Bools = ~self.finite.all(axis=1) | ~np.isfinite(samples.temperature)  # (n,)
+        self.imu_off = subject.settings.get("imu_active") == 0
+        self.intervals: Floats = np.diff(self.time)  # (n - 1,) s
+        jumps = np.diff(frames.sequence)
+        self.step = max(1, int(np.median(jumps))) if len(jumps) else 1  # `every`: one sample in so many
+        nominal = subject.nominal_period_s
+        self.nominal_period = None if nominal is None else nominal * self.step  # s, by the settings
         forward = self.intervals[self.intervals > 0]
-        return float(np.median(forward)) if len(forward) else self.nominal_period or 1e-3
+        # The usual interval, s; what the settings say if there are none.
+        self.period = float(np.median(forward)) if len(forward) else self.nominal_period or 1e-3
+        self.width = max(self.duration, self.period)  # of the plots over time, s
+        self.silent: Bools = np.diff(np.flatnonzero(frames.fresh)) > 1  # REPEATED or INVALID frames between
+        self.missing = self._missing()
+        # Whether the samples on either side do not follow one another.
+        self.broken: Bools = self.silent | (self.missing > 0) | (self.intervals <= 0)
+        self.broken |= self.intervals > _SURELY_LONGER * self.period
+        # By how much each interval with nothing missing in it differs from the usual one, s.
+        self.deviations: Floats = self.intervals[~self.broken] - self.period
+        off = np.abs(self.deviations)
+        self.usual_deviation = float(np.quantile(off, 0.95)) if len(off) else 0.0  # of 95 %, s
+        # Whether the stamps are not those of a clock that is followed.
+        self.is_irregular = self.usual_deviation > LIMITS.irregular * self.period
+        moved = np.diff(samples.stamp_ns - samples.monotonic_ns)
+        self.clock_steps: Floats = moved[np.abs(moved) > _STEP_NS] * 1e-9  # adjustments of CLOCK_REALTIME, s
+        kept = ~self.silent & (self.intervals > 0)
+        periods = float(np.sum(1 + self.missing[kept]))
+        # s, over everything but silences.
+        self.mean_period = float(self.intervals[kept].sum() / periods) if periods else self.period
+        self.silences = self._silences()
+        accounting = StreamAccounting(every=self.step, fresh_only=False)
+        # Not the usual interval: where every other sample is lost, that is two periods.
+        accounting.rate_hz = self.step / (self.nominal_period or self.period)
+        heads = frames.sequence, frames.monotonic_ns, frames.flags
+        for head in zip(*(array.tolist() for array in heads), strict=True):
+            accounting.take(*head)
+        self.counts = accounting.counts  # the frames' kinds, as every client counts them
+        self.lost = int(self.missing.sum())  # samples, except those of a silent sensor
+        # Those of the lost samples that the server had numbered: the client or recorder was too slow.
+        self.withheld = min(self.counts.withheld // self.step, self.lost)
+        # What the sensor warned of, and which channels were saturated: when, s.
+        self.warnings = [
+            (meaning, self.time[samples.warnings & meaning.flag != 0])
+            for meaning in explain(bits(samples.warnings))
+        ]
+        self.saturations = [
+            (channel, self.time[column])
+            for channel, column in zip(CHANNELS, self.saturated.T, strict=True)
+            if column.any()
+        ]
 
-    @property
-    def rate(self) -> float:
-        """Hz."""
-        return 1 / self.period
-
-    @cached_property
-    def silent(self) -> Bools:
-        """(n - 1,) whether REPEATED or INVALID frames lie between one sample and the next."""
-        return self.others > 0
-
-    @cached_property
-    def others(self) -> Ints:
-        """(n - 1,) how many REPEATED or INVALID frames that are."""
-        return np.diff(np.flatnonzero(self.frames.fresh)) - 1
-
-    @cached_property
-    def missing(self) -> Ints:
+    def _missing(self) -> Ints:
         """(n - 1,) how many samples are missing between one and the next, beside those of a silent sensor.
 
         Told by the time that passed and by the mark GAP. A stamp that is late makes one interval long and the
         next one short: that is no loss. Where the sensor was silent, it is the time of which no frame tells.
         """
         wide = self.intervals / self.period
-        if not len(wide):
-            return np.zeros(0, np.int64)
-        following = np.append(wide[1:], 1.0)
-        late_stamp = following < _SHORT
-        periods = np.where(late_stamp, wide + following - 1, wide)
-        missing = np.round(np.clip(periods, 0, 1e12)).astype(np.int64) - 1
-        marked = (self.samples.flags[1:] & DataFlag.GAP != 0) | (np.diff(self.samples.sequence) > self.step)
+        following = np.append(wide[1:], 1.0)[: len(wide)]
+        missing = _room(np.where(following < _SHORT, wide + following - 1, wide))
+        marked = self.samples.flags[1:] & DataFlag.GAP != 0
+        marked |= np.diff(self.samples.sequence) > self.step
         lost = ((wide > _LONGER) & marked) | (wide > _SURELY_LONGER)
-        return np.where(self.silent, self._untold, np.where(lost, np.maximum(missing, 0), 0))
-
-    @cached_property
-    def _untold(self) -> Ints:
-        """(n - 1,) samples that have room between frames too far apart to tell of a silence."""
+        # Samples that have room between frames too far apart to tell of a silence.
         fresh, intervals = self.frames.fresh, np.diff(self.frame_time)
         near = np.where(fresh[:-1] | fresh[1:], _COVERED_S, _COVERED_BETWEEN_S)
-        wide = intervals > np.maximum(near, _COVERED_PERIODS * self.period)
-        room = np.round(np.clip(intervals / self.period, 0, 1e12)).astype(np.int64) - 1
-        summed = np.concatenate(([0], np.cumsum(np.where(wide, room, 0))))
-        return np.diff(summed[np.flatnonzero(fresh)])
+        untold = intervals > np.maximum(near, _COVERED_PERIODS * self.period)
+        summed = np.cumsum(np.where(untold, _room(intervals / self.period), 0))
+        told = np.diff(np.concatenate(([0], summed))[np.flatnonzero(fresh)])
+        return np.where(self.silent, told, np.where(lost, np.maximum(missing, 0), 0))
 
-    @cached_property
-    def broken(self) -> Bools:
-        """(n - 1,) whether the samples on either side do not follow one another."""
-        return (
-            self.silent
-            | (self.missing > 0)
-            | (self.intervals <= 0)
-            | (self.intervals > _SURELY_LONGER * self.period)
-        )
+    def _silences(self) -> Floats:
+        """How long the sensor was silent each time, s, the time before the first and after the last too."""
+        if self.count == 0:
+            return np.full(min(len(self.frames), 1), self.duration)
+        spans = (self.intervals - (1 + self.missing) * self.period)[self.silent]
+        fresh = self.frames.fresh
+        ends = [] if fresh[0] else [self.time[0] - self.frame_time[0]]
+        ends += [] if fresh[-1] else [self.frame_time[-1] - self.time[-1]]
+        return np.asarray(np.maximum(np.concatenate([spans, ends]), 0.0), np.float64)
 
-    @cached_property
-    def imu_off(self) -> bool:
-        """Whether the IMU is switched off."""
-        return self.subject.settings.get("imu_active") == 0
+
+def _room(periods: Floats) -> Ints:
+    """How many samples have room in an interval of so many periods."""
+    return np.round(np.clip(periods, 0, 1e12)).astype(np.int64) - 1
+
+
+def bits(fields: Ints) -> int:
+    """Every bit that is set in any."""
+    return int(np.bitwise_or.reduce(fields))

@@ -4,7 +4,7 @@ stream."""
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -16,9 +16,15 @@ import numpy as np
 from bota_clients.errors import ReportError
 from bota_clients.numbers import count, listing, moment
 from bota_clients.recording.columns import Columns, columns
-from bota_clients.recording.reader import Identity, RecordedSensor, Recording, Settings, open_recording
-from bota_clients.recording.sensors import Histories
-from bota_clients.report.series import Bools, Subject, subject
+from bota_clients.recording.reader import (
+    Histories,
+    Identity,
+    RecordedSensor,
+    Recording,
+    Settings,
+    open_recording,
+)
+from bota_clients.report.series import Subject, subject
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
@@ -31,10 +37,9 @@ from bota_ethercat.text import untrusted
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable
 
-_MOST_EVENTS_NAMED = 10
-_MOST_SENSORS_NAMED = 4
-_LONGEST_CHANGE_NS = 2_000_000_000
-"""A change of settings takes the sensor out of operation for less than this."""
+_MOST_EVENTS_NAMED: Final = 10
+_MOST_SENSORS_NAMED: Final = 4
+_LONGEST_CHANGE_NS: Final = 2_000_000_000  # a change of settings takes the sensor out of operation for less
 
 
 def of_recording(path: Path, choice: SensorChoice | None, imu_units: ImuUnits) -> list[Subject]:
@@ -43,20 +48,20 @@ def of_recording(path: Path, choice: SensorChoice | None, imu_units: ImuUnits) -
     RecordingError if it cannot be read, ReportError if it has no such sensor.
     """
     with open_recording(path) as recording:
-        recorded = [sensor for sensor in recording.sensors if _recorded(recording, sensor)]
+        recorded = [s for s in recording.sensors if not recording.chosen or s.sensor in recording.chosen]
         found = [sensor for sensor in recorded if _meant(sensor, choice)]
         if not found:
             there = [(s.sensor, who.name, who.serial) for s in recorded for *_, who in s.history]
-            raise no_sensor(str(path), choice, dict.fromkeys(there))
-        return [_subject(recording, sensor, choice, imu_units) for sensor in found]
+            raise _no_sensor(str(path), choice, dict.fromkeys(there))
+        remarks = [f"The recording was cut off: {recording.cut_off}."] if recording.cut_off else []
+        if others := [str(sensor.sensor) for sensor in recording.sensors if sensor not in recorded]:
+            remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
+        remarks += _event_remarks(event.name for event in recording.events)
+        subjects = [_subject(recording, sensor, choice, imu_units) for sensor in found]
+        return [subject.with_remarks(remarks) for subject in subjects]
 
 
-def _recorded(recording: Recording, sensor: RecordedSensor) -> bool:
-    """Whether it was chosen for the recording."""
-    return not recording.chosen or sensor.sensor in recording.chosen
-
-
-def no_sensor(
+def _no_sensor(
     where: str, choice: SensorChoice | None, there: Iterable[tuple[object, object, object]]
 ) -> ReportError:
     """The error that the chosen sensor does not exist, with those that do."""
@@ -64,6 +69,14 @@ def no_sensor(
     if choice is None or not known:
         return ReportError(f"{where} has no sensor")
     return ReportError(f"{where} has no sensor {choice}: it has {', '.join(known[:16])}")
+
+
+def _event_remarks(names: Iterable[str]) -> list[str]:
+    """A remark that says which events there were, if any."""
+    counts = Counter(printable(name, 40) for name in names)
+    counts.pop("connected", None)
+    told = [f"{name} ({times})" for name, times in sorted(counts.items())]
+    return [f"Events of the whole recording: {listing(told, _MOST_EVENTS_NAMED)}."] if told else []
 
 
 def _meant(sensor: RecordedSensor, choice: SensorChoice | None) -> list[int]:
@@ -91,60 +104,34 @@ class _Frames:
             if isinstance(item, DataMessage):
                 so_far += 1
                 yield item
-                continue
-            histories.take(item)
-            self.before += [so_far] * (len(histories.of(sensor)) - len(self.before))
+            else:
+                histories.take(item)
+                self.before += [so_far] * (len(histories.of(sensor)) - len(self.before))
 
 
 def _subject(
     recording: Recording, sensor: RecordedSensor, choice: SensorChoice | None, imu_units: ImuUnits
 ) -> Subject:
-    source = _Frames(recording)
-    every = columns(source, sensor.sensor, imu_units)
-    remarks: list[str] = []
-    row, settings = sensor._asdict(), None
-    if sensor.history:
+    """Its longest stretch without a change of settings or sensor."""
+    source, history = _Frames(recording), sensor.history
+    frames = columns(source, sensor.sensor, imu_units)
+    row, values, remarks = sensor._asdict(), None, list[str]()
+    if history:
         # The first settings were in effect before they were received.
-        ends = [0, *source.before[1:], len(every)]
+        ends = [0, *source.before[1:], len(frames)]
         longest = max(_meant(sensor, choice), key=lambda number: ends[number + 1] - ends[number])
-        settings = sensor.history[longest]
-        row |= {**settings.identity._asdict(), "rate_hz": settings.rate_hz}
-        every = every.where(_between(len(every), ends[longest], ends[longest + 1]))
-        if longest + 1 < len(sensor.history):
-            every = _settled(every)
-        remarks = _remarks(sensor.history, settings, every)
-    made = subject(row, settings.values if settings else None, every, recording.path.name, sensor.sensor)
-    if recording.cut_off:
-        remarks.append(f"The recording was cut off: {recording.cut_off}.")
-    others = [str(s.sensor) for s in recording.sensors if not _recorded(recording, s)]
-    if others:
-        remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
-    return made.with_remarks([*remarks, *event_remarks(event.name for event in recording.events)])
-
-
-def event_remarks(names: Iterable[str]) -> list[str]:
-    """A remark that says which events there were, if any."""
-    counts = Counter(printable(name, 40) for name in names)
-    counts.pop("connected", None)
-    if not counts:
-        return []
-    told = [f"{name} ({times})" for name, times in sorted(counts.items())[:_MOST_EVENTS_NAMED]]
-    more = f" and {len(counts) - _MOST_EVENTS_NAMED} other kinds" if len(counts) > _MOST_EVENTS_NAMED else ""
-    return [f"Events of the whole recording: {', '.join(told)}{more}."]
-
-
-def _between(total: int, begin: int, end: int) -> Bools:
-    """A mask of `total` rows that are those from `begin` to before `end`."""
-    rows = np.arange(total)
-    return (rows >= begin) & (rows < end)
-
-
-def _settled(frames: Columns) -> Columns:
-    """Without the end in which the change that follows was made already: the sensor gives nothing then."""
-    fresh = np.flatnonzero(frames.fresh)
-    last = int(fresh[-1]) if len(fresh) else -1
-    changing = frames.monotonic_ns > frames.monotonic_ns[-1:] - _LONGEST_CHANGE_NS
-    return frames.where(~changing | (np.arange(len(frames)) <= last))
+        kept, numbers = history[longest], np.arange(len(frames))
+        row |= {**kept.identity._asdict(), "rate_hz": kept.rate_hz}
+        values = kept.values
+        frames = frames.where((numbers >= ends[longest]) & (numbers < ends[longest + 1]))
+        if longest + 1 < len(history):
+            # Without the end in which the change was made already: the sensor gives nothing then.
+            last = np.flatnonzero(frames.fresh)[-1:].max(initial=-1)
+            changing = frames.monotonic_ns > frames.monotonic_ns[-1:] - _LONGEST_CHANGE_NS
+            frames = frames.where(~changing | (np.arange(len(frames)) <= last))
+        remarks = _remarks(history, kept, frames)
+    made = subject(row, values, frames, recording.path.name, sensor.sensor)
+    return made.with_remarks(remarks)
 
 
 def _remarks(history: Sequence[Settings], kept: Settings, frames: Columns) -> list[str]:
@@ -159,8 +146,7 @@ def _remarks(history: Sequence[Settings], kept: Settings, frames: Columns) -> li
             f"The sensor was exchanged while it was recorded ({'; '.join(there[:_MOST_SENSORS_NAMED])}): "
             f"this report is of serial {kept.identity.serial}; --sensor serial:N chooses."
         )
-    changes = sum(new.identity == old.identity for old, new in pairwise(history))
-    if changes:
+    if changes := sum(new.identity == old.identity for old, new in pairwise(history)):
         remarks.append(f"The settings were changed {count(changes, 'time')} while it was recorded.")
     if len(frames):
         first, last = (moment(int(frames.stamp_ns[row])) for row in (0, -1))
@@ -170,27 +156,17 @@ def _remarks(history: Sequence[Settings], kept: Settings, frames: Columns) -> li
 
 _BATCH_S: Final = 0.05
 _MOST_AGES: Final = 1 << 16
-
-MOST_FRAMES: Final = 4_000_000
-"""About half an hour at 1600 Hz; more than that is what a recording is for."""
+_MOST_FRAMES: Final = 4_000_000  # half an hour at 1600 Hz; more than that is what a recording is for
 
 
-class Received:
-    """Frames in order of arrival."""
+class _Received:
+    """Frames in order of arrival, and by sensor the ages of the samples that were waited for, µs."""
 
     def __init__(self) -> None:
-        self.all: deque[DataMessage] = deque(maxlen=MOST_FRAMES)
-        self.ages_us: dict[int, deque[float]] = {}
-        """By sensor, of the samples that were waited for."""
+        self.all: deque[DataMessage] = deque(maxlen=_MOST_FRAMES)
+        self.ages_us: defaultdict[int, deque[float]] = defaultdict(lambda: deque(maxlen=_MOST_AGES))
 
-    def take(self, frames: Sequence[DataMessage], now_ns: int | None) -> None:
-        """Add what came just now; `now_ns` is CLOCK_MONOTONIC if it is the server's too."""
-        self.all.extend(frames)
-        if frames and now_ns is not None and not frames[-1].flags & NOT_NEW:
-            ages_us = self.ages_us.setdefault(frames[-1].sensor, deque(maxlen=_MOST_AGES))
-            ages_us.append((now_ns - frames[-1].monotonic_ns) * 1e-3)
-
-    def frames(self, sensor: int | None = None) -> Iterable[DataMessage]:
+    def frames(self, sensor: int | None = None) -> Iterator[DataMessage]:
         """The frames of the sensor at this position, or of all."""
         return (frame for frame in self.all if sensor in (None, frame.sensor))
 
@@ -200,22 +176,34 @@ def of_server(
     seconds: float,
     choice: SensorChoice | None,
     imu_units: ImuUnits,
-    progress: Callable[[float], None] = lambda _: None,
+    progress: Callable[[float], None],
 ) -> list[Subject]:
-    """The server's sensors, or those chosen, after `seconds`.
+    """The server's sensors, or those chosen, after `seconds`; `progress` gets the time listened so far, s.
 
     ConnectionFailedError or RefusedError if there is no stream; ReportError if there is no such sensor.
     """
     with Client(address.port, address.host, fresh_only=False, raw=True, reconnect=False).connect() as client:
-        rows = _chosen(client.description, address, choice)
-        received, ended = _listen(client, seconds, progress)
-        names = [str(event.get("event")) for event in client.events if isinstance(event, dict)]
-        changed = "" if ended else _changed(client, rows)
-    remarks = [*([ended] if ended else []), *([changed] if changed else []), *event_remarks(names)]
+        there = _rows(client.description)
+        rows = {
+            position: row
+            for position, row in there.items()
+            if choice is None or choice.matches(position, str(row.get("name")), row.get("serial", -1))
+        }
+        if not rows:
+            known = [(position, row.get("name"), row.get("serial")) for position, row in there.items()]
+            raise _no_sensor(str(address), choice, known)
+        received, remark = _listen(client, seconds, progress)
+        if not remark:
+            now = _rows(client.ask("describe"))
+            if any(now.get(at, {}).get("settings") != row.get("settings") for at, row in rows.items()):
+                changed = "The settings were changed while listening"
+                remark = f"{changed}: limits and filters here are those of the start."
+        events = [str(event.get("event")) for event in client.events if isinstance(event, dict)]
+    remarks = [*([remark] if remark else []), *_event_remarks(events)]
     return [
         replace(
             subject(row, row.get("settings"), columns(received, position, imu_units), str(address), position),
-            age_p99_us=p99(received.ages_us.get(position, ())),
+            age_p99_us=p99(received.ages_us[position]),
         ).with_remarks(remarks)
         for position, row in rows.items()
     ]
@@ -229,43 +217,24 @@ def _rows(description: JsonObject) -> dict[int, dict[str, Any]]:
     }
 
 
-def _chosen(
-    description: JsonObject, address: Address, choice: SensorChoice | None
-) -> dict[int, dict[str, Any]]:
-    rows = _rows(description)
-    found = {
-        position: row
-        for position, row in rows.items()
-        if choice is None or choice.matches(position, str(row.get("name")), row.get("serial", -1))
-    }
-    if not found:
-        there = [(position, row.get("name"), row.get("serial")) for position, row in rows.items()]
-        raise no_sensor(str(address), choice, there)
-    return found
-
-
-def _listen(client: Client, seconds: float, progress: Callable[[float], None]) -> tuple[Received, str]:
-    """The frames of `seconds`, and why they ended early, if they did."""
-    received = Received()
-    begin, same_clock = time.monotonic(), client.session.same_machine
+def _listen(client: Client, seconds: float, progress: Callable[[float], None]) -> tuple[_Received, str]:
+    """What came in `seconds`, and why it ended early, if it did."""
+    received = _Received()
+    begin = time.monotonic()
     while (passed := time.monotonic() - begin) < seconds:
         progress(passed)
         try:
             frames = client.poll(min(_BATCH_S, seconds - passed))
-            received.take(frames, round(time.monotonic() * 1e9) if same_clock else None)
         except ConnectionFailedError as error:
             if not received.all:
                 raise
             return received, f"The connection ended after {passed:.1f} s of {seconds:g}: {error}."
+        received.all.extend(frames)
+        if frames and client.session.same_machine and not frames[-1].flags & NOT_NEW:
+            age_us = time.monotonic() * 1e6 - frames[-1].monotonic_ns * 1e-3
+            received.ages_us[frames[-1].sensor].append(age_us)
     if not received.all:
         raise ReportError(
             f"nothing was received in {seconds:g} s: check ethercat-sensor watch and the server's log"
         )
     return received, ""
-
-
-def _changed(client: Client, rows: dict[int, dict[str, Any]]) -> str:
-    now = _rows(client.ask("describe"))
-    if any(now.get(position, {}).get("settings") != row.get("settings") for position, row in rows.items()):
-        return "The settings were changed while listening: limits and filters here are those of the start."
-    return ""

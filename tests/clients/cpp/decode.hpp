@@ -21,10 +21,9 @@ namespace {
 
 using namespace bota_ethercat;
 
-void print_text(std::string_view inside) {
+void print_text(json::Value text) {
     std::putchar('"');
-    json::Characters characters(inside);
-    for (char32_t c = 0; characters.next(c);) {
+    text.for_each_character([](char32_t c) {
         if (c >= 0x10000) {
             c -= 0x10000;
             std::printf("\\u%04x\\u%04x", 0xD800u + static_cast<unsigned>(c >> 10), 0xDC00u + static_cast<unsigned>(c & 0x3FF));
@@ -33,13 +32,13 @@ void print_text(std::string_view inside) {
         } else {
             std::putchar(static_cast<int>(c));
         }
-    }
+    });
     std::putchar('"');
 }
 
 // Recursive, as no client needs to be: the depth was checked.
 void print_value(json::Value value) {
-    if (value.is_string()) return print_text(value.inside());
+    if (value.is_string()) return print_text(value);
     if (!value.is_object() && !value.is_array()) {
         const std::string_view text = value.text();
         std::fwrite(text.data(), 1, text.size(), stdout);
@@ -47,13 +46,12 @@ void print_value(json::Value value) {
     }
     std::putchar(value.is_object() ? '{' : '[');
     const char* separator = "";
-    json::Value name, item;
-    for (json::Items items(value); items.next(name, item);) {
+    value.for_each([&](json::Value name, json::Value item) {
         std::fputs(separator, stdout);
         if (value.is_object()) print_value(name), std::putchar(':');
         print_value(item);
         separator = ",";
-    }
+    });
     std::putchar(value.is_object() ? '}' : ']');
 }
 
@@ -112,11 +110,8 @@ std::string from_hex(const std::string& digits) {
 void account(const std::string& line) {
     constexpr const char* kKinds[] = {"new", "repeated", "invalid", "old"};
     std::istringstream words(line);
-    std::uint32_t every = 1;
-    bool fresh_only = true;
     StreamAccounting accounting;
-    words >> every >> fresh_only >> accounting.rate_hz;
-    accounting.configure(every, fresh_only);
+    words >> accounting.every >> accounting.fresh_only >> accounting.rate_hz;
     for (std::string word; words >> word;) {
         if (word == "begin") {
             accounting.begin();

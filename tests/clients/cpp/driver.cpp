@@ -2,7 +2,7 @@
 //
 //   new [OPTION=VALUE ...]    another client; the one before is gone
 //   moved                     the same client, moved to another place and back
-//   connect MS | reconnect | close | latest [POSITION] | peek [POSITION] | next MS | collect COUNT MS | follow COUNT HZ [POSITION]
+//   connect MS | reconnect | close | latest [POSITION] | peek [POSITION] | next MS
 //   server [HOST:PORT]        which one a program uses that is given this, or nothing
 //   info [POSITION] | ask REQUEST | describe | status | tare SAMPLES FX FY FZ MX MY MZ
 //
@@ -55,10 +55,29 @@ Reading watched(Call&& call) {
     return reading;
 }
 
+/// Its enumerator; null for a number that is none. -Wswitch: no enumerator is missing here.
 const char* name(Condition condition) {
-    constexpr const char* kNames[] = {"fresh",    "saturated", "not_finite", "late",        "bad_clock",
-                                      "repeated", "invalid",   "silent",     "sensor_lost", "disconnected"};
-    return kNames[static_cast<int>(condition)];
+#define NAMED(name) case Condition::name: return #name;
+    switch (condition) {
+        NAMED(fresh) NAMED(saturated) NAMED(not_finite) NAMED(late) NAMED(bad_clock)
+        NAMED(repeated) NAMED(invalid) NAMED(silent) NAMED(sensor_lost) NAMED(disconnected)
+    }
+    return nullptr;
+}
+
+/// What the thread was given, and what it has.
+void real_time(int priority, int cpu) {
+    const Scheduling given = make_real_time(priority, cpu, true);
+    sched_param has{};
+    sched_getparam(0, &has);
+    std::printf("%d %d %d %d %d\n%s\n", sched_getscheduler(0), has.sched_priority, given.priority, given.cpu, given.memory_locked,
+                given.refused.c_str());
+}
+
+void conditions() {
+    for (int number = 0; number < 256; ++number)
+        if (const auto condition = static_cast<Condition>(number); name(condition) != nullptr)
+            std::printf("%d %s %s\n", number, name(condition), to_string(condition));
 }
 
 /// As Python's JSON has it.
@@ -109,7 +128,6 @@ Options options_from(std::istringstream& words) {
         else if (key == "reconnect") options.reconnect = value == "when_told" ? Reconnect::when_told : Reconnect::by_itself;
         else if (key == "judge_imu") options.judge_imu = number() != 0;
         else if (key == "reconnect_every_ms") options.reconnect_every = std::chrono::milliseconds(number());
-        else if (key == "age_from") options.age_from = value == "arrival" ? AgeFrom::arrival : value == "instant" ? AgeFrom::instant : AgeFrom::automatic;
         else if (key == "max_bytes_per_call") options.max_bytes_per_call = static_cast<std::size_t>(number());
         else if (key == "receive_buffer") options.receive_buffer = static_cast<int>(number());
         else std::exit(2);
@@ -117,54 +135,13 @@ Options options_from(std::istringstream& words) {
     return options;
 }
 
-/// The next samples, as a list.
-void collect(Client& client, long count, long ms) {
-    std::vector<Reading> readings;
-    readings.reserve(static_cast<std::size_t>(count));
-    const std::int64_t end = monotonic_now_ns() + ms * 1'000'000;
-    while (static_cast<long>(readings.size()) < count && monotonic_now_ns() < end) {
-        const Reading reading = watched([&] { return client.next(std::chrono::milliseconds(50)); });
-        if (reading.is_new) readings.push_back(reading);
-    }
-    std::printf("[");
-    for (std::size_t i = 0; i < readings.size(); ++i) {
-        if (i) std::printf(",");
-        print(readings[i]);
-    }
-    std::printf("]");
-}
-
-/// `latest` at a steady pace; what a controller would have seen.
-void follow(Client& client, long count, double hz, std::uint8_t place) {
-    std::uint64_t fresh = 0, too_young = 0, is_new = 0, not_rising = 0, passed_over = 0, withheld = 0, gaps = 0, last = 0;
-    std::int64_t due = monotonic_now_ns();
-    for (long i = 0; i < count; ++i) {
-        due += static_cast<std::int64_t>(1e9 / hz);
-        const timespec at{static_cast<time_t>(due / 1'000'000'000), static_cast<long>(due % 1'000'000'000)};
-        clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &at, nullptr);
-        const std::int64_t before = monotonic_now_ns();
-        const Reading r = watched([&] { return client.latest(place); });
-        fresh += r.fresh();
-        too_young += r.has_sample && r.age_ns < before - static_cast<std::int64_t>(r.monotonic_ns);
-        is_new += r.is_new;
-        not_rising += r.is_new && r.monotonic_ns <= last;
-        if (r.is_new) last = r.monotonic_ns;
-        passed_over += r.passed_over;
-        withheld += r.withheld;
-        gaps += r.gap;
-    }
-    std::printf("{\"calls\":%ld,\"fresh\":%" PRIu64 ",\"too_young\":%" PRIu64 ",\"new\":%" PRIu64 ",\"not_rising\":%" PRIu64
-                ",\"passed_over\":%" PRIu64 ",\"withheld\":%" PRIu64 ",\"gaps\":%" PRIu64 "}",
-                count, fresh, too_young, is_new, not_rising, passed_over, withheld, gaps);
-}
-
 void info(const Client& client, std::uint8_t place) {
     const Counters c = client.counters(place);
     constexpr const char* kLinks[] = {"down", "connecting", "subscribing", "up"};
-    std::printf("{\"link\":\"%s\",\"error\":%s,\"connections\":%u,\"reconfigurations\":%u,\"bad_messages\":%" PRIu64
+    std::printf("{\"link\":\"%s\",\"error\":%s,\"connections\":%u,\"reconfigurations\":%u,\"refused\":%s,\"bad_messages\":%" PRIu64
                 ",\"allocated\":%zu,\"allocates\":%s,\"receives\":%zu,\"other_calls\":%zu,\"fd\":%d",
                 kLinks[static_cast<int>(client.link())], quoted(client.error()).c_str(), client.connections(),
-                client.reconfigurations(), client.bad_messages(), allocated, yes(allocations > 0), received, called, client.fd());
+                client.reconfigurations(), yes(client.refused()), client.bad_messages(), allocated, yes(allocations > 0), received, called, client.fd());
     std::printf(",\"frames\":%" PRIu64 ",\"samples\":%" PRIu64 ",\"repeated\":%" PRIu64 ",\"invalid\":%" PRIu64 ",\"gaps\":%" PRIu64
                 ",\"withheld\":%" PRIu64 ",\"skipped\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"names\":[",
                 c.frames(), c.samples, c.repeated, c.invalid, c.gaps, c.withheld, c.skipped, c.passed_over);
@@ -182,6 +159,8 @@ void print(const Control& control, bool ok) {
 
 int main(int argc, char** argv) {
     if (argc > 1 && std::string_view(argv[1]) == "decode") return decode(argc > 2 && std::string_view(argv[2]) == "accounting");
+    if (argc > 3 && std::string_view(argv[1]) == "real_time") return real_time(std::atoi(argv[2]), std::atoi(argv[3])), 0;
+    if (argc > 1 && std::string_view(argv[1]) == "conditions") return conditions(), 0;
     __sanitizer_install_malloc_and_free_hooks([](const volatile void*, std::size_t) { ++allocations; }, [](const volatile void*) {});
     std::optional<Client> maybe_client;
     std::optional<Control> maybe_control;
@@ -229,15 +208,6 @@ int main(int argc, char** argv) {
             print(watched([&] { return client.peek(place); }));
         } else if (command == "next") {
             print(watched([&] { return client.next(std::chrono::milliseconds(number)); }));
-        } else if (command == "collect") {
-            long ms = 0;
-            words >> ms;
-            collect(client, number, ms);
-        } else if (command == "follow") {
-            double hz = 0;
-            int of = 0;
-            words >> hz >> of;
-            follow(client, number, hz, static_cast<std::uint8_t>(of));
         } else if (command == "info") {
             info(client, place);
         } else if (command == "ask") {

@@ -3,7 +3,7 @@
 //   new [PARAMETER=VALUE ...] [imu] [orientation]   another loop; the one before is gone
 //   open | wait MS | tare | log | max_age | stop
 //   read                 one cycle
-//   run SECONDS HZ       cycles at a steady pace: how many in which condition, how long they took
+//   run SECONDS HZ       cycles at a steady pace: how many in which condition
 //   sealed COUNT         the same at 1 kHz, in a thread to which the kernel allows nothing but sleeping
 //   take CONDITION NOW_MS AGE_MS CHECKED FORCE [RECEIVED_MS CONNECTED]
 //                        what controllers see of this, with the parameters of `new`
@@ -17,7 +17,6 @@
 #include <sys/prctl.h>
 #include <sys/syscall.h>
 
-#include <algorithm>
 #include <cinttypes>
 #include <cstdio>
 #include <cstdlib>
@@ -71,31 +70,16 @@ void sleep_until(std::int64_t due) {
 }
 
 void run(SensorLoop& loop, double seconds, double hz) {
-    const auto cycles = static_cast<std::size_t>(seconds * hz);
-    std::vector<double> took, ages;
-    took.reserve(cycles), ages.reserve(cycles);
     std::map<int, long> conditions;
     std::size_t allocated = 0, bad = 0;
     std::int64_t due = bota_ethercat::monotonic_now_ns();
-    for (std::size_t i = 0; i < cycles; ++i) {
+    for (long left = static_cast<long>(seconds * hz); left > 0; --left) {
         sleep_until(due += static_cast<std::int64_t>(1e9 / hz));
-        const std::int64_t before = bota_ethercat::monotonic_now_ns();
         bad += !watched_read(loop);
-        took.push_back(static_cast<double>(bota_ethercat::monotonic_now_ns() - before) * 1e-3);
         allocated += allocations;
-        ages.push_back(loop.values()[kAge] * 1e6);
         ++conditions[loop.condition()];
     }
-    std::sort(took.begin(), took.end());
-    std::sort(ages.begin(), ages.end());
-    std::printf("{\"cycles\":%zu,\"bad\":%zu,\"allocated\":%zu", cycles, bad, allocated);
-    if (cycles > 0)
-        for (const auto& [name, each] : {std::pair{"read_us", &took}, std::pair{"age_us", &ages}}) {
-            std::printf(",\"%s\":{\"p50\":%.1f,\"p99\":%.1f", name, (*each)[cycles / 2], (*each)[cycles * 99 / 100]);
-            number("max", each->back());
-            std::printf("}");
-        }
-    std::printf(",\"conditions\":{");
+    std::printf("{\"bad\":%zu,\"allocated\":%zu,\"conditions\":{", bad, allocated);
     const char* separator = "";
     for (const auto& [condition, count] : conditions) std::printf("%s\"%d\":%ld", separator, condition, count), separator = ",";
     std::printf("}}");
@@ -165,10 +149,12 @@ int main() {
             gate.emplace(parameters);
             std::printf("{\"why\":%s}", quoted(why).c_str());
         } else if (command == "check") {
-            Identity found;
             const std::string text = line.substr(6);
-            std::printf("{\"found\":%s", yes(find(bota_ethercat::json::Value(text), 0, found)));
-            std::printf(",\"why\":%s,\"max_age\":%g}", quoted(objection(parameters, found)).c_str(), max_age(parameters, found));
+            bota_ethercat::Description description;
+            const bool is_read = bota_ethercat::detail::read_description(bota_ethercat::json::Value(text), description);
+            const SensorInfo* const found = description.find(0);
+            if (!is_read || found == nullptr) return 2;
+            std::printf("{\"why\":%s,\"max_age\":%g}", quoted(objection(parameters, *found, *found)).c_str(), max_age(parameters, *found));
         } else if (command == "take") {
             double now = 0, age = 0, force = 0;
             int condition = 0, checked = 0;
@@ -200,7 +186,7 @@ int main() {
             long ms = 0;
             words >> ms;
             if (command == "open") ok = maybe->open(why);
-            else ok = command == "tare" ? maybe->tare(why) : maybe->wait_until_usable(why, std::chrono::milliseconds(ms));
+            else ok = command == "tare" ? maybe->tare(why) : maybe->wait_until_usable(why, static_cast<double>(ms) / 1e3);
             std::printf("{\"ok\":%s,\"why\":%s}", yes(ok), quoted(ok ? "" : why).c_str());
         } else if (command == "read") {
             ok = watched_read(*maybe);

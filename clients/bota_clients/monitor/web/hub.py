@@ -1,5 +1,11 @@
 """What the connected pages are sent, and what they may have done. No sockets.
 
+States are sent as `state_text` makes them; frames as points of the traces: the extremes of every 10 ms, so
+that no peak is lost. A message with points has `points`, position of the sensor; `start`, time of the first
+point, `times` after it; `columns`, values of each of the 13 channels; `newest`, those of the newest sample;
+`skipped`, if the page was not sent the points before because it was slow. Times are the server's
+CLOCK_MONOTONIC in s, values in SI units or counts, both to six decimals; null: not a finite number.
+
 `WebModel.take` and `connected` are called by the reader's thread, everything else by one other.
 """
 
@@ -8,24 +14,26 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import json
+import math
 import secrets
 import threading
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
 from bota_clients.monitor import words
 from bota_clients.monitor.model import AXES, Model, SensorState, State, clock_text
 from bota_clients.monitor.tare import WAYS, Say
-from bota_clients.monitor.web.points import Feed, after_skipped, start_s
 from bota_clients.numbers import duration
+from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health.observer import COMMON
 from bota_ethercat.health.verdict import Level
-from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits, PdoType
 from bota_ethercat.sensor.meaning import value_meaning
 from bota_ethercat.sensor_choice import MOST_PLACES
-from bota_ethercat.text.json_text import JsonObject, encode_json_text, finite, parse_json_object
+from bota_ethercat.text.json_text import JsonObject, finite, parse_json_object
 from bota_ethercat.text.untrusted import whole
 
 MOST_PAGES: Final = 8
@@ -35,44 +43,118 @@ MOST_BYTES: Final = 1024  # of a message from a page
 MOST_BEHIND: Final = 10  # states without an acknowledgement
 _MOST_MESSAGES: Final = 40  # between two states
 _SILENT_S: Final = 0.1
+STEP_NS: Final = 10_000_000  # of the traces
+MOST_POINTS: Final = 4096  # that wait to be taken: 20 s
+# Six axes of the wrench, acceleration, angular rate, temperature.
+CHANNELS: Final = tuple(field.name for field in COMMON.fields if field.type is PdoType.REAL)
 
-Send = Callable[[str | bytes], None]
+Values = tuple[float, ...]
+Send = Callable[[str], None]
+
+
+class Points:
+    """One sensor's points. A step with one sample is one point, others are two: each channel's extremes."""
+
+    def __init__(self, position: int, imu_units: ImuUnits) -> None:
+        self._position = position
+        factors = {"acceleration": STANDARD_GRAVITY, "angular_rate": math.pi / 180.0}
+        to_si = {} if imu_units is ImuUnits.SI else factors  # from the process data's units
+        self._scale = [to_si.get(name.split(".")[0], 1.0) for name in CHANNELS]
+        self._step: list[tuple[int, Values]] = []  # its samples so far
+        self._points: deque[tuple[int, Values]] = deque(maxlen=MOST_POINTS)
+        self._newest: Values = ()
+        self.last = (-1, -1)  # number and time of the newest frame
+
+    def take(self, frames: Iterable[DataMessage]) -> None:
+        """Frames of any sensors as they came; REPEATED, INVALID and old ones bring nothing."""
+        for sequence, _, time_ns, sensor, flags, _, process_data in frames:
+            is_old = sequence <= self.last[0] and time_ns <= self.last[1]
+            if sensor != self._position or flags & NOT_NEW or is_old:
+                continue
+            if self._step and time_ns // STEP_NS != self._step[0][0] // STEP_NS:
+                self._end_step()
+            self.last = sequence, time_ns
+            self._newest = COMMON.reals.unpack_from(process_data)
+            self._step.append((time_ns, self._newest))
+
+    def batch(self, *, silent: bool = False) -> dict[str, Any] | None:
+        """The points since the last one, as a message; None without any. `silent`: end the step now."""
+        if silent and self._step:
+            self._end_step()
+        if not self._points:
+            return None
+        times, values = zip(*self._points, strict=True)
+        self._points.clear()
+        columns = zip(*values, strict=True)
+        return {
+            "points": self._position,
+            "start": times[0] * 1e-9,
+            "times": [_plain((time_ns - times[0]) * 1e-9) for time_ns in times],
+            "newest": list(map(_plain, self._newest, self._scale)),
+            "columns": [
+                [_plain(v, s) for v in column] for column, s in zip(columns, self._scale, strict=True)
+            ],
+        }
+
+    def _end_step(self) -> None:
+        times, samples = zip(*self._step, strict=True)
+        first, second = zip(*map(_extremes, zip(*samples, strict=True)), strict=True)
+        self._points.append((times[0], first))
+        if len(times) > 1:
+            self._points.append((times[-1], second))
+        self._step.clear()
+
+
+def _plain(value: float, scale: float = 1.0) -> float | None:
+    return round(value * scale, 6) if math.isfinite(value) else None
+
+
+def _extremes(column: Values) -> tuple[float, float]:
+    """Minimum and maximum in the order in which they came."""
+    if not math.isfinite(sum(column)):
+        column = tuple(value for value in column if math.isfinite(value)) or (math.nan,)
+    low, high = min(column), max(column)
+    return (low, high) if column.index(low) < column.index(high) else (high, low)
 
 
 class WebModel(Model):
-    """The monitor's model, whose frames also go to the traces."""
+    """The monitor's model, whose frames also become points of the traces."""
 
     def __init__(self, address: str, imu_units: ImuUnits = ImuUnits.G_DPS) -> None:
         super().__init__(address, imu_units)
-        self.feed = Feed(imu_units)
+        self._points: dict[int, Points] = {}
+        self._points_lock = threading.Lock()
 
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
         """See `Model`."""
-        self.feed.restart()
+        with self._points_lock:
+            for points in self._points.values():
+                points.last = (-1, -1)  # the server may count from the beginning again
         super().connected(description, own_peer, now_s)
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
         """See `Model`."""
         super().take(frames, now_s)
-        self.feed.take(frames)
+        with self._points_lock:
+            for position in {frame.sensor for frame in frames}:
+                self._points.setdefault(position, Points(position, self._imu_units)).take(frames)
+
+    def batches(self, *, silent: bool = False) -> list[dict[str, Any]]:
+        """The messages with points that are due; `silent` as in `Points.batch`."""
+        with self._points_lock:
+            made = [points.batch(silent=silent) for points in self._points.values()]
+        return [batch for batch in made if batch is not None]
 
 
 class Page:
-    """A connected page. It acknowledges states by number; while it lags by two seconds it is sent nothing.
-
-    Attributes:
-        sensor: position of the sensor that it shows.
-        control: whether it has shown the token.
-        missed: whether it was not sent the last points, because it was behind.
-        end: why its connection must be closed; empty if not.
-    """
+    """A connected page. It acknowledges states by number; while it lags by two seconds it is sent nothing."""
 
     def __init__(self, send: Send) -> None:
         self.send = send
-        self.sensor = 0
-        self.control = False
-        self.missed = False
-        self.end = ""
+        self.sensor = 0  # position of the one that it shows
+        self.control = False  # whether it has shown the token
+        self.missed = False  # whether it was not sent the last points, because it was behind
+        self.end = ""  # why its connection must be closed; empty if not
         self.unseen: deque[int] = deque()  # states that it has not acknowledged
         self.messages = 0  # since the last state
 
@@ -94,7 +176,8 @@ class Hub:
         self._pages: set[Page] = set()
         self._number = 0
         self._points_s = 0.0
-        self._kept: dict[int, deque[bytes]] = defaultdict(deque)  # of the last minute, by position
+        # Points of the last minute by position: the time of the first, and the message.
+        self._kept: dict[int, deque[tuple[float, str]]] = defaultdict(deque)
 
     def join(self, send: Send, now_s: float) -> Page | None:
         """A page has connected: it gets the state and the last minute; None if there are enough."""
@@ -125,16 +208,16 @@ class Hub:
     def send_points(self, now_s: float) -> None:
         """Send new points to the pages that keep up; one that lags is told later that it has missed some."""
         silent = now_s - self._points_s > _SILENT_S
-        for position, batch in self._model.feed.batches(silent=silent).items():
-            self._points_s = now_s
-            kept = self._kept[position]
-            kept.append(batch)
-            while not start_s(batch) - KEPT_S <= start_s(kept[0]) <= start_s(batch):  # or of another server
+        for batch in self._model.batches(silent=silent):
+            self._points_s, start_s, text = now_s, batch["start"], _json(batch)
+            kept = self._kept[batch["points"]]
+            kept.append((start_s, text))
+            while not start_s - KEPT_S <= kept[0][0] <= start_s:  # or of another server
                 kept.popleft()
             for page in self._pages:
-                if page.sensor == position:
+                if page.sensor == batch["points"]:
                     if not page.behind:
-                        page.send(after_skipped(batch) if page.missed else batch)
+                        page.send(_json(batch | {"skipped": True}) if page.missed else text)
                     page.missed = page.behind
 
     def take(self, page: Page, text: str | bytes) -> None:
@@ -151,7 +234,7 @@ class Hub:
         before = page.control
         refused = self._do(page, message)
         if refused or page.control != before:
-            page.send(encode_json_text({"control": page.control, "refused": refused}).decode())
+            page.send(_json({"control": page.control, "refused": refused}))
 
     def _do(self, page: Page, message: JsonObject) -> str | None:
         """Do what it asks for; why not."""
@@ -183,8 +266,8 @@ class Hub:
         return None
 
     def _send_kept(self, page: Page) -> None:
-        for batch in self._kept.get(page.sensor, ()):
-            page.send(batch)
+        for _, text in self._kept.get(page.sensor, ()):
+            page.send(text)
 
     def _say(self, text: str, bad: bool = False) -> None:
         self._model.say(f"{clock_text()} {text}", bad)
@@ -222,15 +305,19 @@ def state_text(state: State, position: int, number: int) -> str:
         ],
         "sensor": next((_sensor(sensor) for sensor in state.sensors if sensor.position == position), None),
     }
-    return json.dumps(finite(message), allow_nan=False, separators=(",", ":"), ensure_ascii=False)
+    return _json(finite(message))
+
+
+def _json(message: object) -> str:
+    return json.dumps(message, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
 
 
 def _sensor(sensor: SensorState) -> dict[str, Any]:
     sample, rate_hz = sensor.sample, sensor.nominal_hz
     stream = {
         "Rate": words.rate(sensor),
-        "Age": words.times(sensor.age_us, "worst"),
-        "Age at hand-out": words.times(sensor.hand_out_us, "p99"),
+        "Age": words.times(sensor.age_us),
+        "Age at hand-out": words.times(sensor.hand_out_us),
         "Jitter": words.jitter(sensor),
         "Clock": words.clock(sensor),
     }

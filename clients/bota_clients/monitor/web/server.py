@@ -12,14 +12,13 @@ import contextlib
 import errno
 import itertools
 import logging
-import socket
 import sys
 import time
 from collections.abc import AsyncIterator, Callable
 from functools import partial
 from http import HTTPStatus
 from importlib.resources import files
-from typing import Final
+from typing import Any, Final
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
@@ -53,13 +52,13 @@ _FOREIGN_HOST: Final = (
     "The page is for this machine only: open http://localhost:PORT/, from elsewhere over ssh -L."
 )
 _FOREIGN_ORIGIN: Final = "The stream is for the page that is served here, and not for others."
-_NO_IPV6: Final = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
+_NO_ADDRESS: Final = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT, None)  # no IPv6; asyncio may lose the number
 _POLICY_VIOLATION: Final = 1008
 _TRY_AGAIN_LATER: Final = 1013
 _WHY: Final = {
     errno.EADDRINUSE: "is in use",
     errno.EACCES: "is reserved for root",
-    errno.EADDRNOTAVAIL: "is no address of this machine",
+    **dict.fromkeys(_NO_ADDRESS, "is no address of this machine"),
 }
 
 # Neither requests nor errors of clients are written to the terminal.
@@ -102,9 +101,16 @@ async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: f
 async def serving(
     hub: Hub, host: str, port: int, clock: Callable[[], float] = time.monotonic
 ) -> AsyncIterator[int]:
-    """Serve on a loopback address, `localhost` on both; yields the port. OSError if it cannot be bound."""
-    listening = _listen(host, port)
+    """Serve on a loopback address; yields the port. OSError if it cannot be bound.
+
+    For `localhost` on both addresses, so that no other program answers under one of them.
+    """
     page_files = read_page()
+    options: dict[str, Any] = {
+        "process_request": lambda _, request: answer(page_files, request),
+        "compression": None, "max_size": MOST_BYTES, "max_queue": 4, "open_timeout": 5.0,
+        "close_timeout": 0.5, "server_header": None, "logger": _QUIET,
+    }  # fmt: skip
 
     async def converse(connection: ServerConnection) -> None:
         page = hub.join(partial(broadcast, [connection]), clock())
@@ -129,24 +135,16 @@ async def serving(
             await asyncio.sleep(POINTS_S)
 
     async with contextlib.AsyncExitStack() as stack:
-        for sock in listening:
-            await stack.enter_async_context(
-                serve(
-                    converse,
-                    sock=sock,
-                    process_request=lambda _, request: answer(page_files, request),
-                    compression=None,
-                    max_size=MOST_BYTES,
-                    max_queue=4,
-                    open_timeout=5.0,
-                    close_timeout=0.5,
-                    server_header=None,
-                    logger=_QUIET,
-                )
-            )
+        for address in ("127.0.0.1", "::1") if host == "localhost" else (host,):
+            try:
+                server = await stack.enter_async_context(serve(converse, address, port, **options))
+            except OSError as error:
+                if (host, address) != ("localhost", "::1") or error.errno not in _NO_ADDRESS:
+                    raise
+            port = next(iter(server.sockets)).getsockname()[1]
         sending = asyncio.create_task(send())
         try:
-            yield listening[0].getsockname()[1]
+            yield port
         finally:
             sending.cancel()
 
@@ -192,22 +190,3 @@ def _is_this_machine(host: str) -> bool:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
     except ValueError:
         return False
-
-
-def _listen(host: str, port: int) -> list[socket.socket]:
-    """For `localhost` both addresses, so that no other program answers under one of them."""
-    if host != "localhost":
-        return [_bound(host, port)]
-    first = _bound("127.0.0.1", port)
-    try:
-        return [first, _bound("::1", first.getsockname()[1])]
-    except OSError as error:
-        if error.errno in _NO_IPV6:
-            return [first]
-        first.close()
-        raise
-
-
-def _bound(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    return socket.create_server((host, port), family=family)

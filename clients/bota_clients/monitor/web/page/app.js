@@ -27,7 +27,7 @@ traces.forEach((trace) => trace.start());
 
 const link = new Link({
   points(batch) {
-    if (batch.sensor !== link.sensor) return;
+    if (batch.points !== link.sensor) return;
     history.add(batch, sensor?.nominal_hz ? 1 / sensor.nominal_hz : 0.01);
     newest = batch.newest;
   },
@@ -213,7 +213,7 @@ function frame(now) {
 
 function arrows() {
   const units = [traces[0].unit, traces[1].unit];
-  const vectors = newest ? [[...newest.slice(0, 3)], [...newest.slice(3, 6)]] : [null, null];
+  const vectors = newest ? [newest.slice(0, 3), newest.slice(3, 6)].map((vector) => vector.map((v) => v ?? NaN)) : [null, null];
   const full = wrench.draw(...vectors, units);
   ["force", "torque"].forEach((name, i) => {
     const size = vectors[i] ? Math.hypot(...vectors[i]).toFixed(traces[i].digits) : "--";

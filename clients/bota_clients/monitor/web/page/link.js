@@ -3,26 +3,9 @@
 const RETRY_MS = 1000;
 const SILENT_MS = 1500;
 const GIVEN_UP_MS = 5000;
-const HEADER_BYTES = 16;
 export const CHANNELS = 13;
 
-/** The points of a message; clients/monitor/web/points.py says how they are laid out. */
-export function decode(buffer) {
-  const head = new DataView(buffer);
-  const count = head.getUint16(2, true);
-  const values = new Float32Array(buffer, HEADER_BYTES);
-  const part = (index) => values.subarray(CHANNELS + index * count, CHANNELS + (index + 1) * count);
-  const start = head.getFloat64(8, true);
-  return {
-    sensor: head.getUint8(1),
-    skipped: head.getUint32(4, true) === 1,
-    newest: values.subarray(0, CHANNELS),
-    times: Float64Array.from(part(0), (after) => start + after),
-    columns: Array.from({ length: CHANNELS }, (_, channel) => part(1 + channel)),
-  };
-}
-
-/** Calls `on.state`, `on.points`, `on.reply` with messages and `on.trouble` with a text, or null. */
+/** Calls `on.state`, `on.points` (monitor/web/hub.py says what they are), `on.reply` with messages and `on.trouble` with a text, or null. */
 export class Link {
   constructor(on) {
     this.on = on;
@@ -54,7 +37,6 @@ export class Link {
     const socket = new WebSocket(`ws://${location.host}/stream`);
     this.socket = socket;
     this.heard = performance.now();
-    socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.send({ sensor: this.sensor });
       if (this.token) this.send({ token: this.token });
@@ -69,12 +51,9 @@ export class Link {
 
   #take(data) {
     this.heard = performance.now();
-    if (data instanceof ArrayBuffer) {
-      this.on.points(decode(data));
-      return;
-    }
     const message = JSON.parse(data);
-    if ("state" in message) {
+    if ("points" in message) this.on.points(message);
+    else if ("state" in message) {
       this.send({ seen: message.state });
       this.on.trouble(null);
       this.on.state(message);

@@ -23,17 +23,17 @@ export class History {
   }
 
   /** `period`: of the samples, in seconds. */
-  add({ skipped, times, columns }, period) {
-    const last = this.times.at(-1);
-    if (last !== undefined && times[0] <= last) this.clear(); // another server, or a restarted machine
-    else if (last !== undefined && times[0] - last > 2.5 * Math.max(STEP_S, period)) {
-      this.#push(last + 1e-4);
-      if (skipped) this.skipped.push([last, times[0]]);
-    }
-    for (let i = 0; i < times.length; i++) {
-      if (i && times[i] - times[i - 1] > 2.5 * Math.max(STEP_S, period)) this.#push(times[i - 1] + 1e-4);
-      this.#push(times[i], columns, i);
-    }
+  add({ skipped, start, times, columns }, period) {
+    let last = this.times.at(-1);
+    if (start <= last) this.clear(); // another server, or a restarted machine
+    times.forEach((after, i) => {
+      if (start + after - last > 2.5 * Math.max(STEP_S, period)) {
+        this.#push(last + 1e-4);
+        if (skipped && !i) this.skipped.push([last, start]);
+      }
+      last = start + after;
+      this.#push(last, columns, i);
+    });
     const newest = this.times.at(-1);
     const offset = newest - performance.now() / 1000;
     this.offset = this.offset === null || offset > this.offset || this.offset - offset > 1
@@ -47,18 +47,13 @@ export class History {
   }
 
   copy() {
-    const made = new History();
-    made.times = this.times.slice();
-    made.skipped = this.skipped.slice();
-    made.columns = this.columns.map((column) => column.slice());
-    return made;
+    return Object.assign(new History(), structuredClone({ ...this }));
   }
 
   #push(time, columns, i) {
     this.times.push(time);
     for (let channel = 0; channel < CHANNELS; channel++) {
-      const value = columns ? columns[channel][i] : NaN;
-      this.columns[channel].push(Number.isFinite(value) ? value : null);
+      this.columns[channel].push(columns?.[channel][i] ?? null);
     }
   }
 

@@ -1,36 +1,76 @@
-"""What `ethercat-export` does: writes the samples of a recording as CSV."""
+"""`ethercat-export`: a recording as CSV, for pandas, MATLAB and spreadsheets."""
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
 from typing import Final
 
+from bota_clients.arguments import add_force, add_imu_units, parser, position
 from bota_clients.errors import RecordingError
-from bota_clients.export.options import ExportOptions
 from bota_clients.numbers import count
-from bota_clients.program import say
-from bota_clients.recording.reader import open_recording
+from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.accounting import NOT_NEW
-from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.pdo import ImuUnits, Sample, SampleDecoder
+from bota_ethercat.pdo import ImuUnits, SampleDecoder
 from bota_ethercat.program.new_file import NewFile
 
+_PROGRAM: Final = "ethercat-export"
 _SECOND: Final = 1_000_000_000
 _VECTORS: Final = (("force", "N"), ("torque", "Nm"), ("acceleration", "m_s2"), ("angular_rate", "rad_s"))
 _FLAGS: Final = (DataFlag.GAP, DataFlag.REPEATED, DataFlag.INVALID)
+_REGISTERS: Final = (
+    "force_torque_saturated", "acceleration_saturated", "angular_rate_saturated", "warnings", "status",
+)  # fmt: skip
 COLUMNS: Final = (
     "time_s", "stamp_utc", "sensor", "sequence",
     *(f"{name}_{axis}_{unit}" for name, unit in _VECTORS for axis in "xyz"),
     "temperature_degC",
     *(f"orientation_{axis}" for axis in "xyzw"),
     *(str(flag.name).lower() for flag in _FLAGS),
-    "force_torque_saturated", "acceleration_saturated", "angular_rate_saturated", "warnings", "status",
+    *_REGISTERS,
 )  # fmt: skip
+_SHOW_EVERY_S: Final = 0.5
+_LINES_BETWEEN: Final = 1000
+
+_say = partial(say, _PROGRAM)
+
+
+class ExportOptions(argparse.Namespace):
+    """What to export, and where to."""
+
+    recording: Path
+    output: Path
+    sensor: int | None
+    all: bool
+    imu_units: ImuUnits
+    force: bool
+
+
+def parse_options(argv: Sequence[str] | None) -> ExportOptions:
+    """Read the command line; argparse exits with 2 if it is wrong."""
+    made = parser(
+        _PROGRAM,
+        "Writes the samples of a recording as CSV: a line of names with units, then one per sample.",
+        "For pandas.read_csv(FILE, parse_dates=['stamp_utc']), MATLAB's readtable, or a spreadsheet.",
+    )
+    add = made.add_argument
+    add("recording", type=Path, metavar="FILE.mcap", help="a recording of ethercat-record")
+    add("output", type=Path, nargs="?", metavar="OUT.csv", help="file to write (default: FILE.csv)")
+    add("--sensor", type=position, metavar="N", help="only the sensor at this position on the bus")
+    add("--all", action="store_true", help="also frames that are no new sample: repeated, invalid")
+    add_imu_units(made)
+    add_force(made)
+    options = made.parse_args(argv, ExportOptions())
+    options.output = options.output or options.recording.with_suffix(".csv")
+    if options.output.absolute() == options.recording.absolute():
+        made.error("the table would overwrite the recording: give another name")
+    return options
 
 
 class Table:
@@ -44,8 +84,8 @@ class Table:
     def __init__(self, units: ImuUnits, *, everything: bool) -> None:
         """With `everything` frames that are no new sample have a line too."""
         self.written = self.left_out = 0
-        self._units, self._everything = units, everything
-        self._decoders: dict[int, Callable[[bytes], Sample]] = {}
+        self._everything = everything
+        self._decoder = cache(lambda size: SampleDecoder(size, units))
         self._gaps: dict[int, int] = {}
 
     def lines(self, frames: Iterable[DataMessage]) -> Iterator[str]:
@@ -73,17 +113,11 @@ class Table:
             yield f"{','.join(map(str, cells))},{self._values(frame.process_data, flags)}\n"
 
     def _values(self, data: bytes, flags: int) -> str:
-        decode = self._decoders.get(len(data))
-        if decode is None:
-            decode = self._decoders[len(data)] = SampleDecoder(len(data), self._units).decode
-        sample = decode(data)
+        sample = self._decoder(len(data)).decode(data)
         # Nine digits keep a REAL32 to the bit.
         reals = ",".join([f"{value:.9g}" for value in (*sample.array, sample.temperature)])
         orientation = ",".join([f"{value:.9g}" for value in sample.orientation or ()]) or ",,,"
-        whole = (
-            *(int(bool(flags & flag)) for flag in _FLAGS), sample.force_torque_saturated,
-            sample.acceleration_saturated, sample.angular_rate_saturated, sample.warnings, sample.status,
-        )  # fmt: skip
+        whole = [int(bool(flags & flag)) for flag in _FLAGS] + [getattr(sample, name) for name in _REGISTERS]
         return f"{reals},{orientation},{','.join(map(str, whole))}"
 
 
@@ -92,34 +126,28 @@ def _seconds(ns: int) -> str:
     return f"{'-' if ns < 0 else ''}{whole}.{rest:09d}"
 
 
-_say = partial(say, "ethercat-export")
-_SHOW_EVERY_S: Final = 0.5
-_BETWEEN: Final = 1000
-
-
 def run(options: ExportOptions) -> int:
-    """Export; returns the exit code."""
-    try:
-        return _export(options)
-    except (RecordingError, ProtocolError) as error:
-        _say(str(error))
-        return 1
+    """Export; returns the exit code. Ctrl-C ends it at any time and leaves no file."""
+    from bota_clients.recording.reader import open_recording  # noqa: PLC0415 - needs the extra
 
-
-def _export(options: ExportOptions) -> int:
+    interrupt_on_signals()
     table = Table(options.imu_units, everything=options.all)
-    with open_recording(options.recording) as recording:
-        there = {sensor.sensor: sensor.frames for sensor in recording.sensors if sensor.frames}
-        if not there or options.sensor not in {None, *there}:
-            which = "" if options.sensor is None else f" of sensor {options.sensor}"
-            raise RecordingError(f"{options.recording} has no samples{which}")
-        if recording.cut_off is not None:
-            _say(f"{options.recording} was cut off ({recording.cut_off}): the intact part is exported")
-        total = sum(there.values()) if options.sensor is None else there[options.sensor]
-        with NewFile(options.output, force=options.force) as file:
-            for line in _shown(table.lines(recording.frames(options.sensor)), total):
-                file.write(line)
-            file.finish()
+    try:
+        with open_recording(options.recording) as recording:
+            there = {sensor.sensor: sensor.frames for sensor in recording.sensors if sensor.frames}
+            if not there or options.sensor not in {None, *there}:
+                which = "" if options.sensor is None else f" of sensor {options.sensor}"
+                raise RecordingError(f"{options.recording} has no samples{which}")
+            if recording.cut_off is not None:
+                _say(f"{options.recording} was cut off ({recording.cut_off}): the intact part is exported")
+            total = sum(there.values()) if options.sensor is None else there[options.sensor]
+            with NewFile(options.output, force=options.force) as file:
+                for line in _shown(table.lines(recording.frames(options.sensor)), total):
+                    file.write(line)
+                file.finish()
+    except KeyboardInterrupt:
+        _say("stopped: nothing was written")
+        return 1
     left = f"; {count(table.left_out, 'frame')} without a new sample left out" if table.left_out else ""
     _say(f"{options.output}: {count(table.written, 'sample')}{left}")
     return 0
@@ -130,9 +158,14 @@ def _shown(lines: Iterable[str], total: int) -> Iterator[str]:
     terminal, due = sys.stderr.isatty(), time.monotonic() + _SHOW_EVERY_S
     for number, line in enumerate(lines):
         yield line
-        if terminal and number % _BETWEEN == 0 and time.monotonic() >= due:
+        if terminal and number % _LINES_BETWEEN == 0 and time.monotonic() >= due:
             due += _SHOW_EVERY_S
             sys.stderr.write(f"\r\x1b[K{100 * number // total} %")
             sys.stderr.flush()
     if terminal:
         sys.stderr.write("\r\x1b[K")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Export; returns the exit code."""
+    return start(_PROGRAM, "export", parse_options(argv))

@@ -1,1 +1,0 @@
-"""`ethercat-export`: a recording as a table for pandas, MATLAB and spreadsheets."""

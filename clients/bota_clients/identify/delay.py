@@ -1,0 +1,70 @@
+"""What `ethercat-identify delay` does: the lag of the force, beside what the filters imply."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import numpy as np
+
+from bota_clients.errors import RecordingError
+from bota_clients.identify.cli import IdentifyOptions
+from bota_clients.identify.program import choose
+from bota_clients.program import discard_output, say
+from bota_clients.recording.columns import Columns, columns
+from bota_clients.recording.reader import open_recording
+from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, force_lag_s
+from bota_ethercat.settings import SettingValue, known_settings
+from ft_compensation.identification.delay import Lag, find_lag
+from ft_compensation.quantities import CompensationError
+
+
+def run(options: IdentifyOptions) -> int:
+    """Find it; returns the exit code."""
+    with open_recording(options.path) as recording:
+        sensor = choose(recording, options.sensor)
+        data = columns(recording, sensor.sensor, options.imu_units)
+    if any(row.values != sensor.settings for row in sensor.history):
+        raise RecordingError(f"{options.path}: settings were changed during it: record without that")
+    settings, found, error = known_settings(sensor.settings), None, ""
+    try:
+        found = _find(data, settings)
+    except CompensationError as refusal:
+        error = str(refusal)
+    expected_s = force_lag_s(settings, sensor.rate_hz or None)
+    expected_ms = None if expected_s is None else expected_s * 1e3
+    try:
+        if options.json:
+            sys.stdout.write(json.dumps(_as_json(found, expected_ms, error), indent=1) + "\n")
+        elif found is not None:
+            implied = "unknown" if expected_ms is None else f"{expected_ms:.2f} ms"
+            sys.stdout.write(
+                f"force and torque come {found.seconds * 1e3:.2f} ms (± {found.interval_s * 1e3:.2f} ms, "
+                f"95 %) after the accelerometer; by the filters that were set: {implied}\n"
+            )
+        sys.stdout.flush()
+    except BrokenPipeError:
+        discard_output()
+        return 1
+    if found is None:
+        say("ethercat-identify", f"{options.path}: {error}")
+    return int(found is None)
+
+
+def _find(data: Columns, settings: dict[str, SettingValue]) -> Lag:
+    data = data.where(data.fresh)
+    force, acceleration, rate = data.force, data.acceleration, data.angular_rate
+    usable = np.isfinite(np.concatenate([force, acceleration, rate], axis=1)).all(axis=1)
+    times = (data.monotonic_ns - data.monotonic_ns[:1])[usable] * 1e-9
+    imu, gyroscope = acceleration_response(settings), angular_rate_response(settings)
+    later_s = (gyroscope.delay_s or 0.0) - (imu.delay_s or 0.0)
+    return find_lag(times, force[usable], acceleration[usable], rate[usable], later_s)
+
+
+def _as_json(found: Lag | None, expected_ms: float | None, error: str) -> dict[str, Any]:
+    if found is None:
+        return {"ok": False, "error": error}
+    lag_ms, interval_ms = found.seconds * 1e3, found.interval_s * 1e3
+    values = {"lag_ms": lag_ms, "interval_ms": interval_ms, "expected_ms": expected_ms}
+    return {"ok": True, **values, "explained": found.explained}

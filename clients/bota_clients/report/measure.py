@@ -1,0 +1,210 @@
+"""What is measured of a sensor beside its stream: noise, spectra and drift.
+
+Noise is compared with a healthy sensor although the sensor may move and touch things: docs/report.md says
+how. The range of the cubics of force and torque tells contacts and quick motion; if the accelerometer shows
+that the sensor was shaken even in the calm windows, vibration cannot be told from noise. A median misses
+intermittent noise, so every window is also judged by its second differences, which motion hardly affects.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from matplotlib import mlab
+
+from bota_clients.numbers import figure
+from bota_clients.recording.columns import Floats, Ints
+from bota_clients.report.series import CHANNELS, Bools, Series, noise_limit
+from bota_ethercat.pdo import STANDARD_GRAVITY
+
+_WINDOW_S: Final = 0.5
+_FEWEST_SAMPLES: Final = 32  # in a window
+FEWEST_WINDOWS: Final = 8  # to judge by
+_ORDER: Final = 3
+# A window above this multiple of the limit is noisy; one of few samples needs more, to allow for chance.
+_NOISY: Final = 1.5
+_TO_DEVIATION: Final = 1.4826 / math.sqrt(6)  # median size of second differences of white noise to its std
+_FILLED: Final = 0.8  # share of its samples that a window must have
+
+
+class Noise(NamedTuple):
+    """Noise of the 12 channels, as standard deviations; NaN if unknown."""
+
+    deviation: Floats  # (12,)
+    limit: Floats  # (12,) of a healthy sensor
+    windows: int
+    calm: int  # how many of the windows were used
+    window_s: float
+    noisy: Ints  # (12,) windows that are clearly above the limit, of all
+    worst: Floats  # (12,) standard deviation in the worst of these
+
+    @property
+    def shaken(self) -> bool:
+        """Whether the sensor was shaken, even in the calm windows."""
+        return bool(_shaken(self.deviation, self.limit))
+
+
+def measure_noise(series: Series) -> Noise:
+    """The noise of all channels."""
+    length = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
+    limit = _limits(series)
+    usable = series.finite & ~series.saturated
+    number = np.floor(series.time / length).astype(np.int64)
+    # A clock that jumps back must not join samples that are far apart.
+    edges = [0, *(np.flatnonzero(np.diff(number) != 0) + 1), series.count]
+    fewest = max(_FEWEST_SAMPLES // 2, int(_FILLED * length / series.period))
+    kept = [slice(*ends) for ends in itertools.pairwise(edges) if ends[1] - ends[0] >= fewest]
+    if len(kept) < FEWEST_WINDOWS:
+        unknown = np.full(len(CHANNELS), np.nan)
+        return Noise(unknown, limit, len(kept), 0, length, np.zeros(len(CHANNELS), np.int64), unknown)
+    windows = [_window(series.time[part], series.values[part], usable[part]) for part in kept]
+    deviations, ranges, roughs = np.array(windows).transpose(1, 0, 2)
+    # A window in which a channel is unusable counts as the least calm.
+    reaches = np.where(np.isfinite(ranges), ranges, np.inf)[:, :6]
+    usual = np.median(reaches, axis=0)
+    known = (usual > 0) & np.isfinite(usual)
+    unrest = (reaches[:, known] / usual[known]).max(axis=1, initial=0.0)
+    calm = deviations[np.argsort(unrest, kind="stable")[: max(FEWEST_WINDOWS, len(unrest) // 2)]]
+    measured = np.sum(np.isfinite(calm), axis=0) >= FEWEST_WINDOWS // 2
+    deviation = np.full(len(CHANNELS), np.nan)
+    deviation[measured] = np.nanmedian(calm[:, measured], axis=0)
+    rough = np.where(_shaken(deviations, limit)[:, None], np.nan, roughs)
+    sizes = np.array([part.stop - part.start for part in kept])
+    noisy = rough > limit * np.maximum(_NOISY, 1 + 5 / np.sqrt(sizes))[:, None]
+    worst = np.where(noisy, rough, 0.0).max(axis=0)
+    return Noise(deviation, limit, len(kept), len(calm), length, noisy.sum(axis=0), worst)
+
+
+def _shaken(deviation: Floats, limit: Floats) -> Bools:
+    """Whether at least two axes of the accelerometer are above their limit: that is motion."""
+    shaken: Bools = np.sum(deviation[..., 6:9] > limit[6:9], axis=-1) >= 2
+    return shaken
+
+
+def _limits(series: Series) -> Floats:
+    """(12,) NaN where there is none: raw counts, an unknown SINC length, an IMU that is off."""
+    length = series.subject.sinc_length if series.subject.settings.get("calibration_matrix") else None
+    return np.array([
+        math.nan if (series.imu_off if channel.group.is_imu else length is None)
+        else noise_limit(channel, length or 1)
+        for channel in CHANNELS
+    ])  # fmt: skip
+
+
+def _window(time: Floats, values: Floats, usable: Bools) -> Floats:
+    """(3, 12): standard deviation about the cubic, its range, and the deviation by second differences."""
+    middle, half = (time[0] + time[-1]) / 2, max((time[-1] - time[0]) / 2, 1e-12)
+    basis = np.polynomial.legendre.legvander((time - middle) / half, _ORDER)
+    good = usable.all(axis=0)
+    values = np.where(good, values, 0.0)
+    trend = basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+    deviation = np.sqrt(np.sum((values - trend) ** 2, axis=0) / (len(time) - _ORDER - 1))
+    deviation[(values == values[0]).all(axis=0)] = 0.0  # the fit leaves rounding errors
+    rough = np.median(np.abs(np.diff(values, 2, axis=0)), axis=0) * _TO_DEVIATION
+    return np.where(good, [deviation, np.ptp(trend, axis=0), rough], np.nan)
+
+
+_RESOLUTION_S: Final = 2.0  # length of a segment: a resolution of half a hertz
+_SHORTEST: Final = 64  # samples
+_MOST_FILLED: Final = 3  # longest run of missing samples that is interpolated
+
+
+class Spectrum(NamedTuple):
+    """Amplitude spectral density of all channels, by Welch's method from the longest uninterrupted part."""
+
+    frequency: Floats  # (k,) Hz, without 0
+    density: Floats  # (k, 12) unit/√Hz; NaN for a channel that is constant or has no finite values
+    segments: int  # half-overlapping ones, averaged
+    span_s: float  # duration of the part
+    filled: int  # missing samples that were interpolated
+    resolution_hz: float
+
+
+def measure_spectrum(series: Series) -> Spectrum | None:
+    """The spectra; None if no uninterrupted part is long enough."""
+    gap = series.silent | (series.missing > _MOST_FILLED) | (series.intervals <= 0)
+    gap |= series.intervals > (_MOST_FILLED + 1.5) * series.period
+    edges = np.concatenate(([0], np.flatnonzero(gap) + 1, [series.count]))
+    longest = int(np.argmax(np.diff(edges)))
+    part = slice(edges[longest], edges[longest + 1])
+    # On a regular grid, with missing samples interpolated.
+    indices = np.cumsum(np.append(0, 1 + series.missing[part][: part.stop - part.start - 1]))
+    count = int(indices[-1]) + 1
+    values, good = series.values[part], series.finite[part]
+    usable = [n for n in range(len(CHANNELS))
+              if np.count_nonzero(good[:, n]) >= _SHORTEST and np.ptp(values[good[:, n], n]) > 0]  # fmt: skip
+    if not usable:
+        return None
+    # A power of two near the resolution; a short stretch is still averaged a few times.
+    wanted = 2 ** round(np.log2(max(_SHORTEST, _RESOLUTION_S / series.period)))
+    length = max(_SHORTEST, min(wanted, 2 ** int(np.log2(max(1, count // 4)))))
+    density = np.full((length // 2, len(CHANNELS)), np.nan)
+    window = np.hanning(length + 1)[:-1]
+    for n in usable:
+        even = np.interp(np.arange(count), indices[good[:, n]], values[good[:, n], n])
+        power = np.asarray(mlab.psd(even, length, 1 / series.period, "linear", window, length // 2)[0])
+        density[:, n] = np.sqrt(np.maximum(power[1:], np.finfo(float).tiny))  # never 0: the scale is a log
+    resolution_hz = 1 / (length * series.period)
+    frequency = np.arange(1, length // 2 + 1) * resolution_hz
+    segments = 1 + (count - length) // (length // 2)
+    return Spectrum(frequency, density, segments, count * series.period, count - len(values), resolution_hz)
+
+
+_FEWEST_SPANS: Final = 4
+_MOST_SPANS: Final = 300
+_TURNED_DEG: Final = 2.0
+_LEAST_CHANGE: Final = 0.5  # °C: below this a drift per degree is meaningless
+
+
+class Drift(NamedTuple):
+    """How the readings moved over the recording: medians of m equal spans of about a second."""
+
+    time: Floats  # (m,) s, the middle of each span
+    readings: Floats  # (m, 7) force (N) and torque (Nm) less those of the first span, temperature (°C)
+    change: Floats  # (7,) from the first tenth of the spans to the last
+    turned_deg: float  # how far the direction of gravity moved, by the accelerometer; NaN without one
+
+    def sentence(self) -> str:
+        """What it means."""
+        if not self.turned_deg < _TURNED_DEG:
+            how = (
+                "The IMU cannot tell whether the sensor was turned"
+                if math.isnan(self.turned_deg)
+                else f"The sensor was turned by up to {figure(self.turned_deg, 2)}°"
+            )
+            return f"{how}: the readings changed with the load too, so they say nothing about drift."
+        per_degree = ""
+        if abs(self.change[6]) >= _LEAST_CHANGE:
+            slope = max(self.change[:3] / self.change[6], key=abs)
+            per_degree = f" That is {figure(slope, 2)} N/°C on the axis that changed most."
+        return (
+            "The sensor was not turned. If its load was constant, the change of the readings is its drift; "
+            f"no limit is published for it.{per_degree}"
+        )
+
+
+def measure_drift(series: Series) -> Drift | None:
+    """Medians over time, without samples that are not numbers; None if the recording is too short."""
+    s = series.samples
+    good = ~series.not_finite & ~series.saturated[:, :6].any(axis=1)
+    rows = np.column_stack([series.time, s.force, s.torque, s.temperature, s.acceleration])[good]
+    spans = int(np.clip(series.duration, 0, _MOST_SPANS))
+    index = np.clip(rows[:, 0] / (series.duration or 1.0) * spans, 0, spans - 1).astype(np.int64)
+    order = np.argsort(index, kind="stable")
+    edges = np.flatnonzero(np.diff(index[order])) + 1
+    if len(edges) + 1 < _FEWEST_SPANS:
+        return None
+    medians = np.array([np.median(part, axis=0) for part in np.split(rows[order], edges)])
+    medians[:, 1:7] -= medians[0, 1:7]
+    readings, gravity = medians[:, 1:8], medians[:, 8:]
+    tenth = max(1, len(medians) // 10)
+    change = np.median(readings[-tenth:], axis=0) - np.median(readings[:tenth], axis=0)
+    lengths = np.linalg.norm(gravity, axis=1)
+    turned_deg = math.nan
+    if np.all(lengths >= STANDARD_GRAVITY / 4):
+        units = gravity / lengths[:, None]
+        turned_deg = float(np.degrees(np.arccos(np.clip(units @ units[0], -1, 1)).max()))
+    return Drift(medians[:, 0], readings, change, turned_deg)
