@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
+from pathlib import Path
+from typing import Final
 
-from bridge.middleware import use_own_profiles
-from bridge.signals import block_stop_signals
+from bridge.process import block_stop_signals
+
+# For many small messages. Only Fast DDS 2, the default of ROS 2 Jazzy, reads it; it says why itself.
+PROFILES: Final = Path(__file__).with_name("fastdds.xml")
+_PROFILES_VARIABLE: Final = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 USAGE = """\
 usage: ros2 run bridge client [--ros-args -p NAME:=VALUE ... --params-file FILE ...]
@@ -21,6 +26,12 @@ usage: ros2 run bridge client [--ros-args -p NAME:=VALUE ... --params-file FILE 
 Publishes the force/torque sensor that ethercat-server serves. Parameters, topics and their
 defaults: share/bridge/config/client.yaml.
 """
+
+
+def use_own_profiles(environment: MutableMapping[str, str]) -> None:
+    """Name our file in `environment`, unless the user has named one: who tunes the middleware knows best."""
+    if not environment.get(_PROFILES_VARIABLE):
+        environment[_PROFILES_VARIABLE] = str(PROFILES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -7,7 +7,6 @@ several nodes in one process.
 from __future__ import annotations
 
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from typing import Final, Self
 
@@ -21,39 +20,21 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from bota_ethercat.client.channel import Channel
-from bridge import real_time
-from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics.monitor import Monitor
-from bridge.parameters.declare import LiveParameters, declare, warn_of_others
-from bridge.parameters.row import ParameterError
-from bridge.parameters.sensor_settings import SettingsParameters
-from bridge.parameters.table import Parameters
+from bridge.parameters.declare import LiveParameters, SettingsParameters, declare, warn_of_others
+from bridge.parameters.table import ParameterError, Parameters
+from bridge.process import Worker, call_on_stop_signal, prepare
 from bridge.publishing.compensated_wrench import CompensatedOutput
-from bridge.publishing.filtered_wrench import FilteredTopic
-from bridge.publishing.messages import (
-    ArrayOutput,
-    ImuOutput,
-    Outputs,
-    RawImuOutput,
-    TemperatureOutput,
-    WrenchOutput,
-    make_stages,
-)
-from bridge.publishing.wrench_frames import make_frames
-from bridge.services.bias import BiasServices
-from bridge.services.identify import IdentifyServices
-from bridge.services.sensor import Services
-from bridge.signals import call_on_stop_signal
-from bridge.spinning import OrdinaryExecutor, PromptExecutor, Spinner
-from bridge.stream.link import RequestFailedError, RequestRefusedError
-from bridge.stream.reader import Reader
+from bridge.publishing.messages import make_measured
+from bridge.services import BiasServices, IdentifyServices, SensorServices
+from bridge.spinning import PartExecutor, Spinner
+from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError
+from bridge.stream.reader import Outputs, Reader
 
 SUPERVISOR_TOPIC = "/supervisor_status_data"
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
-SERVER_GOES_ON: Final = 3
-"""Exit code: the supervisor stopped the node, but the server refused to shut down."""
-_ENDS_WITHIN_S: Final = 5.0
+SERVER_GOES_ON: Final = 3  # exit code: the supervisor stopped the node, but the server refused to shut down
 
 
 class StartError(Exception):
@@ -64,8 +45,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
     """The node `bridge`. What ends it sets `exit_code` and calls `on_finish`."""
 
     clock: Clock = SYSTEM_CLOCK
-    channel: Channel | None = None
-    """Tests have a clock and a channel of their own."""
+    channel: Channel | None = None  # tests have a clock and a channel of their own
 
     def __init__(self, arguments: Sequence[str] | None = None) -> None:
         """ParameterError or InvalidTopicNameException if a parameter is wrong.
@@ -76,43 +56,23 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
         self.parameters = parameters = declare(self)
-        compensated = CompensatedOutput(
-            [
-                *make_stages(self, parameters.frame_id),
-                *make_frames(self, parameters),
-                FilteredTopic(self, parameters, lambda: self.reader.link.rate_hz),
-            ]
-        )
-        outputs = Outputs(
-            [
-                ArrayOutput(self, parameters.array_topic),
-                WrenchOutput(self, "wrench", parameters.frame_id),
-                RawImuOutput(self, parameters),
-                ImuOutput(self, parameters),
-                TemperatureOutput(self, "temperature", parameters),
-                compensated,
-            ]
-        )
+        compensated = CompensatedOutput(self, parameters, lambda: self.reader.link.rate_hz)
+        self.outputs = Outputs([*make_measured(self, parameters), compensated])
         self.reader = Reader(
-            parameters, outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
+            parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
         link = self.reader.link
         # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
         self.sensor_settings = SettingsParameters(self, link)
         live = LiveParameters(self)
-        self.compensation = CompensationControl(
-            self, parameters, compensated, link, self.reader.watch, live, lambda: self.reader.not_finite
-        )
+        self.compensation = CompensationControl(self, parameters, compensated, self.reader, live)
+        live.apply = self._apply
         self.monitor = Monitor(
-            self, parameters.limits, self.reader, self.compensation.state, outputs, self.fail
+            self, parameters.limits, self.reader, self.compensation.state, self.outputs, self.fail
         )
-        self.triggers = (
-            Services(self, link, self.sensor_settings, self.compensation.after_sensor_tare),
-            BiasServices(self, self.compensation),
-            IdentifyServices(self, self.compensation),
-        )
-        live.listeners.append(self._apply)
-        self._outputs = outputs
+        SensorServices(self, link, self.sensor_settings, self.compensation.own_offset.after_tare)
+        BiasServices(self, self.compensation)
+        IdentifyServices(self, self.compensation)
         warn_of_others(self)
         link.on_change = self._on_link_change
         self.create_subscription(
@@ -140,9 +100,11 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         return node
 
     def _apply(self, parameters: Parameters) -> None:
+        self.compensation.apply(parameters)
         self.monitor.limits = parameters.limits
         self.reader.limit_rate(parameters.publishing_frequency)
-        self._outputs.configure(parameters)
+        for output in self.outputs.all:
+            output.configure(parameters)
 
     def _on_link_change(self) -> None:
         self.compensation.link_changed()
@@ -184,11 +146,15 @@ def run(arguments: Sequence[str]) -> int:
     except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
         # rclpy has no public names for these.
         wrong_arguments = type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
-        return _refuse(f"ROS cannot start: {why_not_started(error)}", 2 if wrong_arguments else 1)
+        text = " ".join(str(error).split())
+        if "logging directory" in text:
+            text += "; set HOME, or ROS_LOG_DIR to a directory for its log"
+        return _refuse(f"ROS cannot start: {text}", 2 if wrong_arguments else 1)
     try:
         node = BridgeNode.create()
         call_on_stop_signal(lambda _signal: node.finish(0))
-        return spin(node, lambda: real_time.prepare(node.parameters, node.get_logger()))
+        given = node.parameters.rt_priority, node.parameters.cpu
+        return spin(node, lambda: prepare(*given, node.get_logger()))
     except StartError as error:
         return _refuse(str(error), 2)
     finally:
@@ -200,21 +166,14 @@ def spin(node: BridgeNode, on_started: Callable[[], object] = lambda: None) -> i
 
     `on_started` is called once its threads run.
     """
-    prompt = PromptExecutor(node)
-    executor = OrdinaryExecutor(node, prompt)
+    prompt = PartExecutor(node)
+    executor = PartExecutor(node, prompt)
     spinner, prompt_spinner = Spinner(executor), Spinner(prompt)
     node.on_finish = spinner.stop
-
-    def run_prompt() -> None:
-        try:
-            prompt_spinner.run()
-        except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a deaf node
-            node.fail(f"the node no longer listens: {type(error).__name__}: {error}")
-
-    listening = threading.Thread(target=run_prompt, name="listening", daemon=True)
-    listening.start()
-    node.reader.start()
-    node.monitor.start()
+    listener = Worker("listener", prompt_spinner.run, node.fail)
+    listener.start()
+    node.reader.thread.start()
+    node.monitor.thread.start()
     try:
         on_started()
         if node.exit_code is not None:  # a signal came before there was a spinner
@@ -223,22 +182,13 @@ def spin(node: BridgeNode, on_started: Callable[[], object] = lambda: None) -> i
         return node.exit_code or 0
     finally:
         prompt_spinner.stop()
-        listening.join(_ENDS_WITHIN_S)
-        if not (node.monitor.stop() & node.reader.stop()) or listening.is_alive():
+        if not (listener.has_ended() & node.monitor.stop() & node.reader.stop()):
             node.get_logger().error("a thread did not end in time")
         else:
             prompt.shutdown()
         node.compensation.close()
         executor.shutdown()
         node.destroy_node()
-
-
-def why_not_started(error: Exception) -> str:
-    """rclpy's own message, with a remedy where it has none."""
-    text = " ".join(str(error).split())
-    if "logging directory" in text:
-        text += "; set HOME, or ROS_LOG_DIR to a directory for its log"
-    return text
 
 
 def _refuse(text: str, exit_code: int) -> int:

@@ -7,7 +7,6 @@ with `spin` and `shutdown`: that takes the executor's guard condition from under
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
 from typing import Any
 
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -38,39 +37,24 @@ class Spinner:
         with self._lock:
             self._stopping = True
             if not self._ended:
-                self._executor.create_task(_wake)
+                self._executor.create_task(lambda: None)  # something to do, so that `spin_once` returns
 
 
-def _wake() -> None:
-    """Something to do, so that `spin_once` returns."""
+class PartExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy has no types
+    """For some of a node's callbacks: the prompt ones wait for no others, the ordinary ones may block.
 
-
-class PromptExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy has no types
-    """For the callbacks of a node that are in a callback group of their own: they wait for no others.
-
-    rclpy has `MultiThreadedExecutor` for that, which hands every callback to a pool and waits for all of the
-    node's services anew each time: too much beside the reader, for an orientation 500 times a second.
+    Prompt are those in a callback group of their own. rclpy has `MultiThreadedExecutor` for that, which hands
+    every callback to a pool and waits for all of the node's services anew each time: too much beside the
+    reader, for an orientation 500 times a second.
     """
 
-    def __init__(self, node: Node) -> None:
-        super().__init__(context=node.context)
-        default = node.default_callback_group
-        self._part = _Part(node, lambda group: group is not default)
-
-    def get_nodes(self) -> list[Any]:
-        """The node's entities that are for this executor."""
-        return [self._part]
-
-
-class OrdinaryExecutor(SingleThreadedExecutor):  # type: ignore[misc]
-    """For all others of the node's callbacks, which may block. It is the executor that the node knows."""
-
-    def __init__(self, node: Node, prompt: PromptExecutor) -> None:
+    def __init__(self, node: Node, prompt: PartExecutor | None = None) -> None:
+        """Without `prompt` it is the prompt one; with it, the ordinary one, which the node knows."""
         self._prompt = prompt
         super().__init__(context=node.context)
-        default = node.default_callback_group
-        self._part = _Part(node, lambda group: group is default)
-        self.add_node(node)
+        self._part = _Part(node, is_default=prompt is not None)
+        if prompt is not None:
+            self.add_node(node)
 
     def get_nodes(self) -> list[Any]:
         """The node's entities that are for this executor."""
@@ -79,21 +63,18 @@ class OrdinaryExecutor(SingleThreadedExecutor):  # type: ignore[misc]
     def wake(self) -> None:
         """Wake both: the node has another entity, or one less."""
         super().wake()
-        self._prompt.wake()
+        if self._prompt is not None:
+            self._prompt.wake()
 
 
 class _Part:
-    """A node as an executor sees it, with some of its entities."""
+    """A node as an executor sees it, with the entities that are in its default callback group, or not."""
 
-    def __init__(self, node: Node, is_mine: Callable[[Any], bool]) -> None:
-        self._node, self._is_mine = node, is_mine
+    def __init__(self, node: Node, *, is_default: bool) -> None:
+        self._node, self._is_default = node, is_default
 
-    def _mine(self, entities: Iterable[Any]) -> list[Any]:
-        return [entity for entity in entities if self._is_mine(entity.callback_group)]
-
-    subscriptions = property(lambda self: self._mine(self._node.subscriptions))
-    timers = property(lambda self: self._mine(self._node.timers))
-    clients = property(lambda self: self._mine(self._node.clients))
-    services = property(lambda self: self._mine(self._node.services))
-    guards = property(lambda self: self._mine(self._node.guards))
-    waitables = property(lambda self: self._mine(self._node.waitables))
+    def __getattr__(self, kind: str) -> Any:
+        """`subscriptions`, `timers`, `clients`, `services`, `guards` or `waitables`."""
+        default, wanted = self._node.default_callback_group, self._is_default
+        entities = getattr(self._node, kind)
+        return [entity for entity in entities if (entity.callback_group is default) is wanted]

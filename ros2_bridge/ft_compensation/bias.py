@@ -27,15 +27,11 @@ from ft_compensation.quantities import (
 )
 from ft_compensation.stationary import StationaryMeans
 
-GRAVITY_TOLERANCE: Final = 0.5
-"""m/s²: how much a stationary accelerometer may differ from g."""
+# From half of an interval of one axis to the radius that holds as often for three (chi, 3 degrees).
 _ABOUT_THREE_AXES: Final = 2.80 / NORMAL_95
-"""From half of an interval of one axis to the radius that holds as often for three (chi, 3 degrees)."""
 
 
-def check_at_rest(
-    acceleration: Vector3, magnitude: float = STANDARD_GRAVITY, tolerance: float = GRAVITY_TOLERANCE
-) -> None:
+def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.5) -> None:
     """CompensationError unless the stationary accelerometer reads `magnitude`, m/s², within `tolerance`."""
     measured = length(acceleration)
     if abs(measured - magnitude) > tolerance:
@@ -45,38 +41,21 @@ def check_at_rest(
         )
 
 
-def gravity_of(
-    acceleration: Vector3, magnitude: float = STANDARD_GRAVITY, tolerance: float = GRAVITY_TOLERANCE
-) -> Vector3:
-    """Gravity in the sensor's frame, m/s², from what the stationary accelerometer reads.
-
-    Only the direction is taken from it; `magnitude` is the length. Errors as `check_at_rest`.
-    """
-    check_at_rest(acceleration, magnitude, tolerance)
-    scale = -magnitude / length(acceleration)
-    x, y, z = acceleration
-    return x * scale, y * scale, z * scale
-
-
 def force_bound_95(payload: Payload, accelerometer: Accelerometer) -> float:
     """N: in 95 % of cases the accelerometer's own offset and scale show as less force than this.
 
     A tare with the tool on takes the offset's part off.
     """
-    scale = [STANDARD_GRAVITY * part for part in accelerometer.scale_interval]
-    halves = [
-        math.hypot(offset, part) for offset, part in zip(accelerometer.offset_interval, scale, strict=True)
-    ]
+    intervals = zip(accelerometer.offset_interval, accelerometer.scale_interval, strict=True)
+    halves = [math.hypot(offset, STANDARD_GRAVITY * scale) for offset, scale in intervals]
     return payload.mass * _ABOUT_THREE_AXES * max(halves)
 
 
 def estimate_bias(means: StationaryMeans, payload: Payload, specific_force: Vector3) -> Wrench:
-    """The bias that makes the compensated wrench of this window zero.
+    """The bias that makes the compensated wrench of this stationary window zero.
 
-    Args:
-        means: of a stationary window (`StationaryWindow.means`).
-        payload: what hangs on the sensor; its weight is not counted as bias. Without one everything is.
-        specific_force: during the window, in the sensor's frame, m/s².
+    The weight of `payload` is not counted as bias; without one everything is. `specific_force` is that during
+    the window, in the sensor's frame, m/s².
     """
     return means.wrench.plus(_weight(payload, specific_force), -1.0)
 
@@ -88,10 +67,9 @@ def _weight(payload: Payload, specific_force: Vector3) -> Wrench:
 class Taken(NamedTuple):
     """What a bias was taken with."""
 
-    payload: Payload = NO_PAYLOAD
-    """Whose weight is not part of it."""
+    payload: Payload = NO_PAYLOAD  # whose weight is not part of it
+    # During the tare, in the sensor's frame, m/s². None: unknown. Zero: of no tare, it holds for any.
     specific_force: Vector3 | None = ZERO
-    """During the tare, in the sensor's frame, m/s². None: unknown. Zero: of no tare, it holds for any."""
 
     def weighed(self, payload: Payload) -> tuple[Wrench, Taken]:
         """By how much the bias is another for this payload; nothing if the specific force is unknown."""
@@ -123,8 +101,7 @@ class Taken(NamedTuple):
 
 
 _OF_NO_TARE: Final = Taken()
-_EARLY_S: Final = 0.1
-"""A sample may be so much older than the one that a ramp began at."""
+_EARLY_S: Final = 0.1  # a sample may be so much older than the one that a ramp began at
 
 
 class _Course(NamedTuple):
@@ -132,8 +109,7 @@ class _Course(NamedTuple):
     target: Wrench
     begin_s: float
     seconds: float
-    taken: Taken
-    """The target."""
+    taken: Taken  # the target
 
     def is_under_way(self, now_s: float) -> bool:
         """Whether a sample of this time falls into it.

@@ -15,37 +15,26 @@ from ft_compensation.quantities import NO_PAYLOAD, NO_WRENCH, Payload, Wrench
 class Stages(NamedTuple):
     """One sample at every stage. `final` is `measured - bias - tool`."""
 
-    bias: Wrench
-    """Subtracted."""
-    corrected: Wrench
-    """measured - bias"""
-    tool: Wrench
-    """Weight and inertia of the tool; subtracted."""
-    final: Wrench
-    """The load of the environment on the sensor and its tool."""
+    bias: Wrench  # subtracted
+    corrected: Wrench  # measured - bias
+    tool: Wrench  # weight and inertia of the tool; subtracted
+    final: Wrench  # the load of the environment on the sensor and its tool
 
 
 class Compensator:
     """Payload and bias, subtracted from one sample after the other.
 
-    `set_bias` may be called by another thread while `compensate` runs: a sample sees the old bias or the new.
+    Another thread may set `bias` while `compensate` runs: a sample sees the old one or the new.
     """
 
     def __init__(self, payload: Payload = NO_PAYLOAD, bias: Wrench = NO_WRENCH) -> None:
         self.payload, self.bias = payload, bias
 
-    def set_bias(self, bias: Wrench) -> None:
-        """From the next sample on this is subtracted."""
-        self.bias = bias
-
     def compensate(self, force: Vector3, torque: Vector3, specific_force: Vector3) -> Stages:
-        """Every stage of one sample.
+        """Every stage of one sample: `force` (N) and `torque` (Nm, about the wrench origin) as measured.
 
-        Args:
-            force: measured, N.
-            torque: measured, Nm, about the wrench origin.
-            specific_force: at the payload's center of gravity, in the sensor's frame, m/s²: acceleration
-                minus gravity, as an accelerometer there would read.
+        `specific_force` is that at the payload's center of gravity, in the sensor's frame, m/s²: acceleration
+        minus gravity, as an accelerometer there would read.
         """
         bias = self.bias
         m, (cx, cy, cz) = self.payload

@@ -16,36 +16,24 @@ from bota_ethercat.pdo import Vector3
 from ft_compensation.quantities import Payload, length
 from ft_compensation.stationary_limits import StationaryLimits
 
-_LOOK_S: Final = 0.05
-"""Between two samples that are looked at."""
-_LOOKS: Final = 10
-"""In a window."""
-_SLOW: Final = 0.1
-"""rad/s: of a gyroscope that may have an offset."""
-_SAME: Final = 0.94
-"""Cosine: directions of gravity nearer than 20° are one orientation."""
-_MOST: Final = 6
-_FEWEST: Final = 3
-"""Orientations."""
-_LEAST_SPREAD: Final = 0.25
-"""Mean square of the directions about their mean."""
-_LEAST_FORCE: Final = 0.5
-"""N: a smaller weight is not looked for, ..."""
-_LEAST_SHARE: Final = 0.1
-"""... and not less than this part of the compensated one."""
-_MISFIT: Final = 0.15
-"""Of the missing weight: what may be left when a mass explains it; 0.3 N always may."""
+_LOOK_S: Final = 0.05  # between two samples that are looked at
+_LOOKS: Final = 10  # in a window
+_SLOW: Final = 0.1  # rad/s: of a gyroscope that may have an offset
+_SAME: Final = 0.94  # cosine: directions of gravity nearer than 20° are one orientation
+_FEWEST, _MOST = 3, 6  # orientations
+_LEAST_SPREAD: Final = 0.25  # mean square of the directions about their mean
+_LEAST_FORCE: Final = 0.5  # N: a smaller weight is not looked for, ...
+_LEAST_SHARE: Final = 0.1  # ... and not less than this part of the compensated one.
+_MISFIT: Final = 0.15  # of the missing weight: what may be left when a mass explains it; 0.3 N always may
 _LEAST_MISFIT: Final = 0.3
 _LONG_S: Final = 10.0
+# Windows in a row, each in another orientation than the one before and over so many seconds, that agree.
 _CONFIRMATIONS: Final = 3
-"""Windows in a row, each in another orientation than the one before and over so many seconds, that agree."""
 
 
 class _Window(NamedTuple):
-    force: Vector3
-    """N: left after compensation."""
-    gravity: Vector3
-    """m/s²"""
+    force: Vector3  # N: left after compensation
+    gravity: Vector3  # m/s²
 
 
 class PayloadWatch:
@@ -58,10 +46,8 @@ class PayloadWatch:
         limits: StationaryLimits | None = None,
     ) -> None:
         """`say` gets the first finding. Of `limits` the standard deviation of the force counts."""
-        self.finding = ""
-        """What does not agree, a sentence; empty as long as all does."""
-        self.due_s = 0.0
-        """When the next sample is to be looked at, by the samples' time."""
+        self.finding = ""  # what does not agree, a sentence; empty as long as all does
+        self.due_s = 0.0  # when the next sample is to be looked at, by the samples' time
         self._payload, self._say = payload, say
         self._variance = (limits or StationaryLimits()).force_spread ** 2
         self._windows: list[_Window] = []

@@ -7,13 +7,10 @@ from typing import Final, NamedTuple, Self
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 
-Quaternion = tuple[float, float, float, float]
-"""x, y, z, w"""
+Quaternion = tuple[float, float, float, float]  # x, y, z, w
 ZERO: Final[Vector3] = (0.0, 0.0, 0.0)
+# Gravity in the base frame (z up), m/s². The sensor's g is 9.80665 m/s², not 9.81.
 DEFAULT_GRAVITY: Final[Vector3] = (0.0, 0.0, -STANDARD_GRAVITY)
-"""Gravity in the base frame (z up), m/s². The sensor's g is 9.80665 m/s², not 9.81."""
-
-
 _NORM_TOLERANCE: Final = 0.01
 
 
@@ -24,10 +21,8 @@ class CompensationError(Exception):
 class Wrench(NamedTuple):
     """A load that acts on the sensor, at the sensor's wrench origin and in its frame."""
 
-    force: Vector3
-    """N"""
-    torque: Vector3
-    """Nm, about the wrench origin"""
+    force: Vector3  # N
+    torque: Vector3  # Nm, about the wrench origin
 
     @classmethod
     def of(cls, values: object) -> Self:
@@ -51,10 +46,8 @@ NO_WRENCH: Final = Wrench(ZERO, ZERO)
 class Payload(NamedTuple):
     """What hangs on the sensor's tool side, taken for a point mass."""
 
-    mass: float = 0.0
-    """kg"""
-    center: Vector3 = ZERO
-    """Center of gravity in the sensor's frame, m from the wrench origin."""
+    mass: float = 0.0  # kg
+    center: Vector3 = ZERO  # center of gravity in the sensor's frame, m from the wrench origin
 
     @classmethod
     def of(cls, mass: object, center: object) -> Self:
@@ -69,24 +62,18 @@ class Payload(NamedTuple):
         return f"a tool of {self.mass:.3g} kg" if self.mass else "no tool_mass"
 
 
-AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-
-
 def wrench_text(wrench: Wrench) -> str:
     """A wrench for people."""
-    numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, wrench.values, strict=True))
+    axes = "Fx", "Fy", "Fz", "Mx", "My", "Mz"
+    numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(axes, wrench.values, strict=True))
     return f"{numbers} (N, Nm)"
 
 
 NO_PAYLOAD: Final = Payload()
-
-
+# m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered.
 OFFSET_PRIOR: Final = 0.4
-"""m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered."""
-SCALE_PRIOR: Final = 0.005
-"""Likewise of an axis' sensitivity, relative; local gravity is within it."""
-NORMAL_95: Final = 1.96
-"""Half of a 95 % interval, in standard deviations."""
+SCALE_PRIOR: Final = 0.005  # likewise of an axis' sensitivity, relative; local gravity is within it
+NORMAL_95: Final = 1.96  # half of a 95 % interval, in standard deviations
 
 
 class Accelerometer(NamedTuple):
@@ -95,11 +82,9 @@ class Accelerometer(NamedTuple):
     Every `..._interval` is half the width of the 95 % interval; of what is typical, unless it was identified.
     """
 
-    offset: Vector3 = ZERO
-    """m/s²"""
+    offset: Vector3 = ZERO  # m/s²
     scale: Vector3 = (1.0, 1.0, 1.0)
-    offset_interval: Vector3 = (NORMAL_95 * OFFSET_PRIOR,) * 3
-    """m/s²"""
+    offset_interval: Vector3 = (NORMAL_95 * OFFSET_PRIOR,) * 3  # m/s²
     scale_interval: Vector3 = (NORMAL_95 * SCALE_PRIOR,) * 3
 
     def correct(self, acceleration: Vector3) -> Vector3:

@@ -5,22 +5,29 @@ An accelerometer measures it: at rest it reads minus gravity. The tool, held by 
     F = -m s,  M = r x F        s = a - g, at the center of gravity; r: the center of gravity
 
 With an IMU elsewhere on the same rigid body, s = s_imu + alpha x d + omega x (omega x d), d from the IMU to
-the center of gravity. Nobody needs to know where gravity points. Times are seconds on one clock.
+the center of gravity. Nobody needs to know where gravity points.
+
+Without the accelerometer, gravity in the sensor's frame is known by the orientation that a robot tells.
+Between two orientations, and for those that come late, the gyroscope turns gravity on. It is known until the
+newest orientation is too old: nobody goes on with an old pose. Times are seconds on one clock.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 from bota_ethercat.pdo import Vector3
-from ft_compensation.quantities import EXACT, ZERO, Accelerometer
+from ft_compensation.quantities import DEFAULT_GRAVITY, EXACT, ZERO, Accelerometer, Quaternion
 
+# Angular acceleration is the slope of the angular rate over this time, and so half of it late.
 _SLOPE_S: Final = 0.005
-"""Angular acceleration is the slope of the angular rate over this time, and so half of it late."""
-_GAP_S: Final = 0.1
-"""Samples further apart say nothing of the slope between them."""
+_GAP_S: Final = 0.1  # samples further apart say nothing of the slope between them
 _MOST: Final = 64
+_MOST_RATES: Final = 4096  # remembered for orientations that come late: 2.5 s at 1600 Hz
 
 
 class ImuSpecificForce:
@@ -66,3 +73,88 @@ class ImuSpecificForce:
         if passed_s <= 0.0:
             return ZERO
         return (rate[0] - x) / passed_s, (rate[1] - y) / passed_s, (rate[2] - z) / passed_s
+
+
+class QuaternionGravity:
+    """Gravity from orientations of the sensor in a base frame."""
+
+    def __init__(self, gravity: Vector3 = DEFAULT_GRAVITY, *, stale_after_s: float = 0.1) -> None:
+        """`gravity` is in the base, m/s²."""
+        self.base_gravity, self.stale_after_s = gravity, stale_after_s
+        self._newest_s = -math.inf  # time of the newest orientation
+        self._gravity: tuple[float, Vector3] | None = None  # when, and what it was in the sensor's frame
+        self._rates: deque[tuple[float, Vector3]] = deque(maxlen=_MOST_RATES)
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._newest_s, self._gravity = -math.inf, None
+        self._rates.clear()
+
+    def follow(self, angular_rate: Vector3, time_s: float) -> None:
+        """Take a sample's angular rate, rad/s."""
+        rates = self._rates
+        if rates and not 0.0 <= time_s - rates[-1][0] <= self.stale_after_s:
+            rates.clear()  # a gap, or a clock that was set: the orientation is held until the next one
+        if not math.isfinite(sum(angular_rate)):
+            rates.clear()
+            return
+        rates.append((time_s, angular_rate))
+        if self._gravity is not None and len(rates) > 1:
+            self._gravity = _carried(*self._gravity, (rates[-2], rates[-1]))
+
+    def update(self, orientation: Quaternion, time_s: float) -> bool:
+        """Take an orientation x, y, z, w of time `time_s`. False: it is none, or older than what is known."""
+        x, y, z, w = orientation
+        size = x * x + y * y + z * z + w * w
+        if not 0.5 <= size <= 2.0:
+            return False
+        # Messages may overtake each other; a clock that was set back is another matter.
+        if 0.0 < self._newest_s - time_s <= self.stale_after_s:
+            return False
+        gx, gy, gz = self.base_gravity
+        # The inverse turns base vectors into the sensor's: minus the vector part. |q|² cancels in s.
+        s = 2.0 / size
+        tx, ty, tz = s * (gy * z - gz * y), s * (gz * x - gx * z), s * (gx * y - gy * x)
+        gx, gy, gz = (
+            gx + w * tx + (ty * z - tz * y),
+            gy + w * ty + (tz * x - tx * z),
+            gz + w * tz + (tx * y - ty * x),
+        )
+        self._newest_s = time_s
+        later = [each for each in self._rates if each[0] > time_s]
+        known = [each for each in self._rates if each[0] <= time_s][-1:]
+        self._gravity = _carried(time_s, (gx, gy, gz), [*known, *later])
+        return True
+
+    def age_s(self, now_s: float) -> float:
+        """How old the latest orientation is, s; infinite if there is none."""
+        return abs(now_s - self._newest_s)
+
+    def gravity(self, now_s: float) -> Vector3 | None:
+        """Gravity in the sensor's frame, m/s²; None when the orientation is older than `stale_after_s`."""
+        if self._gravity is None or not self.age_s(now_s) <= self.stale_after_s:
+            return None
+        return self._gravity[1]
+
+
+def _carried(
+    time_s: float, gravity: Vector3, rates: Sequence[tuple[float, Vector3]]
+) -> tuple[float, Vector3]:
+    """Gravity of `time_s` turned on by these rates (times ascending), or back, to the last of them."""
+    if rates and time_s > rates[-1][0]:
+        rates = ((time_s, rates[-1][1]), rates[-1])
+    for (before_s, before), (after_s, after) in pairwise(rates):
+        passed_s = after_s - max(before_s, time_s)
+        x, y, z = (0.5 * passed_s * (a + b) for a, b in zip(before, after, strict=True))
+        gx, gy, gz = gravity
+        # What stands still turns by minus the rotation vector in the sensor's frame; to second order.
+        cx, cy, cz = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
+        gx, gy, gz = (
+            gx + cx + 0.5 * (cy * z - cz * y),
+            gy + cy + 0.5 * (cz * x - cx * z),
+            gz + cz + 0.5 * (cx * y - cy * x),
+        )
+        size, wanted = math.sqrt(gx * gx + gy * gy + gz * gz), math.sqrt(sum(g * g for g in gravity))
+        scale = wanted / size
+        gravity, time_s = (gx * scale, gy * scale, gz * scale), after_s
+    return time_s, gravity

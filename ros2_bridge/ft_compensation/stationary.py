@@ -31,10 +31,10 @@ _NO_LIMIT: Final = 1e-12
 _NAMES: Final = ("force", "torque", "acceleration", "angular rate")
 _UNITS: Final = ("N", "Nm", "m/s²", "rad/s")
 Array = NDArray[np.float64]
+# Warnings with which force and torque must not be used.
 BAD_WRENCH: Final = (
     WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.ADC_OUT_OF_SYNC | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE
 )
-"""Warnings with which force and torque must not be used."""
 
 
 class NotStationaryError(CompensationError):
@@ -44,20 +44,14 @@ class NotStationaryError(CompensationError):
 class StationaryMeans(NamedTuple):
     """What the stationary sensor read: means over the window, and standard deviations of single samples."""
 
-    wrench: Wrench
-    """N, Nm"""
-    acceleration: Vector3
-    """m/s²; minus gravity in the sensor's frame"""
-    angular_rate: Vector3
-    """rad/s: the gyroscope's offset, if the sensor did not turn slowly"""
-    force_spread: Vector3
-    """N"""
-    torque_spread: Vector3
-    """Nm"""
+    wrench: Wrench  # N, Nm
+    acceleration: Vector3  # m/s²; minus gravity in the sensor's frame
+    angular_rate: Vector3  # rad/s: the gyroscope's offset, if the sensor did not turn slowly
+    force_spread: Vector3  # N
+    torque_spread: Vector3  # Nm
     samples: int
     seconds: float
-    acceleration_spread: Vector3 = ZERO
-    """m/s²"""
+    acceleration_spread: Vector3 = ZERO  # m/s²
 
 
 class StationaryWindow:
@@ -118,18 +112,14 @@ def stationary_means(rows: Array, seconds: float, limits: StationaryLimits) -> S
             "the sensor's IMU reads only zeros, so it is unknown whether the sensor moves: switch the IMU on "
             "(imu_active)"
         )
-    axis, limit = _worst(spread, limits.spreads)
-    if spread[axis] > limit:
-        raise _moved(axis, f"moved by {spread[axis]:.2g} {_UNITS[axis // 3]} (standard deviation)", limit)
+    _check(spread, limits.spreads, spread, "moved by {} (standard deviation)")
     if len(rows) >= 2 * _BLOCKS:
         blocks = [block[:, :9] for block in np.array_split(rows, _BLOCKS)]
         drift = np.ptp([block.mean(axis=0) for block in blocks], axis=0)
         # The noise within the blocks, which a drifting mean does not raise.
         noise = np.sqrt(np.mean([block.var(axis=0, ddof=1) for block in blocks], axis=0))
         excess = drift - CHANCE * noise / math.sqrt(len(blocks[-1]))
-        axis, limit = _worst(excess, limits.wanders)
-        if excess[axis] > limit:
-            raise _moved(axis, f"drifted by {drift[axis]:.2g} {_UNITS[axis // 3]} within the window", limit)
+        _check(excess, limits.wanders, drift, "drifted by {} within the window")
     rate = float(np.linalg.norm(mean[9:12]))
     if rate > limits.angular_rate:
         raise NotStationaryError(
@@ -141,17 +131,15 @@ def stationary_means(rows: Array, seconds: float, limits: StationaryLimits) -> S
     return StationaryMeans(Wrench(f, t), a, r, of_force, of_torque, len(rows), seconds, of_acceleration)
 
 
-def _worst(values: Array, limits: tuple[float, ...]) -> tuple[int, float]:
-    """The axis nearest to its limit, or farthest beyond it, and that limit."""
+def _check(values: Array, limits: tuple[float, ...], shown: Array, how: str) -> None:
+    """NotStationaryError, with `how` and what is `shown`, if the axis nearest to its limit is beyond it."""
     axis = int((values / np.maximum(limits, _NO_LIMIT)).argmax())
-    return axis, limits[axis]
-
-
-def _moved(axis: int, how: str, limit: float) -> NotStationaryError:
-    return NotStationaryError(
-        f"the sensor is not stationary: {_NAMES[axis // 3]} {'xyz'[axis % 3]} {how}, the limit is {limit:g} "
-        f"{_UNITS[axis // 3]}"
-    )
+    if values[axis] > limits[axis]:
+        name, unit = f"{_NAMES[axis // 3]} {'xyz'[axis % 3]}", _UNITS[axis // 3]
+        raise NotStationaryError(
+            f"the sensor is not stationary: {name} {how.format(f'{shown[axis]:.2g} {unit}')}, the limit is "
+            f"{limits[axis]:g} {unit}"
+        )
 
 
 def _what_is_wrong(sample: Sample) -> str | None:

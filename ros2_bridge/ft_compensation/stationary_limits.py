@@ -14,22 +14,15 @@ class StationaryLimits:
     0.02 Nm. A shorter filter or a noisy environment needs more.
     """
 
-    force_spread: float = 0.8
-    """N"""
-    torque_spread: float = 0.02
-    """Nm"""
+    force_spread: float = 0.8  # N
+    torque_spread: float = 0.02  # Nm
+    # N: how far the means of the quarters of the window may lie apart, beyond what noise explains.
     force_wander: float = 0.3
-    """N: how far the means of the quarters of the window may lie apart, beyond what noise explains."""
-    torque_wander: float = 0.01
-    """Nm, likewise."""
-    angular_rate: float = 0.05
-    """rad/s: length of the mean. A stationary gyroscope may read 0.03."""
-    angular_rate_spread: float = 0.02
-    """rad/s"""
-    acceleration_spread: float = 0.3
-    """m/s²"""
-    acceleration_wander: float = 0.05
-    """m/s²"""
+    torque_wander: float = 0.01  # Nm, likewise
+    angular_rate: float = 0.05  # rad/s: length of the mean. A stationary gyroscope may read 0.03.
+    angular_rate_spread: float = 0.02  # rad/s
+    acceleration_spread: float = 0.3  # m/s²
+    acceleration_wander: float = 0.05  # m/s²
     least_samples: int = 20
 
     @property

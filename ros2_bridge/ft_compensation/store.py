@@ -32,12 +32,11 @@ class Stored(NamedTuple):
 
     bias: Wrench
     payload: Payload | None
-    saved: str
-    """When, ISO 8601 in UTC."""
+    saved: str  # when, ISO 8601 in UTC
+    # The sensor's own offset, which the bias was taken with; None if not known or not needed.
     offset: Wrench | None = None
-    """The sensor's own offset, which the bias was taken with; None if not known or not needed."""
+    # In the sensor's frame during the tare, m/s²; None if not known. Zero: it does not matter.
     specific_force: Vector3 | None = None
-    """In the sensor's frame during the tare, m/s²; None if not known. Zero: it does not matter."""
 
 
 def default_directory() -> Path:
@@ -55,9 +54,9 @@ def default_directory() -> Path:
 class CompensationStore:
     """The files of one directory."""
 
-    def __init__(self, directory: Path | str | None = None) -> None:
-        """None: `default_directory()`. It is made when something is saved."""
-        self.directory = default_directory() if directory is None else Path(directory)
+    def __init__(self, directory: Path) -> None:
+        """It is made when something is saved."""
+        self.directory = directory
 
     def path(self, serial: int) -> Path:
         """The file of the sensor with this serial number."""
@@ -78,15 +77,13 @@ class CompensationStore:
             "version": _VERSION,
             "serial": int(serial),
             "saved": datetime.now(UTC).isoformat(timespec="seconds"),
-            "bias": list(Wrench.of(bias.values).values),
+            "bias": Wrench.of(bias.values).values,
+            "tool_mass": payload and payload.mass,
+            "tool_center_of_gravity": payload and payload.center,
+            "sensor_offset": offset and offset.values,
+            "specific_force": specific_force,
         }
-        if payload is not None:
-            content["tool_mass"] = payload.mass
-            content["tool_center_of_gravity"] = list(payload.center)
-        if offset is not None:
-            content["sensor_offset"] = list(offset.values)
-        if specific_force is not None:
-            content["specific_force"] = list(specific_force)
+        content = {name: value for name, value in content.items() if value is not None}
         try:
             self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
             with NewFile(path, force=True, mode=0o600) as file:

@@ -57,8 +57,8 @@ class Script:
         self.on_subscribe: Callable[[], None] = lambda: None
         self.subscribed = threading.Event()
         self.sequence = 0
+        # How far ahead samples are dated: a node that is starved finds none too old to publish.
         self.ahead_ns = 0
-        """How far ahead samples are dated: a node that is starved finds none too old to publish."""
 
     def send_raw(self, data: bytes) -> None:
         """Send these bytes."""

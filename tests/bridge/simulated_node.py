@@ -1,83 +1,66 @@
 """The whole node in memory and in simulated time: rclpy's node with its parameters, without DDS and sockets.
 
-    server = SimulatedServer()
-    with SimulatedNode(server, tool_mass=0.8) as node:
+    server = Server()
+    with Node(server, tool_mass=0.8) as node:
         wrenches = node.hear("wrench_compensated")
         node.run(1.0)  # simulated seconds
         assert node.trigger("tare") == (True, ...)
-        node.until("7 samples lost", stream=WARN)
+        node.until("7 samples lost", stream="warn")
 
-Time passes in `run`, and while a service waits for something: it is called as the executor would call it. The
-reader runs in its thread, but only while the test waits for it: the same test gives the same run.
+Time passes in `run`, and while a service waits for something: it is called as the executor would call it.
+There is one thread, so the same test gives the same run.
 """
 
 from __future__ import annotations
 
+import contextlib
+import math
 import threading
 import uuid
 from collections import deque
-from collections.abc import Callable
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import GetParameters, SetParameters
-from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.serialization import deserialize_message
-from std_srvs.srv import Trigger
 
+from bota_ethercat.control import Event, event
 from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 from bota_ethercat.framing import FrameDecoder
+from bota_ethercat.pdo import encode
+from bota_ethercat.text.json_text import JsonObject
 from bridge.diagnostics.monitor import TICK_S
-from bridge.node import BridgeNode
-from tests.bridge.conftest import PATIENCE_S, Log, retire
-from tests.bridge.scripted_server import Script
-from tests.bridge.streaming import status, streaming_description
+from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
+from tests.bridge.real_node import PATIENCE_S, Asking, LoggedNode, retire
+from tests.bridge.scripted_server import Script, description
+from tests.compensation.making import TOOL, load
 
-STEP_S = 0.01
-"""Time passes in steps of this length: a sample each."""
-
-
-class World(Protocol):
-    """What a node lives in: time, and a server."""
-
-    def monotonic_ns(self) -> int: ...
-
-    def time_ns(self) -> int: ...
-
-    def accept(self, wire: Wire) -> Callable[[bytes], object]:
-        """Take a connection of the node's; returns where its bytes go. UnreachableError if nobody listens."""
-
-    def step(self) -> None:
-        """STEP_S pass."""
+HEALTHY = dict.fromkeys(("link", "stream", "sensor", "clock", "compensation"), "ok")
+RATE_HZ = 100
+SETTINGS: JsonObject = {"sinc_length": 512, "fir": False, "acceleration_range_g": 2}
+UP, SIDE, OVER = (0, 0, 1), (1, 0, 0), (0, 0, -1)
+ZERO6 = [0.0] * 6
+QUICK: dict[str, object] = {"rest.duration": 0.3, "bias_ramp_time": 0.0}
+STEP_S = 0.01  # time passes in steps of this length: a sample each
 
 
-class Turns:
-    """Two threads, one at a time: the reader runs while the test waits until it has nothing to do."""
+def streaming_description() -> JsonObject:
+    """What a server says whose sensor gives RATE_HZ samples a second."""
+    content = description()
+    content["sensors"][0].update(rate_hz=RATE_HZ, settings=dict(SETTINGS))
+    return content
 
-    def __init__(self) -> None:
-        self.over = False
-        self._changed = threading.Condition()
-        self._awaited: Callable[[], bool] | None = None
 
-    def block(self, awaited: Callable[[], bool]) -> None:
-        """For the reader: wait until something is so."""
-        with self._changed:
-            self._awaited = awaited
-            self._changed.notify_all()
-            self._changed.wait_for(lambda: awaited() or self.over)
-            self._awaited = None
-
-    def settle(self) -> None:
-        """For the test: let the reader do what there is to do."""
-        with self._changed:
-            self._changed.notify_all()
-            waits = self._changed.wait_for(lambda: self._awaited and not self._awaited(), PATIENCE_S)
-            assert waits, "the reader does not come to rest, or has ended"
-
-    def end(self) -> None:
-        with self._changed:
-            self.over = True
-            self._changed.notify_all()
+def status(lost_samples: int = 0, mode: str = "locked") -> JsonObject:
+    """A `status` reply's content."""
+    spread = {"p50": 10.0, "p99": 20.0, "p999": 30.0, "max": 40.0}
+    clock = {"mode": mode, "period_us": 10000.0, "offset_ppm": 1.0, "uncertainty_us": 5.0}
+    return {
+        "ok": True, "cycles": 1, "missed_deadlines": 2, "lost_frames": 3, "wake_us": spread,
+        "exchange_us": spread, "uptime_s": 4.0, "clients": [],
+        "last_10s": {"wake_us": spread, "exchange_us": spread, "age_us": [spread]},
+        "sensors": [{"sensor": 0, "lost_samples": lost_samples, "recoveries": 1, "clock": clock}],
+    }  # fmt: skip
 
 
 class Wire:
@@ -86,10 +69,10 @@ class Wire:
     is_near = True
     own = ("memory", 0)
 
-    def __init__(self, world: World, turns: Turns, clock: SimulatedClock) -> None:
+    def __init__(self, world: Any, clock: SimulatedClock) -> None:
         self.monotonic_ns, self.wait = clock.monotonic_ns, clock.wait
-        self._world, self._turns = world, turns
-        self._arrived, self._ended = bytearray(), True
+        self._world = world
+        self.arrived, self._ended = bytearray(), True
         self._send: Callable[[bytes], object] = lambda _: None
 
     def connect(self, timeout_s: float) -> bool:
@@ -98,7 +81,7 @@ class Wire:
         return True
 
     def feed(self, data: bytes) -> None:
-        self._arrived += data
+        self.arrived += data
 
     def end(self) -> None:
         self._ended = True
@@ -107,7 +90,7 @@ class Wire:
 
     def close(self) -> None:
         self.end()
-        self._arrived.clear()
+        self.arrived.clear()
 
     def fileno(self) -> int:
         return -1
@@ -118,39 +101,37 @@ class Wire:
         self._send(data)
 
     def receive(self, buffer: memoryview, timeout_s: float) -> int:
-        if timeout_s > 0:
-            due_ns = self.monotonic_ns() + round(timeout_s * 1e9)
-            self._turns.block(lambda: bool(self._arrived) or self._ended or self.monotonic_ns() >= due_ns)
-        if not self._arrived and (self._ended or self._turns.over):
+        if not self.arrived and self._ended:
             raise ConnectionFailedError("the server closed it")
-        data = self._arrived[: len(buffer)]
+        data = self.arrived[: len(buffer)]
         buffer[: len(data)] = data
-        del self._arrived[: len(data)]
+        del self.arrived[: len(data)]
         return len(data)
 
 
-class SimulatedServer(Script):
+class Server(Script):
     """Samples once a step, as long as it is not `paused`: with `changes`, but for what comes `once`."""
 
     def __init__(self) -> None:
-        self._now_ns = 5 * 10**9
+        self.now_ns, self.clock_step_ns = 5 * 10**9, 0  # the step: by how much the wall clock has been set
         super().__init__(self)
         self.description = streaming_description()
         self.answers["status"] = lambda _: status()
         self.changes: dict[str, Any] = {}
         self.paused = False
-        self.listens = True
+        self.listens, self.attempted_s = True, list[float]()
         self.sent = 0
         self._once: deque[dict[str, Any]] = deque()
         self._wire: Wire | None = None
 
     def monotonic_ns(self) -> int:
-        return self._now_ns
+        return self.now_ns
 
     def time_ns(self) -> int:
-        return 10**18 + self._now_ns
+        return 10**18 + self.now_ns + self.clock_step_ns
 
     def accept(self, wire: Wire) -> Callable[[bytes], object]:
+        self.attempted_s.append(self.now_ns / 1e9)
         if not self.listens:
             raise UnreachableError("Connection refused")
         self.connections += 1
@@ -175,36 +156,35 @@ class SimulatedServer(Script):
         assert self._wire is not None
         self._wire.end()
 
+    def reconfigure(self, **changed: Any) -> None:
+        """Somebody has changed settings, and perhaps the rate."""
+        values = {name: changed.pop(name) for name in ("rate_hz",) if name in changed}
+        self.send_json(event(Event.RECONFIGURED, sensor=0, settings={**SETTINGS, **changed}, **values))
+
+    def hold(self, up: Sequence[float], **changes: Any) -> None:
+        """From now on the sensor rests so."""
+        self.changes = {"process_data": sensed(up, **changes)}
+
     def step(self) -> None:
-        self._now_ns += round(STEP_S * 1e9)
+        self.now_ns += round(STEP_S * 1e9)
         if self.subscribed.is_set() and not self.paused:
             self.send_sample(float(self.sent), **(self._once.popleft() if self._once else self.changes))
             self.sent += 1
 
 
 class SimulatedClock:
-    """The node's clock: who waits in the reader's thread lets the test go on, who waits in the test's lets
-    time pass."""
+    """The node's clock: who waits lets time pass."""
 
-    def __init__(self, world: World, turns: Turns, step: Callable[[], None]) -> None:
-        self.monotonic_ns, self.time_ns = world.monotonic_ns, world.time_ns
-        self._turns, self._step = turns, step
-        self._test = threading.current_thread()
+    def __init__(self, world: Any, step: Callable[[], None]) -> None:
+        self.monotonic_ns, self.time_ns, self._step = world.monotonic_ns, world.time_ns, step
 
     def monotonic(self) -> float:
-        return self.monotonic_ns() / 1e9
+        return float(self.monotonic_ns() / 1e9)
 
     def wait(self, event: threading.Event, seconds: float, /) -> bool:
         due_s = self.monotonic() + seconds
-
-        def over() -> bool:
-            return event.is_set() or self.monotonic() >= due_s
-
-        if threading.current_thread() is not self._test:
-            self._turns.block(over)
-        else:
-            while not over():
-                self._step()
+        while not event.is_set() and self.monotonic() < due_s:
+            self._step()
         return event.is_set()
 
 
@@ -240,27 +220,25 @@ class Guard:
             self._triggered.append(self._callback)
 
 
-class SimulatedNode:
-    """A node that is connected to `server` as soon as time passes. StartError if it cannot start."""
+class Node(Asking):
+    """A node that is connected to `server` as soon as time passes. StartError if it cannot start.
 
-    def __init__(self, server: World, *arguments: str, **parameters: object) -> None:
+    `server` has the time, takes connections with `accept` (UnreachableError if nobody listens) and lets
+    STEP_S pass with `step`.
+    """
+
+    def __init__(self, server: Any, *arguments: str, **parameters: object) -> None:
         self.name = f"/test_{uuid.uuid4().hex}/bridge"
         self.topics: dict[str, Topic] = {}
-        self._turns, self._triggered = Turns(), list[Callable[[], object]]()
-        self._server, self._tick_ns, self._is_busy = server, 0, False
+        self._triggered = list[Callable[[], object]]()
+        self.server, self._tick_ns, self._is_busy = server, 0, False
         self._agenda: list[tuple[int, Callable[[], object]]] = []
-        self._clock = SimulatedClock(server, self._turns, self.step)
-        logs: list[Log] = []
-        bench = self
+        self._clock = SimulatedClock(server, self.step)
+        bench, self._wire = self, Wire(server, self._clock)
 
-        class Bridge(BridgeNode):
-            clock = self._clock
-            channel = Wire(server, self._turns, self._clock)
-
-            def get_logger(self) -> Any:
-                if not logs:
-                    logs.append(Log(super().get_logger()))
-                return logs[0]
+        class Bridge(LoggedNode):
+            clock: Any = self._clock
+            channel = self._wire
 
             def create_publisher(self, *arguments: Any, **options: Any) -> Any:
                 topic = Topic(super().create_publisher(*arguments, **options))
@@ -272,12 +250,10 @@ class SimulatedNode:
         options = [word for item in parameters.items() for word in ("-p", "{}:={}".format(*item))]
         namespace = self.name.removesuffix("/bridge")
         self.node = Bridge.create(["--ros-args", "-r", f"__ns:={namespace}", *arguments, *options])
-        self._lines = logs[0].lines
         self._arrays = self.hear("/diagnostics")
-        self.node.reader.start()
         self.settle()
 
-    def __enter__(self) -> SimulatedNode:
+    def __enter__(self) -> Node:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -285,39 +261,42 @@ class SimulatedNode:
 
     def close(self) -> None:
         assert self.node.exit_code != 1, self.log
-        self._turns.end()
-        assert self.node.reader.stop(PATIENCE_S)
+        self.node.reader.client.close()
         self.node.compensation.close()
-        for service in list(self.node.services):
-            self.node.destroy_service(service)
         retire(self.node)
 
     @property
     def log(self) -> str:
         """All that it has said."""
-        return "\n".join(self._lines)
+        return self.node.text
 
     # -- time
 
     def at(self, seconds: float, action: Callable[[], object]) -> None:
         """Do something so many seconds from now."""
-        self._agenda.append((self._server.monotonic_ns() + round(seconds * 1e9), action))
+        self._agenda.append((self.server.monotonic_ns() + round(seconds * 1e9), action))
 
     def step(self) -> None:
         """Let STEP_S pass."""
-        for due in [due for due in self._agenda if due[0] <= self._server.monotonic_ns()]:
+        for due in [due for due in self._agenda if due[0] <= self.server.monotonic_ns()]:
             self._agenda.remove(due)
             due[1]()
-        self._server.step()
+        self.server.step()
+        for timer in list(self.node.timers):
+            timer.callback()  # as an executor would call it
         self.settle()
-        if self._server.monotonic_ns() >= self._tick_ns:
-            self._tick_ns = self._server.monotonic_ns() + round(TICK_S * 1e9)
+        if self.server.monotonic_ns() >= self._tick_ns:
+            self._tick_ns = self.server.monotonic_ns() + round(TICK_S * 1e9)
             self.node.monitor.tick()
 
     def settle(self) -> None:
-        """Let the node do what there is to do now."""
-        if self.node.exit_code is None:  # else its client is closed, and its reader ends
-            self._turns.settle()
+        """Let the node do what there is to do now: its reader, which has no thread here, and the executor."""
+        reader = self.node.reader
+        with contextlib.suppress(ConnectionFailedError):  # the node has been told to end
+            reader.read(0.0)
+            while self._wire.arrived:
+                reader.read(0.0)
+        reader.client._reader = None  # who asks the server waits as another thread does
         while self._triggered and not self._is_busy:
             self._triggered.pop(0)()
 
@@ -326,6 +305,12 @@ class SimulatedNode:
         end_s = self._clock.monotonic() + seconds - STEP_S / 2
         while self._clock.monotonic() < end_s:
             self.step()
+
+    def fresh(self, messages: list[Any], seconds: float) -> list[Any]:
+        """What comes in so much time."""
+        messages.clear()
+        self.run(seconds)
+        return messages
 
     def run_until(self, condition: Callable[[], object], what: Callable[[], str] | str) -> None:
         """Let time pass until something is so."""
@@ -348,21 +333,32 @@ class SimulatedNode:
         self.settle()
         return response
 
-    def trigger(self, name: str) -> tuple[bool, str]:
-        """Whether a Trigger service did it, and what it says."""
-        response = self.call(name, Trigger.Request())
-        return response.success, response.message
+    def ask(self, service_type: Any, name: str, request: Any) -> Any:
+        return self.call(name, request)
 
-    def parameters(self, *names: str) -> list[Any]:
-        """The values of the node's parameters; None is NOT_SET."""
-        response = self.call("get_parameters", GetParameters.Request(names=names))
-        return [parameter_value_to_python(value) for value in response.values]
+    def do(self, name: str, *words: str) -> str:
+        """What a Trigger service says that does it, these words among it."""
+        done, text = self.trigger(name)
+        assert done, text
+        assert [word for word in words if word not in text] == [], text
+        return text
 
-    def set_parameter(self, name: str, value: Any) -> tuple[bool, str]:
-        """Whether the node took the value, and why not."""
-        message = Parameter(name, value=value).to_parameter_msg()
-        result = self.call("set_parameters", SetParameters.Request(parameters=[message])).results[0]
-        return result.successful, result.reason
+    def refuse(self, name: str, *words: str) -> str:
+        """What a Trigger service says that does not do it, these words among it."""
+        done, text = self.trigger(name)
+        assert not done, text
+        assert [word for word in words if word not in text] == [], text
+        return text
+
+    def set(self, name: str, value: Any) -> None:
+        """Set a parameter, which the node takes."""
+        assert self.set_parameter(name, value) == (True, "")
+
+    def refuse_value(self, name: str, value: Any, *words: str) -> None:
+        """The node does not take the value, and says these words."""
+        done, reason = self.set_parameter(name, value)
+        assert not done
+        assert [word for word in words if word not in reason] == [], reason
 
     # -- topics
 
@@ -378,7 +374,7 @@ class SimulatedNode:
         self.run_until(lambda: self._arrays, "diagnostics")
         return self._named(self._arrays[-1])
 
-    def until(self, *words: str, **levels: int) -> dict[str, Any]:
+    def until(self, *words: str, **levels: str) -> dict[str, Any]:
         """The first array in which these statuses have these levels and their messages hold these words."""
         self._arrays.clear()
         found: dict[str, Any] = {}
@@ -387,9 +383,7 @@ class SimulatedNode:
             while self._arrays:
                 found.update(self._named(self._arrays.pop(0)))
                 said = " ".join(found[name].message for name in levels)
-                if {name: found[name].level[0] for name in levels} == levels and all(
-                    w in said for w in words
-                ):
+                if {name: level(found[name]) for name in levels} == levels and all(w in said for w in words):
                     return True
             return False
 
@@ -400,3 +394,89 @@ class SimulatedNode:
         prefix = f"{self.name[1:]}: "
         assert all(status.name.startswith(prefix) for status in array.status)
         return {status.name.removeprefix(prefix): status for status in array.status}
+
+
+def sensed(
+    up: Sequence[float],
+    payload: Payload = TOOL,
+    bias: Wrench = NO_WRENCH,
+    size: int = 61,
+    **changes: float,
+) -> bytes:
+    """Process data of a sensor at rest with `up` pointing up. `changes` are added: `force_x=1.0`, ..."""
+    names = [f"{quantity}.{axis}" for quantity in ("force", "torque", "acceleration") for axis in "xyz"]
+    length = math.sqrt(sum(part * part for part in up))
+    values = dict(zip(names, [*load(up, payload, bias).values, *(part / length for part in up)], strict=True))
+    for name, change in changes.items():
+        position, axis = name.rsplit("_", 1)
+        values[f"{position}.{axis}"] = values.get(f"{position}.{axis}", 0.0) + change
+    return encode(size, values)
+
+
+class Stages:
+    """What the node publishes of the compensation."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        names = ("wrench_compensated", "compensation/bias", "compensation/tool")
+        self.all = self.final, self.bias, self.tool = [node.hear(name) for name in names]
+
+    def forget(self) -> None:
+        for messages in self.all:
+            messages.clear()
+
+    def first(self) -> list[float]:
+        """The first compensated wrench since `forget`."""
+        self._node.run_until(lambda: self.final, "wrench_compensated")
+        return six(self.final[0])
+
+    def settle(self, wanted: Sequence[float], within: float = 1e-3) -> None:
+        """Wait until the compensated wrench is so."""
+        self.forget()
+        self._node.run_until(
+            lambda: self.final and is_near(self.final[-1], wanted, within),
+            lambda: f"{wanted}; last: {six(self.final[-1]) if self.final else None}",
+        )
+
+    def at(
+        self, up: Sequence[float], wanted: Sequence[float] = ZERO6, within: float = 1e-3, **changes: Any
+    ) -> None:
+        """Have the sensor rest so, and wait until the compensated wrench is `wanted`."""
+        self._node.server.hold(up, **changes)
+        self.settle(wanted, within)
+
+    def are_silent(self) -> bool:
+        """Whether nothing is published for a while."""
+        self.forget()
+        self._node.run(0.5)
+        return not any(self.all)
+
+
+def six(message: Any) -> list[float]:
+    """A WrenchStamped's six numbers."""
+    f, m = message.wrench.force, message.wrench.torque
+    return [f.x, f.y, f.z, m.x, m.y, m.z]
+
+
+def stamp_ns(message: Any) -> int:
+    """A message's time, ns since the Unix epoch."""
+    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+
+def is_near(message: Any, wanted: Sequence[float], within: float = 1e-3) -> bool:
+    return all(abs(a - b) <= within for a, b in zip(six(message), wanted, strict=True))
+
+
+def weight(up: Sequence[float], payload: Payload = TOOL) -> list[float]:
+    """What the tool's weight is in the sensor's frame."""
+    return list(load(up, payload, NO_WRENCH).values)
+
+
+def values(status: Any) -> dict[str, str]:
+    """A status's values."""
+    return {value.key: value.value for value in status.values}
+
+
+def level(status: Any) -> str:
+    """How bad a status is."""
+    return ("ok", "warn", "error", "stale")[status.level[0]]

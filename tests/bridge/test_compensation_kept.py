@@ -10,17 +10,11 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
-
-from bridge.node import StartError
 from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.store import CompensationStore
-from tests.bridge.compensating import OVER, QUICK, UP, ZERO6, Stages, hold, six
-from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
+from tests.bridge.simulated_node import OVER, QUICK, UP, ZERO6, Node, Server, Stages, six
 from tests.compensation.making import BIAS, TOOL
 
-pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("_ros")]
-OK, WARN, ERROR, STALE = range(4)
 NOTHING = Payload()
 
 
@@ -29,13 +23,13 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.store = folder, CompensationStore(folder)
-        self.server = SimulatedServer()
-        hold(self.server, UP, payload=NOTHING, bias=BIAS)
+        self.server = Server()
+        self.server.hold(UP, payload=NOTHING, bias=BIAS)
 
     @contextlib.contextmanager
-    def start(self, **parameters: Any) -> Iterator[tuple[SimulatedNode, Stages]]:
+    def start(self, **parameters: Any) -> Iterator[tuple[Node, Stages]]:
         given = {**QUICK, "bias_keep": True, "bias_directory": self.folder, **parameters}
-        with SimulatedNode(self.server, **given) as node:
+        with Node(self.server, **given) as node:
             stages = Stages(node)
             node.run(0.1)
             yield node, stages
@@ -59,30 +53,27 @@ def test_a_tare_survives_a_restart(bench: Bench) -> None:
     with bench.start() as (node, stages):
         assert stages.first() == pytest.approx(BIAS.values, abs=1e-5)
         assert bench.kept() is None  # nothing to keep yet: the bias is zero and nobody set it
-        done, text = node.trigger("tare")
-        assert done
-        assert "kept for the next start" in text
+        node.do("tare", "kept for the next start")
         assert bench.kept() == pytest.approx(BIAS.values, abs=1e-4)
     with bench.start() as (node, stages):
         assert stages.first() == pytest.approx(ZERO6, abs=1e-4)  # not one sample without it
         assert list(node.parameters("bias")[0]) == pytest.approx(BIAS.values, abs=1e-4)
         assert "has the bias that was kept at" in node.log
-        assert node.trigger("clear_tare")[0]
+        node.do("clear_tare")
         assert bench.kept() == ZERO6
         assert not node.trigger("undo_tare")[1].startswith("there is no")
 
 
 def test_it_does_not_survive_unasked(bench: Bench) -> None:
     with bench.start(bias_keep=False) as (node, _):
-        done, text = node.trigger("tare")
-        assert done
+        text = node.do("tare")
         assert "kept" not in text
         assert bench.kept() is None
     with bench.start(bias_keep=False) as (node, stages):
         assert stages.first() == pytest.approx(BIAS.values, abs=1e-5)
         # Asked for while it runs, what is in force is kept from then on.
-        assert node.trigger("tare")[0]
-        assert node.set_parameter("bias_keep", True) == (True, "")
+        node.do("tare")
+        node.set("bias_keep", True)
         assert bench.kept() == pytest.approx(BIAS.values, abs=1e-4)
 
 
@@ -97,7 +88,7 @@ def test_a_bias_that_is_given_wins(bench: Bench) -> None:
 def test_another_sensor_has_its_own(bench: Bench) -> None:
     bench.store.save(2, Wrench.of([3.0, -1.5, 7.0, 0.2, -0.05, 0.125]))
     with bench.start() as (node, stages):
-        assert node.trigger("tare")[0]
+        node.do("tare")
         bench.replace_sensor(2)
         stages.forget()
         assert stages.first() == pytest.approx([0.0, 0.0, 0.25, 0.0, 0.0, 0.0], abs=1e-3)
@@ -111,7 +102,7 @@ def test_another_sensor_has_its_own(bench: Bench) -> None:
 
 def test_another_sensor_does_not_get_a_tare_that_is_not_kept(bench: Bench) -> None:
     with bench.start(bias_keep=False) as (node, stages):
-        assert node.trigger("tare")[0]
+        node.do("tare")
         bench.server.drop()  # the same sensor comes back: its bias stays
         stages.forget()
         assert stages.first() == pytest.approx(ZERO6, abs=1e-3)
@@ -123,24 +114,21 @@ def test_another_sensor_does_not_get_a_tare_that_is_not_kept(bench: Bench) -> No
 
 def test_nothing_of_one_sensor_is_used_for_another(bench: Bench) -> None:
     with bench.start(bias_keep=False) as (node, stages):
-        assert node.trigger("tare")[0]
-        assert node.set_parameter("bias", [0.0] * 6) == (True, "")
-        assert node.trigger("identify/start")[0]
-        assert node.trigger("identify/add_pose")[0]
+        node.do("tare")
+        node.set("bias", [0.0] * 6)
+        node.do("identify/start")
+        node.do("identify/add_pose")
         bench.replace_sensor(2)
         stages.settle(list(BIAS.values))
         assert node.trigger("undo_tare") == (False, "there is no change of the bias to undo")
-        done, text = node.trigger("identify/add_pose")
-        assert not done
-        assert "another sensor is there now, so the previous poses were dropped" in text
-        assert "no identification was started" in node.trigger("identify/add_pose")[1]
+        node.refuse("identify/add_pose", "another sensor is there now, so the previous poses were dropped")
+        node.refuse("identify/add_pose", "no identification was started")
 
 
 def test_a_limit_to_the_rate_leaves_out_no_sample_of_a_tare(bench: Bench) -> None:
     with bench.start(publishing_frequency=10.0, **{"rest.duration": 1.0}) as (node, stages):
         stages.forget()
-        done, text = node.trigger("tare")
-        assert done, text
+        text = node.do("tare")
         assert len(stages.final) <= 12
         found = re.match(r"bias of (\d+) samples", text)
         assert found is not None
@@ -152,12 +140,10 @@ def test_a_damaged_file_is_said_and_not_used(bench: Bench) -> None:
     path.write_text(path.read_text()[:-20])
     with bench.start() as (node, stages):
         assert stages.first() == pytest.approx(BIAS.values, abs=1e-5)
-        node.until("is not used: it is not whole", compensation=WARN)
+        node.until("is not used: it is not whole", compensation="warn")
         assert "take the bias again or remove the file" in node.log
-        done, text = node.trigger("tare")
-        assert done
-        assert "kept for the next start" in text
-        node.until(compensation=OK)
+        node.do("tare", "kept for the next start")
+        node.until(compensation="ok")
         assert bench.kept() == pytest.approx(BIAS.values, abs=1e-4)
 
 
@@ -165,16 +151,16 @@ def test_a_damaged_file_is_said_and_not_used(bench: Bench) -> None:
 def test_a_sensor_without_a_number(bench: Bench, serial: str) -> None:
     bench.server.description["sensors"][0]["serial"] = serial
     with bench.start() as (node, _):
-        done, text = node.trigger("tare")
-        assert done
-        assert "not kept: the sensor's serial number is" in text
+        node.do("tare", "not kept: the sensor's serial number is")
 
 
-def offset_changed(bench: Bench, offset: list[float] | None) -> None:
-    """As another client's tare does it: the sensor adds that from now on."""
+def offset_changed(bench: Bench, offset: list[float] | None, *, tell: bool = False) -> None:
+    """As another client's tare does it: the sensor adds that from now on; `tell`: the server says so."""
+    if tell:
+        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": offset})
     changed = ZERO6 if offset is None else offset
     reads = [b + o for b, o in zip(BIAS.values, changed, strict=True)]
-    hold(bench.server, UP, payload=NOTHING, bias=Wrench.of(reads))
+    bench.server.hold(UP, payload=NOTHING, bias=Wrench.of(reads))
     bench.server.description["sensors"][0]["offset"] = offset
 
 
@@ -182,11 +168,10 @@ def test_a_change_of_the_sensors_own_offset_shifts_the_bias(bench: Bench) -> Non
     offset_changed(bench, [0.0] * 6)
     new = [-1.5, 2.25, 9.75, 0.5, 0.25, -0.125]
     with bench.start() as (node, stages):
-        assert node.trigger("tare")[0]
+        node.do("tare")
         stages.settle(ZERO6)
         stages.forget()
-        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": new})
-        offset_changed(bench, new)
+        offset_changed(bench, new, tell=True)
         node.run(0.2)
         worst = max(abs(value) for message in stages.final for value in six(message))
         assert len(stages.final) == 20
@@ -194,55 +179,50 @@ def test_a_change_of_the_sensors_own_offset_shifts_the_bias(bench: Bench) -> Non
         shifted = [b + o for b, o in zip(BIAS.values, new, strict=True)]
         assert list(node.parameters("bias")[0]) == pytest.approx(shifted, abs=1e-4)
         assert "the sensor's own offset was changed by Fx -1.5000 Fy 2.2500" in node.log
-        node.until(compensation=OK)
+        node.until(compensation="ok")
         assert bench.kept() == pytest.approx(shifted, abs=1e-4)
         offset_changed(bench, [1.0] * 6)  # while the node is away, too
         bench.server.drop()
         stages.settle(ZERO6)
         # What a client that does not ask the server has done is not known.
         bench.server.send_json({"event": "sensor_back", "sensor": 0, "offset": None})
-        node.until("the sensor's own offset is no longer known", compensation=WARN)
+        node.until("the sensor's own offset is no longer known", compensation="warn")
         bench.server.send_json({"event": "sensor_back", "sensor": 0, "offset": [1.0] * 6})
-        node.until(compensation=OK)
+        node.until(compensation="ok")
 
 
 def test_an_offset_that_was_not_known_puts_the_bias_in_doubt(bench: Bench) -> None:
     """As of a server that was too old to tell it."""
     with bench.start() as (node, _):
-        assert node.trigger("tare")[0]
-        node.until(compensation=OK)
+        node.do("tare")
+        node.until(compensation="ok")
         offset_changed(bench, [0.0] * 6)
         bench.server.drop()
-        node.until("was unknown when the bias was taken", compensation=WARN)
-        assert node.trigger("tare")[0]
-        node.until(compensation=OK)
+        node.until("was unknown when the bias was taken", compensation="warn")
+        node.do("tare")
+        node.until(compensation="ok")
 
 
-def test_no_bias_is_not_shifted(bench: Bench) -> None:
+def test_no_bias_is_kept_as_none_and_not_shifted(bench: Bench) -> None:
     offset_changed(bench, [0.0] * 6)
     with bench.start() as (node, stages):
-        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": [1.0] * 6})
-        offset_changed(bench, [1.0] * 6)
+        offset_changed(bench, [1.0] * 6, tell=True)
         stages.settle([b + 1.0 for b in BIAS.values])
         assert list(node.parameters("bias")[0]) == ZERO6
-
-
-def test_no_bias_is_kept_as_none(bench: Bench) -> None:
-    """What ~/clear_tare leaves goes with every offset, after a restart too; ~/undo_tare goes back to none."""
+    # What ~/clear_tare leaves goes with every offset, after a restart too; ~/undo_tare goes back to none.
     offset_changed(bench, [0.0] * 6)
     with bench.start() as (node, _):
-        assert node.trigger("tare")[0]
-        assert node.trigger("clear_tare")[0]
+        node.do("tare")
+        node.do("clear_tare")
     offset_changed(bench, [1.0] * 6)
     raw = [b + 1.0 for b in BIAS.values]
     with bench.start() as (node, stages):
         assert stages.first() == pytest.approx(raw, abs=1e-4)
-        node.until(compensation=OK)
-        assert node.trigger("tare")[0]
-        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": [2.0] * 6})
-        offset_changed(bench, [2.0] * 6)
+        node.until(compensation="ok")
+        node.do("tare")
+        offset_changed(bench, [2.0] * 6, tell=True)
         stages.settle(ZERO6)
-        assert node.trigger("undo_tare")[0]
+        node.do("undo_tare")
         stages.settle([b + 2.0 for b in BIAS.values])
 
 
@@ -250,10 +230,9 @@ def test_a_zero_that_was_measured_is_a_bias(bench: Bench) -> None:
     """The sensor's tare and then the node's, or a shift, may leave a bias of exactly 0."""
     offset_changed(bench, [-b for b in BIAS.values])
     with bench.start() as (node, stages):
-        assert node.trigger("tare")[0]
+        node.do("tare")
         assert list(node.parameters("bias")[0]) == pytest.approx(ZERO6, abs=1e-9)
-        bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": [1.0] * 6})
-        offset_changed(bench, [1.0] * 6)
+        offset_changed(bench, [1.0] * 6, tell=True)
         stages.settle(ZERO6)
     offset_changed(bench, [2.0] * 6)
     with bench.start() as (_, stages):
@@ -264,7 +243,7 @@ def test_a_tare_during_which_the_offset_changes_is_refused(bench: Bench) -> None
     offset_changed(bench, [0.0] * 6)
     with bench.start() as (node, _):
         changed = {"event": "offset_changed", "sensor": 0, "offset": [1e-3] * 6}
-        assert node.trigger("identify/start")[0]
+        node.do("identify/start")
         node.at(0.1, lambda: bench.server.send_json(changed))
         assert node.trigger("tare") == (False, "the sensor's own offset was changed meanwhile: call again")
         assert (
@@ -287,39 +266,37 @@ def test_a_kept_bias_is_for_the_offset_of_then(
 ) -> None:
     offset_changed(bench, then)
     with bench.start() as (node, _):
-        assert node.trigger("tare")[0]
+        node.do("tare")
     offset_changed(bench, now)
     with bench.start() as (node, stages):
         assert words in node.log
         if then is not None and now is not None:
             assert stages.first() == pytest.approx(ZERO6, abs=1e-3)
-            node.until(compensation=OK)
+            node.until(compensation="ok")
         else:
             assert list(node.parameters("bias")[0]) == ZERO6
-            node.until("it is unknown whether", compensation=WARN)
+            node.until("it is unknown whether", compensation="warn")
 
 
 def test_a_folder_that_cannot_be_written(bench: Bench, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with bench.start(bias_directory=tmp_path / "file") as (node, stages):
-        done, text = node.trigger("tare")
-        assert done  # it is in force all the same
-        assert "not kept: " in text
+        node.do("tare", "not kept: ")  # it is in force all the same
         stages.settle(ZERO6)
-        node.until("cannot be", compensation=WARN)
-        assert node.set_parameter("bias_directory", str(tmp_path / "other")) == (True, "")
-        node.until(compensation=OK)
+        node.until("cannot be", compensation="warn")
+        node.set("bias_directory", str(tmp_path / "other"))
+        node.until(compensation="ok")
         assert CompensationStore(tmp_path / "other").load(1) is not None
 
 
 def test_a_kept_bias_is_for_the_tool_of_now(bench: Bench) -> None:
     """A tare without tool_mass, a shift, and a restart with one."""
-    hold(bench.server, UP, bias=BIAS)
+    bench.server.hold(UP, bias=BIAS)
     bench.server.description["sensors"][0]["offset"] = ZERO6
     tool = {"tool_mass": TOOL.mass, "tool_center_of_gravity": [*TOOL.center]}
     with bench.start() as (node, _):
         node.run(0.5)
-        assert node.trigger("tare")[0]
+        node.do("tare")
         changed = [1.0] * 6
         bench.server.description["sensors"][0]["offset"] = changed
         bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": changed})
@@ -328,9 +305,8 @@ def test_a_kept_bias_is_for_the_tool_of_now(bench: Bench) -> None:
     for _ in range(2):
         with bench.start(**tool) as (node, stages):
             for up in (OVER, UP):
-                hold(bench.server, up, bias=shifted)
-                stages.settle(ZERO6)
-            node.until(compensation=OK)
+                stages.at(up, bias=shifted)
+            node.until(compensation="ok")
         assert bench.kept() == pytest.approx(shifted.values, abs=1e-3)
     assert "if the tool was put on or exchanged since" not in node.log, "said at the first start"
 
@@ -345,7 +321,7 @@ def test_a_kept_bias_of_a_tool_whose_pose_is_not_known(bench: Bench) -> None:
             "taken with a tool of 1.5 kg, and in which pose is not known: with no tool_mass it may be wrong"
         )
         assert node.log.count(f"{told} by 14.7 N and 1.47 Nm in every pose: tare again") == 1
-        node.until(told, compensation=WARN)
+        node.until(told, compensation="warn")
         bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": [1.0] * 6})
         node.run(0.1)
         stored = bench.store.load(1)
@@ -367,16 +343,6 @@ def test_the_node_ends_while_a_tare_waits(bench: Bench) -> None:
         assert bench.server.monotonic_ns() - began_ns < 3.2e9  # not the 30 s
         assert len(stages.final) >= 299, "the stream does not wait for it"
         assert len(arrays) >= 2, "nor do the diagnostics"
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"settings.sinc_length": 1}, {"tool_mass": -1.0}, {"gravity": "[0.0, 0.0, 0.0]"}]
-)
-def test_a_wrong_parameter_is_told_in_a_sentence(wrong: dict[str, Any]) -> None:
-    with pytest.raises(StartError) as caught:
-        SimulatedNode(SimulatedServer(), gravity_source="topic_imu", **wrong)
-    assert next(iter(wrong)) in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_sensor_that_is_replaced_while_a_tare_waits(bench: Bench) -> None:

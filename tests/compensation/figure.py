@@ -15,28 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
-from ethercat_server.virtual_sensor.measurement import scene
-from ethercat_server.virtual_sensor.measurement.motion import TURN_LENGTH, Turning
+from ethercat_server.virtual_sensor import signals
+from ethercat_server.virtual_sensor.signals import TURN_LENGTH
 from ft_compensation.compensator import Compensator
-from ft_compensation.orientation import QuaternionGravity
 from ft_compensation.quantities import Payload, Wrench
+from ft_compensation.specific_force import QuaternionGravity
 
 Array = NDArray[np.float64]
 
 FIGURE: Final = Path(__file__).parents[2] / "docs" / "compensation.svg"
-BIAS: Final = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)
-"""What this sensor reads without load, N and Nm."""
+BIAS: Final = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)  # what this sensor reads without load, N and Nm
 _RATE: Final = 100
-_EVERY: Final = 40
-"""One sample in this many is drawn."""
+_EVERY: Final = 40  # one sample in this many is drawn
 _COLUMNS: Final = 3
 _PANEL: Final = (270, 180)
-_PLOT: Final = (236, 136)
-"""Width and height of a panel, and of the plot in it, px."""
-_LARGEST: Final = 22.0
-"""N"""
-_MARKS: Final = (-20, -10, 0, 10, 20)
-"""N"""
+_PLOT: Final = (236, 136)  # width and height of a panel, and of the plot in it, px
+_LARGEST: Final = 22.0  # N
+_MARKS: Final = (-20, -10, 0, 10, 20)  # N
 _COLORS: Final = {"x": "#d62728", "y": "#2ca02c", "z": "#1f77b4"}
 _TOUCH: Final = (20.0, 24.0)
 _PUSH: Final = (0.0, 0.0, -12.0)
@@ -45,28 +40,23 @@ _PUSH: Final = (0.0, 0.0, -12.0)
 class Samples(NamedTuple):
     """A turn of the virtual sensor with one contact: n samples."""
 
-    times: Array
-    """(n,) s"""
-    force: Array
-    """(n, 3) measured, N"""
-    torque: Array
-    """(n, 3) measured, Nm"""
-    gravity: Array
-    """(n, 3) in the sensor's frame, from the accelerometer, m/s²"""
-    orientation: Array
-    """(n, 4) of the sensor, quaternions x, y, z, w"""
+    times: Array  # (n,) s
+    force: Array  # (n, 3) measured, N
+    torque: Array  # (n, 3) measured, Nm
+    gravity: Array  # (n, 3) in the sensor's frame, from the accelerometer, m/s²
+    orientation: Array  # (n, 4) of the sensor, quaternions x, y, z, w
 
 
 def samples(noise: bool = True) -> Samples:
     """One slow full turn."""
-    signal = scene.Scene(1, noise, Turning())
+    signal = signals.Scene(1, noise, signals.turn)
     rows: list[tuple[float, ...]] = []
     for number in range(int(TURN_LENGTH * _RATE)):
         time_s = number / _RATE
         reading = signal.reading(number, 0, time_s)
         ax, ay, az = (part * STANDARD_GRAVITY for part in reading.acceleration)
         push = _PUSH if _TOUCH[0] <= time_s < _TOUCH[1] else (0.0, 0.0, 0.0)
-        load = [*push, *scene.cross(scene.CONTACT_POINT, push)]
+        load = [*push, *signals.cross(signals.CONTACT_POINT, push)]
         measured = [a + b + c for a, b, c in zip(reading.force_torque, BIAS, load, strict=True)]
         rows.append((time_s, *measured, -ax, -ay, -az, *reading.orientation))
     table = np.array(rows)
@@ -74,10 +64,10 @@ def samples(noise: bool = True) -> Samples:
 
 
 def compensated(
-    data: Samples, *, bias: object = BIAS, mass: float = scene.TOOL_MASS, gravity: Array | None = None
+    data: Samples, *, bias: object = BIAS, mass: float = signals.TOOL_MASS, gravity: Array | None = None
 ) -> Array:
     """What compensation leaves, (n, 6): right, or with a mistake in what is given."""
-    compensator = Compensator(Payload(mass, scene.TOOL_CENTRE), Wrench.of(bias))
+    compensator = Compensator(Payload(mass, signals.TOOL_CENTRE), Wrench.of(bias))
     rows = zip(data.force, data.torque, -(data.gravity if gravity is None else gravity), strict=True)
     return np.array([compensator.compensate(*(row.tolist() for row in three)).final.values for three in rows])
 
@@ -94,7 +84,7 @@ def turned_the_wrong_way(data: Samples) -> Array:
 
 def tare() -> Array:
     """The bias of somebody who tares with the tool on at the first pose, (6,): the weight is in it."""
-    weight = Compensator(Payload(scene.TOOL_MASS, scene.TOOL_CENTRE)).compensate(
+    weight = Compensator(Payload(signals.TOOL_MASS, signals.TOOL_CENTRE)).compensate(
         (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, STANDARD_GRAVITY)
     ).tool  # fmt: skip
     both: Array = np.array(BIAS) + np.array(weight.values)
@@ -106,7 +96,7 @@ def mistakes(data: Samples) -> Iterator[tuple[str, Array]]:
     yield "tare only, no gravity", compensated(data, bias=tare(), mass=0.0)
     yield "tare with the tool on, and gravity", compensated(data, bias=tare())
     yield "bias added instead of subtracted", compensated(data, bias=-np.array(BIAS))
-    yield "mass 25 % too small", compensated(data, mass=0.75 * scene.TOOL_MASS)
+    yield "mass 25 % too small", compensated(data, mass=0.75 * signals.TOOL_MASS)
     yield "rotation the wrong way round", compensated(data, gravity=turned_the_wrong_way(data))
     yield "frame turned by 90° about z", compensated(data, gravity=data.gravity[:, [1, 0, 2]] * (1, -1, 1))
 
@@ -132,7 +122,7 @@ def draw(path: Path, data: Samples, shown: Mapping[str, Array]) -> None:
         f'<rect width="{width}" height="{height}" fill="white"/>',
         f'<text x="{width / 2:g}" y="14" font-size="11" text-anchor="middle">{title}:{legend}</text>',
     ]
-    three_sigma = 3 * scene.Scene(1, noise=True).deviations[0]
+    three_sigma = 3 * signals.Scene(1, noise=True).deviations[0]
     for number, (name, left) in enumerate(shown.items()):
         down, across = divmod(number, _COLUMNS)
         lines.append(f'<g transform="translate({across * _PANEL[0] + 26} {down * _PANEL[1] + 38})">')

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
@@ -15,12 +16,8 @@ from ft_compensation.quantities import Payload, Wrench
 
 TOOL = Payload(0.8, (0.004, -0.006, 0.055))
 BIAS = Wrench((3.0, -1.5, 7.25), (0.2, -0.05, 0.125))
+# The six directions that may point up.
 AXES = ((0, 0, 1), (0, 0, -1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
-"""The six directions that may point up."""
-
-
-def cross(a: Sequence[float], b: Sequence[float]) -> list[float]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def gravity_for(up: Sequence[float]) -> Vector3:
@@ -33,7 +30,7 @@ def gravity_for(up: Sequence[float]) -> Vector3:
 def load(up: Sequence[float], payload: Payload = TOOL, bias: Wrench = BIAS) -> Wrench:
     """What the sensor measures at rest, from IV.1 to IV.5 turned round."""
     force = [payload.mass * part for part in gravity_for(up)]
-    torque = cross(payload.center, force)
+    torque = np.cross(payload.center, force).tolist()
     return Wrench.of([a + b for a, b in zip([*force, *torque], bias.values, strict=True)])
 
 

@@ -6,7 +6,7 @@ is felt follows from them by differences on a grid that is fine enough.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -14,47 +14,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.sensor.response import (
+    FIR_TAPS,
+    SINC_ORDER,
+    acceleration_response,
+    angular_rate_response,
+    fir_taps,
+)
+from bota_ethercat.settings import SettingValue
 from ft_compensation.quantities import Payload
 
 Array = NDArray[np.float64]
+# Times (n,), s, to position (n, 3), m, and three angles (n, 3), rad.
 Path = Callable[[Array], tuple[Array, Array]]
-"""Times (n,), s, to position (n, 3), m, and three angles (n, 3), rad."""
 GRAVITY: Final = np.array((0.0, 0.0, -STANDARD_GRAVITY))
-IMU: Final[Vector3] = (0.0, 0.0, -0.0257)
-"""Where a SensONE has it."""
+IMU: Final[Vector3] = (0.0, 0.0, -0.0257)  # where a SensONE has it
 _STEP_S: Final = 5e-5
 
 
 class Imperfection(NamedTuple):
     """Of the IMU."""
 
-    acceleration_noise: float = 0.02
-    """m/s²"""
-    rate_noise: float = 0.0017
-    """rad/s"""
-    rate_offset: float = 0.02
-    """rad/s, on each axis"""
-    acceleration_offset: Vector3 = (0.0, 0.0, 0.0)
-    """m/s²"""
+    acceleration_noise: float = 0.02  # m/s²
+    rate_noise: float = 0.0017  # rad/s
+    rate_offset: float = 0.02  # rad/s, on each axis
+    acceleration_offset: Vector3 = (0.0, 0.0, 0.0)  # m/s²
     scale: Vector3 = (1.0, 1.0, 1.0)
 
 
 class Felt(NamedTuple):
     """What the sensor measures: n samples."""
 
-    times: Array
-    """(n,) s"""
-    force: Array
-    """(n, 3) N"""
-    torque: Array
-    """(n, 3) Nm, about the wrench origin"""
-    acceleration: Array
-    """(n, 3) m/s²"""
-    rate: Array
-    """(n, 3) rad/s"""
+    times: Array  # (n,) s
+    force: Array  # (n, 3) N
+    torque: Array  # (n, 3) Nm, about the wrench origin
+    acceleration: Array  # (n, 3) m/s²
+    rate: Array  # (n, 3) rad/s
 
 
 HEALTHY: Final = Imperfection()
+PERFECT: Final = Imperfection(0.0, 0.0, 0.0)
+_FINER: Final = 16
 
 
 def feel(
@@ -88,6 +88,32 @@ def feel(
     acceleration += draw.normal(scale=imu.acceleration_noise, size=acceleration.shape)
     measured = rate + imu.rate_offset + draw.normal(scale=imu.rate_noise, size=rate.shape)
     return Felt(times, force, np.cross(tool.center, force), acceleration, measured)
+
+
+def filtered(
+    path: Path, tool: Payload, seconds: float, settings: Mapping[str, SettingValue], *, seed: int = 0
+) -> Felt:
+    """The same as a sensor with these settings gives it.
+
+    Force and torque go through the filters, on a grid that is finer than the samples; the IMU's only delay.
+    """
+    rate_hz = 51200 / settings["sinc_length"]
+    start_s = (SINC_ORDER + FIR_TAPS) / rate_hz  # until the filters are full
+    early_s = SINC_ORDER / 2 / _FINER / rate_hz  # by which averages over steps are early
+    fine = feel(_later(path, start_s + early_s), tool, seconds + start_s, _FINER * rate_hz, imu=PERFECT)
+    second = np.zeros(_FINER * (FIR_TAPS - 1) + 1)
+    second[::_FINER] = fir_taps()
+    load = np.concatenate([fine.force, fine.torque], axis=1)
+    for taps in [np.full(_FINER, 1 / _FINER)] * SINC_ORDER + [second] * bool(settings["fir"]):
+        load = np.stack([np.convolve(column, taps)[: len(load)] for column in load.T], axis=1)
+    late = [response(settings).delay_s or 0.0 for response in (acceleration_response, angular_rate_response)]
+    accelerometer, gyroscope = (feel(_later(path, by_s), tool, seconds, rate_hz, seed=seed) for by_s in late)
+    load = load[round(start_s * rate_hz) * _FINER :: _FINER][: len(gyroscope.times)]
+    return Felt(gyroscope.times, load[:, :3], load[:, 3:], accelerometer.acceleration, gyroscope.rate)
+
+
+def _later(path: Path, by_s: float) -> Path:
+    return lambda t: path(t - by_s)
 
 
 def rotations(angles: Array) -> Array:

@@ -6,25 +6,22 @@ import struct
 from collections.abc import Iterable, Iterator
 
 from bota_ethercat.pdo import Sample, SampleDecoder
-from ethercat_server.virtual_sensor.firmware.firmware import Firmware
-from ethercat_server.virtual_sensor.firmware.flash import Flash
-from ethercat_server.virtual_sensor.measurement import scene
-from ethercat_server.virtual_sensor.measurement.motion import MOVE_LENGTH, POSE_LENGTH, POSES
+from ethercat_server.virtual_sensor import signals
+from ethercat_server.virtual_sensor.dictionary import Flash
 from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.sensor import Firmware
+from ethercat_server.virtual_sensor.signals import MOVE_LENGTH, POSE_LENGTH, POSES
 from ft_compensation.identification.poses import Pose, pose_of
 from ft_compensation.stationary import StationaryMeans, StationaryWindow
 
-Stream = Iterable[tuple[float, Sample]]
-"""Samples with their times, s since the signal began."""
+Stream = Iterable[tuple[float, Sample]]  # samples with their times, s since the signal began
 
-SINC = 512
-"""100 Hz: quick to simulate."""
+SINC = 512  # 100 Hz: quick to simulate
+# What the sensor adds to its readings (object 0x8000): the bias that is to be found. N, Nm.
 OFFSET = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)
-"""What the sensor adds to its readings (object 0x8000): the bias that is to be found. N, Nm."""
 CYCLE = POSE_LENGTH + MOVE_LENGTH
 POSES_TAKE = len(POSES) * CYCLE
-STILL = 0.4
-"""The part of a cycle that `windows_of_poses` looks at."""
+STILL = 0.4  # the part of a cycle that `windows_of_poses` looks at
 _SETTLE = 0.3
 
 
@@ -76,12 +73,12 @@ def take_poses(stream: Stream) -> list[Pose]:
 
 def deviations(sinc: int = SINC) -> tuple[float, ...]:
     """The standard deviation of the virtual sensor's noise, force (N) and torque (Nm)."""
-    signal = scene.Scene(0, noise=True)
+    signal = signals.Scene(0, noise=True)
     signal.set_sinc_length(sinc)
     return signal.deviations
 
 
 def contact(time_s: float) -> tuple[float, ...]:
     """What the tool of `scene` is really touched with, force (N) and torque (Nm)."""
-    force = scene.contact_force(time_s)
-    return *force, *scene.cross(scene.CONTACT_POINT, force)
+    force = signals.contact_force(time_s)
+    return *force, *signals.cross(signals.CONTACT_POINT, force)

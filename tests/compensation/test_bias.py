@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import random
 from collections.abc import Callable, Sequence
@@ -13,8 +12,7 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.sensor.warnings_register import WarningFlag
-from ft_compensation.bias import BiasRamp, Taken, check_at_rest, estimate_bias, gravity_of
-from ft_compensation.compensator import Compensator
+from ft_compensation.bias import BiasRamp, Taken, check_at_rest, estimate_bias
 from ft_compensation.quantities import NO_PAYLOAD, NO_WRENCH, ZERO, CompensationError, Payload, Wrench
 from ft_compensation.stationary import NotStationaryError, StationaryMeans, StationaryWindow
 from ft_compensation.stationary_limits import StationaryLimits
@@ -43,13 +41,18 @@ def at_rest(up: tuple[float, float, float] = (0, 0, 1), seed: int = 0, **changed
 # Rest.
 
 
-def test_a_window_at_rest_gives_means_and_spreads() -> None:
+def test_a_window_at_rest() -> None:
     means = at_rest()
     assert means.samples == RATE + 1
     assert means.seconds == pytest.approx(1.0)
     assert means.wrench.values == pytest.approx(load((0, 0, 1)).values, abs=0.05)
     assert max(means.force_spread) == pytest.approx(0.3, rel=0.15)
     assert max(means.torque_spread) == pytest.approx(0.007, rel=0.15)
+    noise = random.Random(1)
+    limits = StationaryLimits(angular_rate=0.3)
+    window(lambda _: noisy(noise, BIAS, angular_rate=(0.0, 0.0, 0.2)), limits=limits).means()
+    warm = sample(warnings=int(WarningFlag.OVERTEMPERATURE))
+    assert window(lambda _: warm).means().samples == RATE + 1
 
 
 @pytest.mark.parametrize("seconds", [0.1, 1.0])
@@ -65,7 +68,7 @@ Moved = Callable[[float, random.Random], dict[str, Any]]
 @pytest.mark.parametrize(
     ("moved", "message"),
     [
-        (lambda t, n: {"force": (3 * math.sin(9 * t), 0.0, 0.0)}, r"force x moved by \d.* N .*is 0.8 N"),
+        (lambda t, n: {"force": (1.3 * math.sin(9 * t), 0.0, 0.0)}, r"force x moved by \d.* N .*is 0.8 N"),
         (lambda t, n: {"torque": (0.0, 0.1 * math.sin(9 * t), 0.0)}, r"torque y moved by 0\.0\d+ Nm"),
         (lambda t, n: {"force": (0.0, n.gauss(0, 0.3), t)}, r"force z drifted by 0\.\d+ N within"),
         (lambda t, n: {"torque": (0.03 * t, 0.0, 0.0)}, r"torque x drifted by 0\.02\d* Nm"),
@@ -80,12 +83,6 @@ def test_a_refusal_says_what_moved_by_how_much_and_what_the_limit_is(moved: Move
     collected = window(lambda k: noisy(noise, BIAS, **moved(k / RATE, noise)))
     with pytest.raises(NotStationaryError, match=message):
         collected.means()
-
-
-def test_limits_can_be_widened() -> None:
-    noise = random.Random(1)
-    limits = StationaryLimits(angular_rate=0.3)
-    window(lambda _: noisy(noise, BIAS, angular_rate=(0.0, 0.0, 0.2)), limits=limits).means()
 
 
 @pytest.mark.parametrize(
@@ -110,29 +107,12 @@ def test_one_bad_sample_spoils_the_window(bad: dict[str, Any], message: str) -> 
         collected.means()
 
 
-def test_other_warnings_do_not_spoil_it() -> None:
-    warm = sample(warnings=int(WarningFlag.OVERTEMPERATURE))
-    assert window(lambda _: warm).means().samples == RATE + 1
-
-
-def test_few_samples_make_it_longer() -> None:
+def test_a_window_that_is_too_short_or_whose_clock_is_set_back() -> None:
     collected = StationaryWindow(1.0)
+    with pytest.raises(NotStationaryError, match="only 0 new samples"):
+        collected.means()
     taken = [collected.add(sample(), 0.1 * number) for number in range(20)]
     assert taken == [False] * 19 + [True]
-
-
-def test_nothing_at_all_is_refused() -> None:
-    with pytest.raises(NotStationaryError, match="only 0 new samples"):
-        StationaryWindow().means()
-
-
-def test_a_sensor_without_imu_cannot_say_that_it_rests() -> None:
-    silent = sample(acceleration=(0.0, 0.0, 0.0))
-    with pytest.raises(NotStationaryError, match=r"only zeros.*imu_active"):
-        window(lambda _: silent).means()
-
-
-def test_a_clock_that_jumps_back_ends_the_window() -> None:
     collected = StationaryWindow(1.0)
     for number in range(30):
         assert not collected.add(sample(), 100.0 + number / RATE)
@@ -153,6 +133,9 @@ def felt(up: Sequence[float]) -> Vector3:
 def test_without_payload_everything_is_bias() -> None:
     means = at_rest()
     assert estimate_bias(means, NO_PAYLOAD, ZERO) == means.wrench
+    with pytest.raises(CompensationError, match=r"reads 1\.00 m/s² where 9\.81 should be.*imu_raw_units"):
+        check_at_rest((0.0, 0.0, 1.0), STANDARD_GRAVITY)
+    check_at_rest((0.0, 0.0, 9.5), STANDARD_GRAVITY)
 
 
 @pytest.mark.parametrize("up", AXES)
@@ -160,25 +143,6 @@ def test_with_the_tool_on_only_the_offset_is_taken_in_every_pose(up: tuple[float
     bias = estimate_bias(at_rest(up), TOOL, felt(up))
     assert bias.force == pytest.approx(BIAS.force, abs=0.05)
     assert bias.torque == pytest.approx(BIAS.torque, abs=0.002)
-
-
-def test_a_bias_of_one_pose_holds_in_another() -> None:
-    """The point of it: tare and gravity compensation together leave nothing in any pose."""
-    compensator = Compensator(TOOL, estimate_bias(at_rest((1, 0, 0)), TOOL, felt((1, 0, 0))))
-    for up in AXES:
-        final = compensator.compensate(*load(up), felt(up)).final
-        assert final.force == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
-        assert final.torque == pytest.approx((0.0, 0.0, 0.0), abs=0.004)
-
-
-def test_an_accelerometer_that_reads_nothing_like_g_is_not_believed() -> None:
-    with pytest.raises(CompensationError, match=r"reads 1\.00 m/s² where 9\.81 should be.*imu_raw_units"):
-        check_at_rest((0.0, 0.0, 1.0))
-    check_at_rest((0.0, 0.0, 9.5))
-
-
-def test_only_the_direction_comes_from_the_accelerometer() -> None:
-    assert gravity_of((0.0, 0.0, 10.0)) == (0.0, 0.0, -STANDARD_GRAVITY)
 
 
 # Ramp and undo.
@@ -189,19 +153,16 @@ OLD, NEW = Wrench.of([0, 0, 0, 0, 0, 0]), Wrench.of([1, -2, 4, 0.5, 0, -1])
 def test_the_ramp_is_straight_and_ends_exactly() -> None:
     ramp = BiasRamp(OLD, seconds=2.0)
     ramp.go(NEW, 10.0)
-    assert ramp.at(10.0) == OLD
+    assert ramp.at(10.0) == ramp.at(9.95) == OLD, "a sample that was on its way is as late"
+    assert not ramp.arrived(9.95)
     assert ramp.at(10.5).values == pytest.approx([0.25 * value for value in NEW.values])
     assert not ramp.arrived(11.9)
     assert ramp.at(12.0) == NEW
     assert ramp.at(1e9) == NEW
     assert ramp.arrived(12.0)
-
-
-def test_a_late_sample_from_before_the_ramp_has_the_old_bias() -> None:
-    ramp = BiasRamp(OLD, seconds=2.0)
-    ramp.go(NEW, 10.0)
-    assert ramp.at(9.95) == OLD
-    assert not ramp.arrived(9.95)
+    ramp.seconds = 0.0
+    ramp.go(OLD, 20.0)
+    assert ramp.at(20.0) == ramp.at(19.9) == OLD, "it jumps"
 
 
 @pytest.mark.parametrize("now_s", [9.0, -600.0])
@@ -213,13 +174,6 @@ def test_a_clock_that_is_set_back_does_not_bring_the_old_bias_back(now_s: float)
     assert ramp.arrived(now_s)
 
 
-def test_a_ramp_that_takes_no_time_jumps() -> None:
-    ramp = BiasRamp(OLD)
-    ramp.go(NEW, 10.0)
-    assert ramp.at(10.0) == NEW
-    assert ramp.at(9.9) == NEW, "a sample that was on its way"
-
-
 def test_a_ramp_that_is_turned_round_does_not_jump() -> None:
     ramp = BiasRamp(OLD, seconds=2.0)
     ramp.go(NEW, 10.0)
@@ -228,13 +182,6 @@ def test_a_ramp_that_is_turned_round_does_not_jump() -> None:
     ramp.go(OLD, 10.7)
     assert ramp.at(10.7) == before
     assert ramp.at(11.7) == OLD
-
-
-def test_no_sample_sees_a_jump_larger_than_its_share() -> None:
-    ramp = BiasRamp(OLD, seconds=0.5)
-    ramp.go(NEW, 0.0)
-    steps = [ramp.at(k / RATE).force[2] for k in range(RATE)]
-    assert max(b - a for a, b in itertools.pairwise(steps)) <= 4.0 / (0.5 * RATE) + 1e-12
 
 
 def test_the_last_change_is_undone_once() -> None:

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
-from ethercat_server.virtual_sensor.measurement import scene
+from ethercat_server.virtual_sensor import signals
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import ZERO, Payload, Wrench
 from ft_compensation.specific_force import ImuSpecificForce
 from tests.compensation import equations
 
-CASES = 10_000 if "TEST_SEED" in os.environ else 2_000
-"""All of them in long runs."""
+CASES = 10_000 if "TEST_SEED" in os.environ else 2_000  # all of them in long runs
 
 
 def test_the_fast_path_agrees_with_the_equations_in_thousands_of_cases() -> None:
@@ -34,46 +33,40 @@ def test_the_fast_path_agrees_with_the_equations_in_thousands_of_cases() -> None
     got = []
     for f, m, c, b, kilograms, g in rows:
         compensator = Compensator(Payload.of(kilograms, c))
-        compensator.set_bias(Wrench.of(b))
+        compensator.bias = Wrench.of(b)
         stages = compensator.compensate((*f,), (*m,), (-g[0], -g[1], -g[2]))
         got.append([*stages.corrected.values, *stages.tool.values, *stages.final.values])
     assert np.abs(np.array(got) - np.hstack(wanted)).max() < 1e-9
 
 
-def test_rotations_turn_the_way_they_say() -> None:
-    """Rolled by 90° about x, what points along the sensor's y points up."""
-    rolled = 3.0 * np.array((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
-    assert equations.matrix_from_quaternion(rolled) @ (0, 1, 0) == pytest.approx([0, 0, 1], abs=1e-12)
-
-
-def test_every_stage_adds_up_to_what_was_measured() -> None:
+def test_stages_add_up_and_have_their_signs() -> None:
     compensator = Compensator(Payload(1.0, (0.1, 0.2, 0.3)), Wrench.of(range(6)))
     measured = Wrench((5.0, 6.0, 7.0), (0.5, 0.6, 0.7))
     stages = compensator.compensate(*measured, (0.1, 0.2, 9.9))
     total = stages.bias.plus(stages.tool).plus(stages.final)
     assert total.values == pytest.approx(measured.values)
     assert stages.corrected.values == pytest.approx(measured.plus(stages.bias, -1.0).values)
+    # Upright sensor, 1 kg: the load on the sensor points down, along gravity.
+    stages = Compensator(Payload(1.0, ZERO)).compensate((0.0, 0.0, -9.8), ZERO, (0.0, 0.0, 9.8))
+    assert stages.tool.force == (0.0, 0.0, -9.8)
+    assert stages.final.force == ZERO
+    # Rolled by 90° about x, what points along the sensor's y points up.
+    rolled = 3.0 * np.array((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
+    assert equations.matrix_from_quaternion(rolled) @ (0, 1, 0) == pytest.approx([0, 0, 1], abs=1e-12)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 2.7, 5.3, 11.0])
 def test_signs_are_those_of_the_sensor(seconds: float) -> None:
     """The scene's tool, from physics written elsewhere: what is left is the contact, and nothing else."""
-    reading = scene.Scene(0, noise=False).reading(0, 0, seconds)
+    reading = signals.Scene(0, noise=False).reading(0, 0, seconds)
     fx, fy, fz, mx, my, mz = reading.force_torque
     ax, ay, az = (STANDARD_GRAVITY * part for part in reading.acceleration)
-    stages = Compensator(Payload(scene.TOOL_MASS, scene.TOOL_CENTRE)).compensate(
+    stages = Compensator(Payload(signals.TOOL_MASS, signals.TOOL_CENTRE)).compensate(
         (fx, fy, fz), (mx, my, mz), (ax, ay, az)
     )
-    contact = scene.contact_force(seconds)
+    contact = signals.contact_force(seconds)
     assert stages.final.force == pytest.approx(contact, abs=1e-9)
-    assert stages.final.torque == pytest.approx(scene.cross(scene.CONTACT_POINT, contact), abs=1e-9)
-
-
-def test_a_hanging_tool_pulls_down() -> None:
-    """Upright sensor, 1 kg: the load on the sensor points down, along gravity."""
-    stages = Compensator(Payload(1.0, ZERO)).compensate((0.0, 0.0, -9.8), ZERO, (0.0, 0.0, 9.8))
-    assert stages.tool.force == (0.0, 0.0, -9.8)
-    assert stages.final.force == ZERO
+    assert stages.final.torque == pytest.approx(signals.cross(signals.CONTACT_POINT, contact), abs=1e-9)
 
 
 @pytest.mark.parametrize(

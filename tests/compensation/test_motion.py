@@ -1,4 +1,4 @@
-"""What is left in motion with nothing touching the tool: on rigid-body motion, for tools of up to 2 kg."""
+"""What is left in motion with nothing touching the tool; and where gravity points by orientations."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from bota_ethercat.pdo import STANDARD_GRAVITY
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.bias import force_bound_95
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import EXACT, Accelerometer, Payload
-from ft_compensation.specific_force import ImuSpecificForce
-from tests.compensation import motion
-from tests.compensation.motion import IMU, Array, Felt, Imperfection
+from ft_compensation.identification.weighted import Array
+from ft_compensation.quantities import DEFAULT_GRAVITY, EXACT, Accelerometer, Payload
+from ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
+from tests.compensation import equations, motion
+from tests.compensation.motion import IMU, Felt, Imperfection
 
 TOOLS = (Payload(0.7, (0.0, 0.01, 0.04)), Payload(2.0, (0.004, -0.006, 0.08)))
 SECONDS = 6.0
@@ -51,17 +52,6 @@ def test_at_any_rate_never_worse_than_the_bias_alone(rate_hz: float) -> None:
         force, _ = left_over(felt, tool)
         alone = felt.force - felt.force.mean(axis=0)
         assert np.sqrt((force[1:] ** 2).mean()) < np.sqrt((alone[1:] ** 2).mean())
-
-
-def test_an_ordinary_move_is_no_contact() -> None:
-    """2 kg, 0.4 s of up to 2.5 m/s² and back: weight alone leaves 5 N."""
-    tool = Payload(2.0)
-    path = motion.waypoints(0.8, 0.5, 3, metres=0.5, radians=0.0)
-    felt = motion.feel(path, tool, SECONDS)
-    weight_only = np.linalg.norm(felt.force, axis=1) - 2.0 * STANDARD_GRAVITY
-    assert np.abs(weight_only).max() > 2.0
-    force, _ = left_over(felt, tool)
-    assert np.linalg.norm(force, axis=1)[1:].max() < 0.4
 
 
 def test_the_angular_acceleration_counts() -> None:
@@ -116,3 +106,70 @@ def test_the_bound_covers_the_accelerometers_errors_in_95_percent(known: Acceler
         read = truth * scale + draw.normal(0.0, np.array(known.offset_interval) / 1.96)
         held += tool.mass * float(np.linalg.norm(read - truth)) <= bound
     assert 0.945 <= held / draws <= 0.995
+
+
+G = STANDARD_GRAVITY
+
+
+# Orientations.
+
+
+def quaternion_about(axis: Vector3, turned: float) -> tuple[float, float, float, float]:
+    x, y, z = (math.sin(turned / 2) * part for part in axis)
+    return x, y, z, math.cos(turned / 2)
+
+
+def test_a_quaternion_turns_the_sensor_into_the_base() -> None:
+    """Rolled by +90° about x, the sensor's y points up: gravity is along -y."""
+    source = QuaternionGravity()
+    assert source.update(quaternion_about((1.0, 0.0, 0.0), math.pi / 2), 1.0)
+    assert source.gravity(1.0) == pytest.approx((0.0, -G, 0.0))
+
+
+def test_quaternions_agree_with_the_equations() -> None:
+    draw = np.random.default_rng(3)
+    source = QuaternionGravity((0.3, -0.2, -9.7))
+    for number, q in enumerate(draw.normal(size=(500, 4))):
+        x, y, z, w = (q / np.linalg.norm(q) * draw.uniform(0.9, 1.1)).tolist()
+        assert source.update((x, y, z, w), float(number))
+        wanted = equations.gravity_in_sensor_from_quaternion(q, (0.3, -0.2, -9.7))
+        assert source.gravity(float(number)) == pytest.approx(wanted.tolist(), abs=1e-12)
+
+
+@pytest.mark.parametrize("bad", [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 5.0)])
+def test_what_is_no_orientation_is_not_taken(bad: tuple[float, float, float, float]) -> None:
+    source = QuaternionGravity()
+    assert not source.update(bad, 1.0)
+    assert source.gravity(1.0) is None
+
+
+def test_which_orientation_counts_and_for_how_long() -> None:
+    source = QuaternionGravity(stale_after_s=0.1)
+    source.update((0.0, 0.0, 0.0, 1.0), 1.0)
+    assert not source.update((1.0, 0.0, 0.0, 0.0), 0.95)
+    assert source.gravity(1.0) == pytest.approx(DEFAULT_GRAVITY)
+    assert source.update((1.0, 0.0, 0.0, 0.0), 0.5), "unless the clock was set back"
+    source = QuaternionGravity(stale_after_s=0.25)
+    source.update((0.0, 0.0, 0.0, 1.0), 10.0)
+    answers = [source.gravity(now) is not None for now in (10.0, 10.25, 10.26, 1000.0, 9.7)]
+    assert answers == [True, True, False, False, False]
+    assert source.age_s(10.2) == pytest.approx(0.2)
+
+
+# Orientations that are older or newer than the sample.
+
+
+def arm(turned: float) -> tuple[float, float, float, float]:
+    """The orientation of a sensor that has turned about its x axis by so much."""
+    return quaternion_about((1.0, 0.0, 0.0), turned)
+
+
+def test_an_orientation_is_held_where_the_gyroscope_is_of_no_use() -> None:
+    source = QuaternionGravity()
+    source.follow((2.0, 0.0, 0.0), 1.0)
+    source.update(arm(0.0), 1.0)
+    source.follow((math.nan, 0.0, 0.0), 1.01)
+    assert source.gravity(1.05) == pytest.approx(DEFAULT_GRAVITY)
+    for time_s in (1.02, 9.0, 1.0):  # a gap; and a clock that was set back
+        source.follow((2.0, 0.0, 0.0), time_s)
+    assert source.gravity(1.05) == pytest.approx(DEFAULT_GRAVITY)

@@ -24,34 +24,25 @@ def store(tmp_path: Path) -> CompensationStore:
 
 def test_what_is_saved_is_loaded(store: CompensationStore) -> None:
     assert store.load(SERIAL) is None
-    store.save(SERIAL, BIAS)
-    stored = store.load(SERIAL)
-    assert stored is not None
-    assert (stored.bias, stored.payload) == (BIAS, None)
-    store.save(SERIAL, BIAS, TOOL)
-    stored = store.load(SERIAL)
-    assert stored is not None
-    assert (stored.bias, stored.payload, stored.specific_force) == (BIAS, TOOL, None)
-    store.save(SERIAL, BIAS, TOOL, BIAS, (0.0, 3.0, -9.0))
-    stored = store.load(SERIAL)
-    assert stored is not None
-    assert stored[:2] + stored[3:] == (BIAS, TOOL, BIAS, (0.0, 3.0, -9.0))
+    for kept in ((BIAS, None, None, None), (BIAS, TOOL, None, None), (BIAS, TOOL, BIAS, (0.0, 3.0, -9.0))):
+        store.save(SERIAL, *kept)
+        stored = store.load(SERIAL)
+        assert stored is not None
+        assert stored[:2] + stored[3:] == kept
+    assert store.load(SERIAL + 1) is None, "every sensor has a file of its own"
 
 
-def test_every_sensor_has_a_file_of_its_own(store: CompensationStore) -> None:
-    store.save(1, BIAS)
-    assert store.load(2) is None
-    assert store.load(1) is not None
-
-
-def test_nothing_but_the_file_is_left_behind(store: CompensationStore) -> None:
+def test_what_is_none_is_not_written_and_nothing_is_left_behind(store: CompensationStore) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        store.save(SERIAL, Wrench((float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0)), Payload())
+    assert not store.directory.exists()
     for _ in range(3):
         path = store.save(SERIAL, BIAS, TOOL)
     assert list(store.directory.iterdir()) == [path]
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
-def test_a_write_that_fails_leaves_the_old_file(
+def test_a_failed_write_leaves_the_old_file(
     store: CompensationStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store.save(SERIAL, BIAS)
@@ -69,7 +60,7 @@ def test_a_write_that_fails_leaves_the_old_file(
     assert len(list(store.directory.iterdir())) == 1
 
 
-def test_the_file_is_flushed_before_it_takes_the_name(
+def test_the_file_is_flushed_before_renaming(
     store: CompensationStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     order: list[str] = []
@@ -121,9 +112,7 @@ def whole(**changed: Any) -> dict[str, Any]:
         (json.dumps(whole(specific_force=[0, 0])).encode(), "a specific force is 3 finite numbers"),
     ],
 )
-def test_a_file_that_is_no_good_is_one_sentence(
-    store: CompensationStore, content: bytes, message: str
-) -> None:
+def test_a_damaged_file_is_one_sentence(store: CompensationStore, content: bytes, message: str) -> None:
     store.directory.mkdir(parents=True)
     store.path(SERIAL).write_bytes(content)
     with pytest.raises(StoreError, match=message) as caught:
@@ -141,12 +130,6 @@ def test_what_cannot_be_read_or_written_is_one_sentence(store: CompensationStore
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be written"):
         CompensationStore(tmp_path / "file" / "folder").save(SERIAL, BIAS)
-
-
-def test_a_payload_that_is_none_is_not_written(store: CompensationStore) -> None:
-    with pytest.raises(ValueError, match="finite"):
-        store.save(SERIAL, Wrench((float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0)), Payload())
-    assert not store.directory.exists()
 
 
 def test_the_default_directory_is_xdgs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

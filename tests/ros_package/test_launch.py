@@ -1,10 +1,11 @@
-"""The launch files, run by `ros2 launch` where it is installed; test_launch_files.py does without it."""
+"""The launch files: without ROS by a stand-in; and run by `ros2 launch` where it is installed."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import re
+import runpy
 import shutil
 import signal
 import subprocess
@@ -16,18 +17,67 @@ from pathlib import Path
 
 import pytest
 
+from tests.ros_package.launch_stand_in import arguments_of, stand_in
 from tests.ros_package.package_files import PACKAGE, ROOT, console, in_text
-from tests.ros_package.test_launch_files import ARGUMENTS
 from tests.server.running import free_port, needs_bus
 
 PATIENCE_S = 30.0
-SERVER = f"server_command:={sys.executable} -m ethercat_server.daemon.cli"
+SERVER_COMMAND = f"server_command:={sys.executable} -m ethercat_server.daemon.cli"
 CLIENT = f"""#!{sys.executable}
 import sys
 sys.path[:0] = ["{ROOT}", "{PACKAGE}"]
 from bridge.client import main
 sys.exit(main())
 """
+LAUNCH = PACKAGE / "launch"
+NODE = {
+    "params_file", "namespace", "server_host", "server_port", "sensor", "frame_id", "imu_frame_id",
+    "array_topic", "respawn", "log_level",
+}  # fmt: skip
+SERVER = {"server_port", "server_command", "sensor_options"}
+# Of each file, the arguments that have an effect: what a file sets itself is none.
+ARGUMENTS = {
+    "bridge": NODE,
+    "virtual_server": SERVER,
+    "demo": (NODE | SERVER) - {"server_host"},
+    "two_sensors": (NODE | SERVER | {"virtual"})
+    - {"namespace", "sensor", "frame_id", "imu_frame_id", "array_topic", "sensor_options"},
+}
+
+
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_it_offers_the_arguments_that_have_an_effect(name: str) -> None:
+    listed = arguments_of(LAUNCH / f"{name}.launch.py")
+    assert set(listed) == ARGUMENTS[name]
+    assert len(listed) == len(ARGUMENTS[name])
+
+
+def start_node(params_file: str) -> list[object]:
+    with stand_in():
+        actions = runpy.run_path(str(LAUNCH / "bridge.launch.py"))["start_node"]({"params_file": params_file})
+    assert isinstance(actions, list)
+    return actions
+
+
+def test_a_parameter_file_is_found_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # launch_ros would start the node with its defaults: with the wrong sensor, say.
+    with pytest.raises(FileNotFoundError, match=r"params_file: there is no file /.*/nofile\.yaml"):
+        start_node("nofile.yaml")
+    # The shell leaves the ~ of `params_file:=~/robot.yaml` as it is.
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "robot.yaml").touch()
+    assert len(start_node("~/robot.yaml")) == 1
+
+
+def test_the_page_names_every_file_and_argument() -> None:
+    page = (ROOT / "docs/ros2-workspace.md").read_text()
+    assert {file.name for file in LAUNCH.glob("*.launch.py")} == {f"{name}.launch.py" for name in ARGUMENTS}
+    for name, arguments in ARGUMENTS.items():
+        assert f"`{name}.launch.py`" in page
+        assert [argument for argument in arguments if f"`{argument}`" not in page] == []
+
+
+# Run by `ros2 launch`.
 
 
 class Launched:
@@ -51,11 +101,11 @@ class Launched:
         self._log.seek(0)
         return self._log.read()
 
-    def says(self, *words: str) -> None:
+    def says(self, *words: str, times: int = 1) -> None:
+        """Wait until it has said these words, regular expressions, so often."""
         deadline = time.monotonic() + PATIENCE_S
-        while not all(word in self.log for word in words):
+        while not all(len(re.findall(word, self.log)) >= times for word in words):
             assert time.monotonic() < deadline, f"waited in vain for {words} in:\n{self.log}"
-            assert self.process.poll() is None or all(word in self.log for word in words), self.log
             time.sleep(0.05)
 
     def stop(self) -> int:
@@ -129,7 +179,7 @@ def test_namespace_log_level_and_text_that_looks_like_a_number(launch: Launch) -
     launched = launch(
         "bridge.launch.py", "namespace:=left", "server_host:=127", f"server_port:={free_port()}"
     )
-    launched.says("[left.bridge]: no server at 127:")
+    launched.says(r"\[left.bridge\]: no server at 127:")
     quiet = launch("bridge.launch.py", "log_level:=error", "server_port:=70000")
     quiet.says("parameter server_port is 70000", "--log-level error")
 
@@ -145,11 +195,7 @@ def test_the_arguments_that_are_listed(launch: Launch, name: str) -> None:
 @pytest.mark.ros
 def test_respawn_starts_the_node_again(launch: Launch) -> None:
     launched = launch("bridge.launch.py", "sensor:=300", "respawn:=true")
-    launched.says("parameter sensor is 300")
-    deadline = time.monotonic() + PATIENCE_S
-    while launched.log.count("parameter sensor is 300") < 2:
-        assert time.monotonic() < deadline, launched.log
-        time.sleep(0.1)
+    launched.says("parameter sensor is 300", times=2)
 
 
 @pytest.mark.ros
@@ -164,8 +210,8 @@ def test_a_server_that_is_not_there_ends_the_demo_with_a_sentence(launch: Launch
 @needs_bus
 def test_the_demo_runs_and_ends_cleanly(launch: Launch) -> None:
     port = free_port()
-    launched = launch("demo.launch.py", f"server_port:={port}", SERVER)
-    launched.says(f"connected to localhost:{port}: sensor 0 (BFT-SENS-ECAT-M8", "streaming")
+    launched = launch("demo.launch.py", f"server_port:={port}", SERVER_COMMAND)
+    launched.says(f"connected to localhost:{port}: sensor 0 .BFT-SENS-ECAT-M8", "streaming")
     assert launched.stop() == 0
     assert launched.log.count("process has finished cleanly") == 2, launched.log
     assert "has died" not in launched.log
@@ -175,7 +221,7 @@ def test_the_demo_runs_and_ends_cleanly(launch: Launch) -> None:
 @pytest.mark.bus
 @needs_bus
 def test_the_commands_on_the_page_about_the_node(launch: Launch) -> None:
-    launched = launch("demo.launch.py", f"server_port:={free_port()}", SERVER)
+    launched = launch("demo.launch.py", f"server_port:={free_port()}", SERVER_COMMAND)
     launched.says("connected to localhost")
     commands = [*console("ros2.md"), *in_text("ros2.md")]
     try:
@@ -195,7 +241,7 @@ def test_the_commands_on_the_page_about_the_node(launch: Launch) -> None:
 @pytest.mark.bus
 @needs_bus
 def test_the_end_of_the_server_ends_the_demo(launch: Launch) -> None:
-    launched = launch("demo.launch.py", f"server_port:={free_port()}", SERVER)
+    launched = launch("demo.launch.py", f"server_port:={free_port()}", SERVER_COMMAND)
     launched.says("connected to localhost")
     (pid,) = re.findall(r"\[ethercat-server-\d+\]: process started with pid \[(\d+)\]", launched.log)
     os.kill(int(pid), signal.SIGTERM)
@@ -207,13 +253,9 @@ def test_the_end_of_the_server_ends_the_demo(launch: Launch) -> None:
 @pytest.mark.bus
 @needs_bus
 def test_two_sensors_have_a_node_and_a_namespace_each(launch: Launch) -> None:
-    launched = launch("two_sensors.launch.py", "virtual:=true", f"server_port:={free_port()}", SERVER)
+    launched = launch("two_sensors.launch.py", "virtual:=true", f"server_port:={free_port()}", SERVER_COMMAND)
     launched.says("streaming")
     for namespace, sensor in (("sensone", r"0 \(BFT-SENS-"), ("rokubi", r"1 \(BFT-ROKS-")):
-        pattern = rf"\[{namespace}\.bridge\]: connected to \S+ sensor {sensor}"
-        deadline = time.monotonic() + PATIENCE_S
-        while not re.search(pattern, launched.log):
-            assert time.monotonic() < deadline, launched.log
-            time.sleep(0.05)
+        launched.says(rf"\[{namespace}\.bridge\]: connected to \S+ sensor {sensor}")
     assert launched.stop() == 0
     assert launched.log.count("process has finished cleanly") == 3, launched.log

@@ -1,8 +1,9 @@
-"""The ROS 2 package: its manifest, and that pip (pyproject.toml) and colcon (setup.py) install the same."""
+"""The ROS 2 package: its manifest, what pip and colcon install, its layouts."""
 
 from __future__ import annotations
 
-import ast
+import functools
+import json
 import os
 import re
 import runpy
@@ -13,29 +14,22 @@ import tomllib
 import types
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+from xml.etree import ElementTree
 
 import pytest
 import setuptools
+import yaml
 from catkin_pkg.package import parse_package
 
 from tests.ros_package.package_files import PACKAGE, ROOT, SHARED_FOLDERS, in_text, shared_files
+from tests.test_architecture import imports
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 MARKER = "share/ament_index/resource_index/packages"
 
 
-def imports(path: Path) -> set[str]:
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            names.update(alias.name.split(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            names.add(str(node.module).split(".")[0])
-    return names
-
-
-def test_catkin_pkg_finds_nothing_wrong_in_the_manifest() -> None:
+def test_the_manifest_and_one_version() -> None:
     warnings: list[str] = []
     package = parse_package(str(PACKAGE), warnings=warnings)
     assert not warnings
@@ -43,6 +37,9 @@ def test_catkin_pkg_finds_nothing_wrong_in_the_manifest() -> None:
     assert package.get_build_type() == "ament_python"
     # colcon takes a package with an invalid address for plain Python.
     assert all(re.fullmatch(r"[^@ ]+@[^@ ]+\.[a-z]+", each.email) for each in package.maintainers)
+    version = PROJECT["project"]["version"]
+    assert parse_package(str(PACKAGE)).version == version
+    assert f'version="{version}"' in (PACKAGE / "setup.py").read_text()
 
 
 def test_everything_that_is_imported_is_a_dependency_once() -> None:
@@ -53,17 +50,11 @@ def test_everything_that_is_imported_is_a_dependency_once() -> None:
         packages.get(name, name)
         for folder in ("bridge", "ft_compensation", "launch")
         for path in (PACKAGE / folder).rglob("*.py")
-        for name in imports(path) - ours
+        for name in {imported.split(".")[0] for imported in imports(path)} - ours
     }
     # xacro is for the files in urdf/.
     depends = [each.name for each in parse_package(str(PACKAGE)).exec_depends]
     assert sorted(needed | {"xacro"}) == sorted(depends)
-
-
-def test_one_version() -> None:
-    version = PROJECT["project"]["version"]
-    assert parse_package(str(PACKAGE)).version == version
-    assert f'version="{version}"' in (PACKAGE / "setup.py").read_text()
 
 
 def test_every_package_of_python_files_is_installed() -> None:
@@ -149,3 +140,63 @@ def test_what_is_for_an_index_is_built_and_checked_and_has_its_files_where_ros_l
     environment = os.environ | {"HOME": str(tmp_path)}
     used = subprocess.run(["bash", "-c", shell], env=environment, check=True, capture_output=True, text=True)
     assert "usage: ros2 run bridge client" in used.stdout
+
+
+CONFIG: Final = PACKAGE / "config"
+# Topics of the node in the root namespace, with their types.
+TOPICS: Final = {
+    "/sensone_sensor_data": "std_msgs/Float64MultiArray",
+    "/wrench": "geometry_msgs/WrenchStamped",
+    "/wrench_compensated": "geometry_msgs/WrenchStamped",
+    "/compensation/bias": "geometry_msgs/WrenchStamped",
+    "/compensation/tool": "geometry_msgs/WrenchStamped",
+    "/imu/data_raw": "sensor_msgs/Imu",
+    "/temperature": "sensor_msgs/Temperature",
+    "/diagnostics": "diagnostic_msgs/DiagnosticArray",
+}
+
+
+def assert_shown(topic: str, fields: list[str]) -> None:
+    """The topic is the node's, and its messages have the field (if ROS is there to tell)."""
+    package, name = TOPICS[topic].split("/")
+    messages = pytest.importorskip(f"{package}.msg", reason="ROS messages are missing")
+    assert isinstance(functools.reduce(getattr, fields, getattr(messages, name)()), float), fields
+
+
+def test_plotjuggler_plots_fields_of_the_nodes_topics() -> None:
+    root = ElementTree.parse(CONFIG / "plotjuggler_layout.xml").getroot()
+    streamer, plugin = root.find("previouslyLoaded_Streamer"), root.find("Plugins/plugin")
+    selected = root.find("Plugins/plugin/selected_topics")
+    assert streamer is not None
+    assert plugin is not None
+    assert selected is not None
+    assert streamer.get("name") == plugin.get("ID") == "ROS2 Topic Subscriber"
+    subscribed = set(str(selected.get("value")).split(";"))
+    shown = set()
+    for curve in [str(curve.get("name")) for curve in root.iter("curve")]:
+        (topic,) = [topic for topic in subscribed if curve.startswith(topic + "/")]
+        assert_shown(topic, curve.removeprefix(topic + "/").split("/"))
+        shown.add(topic)
+    assert shown == subscribed
+
+
+def test_foxglove_plots_fields_of_the_nodes_topics_and_shows_the_diagnostics() -> None:
+    panels = json.loads((CONFIG / "foxglove_layout.json").read_text())["configById"].values()
+    values = [path["value"] for panel in panels for path in panel.get("paths", ())]
+    assert values
+    for value in values:
+        topic, *fields = value.split(".")
+        assert_shown(topic, fields)
+    assert {panel["topicToRender"] for panel in panels if "topicToRender" in panel} == {"/diagnostics"}
+
+
+def test_rviz_shows_the_wrenches() -> None:
+    manager = yaml.safe_load((CONFIG / "wrench.rviz").read_text())["Visualization Manager"]
+    shown = {
+        display["Topic"]["Value"]: display["Class"] for display in manager["Displays"] if "Topic" in display
+    }
+    assert shown == dict.fromkeys(("/wrench", "/wrench_compensated"), "rviz_default_plugins/Wrench")
+    (model,) = [display for display in manager["Displays"] if display["Class"].endswith("/RobotModel")]
+    assert model["Description Topic"]["Value"] == "/robot_description"  # of robot_state_publisher
+    assert all("Topic" not in tool for tool in manager["Tools"])
+    assert manager["Global Options"]["Fixed Frame"] == "base_link"  # of urdf/example.urdf.xacro

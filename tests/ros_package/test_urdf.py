@@ -38,13 +38,8 @@ def example(**arguments: str) -> ElementTree.Element:
 
 def offset_mm(robot: ElementTree.Element, parent: str, child: str) -> float:
     """How far along z the fixed joint between two links reaches; nothing else may be moved or turned."""
-    (joint,) = [
-        joint
-        for joint in robot.findall("joint")
-        if (joint.find("parent[@link]"), joint.find("child[@link]")) != (None, None)
-        and joint.find("parent").get("link") == parent  # type: ignore[union-attr]
-        and joint.find("child").get("link") == child  # type: ignore[union-attr]
-    ]
+    joints = robot.findall(f"joint/child[@link='{child}']/..")
+    (joint,) = [joint for joint in joints if joint.find(f"parent[@link='{parent}']") is not None]
     assert joint.get("type") == "fixed"
     origin = joint.find("origin")
     assert origin is not None
@@ -83,8 +78,10 @@ def test_the_body_is_a_solid_cylinder_between_mounting_face_and_wrench_origin(mo
         assert numbers(link.find(f"{part}/origin"), "xyz", "rpy") == [0, 0, h / 2, 0, 0, 0]
 
 
-def test_a_model_without_known_body_has_the_frames_only() -> None:
+def test_unknown_models_and_bodies(capsys: pytest.CaptureFixture[str]) -> None:
     assert not example(model="MEGS").findall("link/*")
+    with pytest.raises(xacro.XacroException, match="no model FOO: it must be one of SENS, ROKS"):
+        example(model="FOO")
 
 
 def test_a_parameter_of_ros_which_is_yaml_takes_it_as_text() -> None:
@@ -131,8 +128,3 @@ def test_two_sensors_fit_on_one_robot() -> None:
     assert [numbers(mass, "value") for mass in robot.findall("link/inertial/mass")] == [[0.239], [1.5]]
     radii = [numbers(cylinder, "radius") for cylinder in robot.findall("link/collision/geometry/cylinder")]
     assert radii == [[0.035], [0.06]]
-
-
-def test_an_unknown_model_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(xacro.XacroException, match="no model FOO: it must be one of SENS, ROKS"):
-        example(model="FOO")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from bridge.parameters.compensation import AUTO, CompensationParameters
+from bridge.parameters.table import AUTO, Parameters
 from bridge.stream.link import Link
 from ft_compensation.bias import BiasRamp, Taken
 from ft_compensation.quantities import NO_WRENCH, Wrench, wrench_text
@@ -18,33 +18,22 @@ class Beginning(NamedTuple):
     """The bias to put in force at once."""
 
     bias: Wrench
-    origin: str
-    """Where it comes from."""
-    is_one: bool
-    """Whether there is a bias: a zero that was not measured is none."""
+    origin: str  # where it comes from
+    is_one: bool  # whether there is a bias: a zero that was not measured is none
     taken: Taken = Taken()
 
 
 class BiasKeeper:
-    """The files, and the sensor that the bias in force is for; for the executor's thread.
-
-    Attributes:
-        serial: of that sensor, for any thread; None until there was one.
-        problem: why the bias could not be kept or read, a sentence; empty if it could, or was not to be.
-    """
+    """The files, and the sensor that the bias in force is for; for the executor's thread."""
 
     def __init__(self, log: Any) -> None:
-        self.serial: str | None = None
-        self.problem = ""
-        self._kept: tuple[Wrench, Taken, Wrench | None] | None = None
-        """The content of the file: a bias, how it was taken, and the sensor's own offset at that time."""
+        self.serial: str | None = None  # of that sensor, for any thread; None until there was one
+        self.problem = ""  # why the bias could not be kept or read, a sentence; empty if it could
+        # The content of the file, None to store it again: a bias, how it was taken, the sensor's own offset.
+        self.kept: tuple[Wrench, Taken, Wrench | None] | None = None
         self._log = log
 
-    def forget(self) -> None:
-        """Store the bias again, whatever the file has."""
-        self._kept = None
-
-    def keep(self, ramp: BiasRamp, parameters: CompensationParameters, offset: Wrench | None) -> None:
+    def keep(self, ramp: BiasRamp, parameters: Parameters, offset: Wrench | None) -> None:
         """Store the bias that `ramp` leads to, for the connected sensor, if enabled and changed.
 
         `offset` is the sensor's own at that time, None if it is unknown, or if there is no bias.
@@ -53,7 +42,7 @@ class BiasKeeper:
             self.problem = ""
             return
         bias, taken = ramp.target, ramp.taken
-        if self.serial is None or (bias, taken, offset) == self._kept:
+        if self.serial is None or (bias, taken, offset) == self.kept:
             return
         try:
             path = _store(parameters).save(
@@ -62,7 +51,7 @@ class BiasKeeper:
         except StoreError as error:
             self._say_not_kept(str(error))
             return
-        self._kept, self.problem = (bias, taken, offset), ""
+        self.kept, self.problem = (bias, taken, offset), ""
         self._log.info(f"the bias is kept in {path}")
 
     def take(
@@ -70,14 +59,19 @@ class BiasKeeper:
         serial: str,
         bias: Wrench,
         origin: str,
-        parameters: CompensationParameters,
+        parameters: Parameters,
         offset: Wrench | None,
     ) -> Beginning | None:
         """Another sensor was connected, with its own `offset`; `bias` from `origin` is in force. None: keep
         it."""
         is_first, self.serial = self.serial is None, serial
-        self._kept = None
-        stored = self._look_up(serial, parameters, offset)
+        self.kept, self.problem = None, ""
+        stored = None
+        try:
+            if parameters.bias_keep:
+                stored = self._load(serial, parameters, offset)
+        except StoreError as error:
+            self._say_not_kept(str(error))
         if stored is None:
             if is_first or origin == FROM_PARAMETER:
                 return None
@@ -94,7 +88,7 @@ class BiasKeeper:
             return None
         before = Taken(stored.payload or parameters.payload, stored.specific_force)
         if stored.offset == offset:
-            self._kept = stored.bias, before, offset
+            self.kept = stored.bias, before, offset
         self._log.info(f"the sensor with serial number {serial} has the bias that was kept at {stored.saved}")
         change, taken = before.weighed(parameters.payload)
         if warning := taken.warning(change, parameters.payload):
@@ -102,27 +96,17 @@ class BiasKeeper:
         is_one = stored.bias != NO_WRENCH or stored.offset is not None
         return Beginning(stored.bias.plus(change), f"kept since {stored.saved}", is_one, taken)
 
-    def _look_up(
-        self, serial: str, parameters: CompensationParameters, offset: Wrench | None
-    ) -> Stored | None:
-        """What was stored, with the bias shifted to the sensor's current `offset`."""
-        self.problem = ""
-        if not parameters.bias_keep:
-            return None
-        try:
-            stored = _store(parameters).load(_number(serial))
-        except StoreError as error:
-            self._say_not_kept(str(error))
-            return None
+    def _load(self, serial: str, parameters: Parameters, offset: Wrench | None) -> Stored | None:
+        """What was stored, with the bias shifted to the sensor's current `offset`; StoreError."""
+        stored = _store(parameters).load(_number(serial))
         is_none = stored is not None and stored.offset is None and stored.bias == NO_WRENCH
         if stored is None or is_none or stored.offset == offset:
             return stored
         if stored.offset is None or offset is None:
-            self._say_not_kept(
+            raise StoreError(
                 f"the stored bias of the sensor with serial number {serial} is not used, because it is "
                 "unknown whether the sensor's own offset has changed since: tare"
             )
-            return None
         change = offset.plus(stored.offset, -1.0)
         self._log.info(
             f"the own offset of the sensor with serial number {serial} has changed by "
@@ -148,7 +132,7 @@ def expand(path: str, parameter: str) -> Path:
         raise StoreError(f"there is no home directory for {path}: give {parameter} in full") from None
 
 
-def _store(parameters: CompensationParameters) -> CompensationStore:
+def _store(parameters: Parameters) -> CompensationStore:
     return CompensationStore(directory_of(parameters.bias_directory))
 
 
@@ -166,12 +150,11 @@ class OwnOffset:
 
     def __init__(self, link: Link) -> None:
         self._link = link
+        # The offset that the bias was taken with; None if it was never known.
         self.of_bias: Wrench | None = None
-        """The offset that the bias was taken with; None if it was never known."""
-        self._appeared = False
-        """Whether the offset became known only after the bias was taken."""
+        self._appeared = False  # whether the offset became known only after the bias was taken
+        # Whether there is a bias. Zero may be one: what a tare finds where the sensor reads nothing.
         self.has_bias = False
-        """Whether there is a bias. Zero may be one: what a tare finds where the sensor reads nothing."""
 
     @property
     def now(self) -> Wrench | None:

@@ -6,30 +6,26 @@ change goes through it, so that it always shows what is in force, or ramped in.
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable
 from typing import Any, Final
 
 from rclpy.node import Node
 
-from bridge.compensating.bias_keeper import FROM_PARAMETER, Beginning, BiasKeeper, OwnOffset
+from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper, OwnOffset
 from bridge.compensating.orientations import SourceChoice
-from bridge.compensating.tool_sources import IMU_IS_OFF, Source
-from bridge.diagnostics.observer import CompensationState
-from bridge.parameters.compensation import CompensationParameters
+from bridge.compensating.tool_sources import IMU_IS_OFF
+from bridge.diagnostics.health import CompensationState
 from bridge.parameters.declare import LiveParameters
-from bridge.parameters.row import ParameterError
-from bridge.parameters.table import Parameters
+from bridge.parameters.table import ParameterError, Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
-from bridge.stream.link import Link
-from bridge.stream.watch import Watch
+from bridge.stream.reader import Reader
 from ft_compensation.bias import BiasRamp, Taken, force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
 
-_MEASURED: Final = ("tare", "identified")
-"""Where a bias comes from that is one even if it is zero."""
+_MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
 _LOOKING_UP: Final = "the bias of this sensor is being looked up"
 
 
@@ -41,51 +37,37 @@ class CompensationControl:
         node: Node,
         parameters: Parameters,
         output: CompensatedOutput,
-        link: Link,
-        watch: Watch,
+        reader: Reader,
         live: LiveParameters,
-        count_not_finite: Callable[[], int],
     ) -> None:
         """ParameterError if the parameters cannot be had here."""
-        self.parameters = parameters.compensation
-        self.output, self.link = output, link
-        self.origin = FROM_PARAMETER
-        """Where the bias in force comes from."""
-        self.sensors = 1
-        """How many have been there: what was measured on one is of no use with another."""
-        self._model = ""
-        """Of the sensor that is or was there."""
+        self.parameters, self.output = parameters, output
+        self.reader, self.link, self._live = reader, reader.link, live
+        self.origin = FROM_PARAMETER  # where the bias in force comes from
+        self.sensors = 1  # how many have been there: what was measured on one is of no use with another
+        self._model = ""  # of the sensor that is or was there
         self._log = node.get_logger()
-        self._choice = SourceChoice(node, parameters.frame_id)
-        self._keeper = BiasKeeper(self._log)
-        self._own_offset = OwnOffset(link)
-        self.count_not_finite = count_not_finite
-        """Samples so far that were not finite somewhere."""
+        self.choice = SourceChoice(node, parameters.frame_id, self.link)
+        self.keeper = BiasKeeper(self._log)
+        self.own_offset = OwnOffset(self.link)
+        # Origin of the bias that is being put in force, and what it was taken with if by a tare.
         self._next: tuple[str, Taken | None] = (FROM_PARAMETER, None)
-        """Origin of the bias that is being put in force, and what it was taken with if by a tare."""
-        self._choice.check(self.parameters)
-        self._ramp = BiasRamp(self.parameters.bias, self.parameters.bias_ramp_time)
-        self._shifting = threading.Lock()
-        """For whoever shifts the ramp, or replaces it and the plan."""
+        self.choice.check(parameters)
+        self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
+        self._shifting = threading.Lock()  # for whoever shifts the ramp, or replaces it and the plan
         self._payload_watch: PayloadWatch | None = None
         self._watched: object = None
-        self._watch, self._live = watch, live
-        live.checks.append(lambda wanted: self._check(wanted.compensation))
-        live.listeners.append(lambda wanted: self._apply(wanted.compensation))
+        live.check = self._check
         self._guard = node.create_guard_condition(self._follow_sensor)
 
     def start(self) -> None:
-        """Open the orientation's source; before any sample comes.
-
-        ParameterError if it cannot be had.
-        """
-        self._choice.open(self.parameters, self._model)
-        self.output.tune(self.parameters)
+        """Open the orientation's source, before any sample comes; ParameterError if it cannot be had."""
+        self.choice.open(self.parameters, self._model)
         self._make_plan()
 
     def close(self) -> None:
         """Stop listening for orientations."""
-        self._choice.close()
+        self.choice.close()
 
     def link_changed(self) -> None:
         """There is another connection, or none; for the reader's thread."""
@@ -99,54 +81,51 @@ class CompensationControl:
                 self._hold()
 
     @property
-    def keeping(self) -> str:
-        """Why the bias could not be kept or read, a sentence; empty if it could, or was not to be."""
-        return self._keeper.problem
-
-    @property
-    def source(self) -> Source:
-        """Where the weight of the tool is taken from."""
-        return self._choice.source
-
-    @property
     def bias(self) -> Wrench:
         """The one in force, or being ramped in."""
         return self._ramp.target
 
-    def after_sensor_tare(self) -> str:
-        """What a new offset in the sensor itself means here, a sentence; "" if nothing."""
-        return self._own_offset.after_tare()
-
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
-        output, source, watch = self.output, self._choice.source, self._payload_watch
-        payload = self.parameters.payload
+        output, source, parameters = self.output, self.choice.source, self.parameters
+        payload, bias, has_subscribers = parameters.payload, self.bias, output.has_subscribers
+        bound = force_bound_95(payload, parameters.accelerometer) if source.is_imu else None
+        age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
+        parts = ["bias"] if bias != NO_WRENCH else []
+        if payload.mass:
+            parts.append("weight and inertia of the tool" if source.is_imu else "weight of the tool")
+        none = "nothing is subtracted: there is no bias and no tool_mass"
+        good = f"subtracted: {', '.join(parts)}" if parts else none
         return CompensationState(
-            has_subscribers=output.has_subscribers,
-            published=output.published,
+            good if has_subscribers else f"{good}; nobody has subscribed",
+            {
+                "gravity_source": source.describe,
+                "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
+                "accelerometer_force": "" if bound is None else round(bound, 3),
+                "tool_mass": round(payload.mass, 4),
+                "tool_center_of_gravity": _numbers(payload.center),
+                "tared": bias != NO_WRENCH,
+                "bias": _numbers(bias.values),
+                "bias_from": self.origin,
+                "bias_ramping": not self._ramp.arrived(output.time_s),
+                "bias_keep": parameters.bias_keep,
+                "subscribed": has_subscribers,
+                "compensated": output.published,
+                "withheld": output.withheld,
+            },
+            has_subscribers=has_subscribers,
+            has_tool=payload.mass > 0.0,
+            source=source.describe,
             withheld=output.withheld,
             why_stopped=self._why_stopped(),
             why_partly=output.problem,
-            source=source.describe,
-            age_s=source.age_s(output.time_s),
-            bound=force_bound_95(payload, self.parameters.accelerometer) if source.is_imu else None,
-            payload=payload,
-            bias=self.bias,
-            origin=self.origin,
-            is_ramping=self.is_ramping,
-            keep=self.parameters.bias_keep,
             stops_on_saturation=output.stops_on_saturation,
             problem=self.conflict()
-            or self._own_offset.doubt()
+            or self.own_offset.doubt()
             or self._ramp.taken.doubt(payload)
-            or self.keeping
-            or (watch.finding if watch is not None else ""),
+            or self.keeper.problem
+            or (self._payload_watch.finding if self._payload_watch is not None else ""),
         )
-
-    @property
-    def is_ramping(self) -> bool:
-        """Whether it is on the way to `bias`, as of the latest sample."""
-        return not self._ramp.arrived(self.output.time_s)
 
     def conflict(self, *, needs_tool: bool = False) -> str | None:
         """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
@@ -181,7 +160,7 @@ class CompensationControl:
 
     def _why_stopped(self) -> str | None:
         """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
-        output, source, watch = self.output, self._choice.source, self._watch
+        output, source, watch = self.output, self.choice.source, self.reader.watch
         sample, stamp_s = output.sample, output.stamp_s
         if not output.has_subscribers:
             if not self.parameters.payload.mass:
@@ -196,7 +175,7 @@ class CompensationControl:
 
     def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
         """Put a bias in force, `taken` by a tare, and keep it if that is asked for."""
-        self._own_offset.begin(bias, is_measured=origin in _MEASURED)
+        self.own_offset.begin(bias, is_measured=origin in _MEASURED)
         self._put(origin, taken, bias=[*bias.values])
 
     def undo_bias(self) -> Wrench:
@@ -225,19 +204,19 @@ class CompensationControl:
         finally:
             self._next = FROM_PARAMETER, None
 
-    def _check(self, wanted: CompensationParameters) -> None:
+    def _check(self, wanted: Parameters) -> None:
         """ParameterError if they cannot be had here."""
-        self._choice.check(wanted)
+        self.choice.check(wanted)
         if self.link.is_connected and (rate_hz := self.link.rate_hz):
             known = self.parameters.filter.problems(rate_hz)
             for problem in wanted.filter.problems(rate_hz):
                 if problem not in known:
                     raise ParameterError(problem)
 
-    def _apply(self, wanted: CompensationParameters) -> None:
+    def apply(self, wanted: Parameters) -> None:
+        """Take other parameters."""
         was, self.parameters = self.parameters, wanted
         self._open_source()
-        self.output.tune(wanted)
         self._ramp.seconds = wanted.bias_ramp_time
         before, (origin, taken) = self.bias, self._next
         # A parameter that the shift of the bias has not reached yet is no wish.
@@ -247,7 +226,7 @@ class CompensationControl:
                 self._ramp = self._ramp.weighed(wanted.payload)
             if is_wish:
                 self._ramp.go(wanted.bias, self.output.time_s, taken or Taken())
-                self._own_offset.begin(wanted.bias, is_measured=origin in _MEASURED)
+                self.own_offset.begin(wanted.bias, is_measured=origin in _MEASURED)
                 self.origin = origin
             self._make_plan()
         if wanted.payload != was.payload and not is_wish:
@@ -258,12 +237,12 @@ class CompensationControl:
         if self.output.hold is not _LOOKING_UP:
             self._hold()
         if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
-            self._keeper.forget()
-        self._keeper.keep(self._ramp, wanted, self._own_offset.to_keep)
+            self.keeper.kept = None
+        self.keeper.keep(self._ramp, wanted, self.own_offset.to_keep)
 
     def _open_source(self) -> None:
         try:
-            self._choice.open(self.parameters, self._model)
+            self.choice.open(self.parameters, self._model)
         except ParameterError as error:  # too late to refuse the parameter
             self._log.error(str(error))
 
@@ -273,12 +252,12 @@ class CompensationControl:
         if watched != self._watched:
             self._watched = watched
             self._payload_watch = PayloadWatch(payload, self._log.warning, rest) if payload.mass else None
-        source, has_tool = self._choice.source, payload.mass > 0.0
+        source, has_tool = self.choice.source, payload.mass > 0.0
         self.output.plan = Plan(source, Compensator(payload), self._ramp, has_tool, self._payload_watch)
 
     def _is_same_sensor(self) -> bool:
         info = self.link.info
-        return not self.link.is_connected or info is None or info.serial == self._keeper.serial
+        return not self.link.is_connected or info is None or info.serial == self.keeper.serial
 
     def _follow_sensor(self) -> None:
         """Find the bias of the sensor that is there now."""
@@ -286,12 +265,15 @@ class CompensationControl:
             info = self.link.info
             if info is None:
                 break
-            is_another = self._keeper.serial is not None
-            offset = self._own_offset.begin(self.bias)
-            begin = self._keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)
+            is_another = self.keeper.serial is not None
+            offset = self.own_offset.begin(self.bias)
+            begin = self.keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)
             if begin is not None:
-                self._own_offset.has_bias = begin.is_one
-                self._begin_with(begin)
+                self.own_offset.has_bias = begin.is_one
+                problem = self.keeper.problem
+                self._ramp = BiasRamp(begin.bias, self.parameters.bias_ramp_time, begin.taken)
+                self._put(begin.origin, bias=[*begin.bias.values])
+                self.origin, self.keeper.problem = begin.origin, problem
             elif is_another:
                 # What was before in its history was the other's too.
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
@@ -299,8 +281,8 @@ class CompensationControl:
             self._open_source()
             self.sensors += is_another
             self._make_plan()
-            if not self.keeping and self.bias != NO_WRENCH:
-                self._keeper.keep(self._ramp, self.parameters, self._own_offset.to_keep)
+            if not self.keeper.problem and self.bias != NO_WRENCH:
+                self.keeper.keep(self._ramp, self.parameters, self.own_offset.to_keep)
         self._follow_offset()
         if self.bias != self.parameters.bias:
             self._live.put(bias=[*self.bias.values])  # shifted
@@ -310,7 +292,7 @@ class CompensationControl:
 
     def _follow_offset(self) -> None:
         """Shift the bias by the change of the sensor's own offset, from the next sample on; any thread."""
-        change = self._own_offset.follow()
+        change = self.own_offset.follow()
         if change is not None:
             with self._shifting:
                 self._ramp.shift(change)
@@ -319,9 +301,6 @@ class CompensationControl:
             )
             self._guard.trigger()
 
-    def _begin_with(self, begin: Beginning) -> None:
-        """Put a bias in force at once, with nothing before it."""
-        problem = self.keeping
-        self._ramp = BiasRamp(begin.bias, self.parameters.bias_ramp_time, begin.taken)
-        self._put(begin.origin, bias=[*begin.bias.values])
-        self.origin, self._keeper.problem = begin.origin, problem
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:.4f}" for value in values)

@@ -6,13 +6,15 @@ The reader alone calls `specific_force`; the others are for the diagnostics' thr
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 from bota_ethercat.pdo import Sample, Vector3
-from bridge.parameters.compensation import CompensationParameters
-from ft_compensation.orientation import QuaternionGravity
+from bota_ethercat.settings import SettingValue
+from bridge.parameters.table import Parameters
+from ft_compensation.alignment import NOT_DELAYED, Alignment, alignment_taps
 from ft_compensation.quantities import Quaternion
-from ft_compensation.specific_force import ImuSpecificForce
+from ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
 
 IMU_IS_OFF = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 
@@ -27,10 +29,8 @@ class Oriented(NamedTuple):
 class Source:
     """The specific force at the tool's center of gravity, m/s² in the sensor's frame. Of this class: none."""
 
-    describe = "none"
-    """Its name for people."""
-    is_imu = False
-    """Whether it is measured, with what the tool accelerates; else it is minus gravity."""
+    describe = "none"  # its name for people
+    is_imu = False  # whether it is measured, with what the tool accelerates; else it is minus gravity
 
     def __init__(self, why: str = "gravity_source is none") -> None:
         """`why` there is none."""
@@ -39,10 +39,7 @@ class Source:
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """m/s², for this sample; None if what is known is too old, or nothing is.
 
-        Args:
-            sample: the next one.
-            time_s: its time by a clock that nobody sets.
-            stamp_s: its time by the wall clock, which others stamp their orientations by.
+        `time_s` is by a clock that nobody sets, `stamp_s` by the wall clock, which others stamp by.
         """
         return None
 
@@ -58,21 +55,36 @@ class Source:
         return math.inf
 
 
+class Filters(Protocol):
+    """What is known of the sensor's filters: the node's `Link`."""
+
+    settings: Mapping[str, SettingValue]  # replaced, never changed in place
+    rate_hz: float
+
+
 class ImuSource(Source):
-    """The sensor's own accelerometer and gyroscope."""
+    """The sensor's own accelerometer and gyroscope, at the instant of its force and torque."""
 
     describe = "imu"
     is_imu = True
 
-    def __init__(self, parameters: CompensationParameters, imu_position: Vector3) -> None:
+    def __init__(self, parameters: Parameters, imu_position: Vector3, filters: Filters) -> None:
         """`imu_position` is the IMU's, m from the wrench origin."""
         (cx, cy, cz), (x, y, z) = parameters.payload.center, imu_position
         self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), parameters.accelerometer)
+        self._filters, self._alignment = filters, Alignment()
+        self._settings: Mapping[str, SettingValue] | None = None  # those of the alignment
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """Of this sample."""
+        if self._filters.settings is not self._settings:
+            self._settings, rate_hz = self._filters.settings, self._filters.rate_hz
+            taps = alignment_taps(self._settings, rate_hz) if rate_hz else NOT_DELAYED
+            self._alignment = Alignment(taps, 1 / rate_hz if rate_hz else 0.0)
         found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
-        return found if any(sample.acceleration) else None
+        if found is None or not any(sample.acceleration):
+            return None
+        return self._alignment.follow(found, time_s)
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """The IMU is off or broken."""
@@ -96,7 +108,7 @@ class Listening(Protocol):
 class ListenerSource(Source):
     """A topic or TF: the latest orientation, carried on to the sample's time by the gyroscope."""
 
-    def __init__(self, parameters: CompensationParameters, listener: Listening) -> None:
+    def __init__(self, parameters: Parameters, listener: Listening) -> None:
         self._listener = listener
         self._limit_s = parameters.orientation.stale_after
         self._turn = QuaternionGravity(parameters.gravity, stale_after_s=self._limit_s)
@@ -104,7 +116,7 @@ class ListenerSource(Source):
         self.describe = listener.describe
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:
-        """From the latest orientation, if its time is close to the sample\'s."""
+        """From the latest orientation, if its time is close to the sample's."""
         self._turn.follow(sample.angular_rate, time_s)
         latest = self._listener.latest
         if latest is not self._taken and latest is not None:

@@ -8,20 +8,26 @@ regular report, a second after the one before, has carried it.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from bota_ethercat.errors import ConnectionFailedError
+from bota_ethercat.health.observer import p99
 from bota_ethercat.health.verdict import Level, Limits
-from bridge.diagnostics.health import Status, judge, text_of
-from bridge.diagnostics.observer import CompensationState, Observer, Snapshot
-from bridge.publishing.messages import Outputs, create_publisher
-from bridge.stream.reader import Reader
+from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import printable
+from bridge.diagnostics.health import OF_SERVER, CompensationState, Counts, Snapshot, Status, judge
+from bridge.process import Worker
+from bridge.publishing.messages import create_publisher
+from bridge.stream.reader import Flags, Outputs, Reader
 
 TICK_S: Final = 0.1
-REPORT_S: Final = 1.0
+_REPORT_S: Final = 1.0
+_SHORTEST_RATE_S: Final = 0.8  # a rate measured over less time than this says little
 _LEVELS: Final = {
     Level.GOOD: DiagnosticStatus.OK,
     Level.LOOK: DiagnosticStatus.WARN,
@@ -31,7 +37,7 @@ _LEVELS: Final = {
 
 
 class Monitor:
-    """Runs from `start` to `stop`. `on_failure` hears of an error that should not be."""
+    """Its `thread` runs until `stop`. `on_failure` hears of an error that should not be."""
 
     def __init__(
         self,
@@ -42,50 +48,137 @@ class Monitor:
         outputs: Outputs,
         on_failure: Callable[[str], object],
     ) -> None:
-        self._observer, self._clock = Observer(reader, compensation), reader.link.clock
-        self.limits = limits
-        """May be replaced at any time."""
-        self._outputs, self._on_failure = outputs, on_failure
+        self.limits = limits  # may be replaced at any time
+        self._reader, self._link, self._clock = reader, reader.link, reader.link.clock
+        self._compensation, self._outputs = compensation, outputs
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
-        self._published_s = self._clock.monotonic()
         self._levels: list[Level] = []
+        self._status: Mapping[str, Any] = {}  # the server's newest, of this connection
+        self._connects, self._asked_s, self._waiting = 0, 0.0, dict[str, Future[JsonObject]]()
+        self._flags = Flags()
+        self._age_us: tuple[float, float] | None = None
+        self._rate_hz: float | None = None
+        self._published_s = now_s = self._clock.monotonic()
+        # The last number of fresh samples, when it changed, and the link's epoch.
+        self._fresh, self._fresh_s, self._epoch = 0, now_s, -1
+        # Where the rate is measured from: samples, time here, and the newest one's stamp.
+        self._rate_fresh, self._rate_s, self._rate_ns = 0, now_s, -1
+        # As of the last regular report, and whether the server's counts are in it.
+        self._then, self._same_server = Counts(), False
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="monitor", daemon=True)
+        self.thread = Worker("monitor", self._run, on_failure)
 
-    def start(self) -> None:
-        """Start looking."""
-        self._thread.start()
-
-    def stop(self, timeout_s: float = 5.0) -> bool:
+    def stop(self) -> bool:
         """Stop and wait for the thread; False if it does not end in time."""
         self._stopping.set()
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        return self.thread.has_ended()
 
     def _run(self) -> None:
-        try:
-            while not self._clock.wait(self._stopping, TICK_S):
-                self.tick()
-        except Exception as error:  # noqa: BLE001 - without diagnostics the node would seem dead
-            if not self._stopping.is_set():
-                self._on_failure(f"the monitor failed: {type(error).__name__}: {error}")
+        while not self._clock.wait(self._stopping, TICK_S):
+            self.tick()
 
     def tick(self) -> None:
         """Look once, and publish if it is time or a level has changed."""
         self._outputs.refresh()
         now_s = self._clock.monotonic()
-        regular = now_s - self._published_s >= REPORT_S
+        regular = now_s - self._published_s >= _REPORT_S
         if regular:
-            self._observer.measure(now_s)
-        snapshot = self._observer.look(now_s)
+            self._measure(now_s)
+        snapshot = self._look(now_s)
         statuses = judge(snapshot, self.limits)
         levels = [status.level for status in statuses]
         if regular or levels != self._levels:
             self._levels, self._published_s = levels, now_s
             self._publish(statuses, snapshot)
         if regular:
-            self._observer.begin_interval(snapshot, now_s)
+            self._begin_interval(snapshot, now_s)
+
+    def _measure(self, now_s: float) -> None:
+        """Work out rate and ages of the interval that ends."""
+        ages, link = self._reader.watch.take_ages(), self._link
+        self._age_us = None
+        if ages and link.is_connected and link.client.session.same_machine:
+            self._age_us = ages[len(ages) // 2] / 1e3, (p99(ages) or 0) / 1e3
+        if link.epoch != self._epoch:
+            return
+        fresh, elapsed_s = self._reader.counts.new, now_s - self._rate_s
+        newest_ns = self._reader.accounting.new_ns
+        # By the stamps, as a delay here is none of the sensor's; by the clock if it has become silent.
+        span_s = (newest_ns - self._rate_ns) * 1e-9 if self._rate_ns >= 0 else 0.0
+        span_s = span_s if span_s >= _SHORTEST_RATE_S else elapsed_s
+        self._rate_hz = (fresh - self._rate_fresh) / span_s if elapsed_s >= _SHORTEST_RATE_S else None
+        self._rate_fresh, self._rate_s, self._rate_ns = fresh, now_s, newest_ns
+
+    def _look(self, now_s: float) -> Snapshot:
+        """How things are now."""
+        link, reader = self._link, self._reader
+        self._collect()
+        status, compensation, seen = self._status, self._compensation(), reader.counts
+        counts = Counts(
+            link.connects, seen.new, seen.missing, seen.stale, seen.limited, seen.repeated, seen.invalid,
+            reader.not_finite, reader.watch.saturated, compensation.withheld,
+        ).with_server(status, link.sensor)  # fmt: skip
+        if link.epoch != self._epoch:
+            self._epoch, self._rate_hz = link.epoch, None
+            self._rate_fresh, self._rate_s = counts.samples, now_s
+            self._rate_ns = reader.accounting.new_ns
+        if counts.samples != self._fresh:
+            self._fresh, self._fresh_s = counts.samples, now_s
+        self._flags = self._flags.merge(reader.watch.take_flags())
+        sample = reader.watch.sample
+        return Snapshot(
+            sensor=link.sensor,
+            address=link.address,
+            connected=link.is_connected,
+            problem=link.problem,
+            is_reachable=link.is_reachable,
+            connection_s=now_s - link.since_s,
+            info=link.info,
+            lost=link.lost,
+            silent_s=max(now_s - max(self._fresh_s, link.since_s), 0.0),
+            rate_hz=self._rate_hz,
+            expected_hz=link.rate_hz,
+            age_us=self._age_us,
+            counts=counts,
+            new=counts.since(self._then, same_server=self._same_server and bool(status)),
+            flags=self._flags,
+            temperature=None if sample is None else sample.temperature,
+            server=status,
+            answer_s=now_s - self._asked_s if self._waiting else 0.0,
+            settings=link.settings,
+            compensation=compensation,
+        )
+
+    def _begin_interval(self, reported: Snapshot, now_s: float) -> None:
+        """`reported` was a regular report: what is new counts from there on. Asks the server again."""
+        self._flags, link = Flags(), self._link
+        counts = reported.counts
+        if not reported.server:  # what it had counted before is still known, unless it is another one then
+            of_server = zip(OF_SERVER, self._then[-len(OF_SERVER) :], strict=True)
+            counts = counts._replace(**dict(of_server))
+        self._then = counts
+        self._same_server = bool(reported.server) or (self._same_server and reported.connected)
+        if link.is_connected and not self._waiting:  # unless an answer is still owed
+            self._asked_s = now_s
+            try:
+                for action in ("status", "describe"):
+                    self._waiting[action] = link.client.request(action)
+            except ConnectionFailedError:
+                self._waiting = {}  # the reader will notice
+
+    def _collect(self) -> None:
+        """Take what the server has answered, without waiting; the link gets the description."""
+        link = self._link
+        if not link.is_connected or link.connects != self._connects:
+            self._connects, self._status, self._waiting = link.connects, {}, {}
+        for action in [action for action, reply in self._waiting.items() if reply.done()]:
+            reply = self._waiting.pop(action)
+            if reply.exception() is None and (content := reply.result()).get("ok") is True:
+                if action == "status":
+                    self._status = content
+                else:
+                    link.described(content)
 
     def _publish(self, statuses: Sequence[Status], snapshot: Snapshot) -> None:
         info = snapshot.info
@@ -102,3 +195,8 @@ class Monitor:
             for status in statuses
         ]
         self._publisher.publish(message)
+
+
+def text_of(value: object) -> str:
+    """A value as a KeyValue carries it."""
+    return str(value).lower() if isinstance(value, bool) else printable(value)

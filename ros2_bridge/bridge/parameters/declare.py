@@ -1,6 +1,7 @@
-"""The table's parameters on the node: declared with what was given, and set while the node runs.
+"""The table's parameters and the sensor's settings on the node: declared with what was given, and set while
+it runs.
 
-Those that are set are checked one by one and together, then applied.
+The table's that are set are checked one by one and together, then applied.
 """
 
 from __future__ import annotations
@@ -13,23 +14,28 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from bota_ethercat.settings import SETTINGS
+from bota_ethercat.errors import SettingError
+from bota_ethercat.settings import SETTINGS, Setting, SettingValue, check_settings, known_settings
 from bota_ethercat.text.did_you_mean import did_you_mean
-from bridge.parameters.row import ParameterError, ParameterValue, Row
-from bridge.parameters.table import PARAMETERS, Parameters, gather_all
+from bridge.parameters.table import PARAMETERS, ParameterError, Parameters, Row, gather
+from bridge.stream.link import CONFIGURE_TIMEOUT_S, Link, RequestFailedError
 
-SETTINGS_PREFIX: Final = "settings."
+_PREFIX: Final = "settings."
+# Prefixes of parameters that rclpy itself may declare.
 _OF_OTHERS: Final = ("qos_overrides.", "use_sim_time", "start_type_description_service")
-"""Prefixes of parameters that rclpy itself may declare."""
 _LIVE: Final = {row.name: row for row in PARAMETERS if row.live}
 _TYPES: Final = {type_.value for type_ in Parameter.Type}
 
 
 def declare(node: Node) -> Parameters:
     """Declare every parameter on `node` and return their values; ParameterError if one is wrong."""
-    # Of any type here: `Row.check` has made each what its default is.
-    values: dict[str, Any] = {row.name: _given(node, row) for row in PARAMETERS}
-    parameters = gather_all(dict(values))
+    values: dict[str, Any] = {}  # of any type here: `Row.check` has made each what its default is
+    for row in PARAMETERS:
+        # Declared loosely for what was given, whatever its type, and undeclared again.
+        given = node.declare_parameter(row.name, row.default, ParameterDescriptor(dynamic_typing=True)).value
+        node.undeclare_parameter(row.name)
+        values[row.name] = row.check(given)
+    parameters = gather(values)
     values["server_port"] = parameters.server_port
     for row in PARAMETERS:
         node.declare_parameter(row.name, values[row.name], descriptor(row), ignore_override=True)
@@ -39,7 +45,7 @@ def declare(node: Node) -> Parameters:
 def warn_of_others(node: Node) -> None:
     """Warn of given parameters that the node does not have; call it once all are declared."""
     # Not the node's own list, which leaves out settings without a value.
-    names = [row.name for row in PARAMETERS] + [SETTINGS_PREFIX + name for name in SETTINGS]
+    names = [row.name for row in PARAMETERS] + [_PREFIX + name for name in SETTINGS]
     for given in node._parameter_overrides:  # rclpy has no public name
         if node.has_parameter(given) or given.startswith(_OF_OTHERS):
             continue
@@ -57,21 +63,13 @@ def descriptor(row: Row) -> ParameterDescriptor:
     described = ParameterDescriptor(description=row.description, read_only=not row.live)
     if row.choices or isinstance(row.default, tuple):
         described.additional_constraints = row.allowed()
-    if row.low is not None and row.high is not None:
-        if type(row.default) is int:
-            described.integer_range = [IntegerRange(from_value=int(row.low), to_value=int(row.high), step=1)]
-        elif isinstance(row.default, float):
-            described.floating_point_range = [
-                FloatingPointRange(from_value=float(row.low), to_value=float(row.high), step=0.0)
-            ]
+    elif type(row.default) is int:
+        described.integer_range = [IntegerRange(from_value=int(row.low), to_value=int(row.high), step=1)]
+    elif isinstance(row.default, float):
+        described.floating_point_range = [
+            FloatingPointRange(from_value=float(row.low), to_value=float(row.high), step=0.0)
+        ]
     return described
-
-
-def _given(node: Node, row: Row) -> ParameterValue:
-    """What was given, checked; declared loosely for that, whatever its type, and undeclared again."""
-    given = node.declare_parameter(row.name, row.default, ParameterDescriptor(dynamic_typing=True)).value
-    node.undeclare_parameter(row.name)
-    return row.check(given)
 
 
 class LiveParameters:
@@ -80,10 +78,8 @@ class LiveParameters:
     def __init__(self, node: Node) -> None:
         """The parameters must have been declared."""
         self._node = node
-        self.checks: list[Callable[[Parameters], object]] = []
-        """Each may refuse new values: ParameterError."""
-        self.listeners: list[Callable[[Parameters], object]] = []
-        """Each gets the new values."""
+        self.check: Callable[[Parameters], object] = lambda _: None  # may refuse new values: ParameterError
+        self.apply: Callable[[Parameters], object] = lambda _: None  # gets the new values
         node.add_pre_set_parameters_callback(_convert)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._after_set)
@@ -100,30 +96,20 @@ class LiveParameters:
 
     def _on_set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         changed = {parameter.name: parameter.value for parameter in parameters if parameter.name in _LIVE}
-        if changed:
-            try:
-                wanted = self._gather(changed)
-                for check in self.checks:
-                    check(wanted)
-            except ParameterError as error:
-                return SetParametersResult(successful=False, reason=str(error))
+        try:
+            if changed:
+                self.check(self._gather(changed))
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _after_set(self, parameters: Sequence[Parameter]) -> None:
         if any(parameter.name in _LIVE for parameter in parameters):
-            found = self._gather({})
-            for listener in self.listeners:
-                listener(found)
+            self.apply(self._gather({}))
 
     def _gather(self, changed: dict[str, Any]) -> Parameters:
-        return gather_all(
-            {
-                row.name: row.check(
-                    changed[row.name] if row.name in changed else self._node.get_parameter(row.name).value
-                )
-                for row in PARAMETERS
-            }
-        )
+        values = {row.name: self._node.get_parameter(row.name).value for row in PARAMETERS} | changed
+        return gather({row.name: row.check(values[row.name]) for row in PARAMETERS})
 
 
 def _refuse_unknown_types(set_parameters: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
@@ -146,12 +132,116 @@ def _refuse_unknown_types(set_parameters: Callable[[Any, Any], Any]) -> Callable
 
 def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:
     """Whole numbers as the floats that are meant: `ros2 param set /bridge tool_mass 1`."""
-    return [_converted(parameter) for parameter in parameters]
+    converted = []
+    for parameter in parameters:
+        try:
+            value: Any = _LIVE[parameter.name].check(parameter.value)
+        except (KeyError, ParameterError):  # of others, or refused soon, with a sentence
+            converted.append(parameter)
+        else:
+            value = [*value] if isinstance(value, tuple) else value
+            converted.append(Parameter(parameter.name, value=value))
+    return converted
 
 
-def _converted(parameter: Parameter) -> Parameter:
-    try:
-        value = _LIVE[parameter.name].check(parameter.value)
-    except (KeyError, ParameterError):  # of others, or refused soon, with a sentence
-        return parameter
-    return Parameter(parameter.name, value=[*value] if isinstance(value, tuple) else value)
+class SettingsParameters:
+    """The sensor's settings as parameters `settings.NAME`, which show what is in force; set one to change it.
+
+    They have no value (NOT_SET) while there is no server, nor where this sensor lacks the setting. The server
+    is asked for every change and must say that it is in force; otherwise the parameter stays as it was.
+    Values given at start do not change the sensor by themselves: other nodes may share it. `apply` puts them,
+    and what was set since, in force together. Lives in the executor's thread, but for `changed`.
+    """
+
+    def __init__(self, node: Node, link: Link) -> None:
+        self._node, self._link = node, link
+        self._wanted: dict[str, SettingValue] = {}  # what this node's user gave at start or set since
+        self._following = True
+        for setting in SETTINGS.values():
+            self._declare(setting)
+        self._following = False
+        if self._wanted:
+            node.get_logger().info(
+                f"settings given at start: {', '.join(self._wanted)}; "
+                "call ~/apply_settings to put them in force"
+            )
+        node.add_on_set_parameters_callback(self._on_set)
+        # `changed`: the settings, or whether there are any, may have changed; for any thread.
+        self.changed: Callable[[], object] = node.create_guard_condition(self._follow).trigger
+
+    def _declare(self, setting: Setting) -> None:
+        name = _PREFIX + setting.name
+        given = self._node.declare_parameter(name, None, _descriptor(setting)).value
+        if given is not None:
+            try:
+                self._wanted[setting.name] = setting.check(given)
+            except SettingError as error:
+                raise ParameterError(f"parameter {name}: {error}") from None
+            self._unset(setting)
+
+    def apply(self) -> dict[str, SettingValue]:
+        """Put in force what was given at start or set since, and return it.
+
+        RequestFailedError if that is nothing or cannot be.
+        """
+        if not self._wanted:
+            raise RequestFailedError(
+                "no settings were given: give settings.NAME at start, or set one while the node runs"
+            )
+        try:
+            self._configure(check_settings(self._wanted))
+        except SettingError as error:
+            raise RequestFailedError(str(error)) from None
+        return dict(self._wanted)
+
+    def _unset(self, setting: Setting) -> None:
+        name = _PREFIX + setting.name
+        self._node.undeclare_parameter(name)
+        self._node.declare_parameter(name, None, _descriptor(setting), ignore_override=True)
+
+    def _follow(self) -> None:
+        """Make the parameters what the settings are."""
+        in_force = self._link.settings
+        self._following = True
+        try:
+            for setting in SETTINGS.values():
+                shown = self._node.get_parameter(_PREFIX + setting.name).value
+                value = in_force.get(setting.name)
+                if value is None and shown is not None:
+                    self._unset(setting)
+                elif value is not None and (value != shown or type(value) is not type(shown)):
+                    self._node.set_parameters([Parameter(_PREFIX + setting.name, value=value)])
+        finally:
+            self._following = False
+
+    def _on_set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        wanted = {p.name.removeprefix(_PREFIX): p.value for p in parameters if p.name.startswith(_PREFIX)}
+        if self._following or not wanted:
+            return SetParametersResult(successful=True)
+        try:
+            self._configure(check_settings(wanted))
+        except (SettingError, RequestFailedError) as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self._wanted.update(wanted)
+        return SetParametersResult(successful=True)
+
+    def _configure(self, wanted: dict[str, SettingValue]) -> None:
+        reply = self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=self._link.sensor, settings=wanted)
+        self._link.take_settings(reply)
+        in_force = known_settings(reply.get("settings"))
+        for name, value in wanted.items():
+            if (held := in_force.get(name)) != value:
+                self.changed()
+                raise RequestFailedError(f"{name} is still {held}: the server did not apply {value}")
+
+
+def _descriptor(setting: Setting) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=setting.meaning[0].upper() + setting.meaning[1:], dynamic_typing=True
+    )
+    if isinstance(setting.choices, range):
+        low, high = setting.choices[0], setting.choices[-1]
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+    elif setting.choices:
+        descriptor.additional_constraints = "one of " + ", ".join(map(str, setting.choices))
+    return descriptor

@@ -1,81 +1,220 @@
 """The node's parameters: one table, from which they are declared, checked, described and documented. No ROS.
 
-Those of the compensation (`compensation`), limits and covariances can be set while the node runs (`live`),
-others are read-only. A wrong value ends the node at start with one sentence. The sensor's settings are
-parameters too, but the server decides about them: `sensor_settings`.
+A wrong value ends the node at start, or is refused while it runs, with one sentence. The sensor's settings
+are parameters too, but the server decides about them: `declare.SettingsParameters`.
 """
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.client.real_time import HIGHEST_PRIORITY
 from bota_ethercat.health.verdict import LIMITS, Limits
-from bota_ethercat.pdo import ImuUnits
-from bridge.parameters.compensation import ROWS as COMPENSATION_ROWS
-from bridge.parameters.compensation import CompensationParameters, gather
-from bridge.parameters.row import NO_TEXTS, Numbers, ParameterError, Row
-from bridge.parameters.wrench_frames import WrenchFrame, parse
+from bota_ethercat.pdo import ImuUnits, Vector3
+from ft_compensation.outputs import LEAST_CUTOFF_HZ, LEAST_NOTCH_HZ, FilterSettings, WrenchTransform
+from ft_compensation.quantities import (
+    DEFAULT_GRAVITY,
+    EXACT,
+    ZERO,
+    Accelerometer,
+    Payload,
+    Quaternion,
+    Wrench,
+    length,
+    unit_quaternion,
+)
+from ft_compensation.stationary_limits import StationaryLimits
 
-_UNKNOWN: Final = (0.0, 0.0, 0.0)
+Numbers = tuple[float, ...]
+ParameterValue = bool | int | float | str | Numbers | tuple[str, ...]
+NO_TEXTS: Final = ("",)  # an empty list of strings: ROS cannot infer the type of []
+AUTO: Final = "auto"  # the value of a path that is for the node to choose
+TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
+_PORT: Final = 12001
+_COVARIANCE_LENGTHS: Final = (3, 9)
 _COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
-
-_LIMITS: Final = "diagnostics."
-"""Prefix of those limits of every verdict that can be set for this node."""
-
-
-def _limit(name: str, meaning: str, low: float, high: float) -> Row:
-    return Row(_LIMITS + name, getattr(LIMITS, name), meaning, low, high)
+_LEAST_GRAVITY: Final = 0.1
+_LEAST_SCALE: Final = 0.5
+_FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_FARTHEST_M: Final = 10.0
+_REST: Final = StationaryLimits()
 
 
-SERVER_PORT: Final = Row("server_port", 12001, "TCP port of ethercat-server", 1, 65535)
-_LIVE: Final = ("publishing_frequency", "temperature_variance", _LIMITS)
-"""Prefixes of what can be set while the node runs; covariances can, too."""
-_TABLE: Final = (
-    Row("server_host", "localhost", "Host that ethercat-server runs on"),
-    SERVER_PORT,
-    Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535),
-    Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255),
-    Row(
-        "rt_priority",
-        40,
+class ParameterError(Exception):
+    """A parameter has a value that it cannot have; the text is one sentence."""
+
+
+class Row(NamedTuple):
+    """One parameter. The default's type is the parameter's; a tuple is texts, or numbers, `lengths` how many.
+
+    `low` and `high` bound a number, or the magnitude of each of several. `live`: can be set while the node
+    runs; others are read-only.
+    """
+
+    name: str
+    default: ParameterValue
+    description: str
+    low: float = 0.0
+    high: float = 0.0
+    choices: tuple[str, ...] = ()
+    lengths: tuple[int, ...] = _COVARIANCE_LENGTHS
+    live: bool = True
+
+    def check(self, value: object) -> ParameterValue:
+        """Return `value`, a whole number as float where one is meant; ParameterError if it cannot be."""
+        several, kind = isinstance(self.default, tuple), self._kind
+        items: list[Any] = [value]
+        if several and hasattr(value, "__iter__") and not isinstance(value, str | bytes):
+            items = list(value)  # rclpy gives an array.array or a list, of whole numbers if all are
+        elif several and kind is str and value is None:
+            items = []  # what rclpy makes of []
+        if not all(map(self._may_be, items)) or (
+            several and kind is float and len(items) not in self.lengths
+        ):
+            raise ParameterError(f"parameter {self.name} is {value!r}: it must be {self.allowed()}")
+        checked = tuple(map(kind, items)) or NO_TEXTS
+        return checked if several else checked[0]
+
+    @property
+    def _kind(self) -> type[Any]:
+        return type(self.default[0] if isinstance(self.default, tuple) else self.default)
+
+    def _may_be(self, item: object) -> bool:
+        kind, several = self._kind, isinstance(self.default, tuple)
+        if type(item) is not kind and (kind, type(item)) != (float, int):
+            return False
+        if isinstance(item, str):
+            return item in self.choices if self.choices else several or bool(item)
+        if isinstance(item, bool) or not isinstance(item, int | float):
+            return True
+        return self.low <= (abs(item) if several else item) <= self.high  # nor is it a NaN
+
+    def allowed(self) -> str:
+        """The values that it may have, in words."""
+        if self.choices:
+            return " or ".join(self.choices)
+        if isinstance(self.default, tuple):
+            if self._kind is str:
+                return "a list of texts"
+            if self.lengths == _COVARIANCE_LENGTHS:
+                return "3 numbers, the variances, or 9, the covariance row by row"
+            return f"{self.lengths[0]} numbers, none beyond {self.high:g} either way"
+        if isinstance(self.default, str):
+            return "text that is not empty"
+        if isinstance(self.default, bool):
+            return "true or false"
+        kind = "a whole number" if isinstance(self.default, int) else "a number"
+        return f"{kind} from {self.low:g} to {self.high:g}"
+
+
+PARAMETERS: Final = (
+    Row("server_host", "localhost", "Host that ethercat-server runs on", live=False),
+    Row("server_port", _PORT, "TCP port of ethercat-server", 1, 65535, live=False),
+    Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535, live=False),
+    Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255, live=False),
+    Row("rt_priority", 40,
         "SCHED_FIFO priority of the stream's thread, if allowed; 0 = as the node was started",
-        0,
-        HIGHEST_PRIORITY,
-    ),
-    Row("cpu", -1, "CPU of the stream's thread; -1 = any", -1, 1023),
+        0, HIGHEST_PRIORITY, live=False),
+    Row("cpu", -1, "CPU of the stream's thread; -1 = any", -1, 1023, live=False),
     Row("publishing_frequency", 0.0, "Most messages a second, always the newest; 0 = every sample", 0, 1e6),
-    Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray"),
-    Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature"),
-    Row(
-        "wrench_frames",
-        NO_TEXTS,
+    Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray", live=False),
+    Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature",
+        live=False),
+    Row("wrench_frames", NO_TEXTS,
         "Frames of wrench_compensated/NAME: NAME (by TF), or 'NAME x y z [qx qy qz qw]' in frame_id, m",
-    ),
-    Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages"),
-    Row(
-        "imu_raw_units",
-        ImuUnits.G_DPS.value,
-        "What the sensor sends acceleration and angular rate in",
-        choices=tuple(units.value for units in ImuUnits),
-    ),
-    Row("orientation_covariance", _UNKNOWN, f"Of the IMU's orientation, rad²: {_COVARIANCE}", 0, 1e12),
-    Row("angular_velocity_covariance", _UNKNOWN, f"Of the IMU, (rad/s)²: {_COVARIANCE}", 0, 1e12),
-    Row("linear_acceleration_covariance", _UNKNOWN, f"Of the IMU, (m/s²)²: {_COVARIANCE}", 0, 1e12),
+        live=False),
+    Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages", live=False),
+    Row("imu_raw_units", ImuUnits.G_DPS.value, "What the sensor sends acceleration and angular rate in",
+        choices=tuple(units.value for units in ImuUnits), live=False),
+    Row("orientation_covariance", ZERO, f"Of the IMU's orientation, rad²: {_COVARIANCE}", 0, 1e12),
+    Row("angular_velocity_covariance", ZERO, f"Of the IMU, (rad/s)²: {_COVARIANCE}", 0, 1e12),
+    Row("linear_acceleration_covariance", ZERO, f"Of the IMU, (m/s²)²: {_COVARIANCE}", 0, 1e12),
     Row("temperature_variance", 0.0, "Of the temperature, K²; 0 = unknown", 0, 1e6),
-    _limit("stale_after", "Seconds without a new sample that are an error", 0.05, 60),
-    _limit("rate_tolerance", "Part by which the rate may differ before it is a warning", 0, 1),
-    _limit("age_warn", "Age of the samples (p99), s, from which it is a warning", 0, 60),
-    _limit("age_error", "Age of the samples (p99), s, from which it is an error", 0, 60),
-    _limit("lost_warn", "Samples lost or skipped in a second that are a warning", 1, 10**6),
-    _limit("temperature_warn", "Temperature, °C, from which it is a warning", -40, 200),
-    _limit("temperature_error", "Temperature, °C, from which it is an error", -40, 200),
-    *COMPENSATION_ROWS,
-)
-PARAMETERS: Final = tuple(
-    row._replace(live=row.live or row.name.startswith(_LIVE) or row.name.endswith("_covariance"))
-    for row in _TABLE
-)
+    # Those limits of every verdict that can be set for this node.
+    Row("diagnostics.stale_after", LIMITS.stale_after,
+        "Seconds without a new sample that are an error", 0.05, 60),
+    Row("diagnostics.rate_tolerance", LIMITS.rate_tolerance,
+        "Part by which the rate may differ before it is a warning", 0, 1),
+    Row("diagnostics.age_warn", LIMITS.age_warn,
+        "Age of the samples (p99), s, from which it is a warning", 0, 60),
+    Row("diagnostics.age_error", LIMITS.age_error,
+        "Age of the samples (p99), s, from which it is an error", 0, 60),
+    Row("diagnostics.lost_warn", LIMITS.lost_warn,
+        "Samples lost or skipped in a second that are a warning", 1, 10**6),
+    Row("diagnostics.temperature_warn", LIMITS.temperature_warn,
+        "Temperature, °C, from which it is a warning", -40, 200),
+    Row("diagnostics.temperature_error", LIMITS.temperature_error,
+        "Temperature, °C, from which it is an error", -40, 200),
+    Row("tool_mass", 0.0, "Mass of what hangs on the sensor, kg; 0 = it is not compensated", 0, 1000),
+    Row("tool_center_of_gravity", ZERO, "Its center of gravity in frame_id, m", 0, 10, lengths=(3,)),
+    Row("gravity", DEFAULT_GRAVITY,
+        "Gravity, m/s², in the base frame: that of the orientations", 0, 100, lengths=(3,)),
+    Row("bias", (0.0,) * 6,
+        "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6, lengths=(6,)),
+    Row("bias_ramp_time", 0.5, "Seconds in which a new bias replaces the old one; 0 = at once", 0, 60),
+    Row("bias_keep", False, "Whether the bias is kept across restarts, by the sensor's serial number"),
+    Row("bias_directory", AUTO,
+        "Where it is kept; auto = bota-ethercat-bridge in $XDG_STATE_HOME or ~/.local/state"),
+    Row("imu_position", ZERO,
+        "Position of the IMU in frame_id, m; zeros = that of the sensor's model", 0, 1, lengths=(3,)),
+    Row("on_saturation", "publish",
+        "What wrench_compensated does on samples whose force or torque is saturated",
+        choices=("publish", "stop")),
+    Row("gravity_source", "imu",
+        "Where the tool's weight is from: imu (with its inertia), or an orientation of the robot's",
+        choices=("none", "imu", *TOPIC_SOURCES, "tf")),
+    Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
+    Row("orientation.base_frame", "base_link", "Frame that gravity is given in, for the source tf"),
+    Row("orientation.mounting", (0.0, 0.0, 0.0, 1.0),
+        "Quaternion x y z w: frame_id in the frame of the topic", 0, 1, lengths=(4,)),
+    Row("orientation.stale_after", 0.1,
+        "Largest difference of the stamps of orientation and sample, s", 0.001, 10),
+    Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
+    Row("accelerometer.scale", EXACT.scale, "Its scale factors; ~/identify finds them", 0, 2, lengths=(3,)),
+    Row("accelerometer.offset_interval", EXACT.offset_interval,
+        "Half of the 95 % interval of its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
+    Row("accelerometer.scale_interval", EXACT.scale_interval,
+        "Half of the 95 % interval of its scale; ~/identify finds it", 0, 1, lengths=(3,)),
+    Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
+    Row("rest.force_spread", _REST.force_spread, "Largest standard deviation when stationary, N", 0, 1e3),
+    Row("rest.torque_spread", _REST.torque_spread, "Largest standard deviation when stationary, Nm", 0, 1e3),
+    Row("rest.force_wander", _REST.force_wander, "Largest drift of the mean when stationary, N", 0, 1e3),
+    Row("rest.torque_wander", _REST.torque_wander, "Largest drift of the mean when stationary, Nm", 0, 1e3),
+    Row("rest.angular_rate", _REST.angular_rate, "Largest mean angular rate when stationary, rad/s", 0, 10),
+    Row("rest.angular_rate_spread", _REST.angular_rate_spread,
+        "Largest standard deviation when stationary, rad/s", 0, 10),
+    Row("rest.acceleration_spread", _REST.acceleration_spread,
+        "Largest standard deviation when stationary, m/s²", 0, 100),
+    Row("rest.acceleration_wander", _REST.acceleration_wander,
+        "Largest drift of the mean when stationary, m/s²", 0, 100),
+    Row("filter.cutoff", 0.0, "Low-pass of wrench_filtered, -3 dB, Hz; 0 = no such topic", 0, 1000),
+    Row("filter.notch", 0.0, "Center of its notch, Hz; 0 = none", 0, 1000),
+    Row("filter.notch_width", 5.0, "Width of the notch between -3 dB points, Hz", 0.1, 1000),
+    Row("filter.dead_band_force", 0.0, "Subtracted from the magnitude of its force, N; 0 = none", 0, 1e6),
+    Row("filter.dead_band_torque", 0.0, "Subtracted from the magnitude of its torque, Nm; 0 = none", 0, 1e6),
+    Row("identify.file", AUTO,
+        "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bias_directory"),
+)  # fmt: skip
+
+
+class OrientationParameters(NamedTuple):
+    """Where the orientation comes from."""
+
+    source: str
+    topic: str
+    base_frame: str
+    mounting: Quaternion
+    stale_after: float
+
+
+class WrenchFrame(NamedTuple):
+    """A frame of the compensated wrench besides the sensor's, and the end of a topic's name."""
+
+    name: str
+    fixed: WrenchTransform | None = None  # from `frame_id` to it; None: from TF
 
 
 class Parameters(NamedTuple):
@@ -84,6 +223,8 @@ class Parameters(NamedTuple):
     server_host: str
     server_port: int
     sensor: int
+    rt_priority: int
+    cpu: int
     publishing_frequency: float
     array_topic: str
     imu_units: ImuUnits
@@ -93,37 +234,117 @@ class Parameters(NamedTuple):
     angular_velocity_covariance: Numbers
     linear_acceleration_covariance: Numbers
     temperature_variance: float
-    wrench_frames: tuple[WrenchFrame, ...]
     limits: Limits
-    compensation: CompensationParameters
-    """As they are at start."""
-    rt_priority: int
-    cpu: int
+    wrench_frames: tuple[WrenchFrame, ...]
+    payload: Payload
+    gravity: Vector3
+    bias: Wrench
+    bias_ramp_time: float
+    bias_keep: bool
+    bias_directory: str
+    imu_position: Vector3
+    on_saturation: str
+    orientation: OrientationParameters
+    accelerometer: Accelerometer
+    rest_duration: float
+    rest: StationaryLimits
+    identify_file: str
+    filter: FilterSettings
 
 
-def gather_all(values: dict[str, Any]) -> Parameters:
-    """From checked values by the rows' names, which it uses up; ParameterError if they do not go together."""
-    port, alias = values["server_port"], values["SERVER_PORT"]
+def gather(given: Mapping[str, Any]) -> Parameters:
+    """From checked values by the rows' names; ParameterError if they do not go together."""
+    values = dict(given)
+    port, alias = values["server_port"], values.pop("SERVER_PORT")
     if alias:
-        if port not in (SERVER_PORT.default, alias):
+        if port not in (_PORT, alias):
             raise ParameterError(
                 f"parameters server_port is {port} and SERVER_PORT is {alias}: they are one thing, give one"
             )
         values["server_port"] = alias
-    del values["SERVER_PORT"]
     for name in ("frame_id", "imu_frame_id", "orientation.base_frame"):
         if values[name].startswith("/"):
             raise ParameterError(
                 f"parameter {name} is {values[name]!r}: frames have no leading slash, give "
                 f"{values[name].lstrip('/') or 'a name'!r}"
             )
-    compensation = gather({row.name: values.pop(row.name) for row in COMPENSATION_ROWS})
-    rows = [row.name for row in _TABLE if row.name.startswith(_LIMITS)]
-    limits = LIMITS._replace(**{name.removeprefix(_LIMITS): values.pop(name) for name in rows})
-    units, frames = ImuUnits(values.pop("imu_raw_units")), parse(values.pop("wrench_frames"))
+    gravity, mounting = values["gravity"], values["orientation.mounting"]
+    if length(gravity) < _LEAST_GRAVITY:
+        raise ParameterError(
+            f"parameter gravity is {list(gravity)}: it must be at least {_LEAST_GRAVITY} m/s² long; for no "
+            "compensation of gravity set tool_mass to 0"
+        )
+    try:
+        values["orientation.mounting"] = unit_quaternion(mounting)
+    except ValueError as error:
+        raise ParameterError(f"parameter orientation.mounting is {list(mounting)}: {error}") from None
+    if min(scale := values["accelerometer.scale"]) < _LEAST_SCALE:
+        raise ParameterError(
+            f"parameter accelerometer.scale is {list(scale)}: each must be at least {_LEAST_SCALE}; 1 is an "
+            "exact axis"
+        )
+    for name, least in (("filter.cutoff", LEAST_CUTOFF_HZ), ("filter.notch", LEAST_NOTCH_HZ)):
+        if 0.0 < values[name] < least:
+            raise ParameterError(
+                f"parameter {name} is {values[name]:g}: it must be 0, for none, or at least {least:g} Hz"
+            )
+
+    def group(prefix: str) -> dict[str, Any]:
+        return {name.removeprefix(prefix): values.pop(name) for name in given if name.startswith(prefix)}
+
+    rest = group("rest.")
     return Parameters(
-        **values, imu_units=units, wrench_frames=frames, limits=limits, compensation=compensation
+        limits=LIMITS._replace(**group("diagnostics.")),
+        imu_units=ImuUnits(values.pop("imu_raw_units")),
+        wrench_frames=parse_frames(values.pop("wrench_frames")),
+        payload=Payload(values.pop("tool_mass"), values.pop("tool_center_of_gravity")),
+        bias=Wrench.of(values.pop("bias")),
+        orientation=OrientationParameters(values.pop("gravity_source"), **group("orientation.")),
+        accelerometer=Accelerometer(**group("accelerometer.")),
+        rest_duration=rest.pop("duration"),
+        rest=StationaryLimits(**rest),
+        identify_file=values.pop("identify.file"),
+        filter=FilterSettings(**group("filter.")),
+        **values,
     )
 
 
-DEFAULTS: Final = gather_all({row.name: row.default for row in PARAMETERS})
+def parse_frames(texts: Sequence[str]) -> tuple[WrenchFrame, ...]:
+    """The frames of all strings of `wrench_frames` that are not empty; ParameterError.
+
+    Each is `NAME`, whose pose TF tells, or `NAME x y z [qx qy qz qw]`, which is its pose in `frame_id`.
+    """
+    frames = tuple(_parse_frame(text) for text in texts if text.strip())
+    names = [frame.name for frame in frames]
+    for name in names:
+        if names.count(name) > 1:
+            raise ParameterError(f"parameter wrench_frames names {name!r} twice: give each frame once")
+    return frames
+
+
+def _parse_frame(text: str) -> WrenchFrame:
+    name, *words = text.split()
+    if not _FRAME_NAME.fullmatch(name):
+        raise ParameterError(
+            f"parameter wrench_frames has {name!r}, which cannot be part of a topic's name: use letters, "
+            "digits and _, and no digit first"
+        )
+    if not words:
+        return WrenchFrame(name)
+    try:
+        numbers = [float(word) for word in words]
+        if len(numbers) not in (3, 7) or not all(map(math.isfinite, numbers)):
+            raise ValueError(f"{len(numbers)} numbers follow the name")
+        x, y, z, qx, qy, qz, qw = numbers if len(numbers) == 7 else [*numbers, 0.0, 0.0, 0.0, 1.0]
+        if max(abs(x), abs(y), abs(z)) > _FARTHEST_M:
+            raise ValueError(f"that is farther than {_FARTHEST_M:g} m from the sensor")
+        pose = WrenchTransform.of((x, y, z), (qx, qy, qz, qw))
+    except ValueError as error:
+        raise ParameterError(
+            f"parameter wrench_frames has {text!r}: it must be NAME, NAME x y z, or NAME x y z qx qy qz qw, "
+            f"in m ({error})"
+        ) from None
+    return WrenchFrame(name, pose.inverse())
+
+
+DEFAULTS: Final = gather({row.name: row.default for row in PARAMETERS})

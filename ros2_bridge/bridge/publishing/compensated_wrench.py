@@ -1,27 +1,237 @@
-"""`wrench_compensated` and what was subtracted, a topic each: the compensation as the reader runs it.
+"""`wrench_compensated`, what was subtracted, and the same filtered and in other frames: a topic each.
 
 The reader calls `publish` for every selected sample, but only while somebody has subscribed or a window is
-open. What it goes by is a `Plan`, which the executor's thread replaces as a whole: there are no locks.
+open. What it goes by is a `Plan`, which the executor's thread replaces as a whole: there are no locks. TF is
+listened to only while somebody has subscribed to a topic that needs it; the reader takes what was found last.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
 
+from geometry_msgs.msg import WrenchStamped
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+
+from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample, Vector3
+from bridge.compensating.orientations import LookUp, UnusableError, check_tf, follow_tf
 from bridge.compensating.tool_sources import Source
-from bridge.parameters.compensation import CompensationParameters
-from bridge.publishing.filtered_wrench import FilteredTopic
-from bridge.publishing.messages import StageTopic
+from bridge.parameters.table import Parameters
+from bridge.publishing.messages import Topic
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
+from ft_compensation.outputs import FilterSettings, WrenchFilter, WrenchTransform
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
 from ft_compensation.stationary import StationaryWindow
 from ft_compensation.stationary_limits import StationaryLimits
+
+# Failed lookups after the first subscription before it is a problem: TF has to arrive first.
+_PATIENCE: Final = 200
+_NS_PER_S: Final = 1_000_000_000
+
+
+class WrenchTopic(Topic):
+    """`geometry_msgs/WrenchStamped` of one stage of the compensation."""
+
+    takes_all = False  # whether `note` wants what `publishing_frequency` leaves out
+    problem = ""  # why nothing is published, a sentence
+
+    def __init__(self, node: Node, topic: str, frame_id: str, stage: str = "final") -> None:
+        super().__init__(node, WrenchStamped, topic)
+        self._pack = StampedNumbers(frame_id, 6).pack
+        self.index = Stages._fields.index(stage)
+
+    def configure(self, parameters: Parameters) -> None:
+        """Take other parameters from the next sample on; for the executor's thread."""
+
+    def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
+        """Take note of a sample that is not published."""
+
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
+        """Publish a force, N, and a torque, Nm."""
+        self._send(self._pack(frame.stamp_ns, *force, *torque))
+
+
+class FixedFrameTopic(WrenchTopic):
+    """`wrench_compensated/NAME` in a frame fixed to the sensor's."""
+
+    def __init__(self, node: Node, name: str, transform: WrenchTransform) -> None:
+        super().__init__(node, f"wrench_compensated/{name}", name)
+        self._transform = transform
+
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
+        """Publish them in this frame."""
+        super().send(*self._transform.apply(force, torque), frame)
+
+
+class TfFrameTopic(WrenchTopic):
+    """`wrench_compensated/NAME` in a frame known to TF: `look` is for one thread, `send` the reader's."""
+
+    def __init__(self, node: Node, name: str, parameters: Parameters) -> None:
+        super().__init__(node, f"wrench_compensated/{name}", name)
+        self._name, self._source = name, parameters.frame_id
+        self.wanted = False  # whether anybody had subscribed at the last look
+        self.on_change: Callable[[], object] = lambda: None  # called when that changes
+        self._found: tuple[WrenchTransform, int] | None = None  # 0: it holds at any time
+        self._error, self._misses, self._asked_ns = "", 0, 0
+        self.configure(parameters)
+
+    def configure(self, parameters: Parameters) -> None:
+        """Take the limit of the age."""
+        self._limit_ns = parameters.orientation.stale_after * _NS_PER_S
+
+    def is_wanted(self) -> bool:
+        """Whether anybody has subscribed."""
+        was, self.wanted = self.wanted, super().is_wanted()
+        if self.wanted is not was:
+            self.on_change()
+        return self.wanted
+
+    def look(self, look_up: LookUp) -> None:
+        """Ask TF for the latest it has."""
+        try:
+            translation, rotation, stamp_ns = look_up(self._name, self._source)
+        except UnusableError as error:
+            self._error = str(error)
+            self._misses += 1
+        else:
+            self._found = WrenchTransform.of(translation, rotation), stamp_ns
+
+    def forget(self) -> None:
+        """Forget the pose."""
+        self._found, self._misses = None, 0
+
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
+        """Publish them in this frame, if its pose is known."""
+        self._asked_ns = asked_ns = frame.stamp_ns
+        if (found := self._found) is not None:
+            transform, stamp_ns = found
+            if not stamp_ns or abs(asked_ns - stamp_ns) <= self._limit_ns:
+                super().send(*transform.apply(force, torque), frame)
+
+    @property
+    def problem(self) -> str:  # type: ignore[override]
+        """Why nothing is published, a sentence."""
+        what = f"wrench_compensated/{self._name} has stopped: "
+        if self._found is None:
+            return "" if self._misses < _PATIENCE else what + self._error
+        behind_ns = self._asked_ns - self._found[1]
+        if not self._found[1] or not self._asked_ns or abs(behind_ns) <= self._limit_ns:
+            return ""
+        differs_s, order = abs(behind_ns) / _NS_PER_S, "older" if behind_ns > 0 else "newer"
+        return (
+            f"{what}TF's latest pose of {self._source} in {self._name} is {differs_s:.3g} s {order} than the "
+            f"sample (limit {self._limit_ns / _NS_PER_S:g} s, orientation.stale_after)"
+        )
+
+
+def make_frames(node: Node, parameters: Parameters) -> list[WrenchTopic]:
+    """A topic for each of the parameter `wrench_frames`; ParameterError if one needs TF and there is none."""
+    frames = parameters.wrench_frames
+    by_tf = [frame.name for frame in frames if frame.fixed is None]
+    if by_tf:
+        check_tf(f"parameter wrench_frames has {by_tf[0]!r} by TF", f"give its pose: '{by_tf[0]} x y z'")
+    followed = [TfFrameTopic(node, name, parameters) for name in by_tf]
+    if followed:
+        _follow_tf(node, followed)
+    return [*(FixedFrameTopic(node, name, fixed) for name, fixed in frames if fixed is not None), *followed]
+
+
+def _follow_tf(node: Node, topics: Sequence[TfFrameTopic]) -> None:
+    """Listen to TF while one of `topics` is wanted."""
+    group, close = MutuallyExclusiveCallbackGroup(), list[Callable[[], None]]()
+
+    def look(look_up: LookUp) -> None:
+        for topic in topics:
+            if topic.wanted:
+                topic.look(look_up)
+
+    def change() -> None:
+        wanted = any(topic.wanted for topic in topics)
+        if wanted and not close:
+            close.append(follow_tf(node, group, look))
+        elif close and not wanted:
+            close.pop()()
+            for topic in topics:
+                topic.forget()
+
+    guard = node.create_guard_condition(change, group)
+    for topic in topics:
+        topic.on_change = guard.trigger
+
+
+class FilteredTopic:
+    """`wrench_filtered`, if configured, from every sample: `publishing_frequency` comes after it."""
+
+    index = Stages._fields.index("final")
+    takes_all = True
+
+    def __init__(self, node: Node, parameters: Parameters, rate_hz: Callable[[], float]) -> None:
+        """`rate_hz` tells the sensor's sampling rate, 0 if it is not known."""
+        self._node, self._frame_id, self._rate_hz = node, parameters.frame_id, rate_hz
+        self.problem = ""
+        self._topic: WrenchTopic | None = None
+        self._filter = WrenchFilter()
+        self._designed: tuple[FilterSettings, float] | None = None
+        self.configure(parameters)
+
+    def configure(self, parameters: Parameters) -> None:
+        """Take other settings from the next sample on; for the executor's thread."""
+        self._settings = parameters.filter
+        if self._settings.cutoff and self._topic is None:
+            self._topic = WrenchTopic(self._node, "wrench_filtered", self._frame_id)
+
+    def is_wanted(self) -> bool:
+        """Whether it is configured and anybody has subscribed."""
+        if self._topic is None or not self._settings.cutoff:
+            return False
+        wanted = self._topic.is_wanted()
+        if not wanted and self._rate_hz():
+            self._is_ready()  # so that the delay is logged before there is a subscriber
+        return wanted
+
+    def _is_ready(self) -> bool:
+        """Whether there is a filter for the current settings and sampling rate."""
+        wanted = self._settings, self._rate_hz()
+        if wanted != self._designed:
+            why_not = self._design(*wanted)
+            self.problem = f"wrench_filtered has stopped: {why_not}" if why_not else ""
+            self._designed = wanted
+            if self.problem:
+                self._node.get_logger().warning(self.problem)
+        return not self.problem
+
+    def _design(self, settings: FilterSettings, rate_hz: float) -> str:
+        """Make it; why not, a sentence."""
+        if not settings.cutoff:
+            return "filter.cutoff is 0"
+        if not rate_hz:
+            return "the server does not report the sampling rate"
+        try:
+            self._filter.design(settings, rate_hz)
+        except CompensationError as error:
+            return str(error)
+        notch = f", notch {settings.notch:g} Hz" if settings.notch else ""
+        self._node.get_logger().info(
+            f"wrench_filtered is delayed by {self._filter.delay_s * 1e3:.1f} ms: cut-off "
+            f"{settings.cutoff:g} Hz{notch}, sampling rate {rate_hz:g} Hz"
+        )
+        return ""
+
+    def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
+        """Filter a sample that is not published."""
+        if self._is_ready():
+            self._filter.step(force, torque, frame.monotonic_ns)
+
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
+        """Filter a sample and publish it."""
+        if self._is_ready() and self._topic is not None:
+            self._topic.send(*self._filter.step(force, torque, frame.monotonic_ns), frame)
 
 
 class Plan(NamedTuple):
@@ -30,10 +240,9 @@ class Plan(NamedTuple):
     source: Source
     compensator: Compensator
     ramp: BiasRamp
-    has_tool: bool
-    """Whether anything has weight."""
+    has_tool: bool  # whether anything has weight
+    # Checks now and then whether the payload is still the one that is compensated.
     watch: PayloadWatch | None = None
-    """Checks now and then whether the payload is still the one that is compensated."""
 
 
 class RestWindow(StationaryWindow):
@@ -67,29 +276,32 @@ class RestWindow(StationaryWindow):
 
 
 class CompensatedOutput:
-    """An output of the reader's."""
+    """All topics of the compensation, as one output of the reader's."""
 
     fields = ("force", "torque")
 
-    def __init__(self, topics: Sequence[StageTopic | FilteredTopic]) -> None:
-        self._all = topics
-        self._wanted: tuple[StageTopic | FilteredTopic, ...] = ()
-        self._noting: tuple[StageTopic | FilteredTopic, ...] = ()
+    def __init__(self, node: Node, parameters: Parameters, rate_hz: Callable[[], float]) -> None:
+        """ParameterError if a frame cannot be had. `rate_hz` as for `FilteredTopic`."""
+        stages = {"wrench_compensated": "final", "compensation/bias": "bias", "compensation/tool": "tool"}
+        self._all: tuple[WrenchTopic | FilteredTopic, ...] = (
+            *(WrenchTopic(node, topic, parameters.frame_id, stage) for topic, stage in stages.items()),
+            *make_frames(node, parameters),
+            FilteredTopic(node, parameters, rate_hz),
+        )
+        self._wanted: tuple[WrenchTopic | FilteredTopic, ...] = ()
+        self._noting: tuple[WrenchTopic | FilteredTopic, ...] = ()
         self.plan = Plan(Source(), Compensator(), BiasRamp(), has_tool=False)
-        self.window: RestWindow | None = None
-        """The one that is open."""
-        self.hold: str | None = None
-        """Why nothing may be published for now, whatever else is known."""
+        self.window: RestWindow | None = None  # the one that is open
+        self.hold: str | None = None  # why nothing may be published for now, whatever else is known
+        # Whether saturated samples are not published, and whether the latest was one of them.
         self.stops_on_saturation = self.is_saturated = False
-        """Whether saturated samples are not published, and whether the latest was one of them."""
+        # Samples since the node started that were compensated, and that were not.
         self.published = self.withheld = 0
-        """Samples since the node started that were compensated, and that were not."""
-        self.is_stopped = False
-        """Whether the latest could not be compensated."""
-        self.sample: Sample | None = None
-        """The latest that came here."""
+        self.is_stopped = False  # whether the latest could not be compensated
+        self.sample: Sample | None = None  # the latest that came here
+        # Its time, s: by the server's monotonic clock, and since the Unix epoch.
         self.time_s = self.stamp_s = 0.0
-        """Its time, s: by the server's monotonic clock, and since the Unix epoch."""
+        self.configure(parameters)
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
@@ -109,11 +321,11 @@ class CompensatedOutput:
         """Why single subscribed topics are silent; "" if none is."""
         return "; ".join(topic.problem for topic in self._wanted if topic.problem)
 
-    def tune(self, parameters: CompensationParameters) -> None:
+    def configure(self, parameters: Parameters) -> None:
         """Take what parameters say of the topics; for the executor's thread."""
         self.stops_on_saturation = parameters.on_saturation == "stop"
         for topic in self._all:
-            topic.tune(parameters)
+            topic.configure(parameters)
 
     def follow(self, sample: Sample, frame: DataMessage) -> None:
         """Give source, open window and filters a sample that is not published."""
@@ -158,5 +370,5 @@ class CompensatedOutput:
     @staticmethod
     def _stages(plan: Plan, sample: Sample, felt: Vector3, time_s: float) -> Stages:
         compensator = plan.compensator
-        compensator.set_bias(plan.ramp.at(time_s))
+        compensator.bias = plan.ramp.at(time_s)
         return compensator.compensate(sample.force, sample.torque, felt)

@@ -23,20 +23,18 @@ from bota_ethercat.framing import DataMessage
 
 BACKLOG_NS: Final = 50_000_000
 FRESH_NS: Final = 4_000_000
+# After a stall the age must fall by half of this per such time: then the backlog is being read.
 _CATCH_UP_NS: Final = 20_000_000
-"""After a stall the age must fall by half of this per such time: then the backlog is being read."""
+# The usual age follows each age with these weights (1/n): a low expectile, as delays only add.
 _FALL, _RISE = 8, 64
-"""The usual age follows each age with these weights (1/n): a low expectile, as delays only add."""
 
 
 @dataclass(slots=True)
 class FrameCounts(StreamCounts):
     """Counts of the sensor's frames since the node started, with what the node itself left out."""
 
-    stale: int = 0
-    """New frames not published because newer ones were waiting."""
-    limited: int = 0
-    """New frames not published because of `publishing_frequency`."""
+    stale: int = 0  # new frames not published because newer ones were waiting
+    limited: int = 0  # new frames not published because of `publishing_frequency`
 
 
 class FrameSelector:
@@ -48,12 +46,11 @@ class FrameSelector:
         self._limit: RateLimit | None
         self.limit(limit_hz)
         self._may_be_negative = not same_clock
-        self._usual_ns: int | None = None
-        """The usual age; None before the first frame."""
+        self._usual_ns: int | None = None  # the usual age; None before the first frame
+        # While everything is stale: the time of the last check of the age, and the age.
         self._skipping: tuple[int, int] | None = None
-        """While everything is stale: the time of the last check of the age, and the age."""
+        # New frames that the rate limit left out of the last `select`, older than the one selected.
         self.passed_over: Sequence[DataMessage] = ()
-        """New frames that the rate limit left out of the last `select`, older than the one selected."""
 
     def limit(self, hz: float) -> None:
         """Select at most this many a second, 0 = all; from any thread."""
@@ -121,8 +118,7 @@ class RateLimit:
     stream's rate lets every sample pass although their intervals vary.
     """
 
-    _MOST_CREDIT: Final = 2.0
-    """With less, a limit just below the stream's rate would not be reached."""
+    _MOST_CREDIT: Final = 2.0  # with less, a limit just below the stream's rate would not be reached
 
     def __init__(self, hz: float) -> None:
         self._per_ns = hz / 1e9

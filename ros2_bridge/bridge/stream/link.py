@@ -7,23 +7,36 @@ not trusted.
 from __future__ import annotations
 
 import contextlib
+import threading
+import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.client.client import Client
 from bota_ethercat.client.session import Disconnected
 from bota_ethercat.control import Event, six_numbers
-from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError, SettingError
-from bota_ethercat.settings import SETTINGS, SettingValue
+from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError
+from bota_ethercat.settings import SettingValue, known_settings
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import number, printable, rows
-from bridge.clock import Clock
 from ft_compensation.quantities import Wrench, wrench_text
 
 CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0
 SHUTDOWN_TIMEOUT_S: Final = 3.0
 _MOST_HZ: Final = 1e6
+
+
+class Clock:
+    """Time as the node's threads see it; tests have a clock of their own, and let it pass as they like."""
+
+    monotonic = staticmethod(time.monotonic)
+    monotonic_ns = staticmethod(time.monotonic_ns)
+    time_ns = staticmethod(time.time_ns)
+    wait = staticmethod(threading.Event.wait)  # until an event is set, so many seconds at most; whether it is
+
+
+SYSTEM_CLOCK: Final = Clock()
 
 
 class RequestFailedError(Exception):
@@ -44,13 +57,11 @@ class SensorInfo(NamedTuple):
     state: str
     hardware: str = "?"
     firmware: str = "?"
-    rate: float = 0.0
-    """`rate_hz` as a number; 0 if it is none."""
+    rate: float = 0.0  # `rate_hz` as a number; 0 if it is none
     settings: Mapping[str, SettingValue] = {}
-    settling: bool = False
-    """Whether its data has not settled."""
+    settling: bool = False  # whether its data has not settled
+    # Its own force/torque offset, N and Nm; None if the server does not say.
     offset: tuple[float, ...] | None = None
-    """Its own force/torque offset, N and Nm; None if the server does not say."""
 
     def __str__(self) -> str:
         """One phrase for the log."""
@@ -61,35 +72,26 @@ class Link:
     """`on_change` is called, in the writer's thread, after each change of what is known."""
 
     def __init__(self, client: Client, sensor: int, clock: Clock) -> None:
-        self.client = client
-        """Of the node's only connection."""
-        self.clock = clock
-        """What everything is timed by."""
+        self.client = client  # of the node's only connection
+        self.clock = clock  # what everything is timed by
         self.address = printable(client.address)
         self.sensor = sensor
         self.on_change: Callable[[], object] = lambda: None
         self.is_connected = False
+        # The sensor as the server described it last; kept when the connection ends.
         self.info: SensorInfo | None = None
-        """The sensor as the server described it last; kept when the connection ends."""
-        self.settings: Mapping[str, SettingValue] = {}
-        """The sensor's settings; empty without a connection."""
+        self.settings: Mapping[str, SettingValue] = {}  # the sensor's settings; empty without a connection
+        # The sensor's own force/torque offset, part of every sample, N and Nm; None: not known.
         self.offset: tuple[float, ...] | None = None
-        """The sensor's own force/torque offset, part of every sample, N and Nm; None: not known."""
-        self.rate_hz = 0.0
-        """Samples a second that are to be expected; 0 if the server does not say."""
-        self.problem = client.session.problem
-        """Why there is no connection."""
+        self.rate_hz = 0.0  # samples a second that are to be expected; 0 if the server does not say
+        self.problem = client.session.problem  # why there is no connection
+        # Whether there is a server there for all that; it may be too old, or have no such sensor.
         self.is_reachable = False
-        """Whether there is a server there for all that; it may be too old, or have no such sensor."""
-        self.lost: str | None = None
-        """The server's words, while the sensor is lost."""
+        self.lost: str | None = None  # the server's words, while the sensor is lost
         self.connects = 0
-        self.since_s = clock.monotonic()
-        """CLOCK_MONOTONIC when the connection was made or lost."""
-        self.ending = False
-        """The node ends: whoever waits for something gives up."""
-        self.epoch = 0
-        """Raised by everything that interrupts the stream or changes its rate."""
+        self.since_s = clock.monotonic()  # CLOCK_MONOTONIC when the connection was made or lost
+        self.ending = False  # the node ends: whoever waits for something gives up
+        self.epoch = 0  # raised by everything that interrupts the stream or changes its rate
 
     def connected(self, description: JsonObject) -> SensorInfo:
         """The stream begins."""
@@ -200,25 +202,12 @@ class Link:
             raise RequestRefusedError(
                 f"the server at {address} refused to shut down: {error} ({error.code})"
             ) from None
-        except NoReplyError:
-            raise RequestFailedError(
-                f"the server at {address} did not answer the request to shut down"
-            ) from None
         except ConnectionFailedError as error:
-            raise RequestFailedError(
-                f"the server at {address} could not be told to shut down: {error}"
-            ) from None
+            why = f"could not be told to shut down: {error}"
+            if isinstance(error, NoReplyError):
+                why = "did not answer the request to shut down"
+            raise RequestFailedError(f"the server at {address} {why}") from None
         return f"the server at {address} is shutting down"
-
-
-def known_settings(settings: object) -> dict[str, SettingValue]:
-    """Those of `settings`, a message's, that are in the table and have a value that they can have."""
-    found: dict[str, SettingValue] = {}
-    for name, value in settings.items() if isinstance(settings, dict) else ():
-        if name in SETTINGS:
-            with contextlib.suppress(SettingError):
-                found[name] = SETTINGS[name].check(value)
-    return found
 
 
 def known_rate(rate_hz: object) -> float:
@@ -234,20 +223,25 @@ def known_offset(offset: object) -> tuple[float, ...] | None:
         return None
 
 
+def offset_text(offset: object, unknown: str = "unknown") -> str:
+    """An offset from a message for people."""
+    known = known_offset(offset)
+    return unknown if known is None else wrench_text(Wrench.of(known))
+
+
 def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
     """The row of `sensor` in a `describe` reply; RequestFailedError if there is none."""
     found = rows(description.get("sensors"))
     for row in found:
         if row.get("sensor") == sensor and not isinstance(row.get("sensor"), bool):
-            name, serial, rate, state, hardware, firmware = (
-                printable(row.get(key, "?"), 40)
-                for key in ("name", "serial", "rate_hz", "state", "hardware", "firmware")
-            )
-            number = known_rate(row.get("rate_hz"))
-            settings, settling = known_settings(row.get("settings")), row.get("settling") is True
-            offset = known_offset(row.get("offset"))
+            keys = "name", "serial", "rate_hz", "state", "hardware", "firmware"
             return SensorInfo(
-                sensor, name, serial, rate, state, hardware, firmware, number, settings, settling, offset
+                sensor=sensor,
+                **{key: printable(row.get(key, "?"), 40) for key in keys},
+                rate=known_rate(row.get("rate_hz")),
+                settings=known_settings(row.get("settings")),
+                settling=row.get("settling") is True,
+                offset=known_offset(row.get("offset")),
             )
     there = ", ".join(printable(row.get("sensor"), 10) for row in found[:16]) or "none"
     raise RequestFailedError(
@@ -265,19 +259,14 @@ def sentence(message: JsonObject, before: Mapping[str, SettingValue]) -> str:
         lost_s = number(message.get("lost_s"))
         return "the sensor is back" + ("" if lost_s is None else f" after {lost_s:g} s")
     if event == Event.RECONFIGURED:
-        return f"the sensor was reconfigured{_changes(message, before)}"
+        settings = known_settings(message.get("settings")).items()
+        changed = [f"{name} {str(value).lower()}" for name, value in settings if before.get(name) != value]
+        return "the sensor was reconfigured" + (f": {', '.join(changed)}" if changed else "")
     if event == Event.OFFSET_CHANGED:
-        offset = known_offset(message.get("offset"))
-        now = "no longer known" if offset is None else f"{wrench_text(Wrench.of(offset))} now"
-        return f"the sensor's own offset is {now}"
+        now = offset_text(message.get("offset"), unknown="")
+        return "the sensor's own offset is " + (f"{now} now" if now else "no longer known")
     if event == Event.EMERGENCY:
         return "the sensor reports an emergency" + (f": {printable(told)}" if isinstance(told, str) else "")
     if event == Event.SHUTTING_DOWN:
         return "the server is shutting down"
     return f"the server sent the event {printable(event, 40)}, which this version does not know"
-
-
-def _changes(message: Mapping[str, Any], before: Mapping[str, SettingValue]) -> str:
-    now = known_settings(message.get("settings"))
-    changed = [f"{name} {str(value).lower()}" for name, value in now.items() if before.get(name) != value]
-    return f": {', '.join(changed)}" if changed else ""

@@ -1,15 +1,17 @@
 """The reader: the thread that the node's client receives in, which publishes at once. Nothing else touches
 the stream.
 
-With a channel and a clock of the caller's `run` needs neither sockets nor real time. `start` runs it in a
-thread.
+With a channel and a clock of the caller's `run` needs neither sockets nor real time. `thread` runs it.
 """
 
 from __future__ import annotations
 
-import threading
+import contextlib
+import math
+import struct
+from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.client.channel import Channel
 from bota_ethercat.client.client import Client
@@ -19,28 +21,117 @@ from bota_ethercat.control import Event
 from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
-from bridge.clock import SYSTEM_CLOCK, Clock
 from bridge.parameters.table import Parameters
+from bridge.process import Worker
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
-from bridge.stream.link import Link, sentence
-from bridge.stream.watch import Watch
+from bridge.stream.link import SYSTEM_CLOCK, Clock, Link, sentence
 
 SILENCE_S: Final = 1.0
 _SILENCE_NS: Final = round(0.99e9 * SILENCE_S)  # a wait may end some microseconds early
-_LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
-"""The latest time that a ROS message can carry."""
+_LAST_STAMP_NS: Final = (2**31 - 1) * 10**9  # the latest time that a ROS message can carry
 _WARN_EVERY_S: Final = 10.0
+_MOST_NOTED: Final = 8192
 
 
-class Outputs(Protocol):
-    """What the samples go to: `bridge.publishing.messages.Outputs`."""
+class Flags(NamedTuple):
+    """The fields of the process data that say how the sensor is."""
+
+    status: int = 0
+    warnings: int = 0
+    force_torque_saturated: int = 0
+    acceleration_saturated: int = 0
+    angular_rate_saturated: int = 0
+
+    def merge(self, other: tuple[int, ...]) -> Flags:
+        """What is set in either."""
+        return Flags(*(mine | theirs for mine, theirs in zip(self, other, strict=True)))
+
+
+_BASE: Final = LAYOUTS[min(LAYOUTS)]
+# Of every size of process data, which all begin alike: the flags, and nothing of the rest.
+_FLAGS: Final = struct.Struct(
+    "<" + "".join(f.type.value if f.name in Flags._fields else f"{f.type.size}x" for f in _BASE.fields)
+)
+_FORCE_TORQUE: Final = Flags._fields.index("force_torque_saturated")
+
+
+class Watch:
+    """What the hot path notes for the diagnostics: the sensor's flags and the samples' ages. No locks.
+
+    `see` is for the reader, `take_flags` and `take_ages` are for the monitor: a deque's append and popleft
+    are atomic.
+    """
+
+    def __init__(self) -> None:
+        self._seen = self._current = tuple(Flags())
+        self._changes: deque[tuple[int, ...]] = deque(maxlen=_MOST_NOTED)
+        # Nanoseconds from a sample to the end of its publication, newest last.
+        self.ages: deque[int] = deque(maxlen=_MOST_NOTED)
+        self.sample: Sample | None = None  # the newest sample that was published
+        self.stamp_ns = 0  # its time, ns since the Unix epoch
+        self.saturated = 0  # samples whose force or torque was saturated
+
+    def see(self, frames: Sequence[DataMessage]) -> None:
+        """Note the flags of new frames, whether they are to be published or not."""
+        for frame in frames:
+            flags = _FLAGS.unpack_from(frame.process_data)
+            if flags != self._seen:
+                self._seen = flags
+                self._changes.append(flags)
+            if flags[_FORCE_TORQUE]:
+                self.saturated += 1
+
+    def take_flags(self) -> Flags:
+        """All that were set since the last call, if only for one frame, and those that are set now."""
+        merged = Flags(*self._current)
+        while self._changes:
+            self._current = self._changes.popleft()
+            merged = merged.merge(self._current)
+        return merged
+
+    def take_ages(self) -> list[int]:
+        """The ages since the last call, in ascending order."""
+        taken, self.ages = self.ages, deque(maxlen=_MOST_NOTED)
+        return sorted(taken)
+
+
+class Output(Protocol):
+    """A topic, or some that belong together, fed with every selected sample."""
 
     @property
-    def wanted(self) -> Sequence[Any]:
-        """Those outputs that somebody has subscribed to."""
+    def fields(self) -> Sequence[str]:
+        """The fields of `Sample` that it publishes: all of them are finite when `publish` is called."""
+
+    def is_wanted(self) -> bool:
+        """Whether anybody is there for what `publish` does. Asked now and then, not by the reader."""
+
+    def publish(self, sample: Sample, frame: DataMessage, /) -> None:
+        """Publish `sample`, which came in `frame`: its stamp, and for intervals its monotonic time."""
+
+    def follow(self, sample: Sample, frame: DataMessage) -> None:
+        """Take note of a sample that `publishing_frequency` leaves out."""
+
+    def configure(self, parameters: Parameters) -> None:
+        """Take other parameters, such as covariances, from the next sample on; for the executor's thread."""
+
+
+class Outputs:
+    """All outputs. `wanted` are those that were so at the last `refresh`."""
+
+    def __init__(self, outputs: Sequence[Output]) -> None:
+        self.all = tuple(outputs)
+        self.wanted: tuple[Output, ...] = ()
+
+    def refresh(self) -> None:
+        """Look who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
+        self.wanted = tuple(output for output in self.all if output.is_wanted())
 
     def publish_finite(self, sample: Sample, frame: DataMessage) -> None:
         """Publish a sample that is not finite everywhere where it is."""
+        for output in self.wanted:
+            parts = [getattr(sample, field) for field in output.fields]
+            if math.isfinite(sum(sum(p) if isinstance(p, tuple) else p or 0.0 for p in parts)):
+                output.publish(sample, frame)
 
 
 class Reader:
@@ -63,7 +154,6 @@ class Reader:
         self._sensor = parameters.sensor
         self._outputs = outputs
         self._log = log
-        self._on_failure = on_failure
         self.counts = FrameCounts()
         self.not_finite = 0
         self._decoders = {size: SampleDecoder(size, parameters.imu_units) for size in LAYOUTS}
@@ -71,7 +161,8 @@ class Reader:
             parameters.server_port, parameters.server_host, sensors=[self._sensor], channel=channel
         )
         self._state = self.client.session.state(self._sensor)
-        self._state.accounting.counts = self.counts
+        self.accounting = self._state.accounting
+        self.accounting.counts = self.counts
         self._clock = clock
         self.link = Link(self.client, self._sensor, clock)
         self.watch = Watch()
@@ -80,17 +171,12 @@ class Reader:
         self._problem: str | None = None
         self._is_silent = False
         self._next_warning_s = 0.0
-        self._thread = threading.Thread(target=self._run, name="reader", daemon=True)
+        self.thread = Worker("reader", self.run, on_failure)
 
-    def start(self) -> None:
-        """Start reading."""
-        self._thread.start()
-
-    def stop(self, timeout_s: float = 5.0) -> bool:
+    def stop(self) -> bool:
         """Stop reading and wait for the thread; False if it does not end in time."""
         self.client.close()
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        return self.thread.has_ended()
 
     def limit_rate(self, hz: float) -> None:
         """Publish at most this many samples a second, 0 = all; from any thread."""
@@ -98,11 +184,6 @@ class Reader:
             self._limit_hz = hz
             self._selector.limit(hz)
             self._warn_of_aliases()
-
-    @property
-    def newest_ns(self) -> int:
-        """CLOCK_MONOTONIC of the server when the newest sample was taken; -1 before the first."""
-        return self._state.accounting.new_ns
 
     def _warn_of_aliases(self) -> None:
         if 0 < self._limit_hz < self.link.rate_hz:
@@ -112,32 +193,27 @@ class Reader:
                 "at lower frequencies (aliasing); take every sample, or a longer sinc_length"
             )
 
-    def _run(self) -> None:
-        try:
-            self.run()
-        except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a dead node
-            self._on_failure(f"the reader failed: {type(error).__name__}: {error}")
-
     def run(self) -> None:
         """Connect and read, again and again, until `stop`."""
-        poll, sensor = self.client.poll_all, self._sensor
-        while True:
-            try:
-                items = poll(SILENCE_S)
-            except ConnectionFailedError:  # `client` has been closed: every other end is an event
-                return
-            if self._is_silent or not items:
-                self._watch_silence()
-            frames = []
-            for item in items:
-                if isinstance(item, DataMessage):
-                    if item.sensor == sensor:
-                        frames.append(item)
-                    continue
-                self._publish(frames)
-                frames = []
-                self._take_event(item)
+        with contextlib.suppress(ConnectionFailedError):
+            while True:
+                self.read(SILENCE_S)
+
+    def read(self, timeout_s: float) -> None:
+        """Publish what arrives within `timeout_s`; ConnectionFailedError once `client` has been closed."""
+        items = self.client.poll_all(timeout_s)
+        if self._is_silent or not items:
+            self._watch_silence()
+        frames = []
+        for item in items:
+            if isinstance(item, DataMessage):
+                if item.sensor == self._sensor:
+                    frames.append(item)
+                continue
             self._publish(frames)
+            frames = []
+            self._take_event(item)
+        self._publish(frames)
 
     def _watch_silence(self) -> None:
         """Log, once, that nothing came for SILENCE_S, and that something came again."""

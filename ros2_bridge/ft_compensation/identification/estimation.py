@@ -18,18 +18,16 @@ import numpy as np
 from ft_compensation.identification.weighted import Array, Known, Solution, solve, two_sided
 from ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
 
+# m/s²: what is assumed of the length of a mean acceleration beyond offset and sensitivities, ...
 _LENGTH_DEVIATION: Final = 0.002
-"""m/s²: what is assumed of the length of a mean acceleration beyond offset and sensitivities, ..."""
-_LENGTH_DEGREES: Final = 6.0
-"""... as if it were estimated from so many residuals."""
+_LENGTH_DEGREES: Final = 6.0  # ... as if it were estimated from so many residuals.
+# N, Nm, m/s²: standard deviations below which nothing is believed, where equations of all kinds meet.
 _FLOOR: Final = np.array([1e-6] * 3 + [1e-7] * 3 + [1e-6])
-"""N, Nm, m/s²: standard deviations below which nothing is believed, where equations of all kinds meet."""
 _FLOOR_ALONE: Final = 1e-12
+# Of an axis' variance at the offset that the lengths alone give: six poses could be made to fit one axis
+# perfectly by an offset that they hardly determine.
 _LEAST_SHARE: Final = 0.3
-"""Of an axis' variance at the offset that the lengths alone give: six poses could be made to fit one axis
-perfectly by an offset that they hardly determine."""
-_NOTHING: Final = 1e-9
-"""kg: no mass at all has its center anywhere."""
+_NOTHING: Final = 1e-9  # kg: no mass at all has its center anywhere
 _FEW: Final = 3
 _LENGTH_ROUNDS: Final = 3
 _ROUNDS: Final = 9
@@ -40,29 +38,20 @@ class Value(NamedTuple):
     """Some estimated quantities."""
 
     value: Array
-    half: Array
-    """Half the width of the confidence interval."""
+    half: Array  # half the width of the confidence interval
 
 
 class Estimate(NamedTuple):
     """The answer; shapes without the leading axes."""
 
-    mass: Value
-    """(1,), kg"""
-    center: Value
-    """(3,), m"""
-    bias: Value
-    """(6,), N and Nm"""
-    offset: Value | None
-    """(3,), m/s², of the accelerometer; None where gravity is not from it."""
-    scale: Value | None
-    """(3,): what its axes read per m/s²."""
-    gravity: Array
-    """(n, 3), m/s²: as far as known now."""
-    residuals: Array
-    """(n, 6), N and Nm: measured minus modelled."""
-    degrees: Array
-    """(6,): degrees of freedom of the residuals of each axis."""
+    mass: Value  # (1,), kg
+    center: Value  # (3,), m
+    bias: Value  # (6,), N and Nm
+    offset: Value | None  # (3,), m/s², of the accelerometer; None where gravity is not from it
+    scale: Value | None  # (3,): what its axes read per m/s²
+    gravity: Array  # (n, 3), m/s²: as far as known now
+    residuals: Array  # (n, 6), N and Nm: measured minus modelled
+    degrees: Array  # (6,): degrees of freedom of the residuals of each axis
 
 
 def estimate(
@@ -72,16 +61,10 @@ def estimate(
     acceleration: Array | None = None,
     acceleration_variance: Array | float = 0.0,
 ) -> Estimate:
-    """Solve the poses.
+    """Solve the poses: wrench (..., n, 6), N and Nm, and gravity (..., n, 3), in the sensor's frame, m/s².
 
-    Args:
-        wrench: (..., n, 6), N and Nm.
-        gravity: (..., n, 3), in the sensor's frame, m/s².
-        confidence: of the intervals.
-        acceleration: (..., n, 3), m/s², if gravity is from it.
-        acceleration_variance: (...,) of its means by the sensor's noise, (m/s²)².
-
-    LinAlgError if the equations leave an unknown open.
+    Also `acceleration` (..., n, 3), m/s², if gravity is from it, with `acceleration_variance` (...,) of its
+    means by the sensor's noise, (m/s²)². LinAlgError if the equations leave an unknown open.
     """
     measured = np.swapaxes(wrench, -1, -2)
     scale = offset = None
@@ -132,14 +115,10 @@ def _alone(gravity: Array, measured: Array, floor: float = _FLOOR_ALONE) -> Solu
 class _Linear(NamedTuple):
     """The equations of the accelerometer about an offset and scale."""
 
-    gravity: Array
-    """(..., n, 3)"""
-    turn: Array
-    """(..., n, 3, 6): change of gravity by offset and scale."""
-    stretch: Array
-    """(..., 1, n, 6): change of the length of u."""
-    excess: Array
-    """(..., 1, n): by how much gravity is longer than u."""
+    gravity: Array  # (..., n, 3)
+    turn: Array  # (..., n, 3, 6): change of gravity by offset and scale
+    stretch: Array  # (..., 1, n, 6): change of the length of u
+    excess: Array  # (..., 1, n): by how much gravity is longer than u
 
 
 def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:

@@ -8,45 +8,29 @@ from pathlib import Path
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.program.new_file import NewFile
 from ft_compensation.identification.payload import Identified
-from ft_compensation.quantities import Accelerometer, Payload, Wrench
-
-
-def to_yaml(
-    payload: Payload,
-    bias: Wrench,
-    gravity: Vector3 | None = None,
-    comment: str = "",
-    node: str = "/**",
-    accelerometer: Accelerometer | None = None,
-) -> str:
-    """The text of a parameter file for `node`; `comment` goes on top of it.
-
-    `gravity` is in the base frame, m/s²; without it the file does not say how the base stands. Without
-    `accelerometer` it leaves that one alone.
-    """
-    rows: list[tuple[str, Sequence[float], str]] = [
-        ("tool_center_of_gravity", payload.center, "m, in the sensor's frame"),
-        ("bias", bias.values, "N, Nm: Fx Fy Fz Mx My Mz, subtracted"),
-    ]
-    if gravity is not None:
-        rows.append(("gravity", gravity, "m/s², in the base frame"))
-    if accelerometer is not None:
-        rows.append(("accelerometer.offset", accelerometer.offset, "m/s², subtracted"))
-        rows.append(("accelerometer.scale", accelerometer.scale, "divided by, after that"))
-        rows.append(("accelerometer.offset_interval", accelerometer.offset_interval, "m/s², half of 95 %"))
-        rows.append(("accelerometer.scale_interval", accelerometer.scale_interval, "half of 95 %"))
-    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
-    lines += [f"{node}:", "  ros__parameters:", f"    tool_mass: {_number(payload.mass)}  # kg"]
-    lines += [f"    {name}: [{', '.join(map(_number, values))}]  # {unit}" for name, values, unit in rows]
-    return "\n".join(lines) + "\n"
 
 
 def write_yaml(path: Path, result: Identified, comment: str = "", gravity: Vector3 | None = None) -> None:
-    """Write what was identified, or replace it; `gravity` as for `to_yaml`. FileError if that fails."""
-    accelerometer = result.accelerometer.calibration if result.accelerometer else None
-    text = to_yaml(result.payload, result.bias, gravity, comment, accelerometer=accelerometer)
+    """Write what was identified, or replace it, with `comment` on top; FileError if that fails.
+
+    `gravity` is in the base frame, m/s²; without it the file does not say how the base stands. Where gravity
+    was not from the accelerometer, the file leaves that one alone.
+    """
+    rows: list[tuple[str, Sequence[float], str]] = [
+        ("tool_center_of_gravity", result.payload.center, "m, in the sensor's frame"),
+        ("bias", result.bias.values, "N, Nm: Fx Fy Fz Mx My Mz, subtracted"),
+    ]
+    if gravity is not None:
+        rows.append(("gravity", gravity, "m/s², in the base frame"))
+    if result.accelerometer is not None:
+        units = "m/s², subtracted", "divided by, after that", "m/s², half of 95 %", "half of 95 %"
+        parts = zip(result.accelerometer.calibration._asdict().items(), units, strict=True)
+        rows += [(f"accelerometer.{name}", part, unit) for (name, part), unit in parts]
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    lines += ["/**:", "  ros__parameters:", f"    tool_mass: {_number(result.payload.mass)}  # kg"]
+    lines += [f"    {name}: [{', '.join(map(_number, values))}]  # {unit}" for name, values, unit in rows]
     with NewFile(path, force=True) as file:
-        file.write(text)
+        file.write("\n".join(lines) + "\n")
         file.finish()
 
 

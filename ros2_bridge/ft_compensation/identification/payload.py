@@ -26,23 +26,18 @@ from ft_compensation.quantities import (
 )
 from ft_compensation.stationary import triple
 
-LARGEST_MASS: Final = 500.0
-"""kg: no sensor of the family carries more."""
-LARGEST_CENTRE: Final = 2.0
-"""m"""
+LARGEST_MASS: Final = 500.0  # kg: no sensor of the family carries more
+LARGEST_CENTRE: Final = 2.0  # m
 _LARGEST_MISFIT: Final = 0.1
+# N: residuals are refused beyond this plus a tenth of the weight; torques at the arm of the weight.
 _FORGIVEN_MISFIT: Final = 1.0
-"""N: residuals are refused beyond this plus a tenth of the weight; torques at the arm of the weight."""
+# Of the interval before anything is measured: an offset no better known than so is not determined.
 _UNKNOWN: Final = 0.5
-"""Of the interval before anything is measured: an offset no better known than so is not determined."""
 
-ARM: Final = 0.05
-"""m: what makes a torque of a force where the center of gravity is nearer."""
+ARM: Final = 0.05  # m: what makes a torque of a force where the center of gravity is nearer
 _SUSPICIOUS: Final = 3.0
-_NEGLIGIBLE: Final = 0.01
-"""Of the weight: a residual below it is not worth a word."""
-_RARE: Final = 3.09
-"""Standard deviations that noise exceeds once in a thousand times."""
+_NEGLIGIBLE: Final = 0.01  # of the weight: a residual below it is not worth a word
+_RARE: Final = 3.09  # standard deviations that noise exceeds once in a thousand times
 
 
 class IdentificationError(CompensationError):
@@ -52,23 +47,20 @@ class IdentificationError(CompensationError):
 class Fit(NamedTuple):
     """How well force or torque fits."""
 
-    rms: float
-    """Of the residuals, with the degrees of freedom taken into account, N or Nm."""
-    degrees: float
-    """Of freedom."""
+    rms: float  # of the residuals, with the degrees of freedom taken into account, N or Nm
+    degrees: float  # of freedom
+    # Squares of the residuals in units of what the windows' noise explains, per degree of freedom: 1 is
+    # ideal. None where that noise is not known.
     chi_square: float | None
-    """Squares of the residuals in units of what the windows' noise explains, per degree of freedom: 1 is
-    ideal. None where that noise is not known."""
+    # `noise` explains the residuals, or they are `small` (1 % of the weight) all the same, or `large`.
     verdict: str
-    """`noise` explains the residuals, or they are `small` (1 % of the weight) all the same, or `large`."""
 
 
 class OffsetFit(NamedTuple):
     """What the poses say of the accelerometer."""
 
     calibration: Accelerometer
-    undetermined: str
-    """Axes whose offset the poses do not determine: "", "x", ..."""
+    undetermined: str  # axes whose offset the poses do not determine: "", "x", ...
 
 
 class Identified(NamedTuple):
@@ -76,45 +68,33 @@ class Identified(NamedTuple):
 
     payload: Payload
     bias: Wrench
-    gravity: float
-    """Its magnitude in the poses, m/s²."""
-    mass_interval: float
-    """kg"""
-    centre_interval: Vector3
-    """m"""
-    bias_interval: Wrench
-    """N, Nm"""
+    gravity: float  # its magnitude in the poses, m/s²
+    mass_interval: float  # kg
+    centre_interval: Vector3  # m
+    bias_interval: Wrench  # N, Nm
+    # Of the intervals: 0.95 as a rule. Student's t; each axis has the variance that its residuals show.
     confidence: float
-    """Of the intervals: 0.95 as a rule. Student's t; each axis has the variance that its residuals show."""
-    residuals: tuple[Wrench, ...]
-    """What the answer leaves of each pose, in order: measured minus modelled."""
-    force_rms: float
-    """Of the residuals, with the degrees of freedom taken into account, N."""
-    torque_rms: float
-    """Likewise, Nm."""
+    residuals: tuple[Wrench, ...]  # what the answer leaves of each pose, in order: measured minus modelled
+    force_rms: float  # of the residuals, with the degrees of freedom taken into account, N
+    torque_rms: float  # likewise, Nm
+    # Of the problem with each unknown in a unit of its own size: 1.2 is ideal, beyond 10 is bad.
     condition: float
-    """Of the problem with each unknown in a unit of its own size: 1.2 is ideal, beyond 10 is bad."""
     coverage: Coverage
-    notes: tuple[str, ...]
-    """What a person should know, sentences: a pose that does not fit, a wide interval."""
+    notes: tuple[str, ...]  # what a person should know, sentences: a pose that does not fit, a wide interval
     force_fit: Fit
     torque_fit: Fit
-    accelerometer: OffsetFit | None
-    """None where gravity is not from it: it is not touched then."""
+    accelerometer: OffsetFit | None  # None where gravity is not from it: it is not touched then
 
 
 def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool = False) -> Identified:
     """Mass, center of gravity and bias from `poses`.
 
-    If every pose has its `acceleration`, the accelerometer's offset and sensitivities are found too.
-    IdentificationError, a sentence, where the poses do not suffice.
+    At least four, whose directions of gravity do not lie in one plane; six with each axis of the sensor once
+    up and once down are best. If every pose has its `acceleration`, the accelerometer's offset and
+    sensitivities are found too. IdentificationError, a sentence, where the poses do not suffice.
 
-    Args:
-        poses: at least four, whose directions of gravity do not lie in one plane; six with each axis of the
-            sensor once up and once down are best.
-        confidence: of the intervals.
-        one_axis: take poses that turn about one axis only, if there are three or more. The equations have an
-            answer then, but nothing contradicts an error in the direction that never changed.
+    `one_axis` takes poses that turn about one axis only, if there are three or more. The equations have an
+    answer then, but nothing contradicts an error in the direction that never changed.
     """
     if len(poses) > MOST_POSES:
         raise IdentificationError(f"{len(poses)} poses are more than the {MOST_POSES} that are taken")
@@ -153,6 +133,7 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
     residuals = tuple(map(Wrench.of, found.residuals.tolist()))
     centre_interval = triple(found.center.half)
     accelerometer = _accelerometer(found.offset, found.scale)
+    undetermined = accelerometer.undetermined if accelerometer else ""
     return Identified(
         payload,
         Wrench.of(found.bias.value.tolist()),
@@ -167,10 +148,9 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
         _condition(gravity),
         seen,
         (
-            *fit_notes(poses, forces, force, "force", "N", weight),
-            *fit_notes(poses, torques, torque, "torque", "Nm", moment),
-            *interval_notes(mass, mass_interval, length(centre_interval)),
-            *offset_notes(accelerometer.undetermined if accelerometer else ""),
+            *_fit_notes(poses, forces, force, "force", "N", weight),
+            *_fit_notes(poses, torques, torque, "torque", "Nm", moment),
+            *_other_notes(mass, mass_interval, length(centre_interval), undetermined),
         ),
         force,
         torque,
@@ -245,7 +225,7 @@ def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, we
     return Fit(rms, freedom, chi_square, "small" if rms <= _NEGLIGIBLE * weight else "large")
 
 
-def fit_notes(
+def _fit_notes(
     poses: Sequence[Pose], residuals: Array, fit: Fit, name: str, unit: str, weight: float
 ) -> Iterator[str]:
     """A pose that fits worse than the others, or residuals that noise does not explain; as for `judge`."""
@@ -265,21 +245,13 @@ def fit_notes(
         )
 
 
-def interval_notes(mass: float, mass_interval: float, centre_interval: float) -> Iterator[str]:
-    """Of wide intervals; kg and m."""
-    if mass_interval > 0.05 * mass:
-        yield (
-            f"the mass is known to ± {100 * mass_interval / mass:.0f} % only: take more poses, or longer ones"
-        )
-    if centre_interval > 0.01:
-        yield (
-            f"the center of gravity is known to ± {1000 * centre_interval:.0f} mm only: take more poses, or "
-            "longer ones"
-        )
-
-
-def offset_notes(undetermined: str) -> Iterator[str]:
-    """Of axes, as in "xz", whose offset of the accelerometer the poses do not determine."""
+def _other_notes(mass: float, mass_half: float, centre_half: float, undetermined: str) -> Iterator[str]:
+    """Of wide intervals, kg and m, and of axes, as in "xz", whose offset of the accelerometer is open."""
+    more = "take more poses, or longer ones"
+    if mass_half > 0.05 * mass:
+        yield f"the mass is known to ± {100 * mass_half / mass:.0f} % only: {more}"
+    if centre_half > 0.01:
+        yield f"the center of gravity is known to ± {1000 * centre_half:.0f} mm only: {more}"
     if undetermined:
         yield (
             f"the poses do not determine the accelerometer's offset along {' and '.join(undetermined)}, so "

@@ -10,39 +10,30 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from ft_compensation.bias import gravity_of
+from ft_compensation.bias import check_at_rest
 from ft_compensation.quantities import ZERO, CompensationError, Wrench, length
-from ft_compensation.stationary import StationaryMeans, triple
+from ft_compensation.stationary import Array, StationaryMeans, triple
 
-LEAST_POSES: Final = 4
+_LEAST_POSES: Final = 4
 MOST_POSES: Final = 1000
-LEAST_SPREAD: Final = 0.1
-"""Of the directions of gravity, in g: less along an axis counts as not seen."""
-_SAME_POSE: Final = 0.97
-"""Cosine: directions nearer than 14° are the same pose."""
-_LARGEST_OFFSET: Final = 1.5
-"""m/s²: of an accelerometer whose offset is yet to be found."""
+_LEAST_SPREAD: Final = 0.1  # of the directions of gravity, in g: less along an axis counts as not seen
+_SAME_POSE: Final = 0.97  # cosine: directions nearer than 14° are the same pose
+_LARGEST_OFFSET: Final = 1.5  # m/s²: of an accelerometer whose offset is yet to be found
 
 
 class Pose(NamedTuple):
     """What was measured while the sensor was stationary, with nothing touching the tool."""
 
-    wrench: Wrench
-    """Mean, N and Nm; nothing subtracted."""
-    gravity: Vector3
-    """In the sensor's frame, m/s²."""
-    force_spread: Vector3 = ZERO
-    """Standard deviation of single samples, N."""
-    torque_spread: Vector3 = ZERO
-    """Likewise, Nm."""
+    wrench: Wrench  # mean, N and Nm; nothing subtracted
+    gravity: Vector3  # in the sensor's frame, m/s²
+    force_spread: Vector3 = ZERO  # standard deviation of single samples, N
+    torque_spread: Vector3 = ZERO  # likewise, Nm
     samples: int = 1
+    # What the accelerometer read, m/s², where `gravity` is from it; None where it is from something else.
     acceleration: Vector3 | None = None
-    """What the accelerometer read, m/s², where `gravity` is from it; None where it is from something else."""
-    acceleration_spread: Vector3 = ZERO
-    """Standard deviation of single samples, m/s²."""
+    acceleration_spread: Vector3 = ZERO  # standard deviation of single samples, m/s²
 
     @property
     def up(self) -> Vector3:
@@ -62,31 +53,26 @@ def pose_of(
     """
     acceleration = None
     if gravity is None:
-        acceleration = means.acceleration
-        gravity = gravity_of(acceleration, magnitude, _LARGEST_OFFSET)
+        acceleration = x, y, z = means.acceleration
+        check_at_rest(acceleration, magnitude, _LARGEST_OFFSET)
+        scale = -magnitude / length(acceleration)  # only the direction is taken from it
+        gravity = x * scale, y * scale, z * scale
     elif not length(gravity) > 0.0:
         raise CompensationError("a pose without gravity says nothing about a payload")
     return Pose(
-        means.wrench,
-        gravity,
-        means.force_spread,
-        means.torque_spread,
-        means.samples,
-        acceleration,
-        means.acceleration_spread,
-    )
+        means.wrench, gravity, means.force_spread, means.torque_spread, means.samples,
+        acceleration, means.acceleration_spread,
+    )  # fmt: skip
 
 
 class Coverage(NamedTuple):
     """How well some poses see a payload."""
 
     poses: int
+    # Standard deviation of gravity's direction along three axes, in g, best seen first; 0.58 is ideal.
     spread: Vector3
-    """Standard deviation of gravity's direction along three axes, in g, best seen first; 0.58 is ideal."""
-    missing: str | None
-    """Why the poses do not suffice, a sentence; None if they do."""
-    next_pose: str
-    """What to do next, a sentence."""
+    missing: str | None  # why the poses do not suffice, a sentence; None if they do
+    next_pose: str  # what to do next, a sentence
 
     @property
     def advice(self) -> str:
@@ -96,17 +82,12 @@ class Coverage(NamedTuple):
         return f"not enough yet: {self.missing}; {self.next_pose}"
 
 
-def directions(poses: Sequence[Pose]) -> NDArray[np.float64]:
-    """Where gravity points in the sensor's frame: (n, 3), length 1."""
-    return -np.array([pose.up for pose in poses], dtype=np.float64).reshape(-1, 3)
-
-
 def coverage(poses: Sequence[Pose], *, one_axis: bool = False) -> Coverage:
     """What `poses` have seen. With `one_axis`, poses about one axis may suffice (see `payload.identify`)."""
-    down = directions(poses)
     if not poses:
         return Coverage(0, ZERO, "there is no pose yet", _sentence(np.array((0.0, 0.0, 1.0))))
-    _, spread, axes = _spread(down)
+    down = -np.array([pose.up for pose in poses])  # where gravity points in the sensor's frame
+    spread, axes = _spread(down)
     return Coverage(
         len(poses),
         triple(spread),
@@ -115,7 +96,7 @@ def coverage(poses: Sequence[Pose], *, one_axis: bool = False) -> Coverage:
     )
 
 
-def name_direction(direction: NDArray[np.float64]) -> str:
+def _name_direction(direction: Array) -> str:
     """A line in the sensor's frame in words: "the sensor's x axis", or its components."""
     unit = direction / np.linalg.norm(direction)
     axis = int(np.abs(unit).argmax())
@@ -126,41 +107,38 @@ def name_direction(direction: NDArray[np.float64]) -> str:
     return f"the direction ({parts}) of the sensor's frame"
 
 
-def _spread(
-    down: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Mean direction, standard deviations along the principal axes (largest first), the axes as rows."""
-    mean = down.mean(axis=0)
-    values, vectors = np.linalg.eigh(np.atleast_2d((down - mean).T @ (down - mean)) / len(down))
-    return mean, np.sqrt(np.maximum(values[::-1], 0.0)), vectors.T[::-1]
+def _spread(down: Array) -> tuple[Array, Array]:
+    """Standard deviations along the principal axes (largest first), the axes as rows."""
+    moved = down - down.mean(axis=0)
+    values, vectors = np.linalg.eigh(np.atleast_2d(moved.T @ moved) / len(down))
+    return np.sqrt(np.maximum(values[::-1], 0.0)), vectors.T[::-1]
 
 
-def _missing(
-    count: int, spread: NDArray[np.float64], axes: NDArray[np.float64], one_axis: bool
-) -> str | None:
-    if spread[0] < LEAST_SPREAD:
+def _missing(count: int, spread: Array, axes: Array, one_axis: bool) -> str | None:
+    if spread[0] < _LEAST_SPREAD:
         same = "the only pose had" if count == 1 else f"all {count} poses had"
         return (
             f"{same} gravity in the same direction of the sensor's frame (turning about the vertical does "
             "not count), so weight and bias cannot be told apart: mass and center of gravity are unseen"
         )
-    if spread[1] < LEAST_SPREAD:
+    if spread[1] < _LEAST_SPREAD:
         return (
-            f"gravity moved only along {name_direction(axes[0])}, so the center of gravity along it is "
+            f"gravity moved only along {_name_direction(axes[0])}, so the center of gravity along it is "
             "unseen: tilt the sensor about another axis too"
         )
-    if spread[2] < LEAST_SPREAD and not one_axis:
+    if spread[2] < _LEAST_SPREAD and not one_axis:
         return (
             "the sensor was turned about one axis only: gravity never changed along "
-            f"{name_direction(axes[2])}, so nothing checks the answer in that direction (standard deviation "
-            f"{spread[2]:.2f} g, at least {LEAST_SPREAD:g} g is needed)"
+            f"{_name_direction(axes[2])}, so nothing checks the answer in that direction (standard deviation "
+            f"{spread[2]:.2f} g, at least {_LEAST_SPREAD:g} g is needed)"
         )
-    least = LEAST_POSES - one_axis
+    least = _LEAST_POSES - one_axis
     if count < least:
         return f"there {'is' if count == 1 else 'are'} {count} of at least {least} poses"
     return None
 
 
+# Directions that may point up: the axes, then between two of them, then between three.
 _CANDIDATES: Final = [
     np.array(signs, dtype=np.float64)
     for signs in sorted(
@@ -168,15 +146,14 @@ _CANDIDATES: Final = [
         key=lambda signs: (sum(map(abs, signs)), [-sign for sign in signs[::-1]]),
     )
 ]
-"""Directions that may point up: the axes, then between two of them, then between three."""
 
 
-def _next_up(down: NDArray[np.float64]) -> NDArray[np.float64]:
+def _next_up(down: Array) -> Array:
     """The candidate that, pointing up, helps the worst seen direction most; the simplest one of equals."""
     best, best_gain = _CANDIDATES[0], -1.0
     for candidate in _CANDIDATES:
         up = candidate / np.linalg.norm(candidate)
-        _, spread, _ = _spread(np.vstack([down, -up]))
+        spread, _ = _spread(np.vstack([down, -up]))
         # Where one more pose cannot help the worst direction, it may help the second or the first.
         gain = float(spread[2] + 0.1 * spread[1] + 0.01 * spread[0])
         # One that was taken already is the last resort, and so is one that is hard to aim at.
@@ -186,7 +163,7 @@ def _next_up(down: NDArray[np.float64]) -> NDArray[np.float64]:
     return best
 
 
-def _sentence(up: NDArray[np.float64]) -> str:
+def _sentence(up: Array) -> str:
     axes = [f"{'+' if part > 0 else '-'}{name}" for name, part in zip("xyz", up, strict=True) if part]
     if len(axes) == 1:
         return f"turn the sensor so that its {axes[0]} axis points up"

@@ -18,51 +18,38 @@ _ROUNDS: Final = 60
 _CONVERGED: Final = 1e-4
 _MOST_DEGREES: Final = 1e6
 _LEAST_DEGREES: Final = 0.5
-_LEAST_RATIO: Final = 1e-9
-"""Of two variances: beyond it the arithmetic fails."""
+_LEAST_RATIO: Final = 1e-9  # of two variances: beyond it the arithmetic fails
+# Six poses need more than Kenward and Roger's correction of the covariance, which is of first order. With its
+# square taken so often, 95 % intervals cover 93 to 97 % for 6 to 24 poses and axes whose noise differs
+# tenfold (`tests/compensation/test_payload.py`).
 _SECOND_ORDER: Final = 5.0
-"""Six poses need more than Kenward and Roger's correction of the covariance, which is of first order. With
-its square taken so often, 95 % intervals cover 93 to 97 % for 6 to 24 poses and axes whose noise differs
-tenfold (`tests/compensation/test_coverage.py`)."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _HALVINGS: Final = 44
-_NORMAL: Final = 2000.0
-"""Degrees of freedom beyond which the quantile changes no more within four digits."""
+_NORMAL: Final = 2000.0  # degrees of freedom beyond which the quantile changes no more within four digits
 
 
 class Known(NamedTuple):
     """What is known before anything is measured."""
 
+    # (p, p): inverse of the covariance of the unknowns, about zero; zeros where nothing is known.
     information: Array
-    """(p, p): inverse of the covariance of the unknowns, about zero; zeros where nothing is known."""
-    floor: Array
-    """(..., k): the variances are at least this, so that perfect data divide by no zero."""
-    degrees: Array | float = 0.0
-    """(k,): how many residuals the assumed variances are worth; 0 = not assumed."""
-    variance: Array | float = 0.0
-    """(..., k): the assumed variances."""
+    floor: Array  # (..., k): the variances are at least this, so that perfect data divide by no zero
+    degrees: Array | float = 0.0  # (k,): how many residuals the assumed variances are worth; 0 = not assumed
+    variance: Array | float = 0.0  # (..., k): the assumed variances
 
 
 class Solution(NamedTuple):
     """p unknowns from k groups of n equations."""
 
-    answer: Array
-    """(..., p)"""
-    covariance: Array
-    """(..., p, p)"""
-    variances: Array
-    """(..., k): of a single equation of each group."""
-    residuals: Array
-    """(..., k, n)"""
-    degrees: Array
-    """(..., k): residual degrees of freedom of each group."""
-    plain: Array
-    """(..., p, p): the covariance if the weights were exact."""
-    parts: Array
-    """(..., k, p, p): the contribution of each group to it."""
-    uncertainty: Array
-    """(..., k, k): covariance of the logarithms of the variances."""
+    answer: Array  # (..., p)
+    covariance: Array  # (..., p, p)
+    variances: Array  # (..., k): of a single equation of each group
+    residuals: Array  # (..., k, n)
+    degrees: Array  # (..., k): residual degrees of freedom of each group
+    plain: Array  # (..., p, p): the covariance if the weights were exact
+    parts: Array  # (..., k, p, p): the contribution of each group to it
+    uncertainty: Array  # (..., k, k): covariance of the logarithms of the variances
 
     def student(self, directions: Array) -> tuple[Array, Array]:
         """Standard deviation and degrees of freedom of linear combinations `directions` (..., q, p)."""

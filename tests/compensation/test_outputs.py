@@ -1,4 +1,4 @@
-"""The filter of wrench_filtered, held to the analytic responses of its prototypes and to what it delays."""
+"""The wrench filtered, held to analytic responses; and in other frames, held to statics."""
 
 from __future__ import annotations
 
@@ -8,10 +8,23 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from ft_compensation.outputs.filter import Coefficients, FilterSettings, WrenchFilter, beyond, low_pass, notch
-from ft_compensation.quantities import ZERO, CompensationError
+from bota_ethercat.pdo import Vector3
+from ft_compensation.outputs import (
+    Coefficients,
+    FilterSettings,
+    WrenchFilter,
+    WrenchTransform,
+    beyond,
+    low_pass,
+    notch,
+)
+from ft_compensation.quantities import ZERO, CompensationError, Quaternion
+from tests.compensation.equations import matrix_from_quaternion
 
 RATE_HZ = 800.0
 STEP_NS = 1_250_000
@@ -100,8 +113,12 @@ def test_delays_are_as_the_documentation_says() -> None:
     assert notch(50.0, 5.0, RATE_HZ).delay / RATE_HZ == pytest.approx(0.16 * 5.0 / 50.0**2, rel=0.05)
 
 
-def test_the_first_sample_is_no_step() -> None:
+def test_neither_the_first_sample_nor_another_cut_off_makes_a_step() -> None:
     assert run(designed(notch=50.0), lambda _: 42.0, 800) == pytest.approx([42.0] * 800, abs=1e-6)
+    made = designed(cutoff=1.0)
+    before = run(made, lambda n: 10.0 + (n % 2), 2000)[-1]
+    made.design(FilterSettings(cutoff=2.0), RATE_HZ)
+    assert run(made, lambda n: 10.0 + (n % 2), 1, first=2000)[0] == pytest.approx(before, abs=0.01)
 
 
 def test_after_a_pause_it_begins_anew_and_after_a_few_lost_samples_it_goes_on() -> None:
@@ -116,30 +133,14 @@ def test_after_a_pause_it_begins_anew_and_after_a_few_lost_samples_it_goes_on() 
     assert run(fast, lambda _: 5.0, 1, first=16) == [5.0]
 
 
-def test_another_cut_off_while_it_runs_makes_no_step() -> None:
-    made = designed(cutoff=1.0)
-    before = run(made, lambda n: 10.0 + (n % 2), 2000)[-1]
-    made.design(FilterSettings(cutoff=2.0), RATE_HZ)
-    assert run(made, lambda n: 10.0 + (n % 2), 1, first=2000)[0] == pytest.approx(before, abs=0.01)
-
-
-def test_another_rate_makes_another_filter() -> None:
-    made = designed()
-    was_s = made.delay_s
-    made.design(FilterSettings(cutoff=10.0), 400.0)
-    assert made.delay_s == pytest.approx(was_s, rel=1e-2)  # the same cut-off in Hz
-    assert designed(rate_hz=400.0).delay_s == made.delay_s
-
-
 def test_what_the_rate_does_not_allow() -> None:
-    with pytest.raises(
-        CompensationError, match=r"filter.cutoff is 75 Hz, but must be below half of the sampling rate, 75 Hz"
+    for wrong, words in (
+        ({"cutoff": 75.0}, "filter.cutoff is 75 Hz, but must be below half of the sampling rate, 75 Hz"),
+        ({"notch": 100.0}, "filter.notch is 100 Hz"),
+        ({"notch": 50.0, "notch_width": 80.0}, "filter.notch_width is 80 Hz"),
     ):
-        designed(150.0, cutoff=75.0)
-    with pytest.raises(CompensationError, match=r"filter.notch is 100 Hz"):
-        designed(150.0, notch=100.0)
-    with pytest.raises(CompensationError, match=r"filter.notch_width is 80 Hz"):
-        designed(150.0, notch=50.0, notch_width=80.0)
+        with pytest.raises(CompensationError, match=words):
+            designed(150.0, **wrong)
     designed(9.0, cutoff=2.0)  # the width of no notch does not matter
 
 
@@ -153,3 +154,92 @@ def test_the_dead_band_is_continuous_and_keeps_the_direction() -> None:
     force, torque = made.step((0.5, 0.5, 0.5), (0.0, -0.3, 0.0), 10**12)
     assert force == ZERO
     assert torque == pytest.approx((0.0, -0.2, 0.0))
+
+
+HALF = math.sqrt(0.5)
+UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
+ABOUT_X: Quaternion = (HALF, 0.0, 0.0, HALF)  # a quarter of a turn: y of the turned frame is z of the other
+NUMBERS = st.floats(-100.0, 100.0)
+VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS)
+QUATERNIONS = (
+    st.tuples(*[st.floats(-1.0, 1.0)] * 4)
+    .filter(lambda q: math.hypot(*q) > 0.1)
+    .map(
+        lambda q: (q[0] / math.hypot(*q), q[1] / math.hypot(*q), q[2] / math.hypot(*q), q[3] / math.hypot(*q))
+    )
+)
+TRANSFORMS = st.builds(WrenchTransform.of, VECTORS, QUATERNIONS)
+
+
+def near(values: tuple[float, ...]) -> object:
+    return pytest.approx(values, abs=1e-9)
+
+
+def test_a_push_at_the_tool_center_point_or_at_the_sensor() -> None:
+    """The TCP is 0.2 m in front of the sensor, which feels 5 N across at that arm: 1 Nm.
+
+    A push at the sensor acts 0.2 m behind the TCP: about y it turns the other way than in front.
+    """
+    tcp = WrenchTransform.of((0.0, 0.0, 0.2), UPRIGHT).inverse()
+    force, torque = tcp.apply((5.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    assert force == near((5.0, 0.0, 0.0))
+    assert torque == near(ZERO)
+    assert tcp.apply((5.0, 0.0, 0.0), ZERO).torque == near((0.0, -1.0, 0.0))
+
+
+def test_a_weight_on_a_stretched_arm_in_the_base() -> None:
+    """The sensor is 0.8 m before the base and 0.5 m above, its z axis horizontal along the base's -y.
+
+    A kilogram hangs on it: in the base 9.81 N down, and about its origin 0.8 m x 9.81 N, tipping forward
+    (about +y); the height has no part in it.
+    """
+    base = WrenchTransform.of((0.8, 0.0, 0.5), ABOUT_X)
+    weight = 9.81
+    force, torque = base.apply((0.0, -weight, 0.0), ZERO)  # the sensor's y axis points up
+    assert force == near((0.0, 0.0, -weight))
+    assert torque == near((0.0, 0.8 * weight, 0.0))
+
+
+def test_a_pure_torque_and_a_quaternion_that_is_nearly_one() -> None:
+    force, torque = WrenchTransform.of((3.0, -2.0, 1.0), ABOUT_X).apply(ZERO, (0.0, 2.0, 0.0))
+    assert force == near(ZERO)
+    assert torque == near((0.0, 0.0, 2.0))
+    force = WrenchTransform.of(ZERO, (0.0, 0.0, 0.0, 0.995)).apply((1.0, 2.0, 3.0), ZERO).force
+    assert force == near((1.0, 2.0, 3.0))
+
+
+@given(TRANSFORMS, VECTORS, VECTORS)
+def test_there_and_back_is_where_it_was(transform: WrenchTransform, force: Vector3, torque: Vector3) -> None:
+    there = transform.apply(force, torque)
+    assert transform.inverse().apply(*there).values == pytest.approx((*force, *torque), abs=1e-8)
+
+
+@given(VECTORS, QUATERNIONS, VECTORS, VECTORS, VECTORS, VECTORS)
+def test_power_is_the_same_in_every_frame(
+    translation: Vector3,
+    quaternion: Quaternion,
+    force: Vector3,
+    torque: Vector3,
+    velocity: Vector3,
+    rate: Vector3,
+) -> None:
+    """Of a moving body: force times velocity of the frame's origin, plus torque times angular rate."""
+    to_target = matrix_from_quaternion(quaternion)
+    omega = to_target @ rate
+    # The target's origin as a point of the body, seen from the source's, which is at `translation`.
+    moved = to_target @ velocity - np.cross(omega, translation)
+    there = WrenchTransform.of(translation, quaternion).apply(force, torque)
+    power = np.dot(force, velocity) + np.dot(torque, rate)
+    assert np.dot(there.force, moved) + np.dot(there.torque, omega) == pytest.approx(power, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("translation", "quaternion"),
+    [
+        (ZERO, (0.0, 0.0, 0.0, 0.0)), (ZERO, (0.5, 0.5, 0.5, 0.6)), (ZERO, (0.0, 0.0, math.nan, 1.0)),
+        ((0.0, math.inf, 0.0), UPRIGHT), ((math.nan, 0.0, 0.0), UPRIGHT),
+    ],
+)  # fmt: skip
+def test_what_is_no_pose(translation: Vector3, quaternion: Quaternion) -> None:
+    with pytest.raises(ValueError, match=r"a rotation is a quaternion of length 1|three finite numbers"):
+        WrenchTransform.of(translation, quaternion)

@@ -1,39 +1,38 @@
-"""`wrench_filtered`: a notch if wanted, a second-order Butterworth low-pass, a dead band. Plain floats.
+"""The compensated wrench filtered, and in another frame. Plain floats.
 
-Sections are biquads in direct form I: their state is past inputs and outputs, which mean the same whatever
-the coefficients, so a new cut-off makes no step. At the first sample, and after a pause longer than the
-filter's memory, the state is what a constant load would have left: no transient.
+`wrench_filtered`: a notch if wanted, a second-order Butterworth low-pass, a dead band. Sections are biquads
+in direct form I: their state is past inputs and outputs, which mean the same whatever the coefficients, so a
+new cut-off makes no step. At the first sample, and after a pause longer than the filter's memory, the state
+is what a constant load would have left: no transient.
+
+Another frame: rotated, and its torque about the other frame's origin. Force and torque of one load, seen from
+frame B instead of S (R takes vectors of S to B, t is the origin of S in B): f_B = R f_S, and m_B = R m_S +
+cross(t, f_B), because a force that acts at a distance has a torque. Frames at rest to each other or not: this
+holds at each instant.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 from bota_ethercat.pdo import Vector3
-from ft_compensation.quantities import CompensationError, Wrench
+from ft_compensation.quantities import ZERO, CompensationError, Quaternion, Wrench, unit_quaternion
 
 LEAST_CUTOFF_HZ: Final = 0.05
 LEAST_NOTCH_HZ: Final = 1.0
-Six = tuple[float, ...]
-"""Fx Fy Fz (N) Mx My Mz (Nm)"""
-_SHORTEST_PAUSE: Final = 3.5
-"""Sample periods: fewer are a few lost samples, which the state outlives."""
+Six = tuple[float, ...]  # Fx Fy Fz (N) Mx My Mz (Nm)
+_SHORTEST_PAUSE: Final = 3.5  # sample periods: fewer are a few lost samples, which the state outlives
 
 
 class FilterSettings(NamedTuple):
     """What is filtered out: the parameters `filter.*`."""
 
-    cutoff: float = 0.0
-    """-3 dB, Hz; 0 = no filter"""
-    notch: float = 0.0
-    """Its center, Hz; 0 = none"""
-    notch_width: float = 5.0
-    """Between its -3 dB points, Hz"""
-    dead_band_force: float = 0.0
-    """N"""
-    dead_band_torque: float = 0.0
-    """Nm"""
+    cutoff: float = 0.0  # -3 dB, Hz; 0 = no filter
+    notch: float = 0.0  # its center, Hz; 0 = none
+    notch_width: float = 5.0  # between its -3 dB points, Hz
+    dead_band_force: float = 0.0  # N
+    dead_band_torque: float = 0.0  # Nm
 
     def problems(self, rate_hz: float) -> list[str]:
         """Why samples of this rate are too few for it, a sentence for each frequency."""
@@ -87,10 +86,7 @@ class _Section:
 
     def __init__(self, coefficients: Coefficients) -> None:
         self.coefficients = coefficients
-        self._x1: Six = ()
-        self._x2: Six = ()
-        self._y1: Six = ()
-        self._y2: Six = ()
+        self.restart(())
 
     def restart(self, values: Six) -> None:
         """As if `values` had always been."""
@@ -110,11 +106,9 @@ class WrenchFilter:
     """Filters every sample of a stream. `step` is for one thread; another may `design` meanwhile."""
 
     def __init__(self) -> None:
-        self.delay_s = 0.0
-        """Group delay at DC, without the sensor's own filters."""
+        self.delay_s = 0.0  # group delay at DC, without the sensor's own filters
         self._sections: tuple[_Section, ...] = ()
-        self._running: tuple[_Section, ...] = ()
-        """Those that have a state."""
+        self._running: tuple[_Section, ...] = ()  # those that have a state
         self._dead_band_force = self._dead_band_torque = 0.0
         self._longest_pause_ns = 0.0
         self._last_ns = 0
@@ -163,3 +157,52 @@ def beyond(vector: Vector3, dead_band: float) -> Vector3:
         return 0.0, 0.0, 0.0
     share = 1.0 - dead_band / size
     return x * share, y * share, z * share
+
+
+Rotation = tuple[Vector3, Vector3, Vector3]  # a rotation matrix, row by row
+_IDENTITY: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class WrenchTransform(NamedTuple):
+    """From a source frame to a target frame."""
+
+    rotation: Rotation = _IDENTITY  # takes vectors of the source frame to the target frame
+    translation: Vector3 = ZERO  # the origin of the source frame in the target frame, m
+
+    @classmethod
+    def of(cls, translation: Vector3, quaternion: Quaternion) -> Self:
+        """From the pose of the source frame in the target frame, as TF gives it. ValueError if it is none."""
+        x, y, z, w = unit_quaternion(quaternion)
+        if not math.isfinite(sum(translation)):
+            raise ValueError("a translation is three finite numbers")
+        rotation = (
+            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+            (2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
+            (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
+        )
+        return cls(rotation, translation)
+
+    def inverse(self) -> Self:
+        """From the target frame to the source frame."""
+        (a, b, c), (d, e, f), (g, h, i) = self.rotation
+        x, y, z = self.translation
+        back = (a, d, g), (b, e, h), (c, f, i)
+        return type(self)(
+            back, (-a * x - d * y - g * z, -b * x - e * y - h * z, -c * x - f * y - i * z)
+        )  # fmt: skip
+
+    def apply(self, force: Vector3, torque: Vector3) -> Wrench:
+        """The wrench in the target frame, its torque about that frame's origin."""
+        (a, b, c), (d, e, f), (g, h, i) = self.rotation
+        x, y, z = self.translation
+        fx, fy, fz = force
+        mx, my, mz = torque
+        px, py, pz = a * fx + b * fy + c * fz, d * fx + e * fy + f * fz, g * fx + h * fy + i * fz
+        return Wrench(
+            (px, py, pz),
+            (
+                a * mx + b * my + c * mz + y * pz - z * py,
+                d * mx + e * my + f * mz + z * px - x * pz,
+                g * mx + h * my + i * mz + x * py - y * px,
+            ),
+        )

@@ -1,0 +1,108 @@
+"""The node's own process: stop signals, the scheduling of its threads, and threads that do not die silently.
+
+SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in every thread and one
+thread waits for them. A handler would run only when the main thread next executes Python, which it does not
+while it waits inside ROS for the next message.
+
+The stream's thread gets `rt_priority` and `cpu`. It takes locks that know no priorities, Python's (GIL) and
+the middleware's: whoever holds one while another program has its CPU delays the stream, beside endless loops
+by 2 to 5 ms. So the threads that do so all the time get the priority just below: the monitor, the callbacks
+that wait for no others, Fast DDS. The executor of the services stays ordinary: what it does may take long.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from bota_ethercat.client.real_time import make_real_time
+
+STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
+_SAME_S: Final = 1.0
+STREAM: Final = "reader"
+BESIDE: Final = ("monitor", "listener")  # threads of the node that share Python's lock with the stream's
+_MIDDLEWARE: Final = "dds."  # how Fast DDS names its threads
+# Longest time that the stream waits for Python's lock. A sample takes less, so it is not interrupted.
+_SWITCH_S: Final = 0.0002
+
+
+class Worker(threading.Thread):
+    """A daemon thread that tells why it has ended if that is an error."""
+
+    def __init__(self, name: str, work: Callable[[], object], on_failure: Callable[[str], object]) -> None:
+        super().__init__(name=name, daemon=True)
+        self._work, self._on_failure = work, on_failure
+
+    def run(self) -> None:
+        """Work."""
+        try:
+            self._work()
+        except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a dead node
+            self._on_failure(f"the {self.name} failed: {type(error).__name__}: {error}")
+
+    def has_ended(self, within_s: float = 5.0) -> bool:
+        """Wait for it; False if it does not end in time."""
+        self.join(within_s)
+        return not self.is_alive()
+
+
+def block_stop_signals() -> None:
+    """Keep SIGINT and SIGTERM pending in this thread and all it starts later."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+
+
+def call_on_stop_signal(callback: Callable[[signal.Signals], None]) -> None:
+    """Call `callback` from a thread of its own at the first signal.
+
+    A later one ends the process at once, but not one right behind the first: a terminal and a launcher may
+    each send theirs.
+    """
+
+    def wait() -> None:
+        callback(signal.Signals(signal.sigwait(STOP_SIGNALS)))
+        impatient_s = time.monotonic() + _SAME_S
+        while True:
+            number = signal.sigwait(STOP_SIGNALS)
+            if time.monotonic() >= impatient_s:
+                os._exit(128 + number)
+
+    threading.Thread(target=wait, name="signals", daemon=True).start()
+
+
+def prepare(rt_priority: int, cpu: int, log: Any) -> None:
+    """Give the node's threads, which run, their scheduling as far as allowed, and log one line of it."""
+    if not rt_priority and cpu < 0:
+        return
+    stream = next((each.native_id for each in threading.enumerate() if each.name == STREAM), None)
+    if stream is None:  # it has failed, and the node ends
+        return
+    scheduling = make_real_time(rt_priority, cpu, thread=stream)
+    if scheduling.priority:
+        below = os.sched_param(max(1, scheduling.priority - 1))
+        for thread in _beside():
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.sched_setscheduler(thread, os.SCHED_FIFO, below)
+        sys.setswitchinterval(_SWITCH_S)
+        gc.collect()
+        gc.freeze()  # what is loaded by now stays: no collection needs to look at it
+    if scheduling.refused:
+        log.warning(f"the stream has {scheduling}; samples may be late on a busy machine")
+    else:
+        log.info(f"the stream has {scheduling}")
+
+
+def _beside() -> Iterator[int]:
+    """The threads whose locks the stream needs."""
+    yield from (thread.native_id or 0 for thread in threading.enumerate() if thread.name in BESIDE)
+    for task in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(OSError):
+            if (task / "comm").read_text(encoding="utf-8", errors="replace").startswith(_MIDDLEWARE):
+                yield int(task.name)

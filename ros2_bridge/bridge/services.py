@@ -1,0 +1,326 @@
+"""The services, all `std_srvs/Trigger`; the message says what came of it.
+
+Each blocks the executor, and never the stream: until the server has answered or a time-out, or for the
+`rest.duration` of a window.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from bota_ethercat.errors import FileError
+from bota_ethercat.pdo import Vector3
+from bridge.compensating.bias_keeper import directory_of, expand
+from bridge.compensating.control import CompensationControl
+from bridge.parameters.declare import SettingsParameters
+from bridge.parameters.table import AUTO
+from bridge.publishing.compensated_wrench import RestWindow
+from bridge.stream.link import (
+    CONFIGURE_TIMEOUT_S,
+    DESCRIBE_TIMEOUT_S,
+    Link,
+    RequestFailedError,
+    find_sensor,
+    offset_text,
+)
+from ft_compensation.bias import Taken, check_at_rest, estimate_bias
+from ft_compensation.identification.parameter_file import write_yaml
+from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
+from ft_compensation.identification.poses import Pose, coverage, pose_of
+from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, length, wrench_text
+
+_TARE_S: Final = 0.5  # how long a tare of the sensor averages
+_FEWEST_SAMPLES, _MOST_SAMPLES = 20, 2000
+# The server may take so many times as long as the samples should: it takes them twice.
+_TARE_PATIENCE: Final = 6.0
+_TARE_EXTRA_S: Final = 4.0
+_PATIENCE_S: Final = 2.0  # a window may take this much longer than half as long again as it lasts
+_LOOK_S: Final = 0.05
+_SETTLED_WITHIN_S: Final = 10.0
+
+
+def _create_triggers(node: Node, prefix: str, *acts: Callable[[], str]) -> None:
+    """A service named as each act, which returns what it did; an error says why it was not done."""
+    log = node.get_logger()
+    for act in acts:
+
+        def answer(_request: Any, response: Any, act: Callable[[], str] = act) -> Any:
+            try:
+                response.message, response.success = act(), True
+            except (CompensationError, RequestFailedError) as error:
+                response.message, response.success = str(error), False
+                log.warning(f"{prefix}{_name(act)} failed: {error}")
+            else:
+                if not _name(act).startswith("get_"):
+                    log.info(response.message)
+            return response
+
+        node.create_service(Trigger, f"~/{prefix}{_name(act)}", answer)
+
+
+def _name(act: Callable[[], str]) -> str:
+    return act.__name__.lstrip("_")
+
+
+class SensorServices:
+    """What the server does, for every client."""
+
+    def __init__(
+        self, node: Node, link: Link, settings: SettingsParameters, after_tare: Callable[[], str]
+    ) -> None:
+        """`after_tare` says what a new offset in the sensor means for the rest of the node; "" if nothing."""
+        self._link, self._settings, self._after_tare = link, settings, after_tare
+        acts = self._sensor_tare, self._get_settings, self._apply_settings, self._save_settings
+        _create_triggers(node, "", *acts)
+
+    def _sensor_tare(self) -> str:
+        rate_hz = self._link.rate_hz or 800.0
+        samples = min(max(round(_TARE_S * rate_hz), _FEWEST_SAMPLES), _MOST_SAMPLES)
+        timeout_s = _TARE_EXTRA_S + _TARE_PATIENCE * samples / rate_hz
+        reply = self._link.ask("tare", timeout_s, sensor=self._link.sensor, samples=samples)
+        titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
+        parts = [f"{title} {offset_text(reply.get(key))}" for key, title in titles]
+        text = f"sensor {self._link.sensor} tared: " + "; ".join(parts)
+        also = self._after_tare()
+        return f"{text}. {also}" if also else text
+
+    def _get_settings(self) -> str:
+        info = find_sensor(self._link.ask("describe", DESCRIBE_TIMEOUT_S), self._link.sensor)
+        return json.dumps({**info.settings, "rate_hz": info.rate})
+
+    def _apply_settings(self) -> str:
+        return f"sensor {self._link.sensor} has these settings now: {json.dumps(self._settings.apply())}"
+
+    def _save_settings(self) -> str:
+        # `configure` wants at least one setting: one as it is.
+        setting = next(iter(self._link.settings.items()), None)
+        sensor = self._link.sensor
+        if setting is None:
+            raise RequestFailedError(
+                f"the settings of sensor {sensor} are not known: there is no server at {self._link.address}, "
+                "or the sensor has none"
+            )
+        name, value = setting
+        self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=sensor, settings={name: value}, save=True)
+        return f"sensor {sensor} keeps its settings and offset in its flash now"
+
+
+class BiasServices:
+    """Take, clear and undo the node's bias."""
+
+    def __init__(self, node: Node, control: CompensationControl) -> None:
+        self._control = control
+        _create_triggers(node, "", self._tare, self._clear_tare, self._undo_tare)
+
+    def _tare(self) -> str:
+        control = self._control
+        payload = control.parameters.payload
+        window = take_window(control, needs_tool=payload.mass > 0)
+        means = window.means()
+        felt: Vector3 | None = None
+        try:
+            if conflict := control.conflict(needs_tool=True):
+                raise CompensationError(conflict)
+            felt = window.specific_force()
+            check_at_rest(felt, length(control.parameters.gravity))
+        except CompensationError:
+            if payload.mass:
+                raise
+            felt = None  # until there is a tool_mass nobody needs it
+        control.set_bias(estimate_bias(means, payload, felt or ZERO), "tare", Taken(payload, felt))
+        if payload.mass:
+            weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
+        else:
+            weight = (
+                "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds in "
+                "this orientation only"
+            )
+        return self._done(f"bias of {means.samples} samples: {wrench_text(control.bias)}; {weight}")
+
+    def _clear_tare(self) -> str:
+        self._control.set_bias(NO_WRENCH, "cleared")
+        return self._done("the bias is zero")
+
+    def _undo_tare(self) -> str:
+        return self._done(f"back to the bias before: {wrench_text(self._control.undo_bias())}")
+
+    def _done(self, text: str) -> str:
+        problem = self._control.keeper.problem
+        if not self._control.parameters.bias_keep:
+            return text
+        return text + (f"; not kept: {problem}" if problem else "; kept for the next start")
+
+
+class IdentifyServices:
+    """`~/identify/...`: the payload, from a few static poses; one identification at a time."""
+
+    def __init__(self, node: Node, control: CompensationControl) -> None:
+        self._control, self._log = control, node.get_logger()
+        self._poses: list[Pose] | None = None  # those taken so far; None: no identification was started
+        self._sensor = self._sensor_now()  # as of its start
+        self._result: Identified | None = None  # the latest solution, of the current poses
+        acts = self._start, self._add_pose, self._drop_pose, self._solve, self._apply, self._cancel
+        _create_triggers(node, "identify/", *acts)
+
+    def _start(self) -> str:
+        if self._control.parameters.orientation.source == "none":
+            raise CompensationError("gravity_source is none, so a pose says nothing: set it, such as to imu")
+        before = "" if self._poses is None else f", the {len(self._poses)} poses before are dropped"
+        self._poses, self._result = [], None
+        self._sensor = self._sensor_now()
+        return (
+            f"identification started{before}; gravity is known by {self._control.choice.source.describe}; "
+            f"{coverage([]).next_pose}, hold it still with nothing touching the tool, and call "
+            "identify/add_pose"
+        )
+
+    def _add_pose(self) -> str:
+        poses = self._started()
+        window = take_window(self._control, needs_tool=True)
+        means = window.means()
+        x, y, z = window.specific_force()
+        magnitude = length(self._control.parameters.gravity)
+        poses.append(pose_of(means, None if window.source.is_imu else (-x, -y, -z), magnitude))
+        self._result = None
+        x, y, z = (round(part, 2) + 0.0 for part in poses[-1].up)
+        return (
+            f"pose {len(poses)} taken (up is {x:.2f}, {y:.2f}, {z:.2f} in the sensor's frame); "
+            f"{coverage(poses).advice}"
+        )
+
+    def _drop_pose(self) -> str:
+        poses = self._started()
+        if not poses:
+            raise CompensationError("there is no pose to take back")
+        poses.pop()
+        self._result = None
+        return f"the pose is dropped, {len(poses)} are left; {coverage(poses).advice}"
+
+    def _solve(self) -> str:
+        result = self._result = identify(self._started())
+        parts = [summary(result), *details(result)]
+        return ". ".join([*parts, f"{self._write(result, parts)}; identify/apply puts it in force"])
+
+    def _apply(self) -> str:
+        if self._poses is not None:
+            self._started()
+        result = self._result
+        if result is None:
+            raise CompensationError("there is no result to apply: call identify/solve first")
+        accelerometer = result.accelerometer.calibration if result.accelerometer else None
+        self._control.set_payload(result.payload, result.bias, accelerometer)
+        not_kept = self._control.keeper.problem
+        return (
+            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias"
+            + (", accelerometer.offset and accelerometer.scale" if accelerometer else "")
+            + "; to keep the tool, start the node with the file"
+            + (f"; the bias is not kept: {not_kept}" if not_kept else "")
+        )
+
+    def _cancel(self) -> str:
+        poses = self._started()
+        self._poses = self._result = None
+        return f"identification cancelled, {len(poses)} poses dropped; nothing was changed"
+
+    def _started(self) -> list[Pose]:
+        now = self._sensor_now()
+        if self._poses is not None and self._sensor != now:
+            self._poses = self._result = None
+            is_same = now[0] == self._sensor[0]
+            what = "the sensor's own offset was changed" if is_same else "another sensor is there now"
+            raise CompensationError(f"{what}, so the previous poses were dropped: call identify/start again")
+        if self._poses is None:
+            raise CompensationError("no identification was started: call identify/start first")
+        return self._poses
+
+    def _sensor_now(self) -> tuple[int, object]:
+        """What all poses must share: the sensor and its own offset."""
+        return self._control.sensors, self._control.link.offset
+
+    def _write(self, result: Identified, comment: list[str]) -> str:
+        try:
+            path = self._path()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_yaml(path, result, "\n".join(comment), self._control.parameters.gravity)
+        except (CompensationError, FileError, OSError) as error:
+            self._log.warning(f"the result of the identification is not written: {error}")
+            return f"Not written: {error}"
+        return f"Written to {path}"
+
+    def _path(self) -> Path:
+        parameters, info = self._control.parameters, self._control.link.info
+        if parameters.identify_file != AUTO:
+            return expand(parameters.identify_file, "identify.file")
+        serial = info.serial if info is not None and info.serial.isalnum() else "unknown"
+        return directory_of(parameters.bias_directory) / f"sensor-{serial}-payload.yaml"
+
+
+def details(result: Identified) -> list[str]:
+    """What `summary` leaves out, a sentence each: bias, residuals by pose, condition, next pose."""
+    left = [
+        f"{position}: {length(residual.force):.2g} N {length(residual.torque):.2g} Nm"
+        for position, residual in enumerate(result.residuals, 1)
+    ]
+    return [
+        f"Bias {wrench_text(result.bias)}, ± {wrench_text(result.bias_interval)}",
+        *([accelerometer_text(result.accelerometer)] if result.accelerometer else []),
+        f"Residuals by pose, {', '.join(left)}",
+        f"Condition {result.condition:.2f} (1.2 is ideal, beyond 10 is bad)",
+        f"One more pose would help most so: {result.coverage.next_pose}",
+    ]
+
+
+def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow:
+    """The samples of the next `rest.duration`, whole, once the sensor's data has settled.
+
+    CompensationError or RequestFailedError if they do not come or mean nothing.
+    """
+    if (conflict := control.conflict(needs_tool=needs_tool)) is not None:
+        raise CompensationError(conflict)
+    link, clock = control.link, control.link.clock
+    if not link.is_connected:
+        raise CompensationError(f"{link.absence}, so there are no samples")
+    _wait_settled(link)
+    seconds, limits = control.parameters.rest_duration, control.parameters.rest
+    window = RestWindow(seconds, limits, control.choice.source)
+    patience_s = 1.5 * seconds + _PATIENCE_S
+    deadline_s = clock.monotonic() + patience_s
+    info, offset, bad = link.info, link.offset, control.reader.not_finite
+    control.output.window = window
+    try:
+        while not clock.wait(window.done, _LOOK_S):
+            if link.ending:
+                raise CompensationError("the node ends")
+            if clock.monotonic() > deadline_s:
+                raise CompensationError(
+                    f"only {window.count} samples came in {patience_s:.1f} s: see /diagnostics, stream"
+                )
+    finally:
+        control.output.window = None
+    # By what the reader knows: the executor, which would count another sensor, is the one that waits here.
+    if info is not None and link.info is not None and info.serial != link.info.serial:
+        raise CompensationError("the sensor was replaced by another meanwhile: call again")
+    if offset != link.offset:
+        raise CompensationError("the sensor's own offset was changed meanwhile: call again")
+    if bad := control.reader.not_finite - bad:
+        raise CompensationError(
+            f"the window is spoiled: {bad} of its samples were not finite; see /diagnostics, stream, and "
+            "call again"
+        )
+    return window
+
+
+def _wait_settled(link: Link) -> None:
+    """After a sensor has entered OP its data settles, which the server knows."""
+    deadline_s = link.clock.monotonic() + _SETTLED_WITHIN_S
+    while find_sensor(link.ask("describe", DESCRIBE_TIMEOUT_S), link.sensor).settling:
+        if link.clock.monotonic() > deadline_s:
+            raise CompensationError(f"sensor {link.sensor} does not settle: see the server's log")
+        link.clock.wait(threading.Event(), _LOOK_S)

@@ -1,0 +1,118 @@
+"""How much later force and torque are than the accelerometer, in a recording of a sensor that was shaken.
+
+Nothing touches the tool, so the force is a linear function of what the IMU felt some time before: of the
+specific force, the angular acceleration and the products of the angular rates. The lag with the least sum of
+squares is taken. Its interval is the wider of two: that of the lags of eight parts of the recording, which
+covers what the model leaves out (a cable, a tool that bends), and what the residuals' noise gives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ft_compensation.quantities import CompensationError
+
+Array = NDArray[np.float64]
+
+_PARTS: Final = 8
+_T_95: Final = 2.365  # Student's t for as many parts
+_EARLIEST_S, _LATEST_S = -0.1, 0.2
+# Motion must explain so much of the force's variance, and the interval be so narrow: else nothing was shown.
+_EXPLAINED: Final = 0.5
+_WIDEST_S: Final = 0.005
+_LEAST_S: Final = 4.0
+_SMOOTHED_S: Final = 0.04
+
+
+class Lag(NamedTuple):
+    """What a recording shows."""
+
+    seconds: float  # by which force and torque come later than the accelerometer; negative: earlier
+    interval_s: float  # 95 % interval: plus and minus
+    explained: float  # part of the force's variance that the motion explains, 0 to 1
+
+
+def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyroscope_s: float = 0.0) -> Lag:
+    """From samples, (n,) s and (n, 3) N, m/s² and rad/s; CompensationError if they do not show it.
+
+    `gyroscope_s`: by how much the gyroscope is later than the accelerometer.
+    """
+    if not (np.diff(times) > 0).all():
+        raise CompensationError("the samples are not in the order of their times: record from one server")
+    seconds = float(times[-1] - times[0]) if len(times) else 0.0
+    if seconds < _LEAST_S:
+        raise CompensationError(f"{seconds:.1f} s are too few: shake the sensor for 10 s")
+    period = float(np.median(np.diff(times)))
+    # All alike: else noise would be least, and fit best, between two samples.
+    window = np.hanning(max(3, round(_SMOOTHED_S / period) | 1) + 2)[1:-1]
+    window /= window.sum()
+    force, acceleration, rate = (_smoothed(columns, window) for columns in (force, acceleration, rate))
+    products = (rate[:, :, None] * rate[:, None]).reshape(-1, 9)
+    turned = np.concatenate([np.gradient(rate, times, axis=0), products], axis=1)
+    looks = np.arange(times[0] + _LATEST_S, times[-1] + _EARLIEST_S, _SMOOTHED_S / 4)
+    force = _at(looks, times, force)
+
+    def moved(lag: float) -> Array:
+        felt = _at(looks - lag, times, acceleration), _at(looks - lag + gyroscope_s, times, turned)
+        return np.concatenate(felt, axis=1)
+
+    def left(lag: float) -> float:
+        rows = moved(lag)
+        return float(((force - rows @ np.linalg.lstsq(rows, force, rcond=None)[0]) ** 2).sum())
+
+    coarse = np.arange(_EARLIEST_S, _LATEST_S, max(period, 0.002))
+    best = _lowest(left, float(coarse[np.argmin([left(lag) for lag in coarse])]), max(period, 0.002))
+    rows = moved(best)
+    tool = np.linalg.lstsq(rows, force, rcond=None)[0]
+    total = float((force**2).sum())
+    explained = 1.0 - left(best) / total if total else 0.0
+    if explained < _EXPLAINED:
+        raise CompensationError(
+            f"motion explains only {100 * explained:.0f} % of the force: shake the sensor with a tool on it "
+            "that nothing touches"
+        )
+    # Of each part the lag that fits best beside it, from the slope of the specific force.
+    slope = ((moved(best - period) - moved(best + period)) / (2 * period)) @ tool
+    off = force - rows @ tool
+    lags = []
+    for part, rest in zip(np.array_split(slope, _PARTS), np.array_split(off, _PARTS), strict=True):
+        steepness = float(((part - part.mean(axis=0)) ** 2).sum())
+        lags.append(-float(((part - part.mean(axis=0)) * rest).sum()) / max(steepness, 1e-30))
+    step = max(period, 0.002)
+    curve = max(left(best - step) - 2 * left(best) + left(best + step), 1e-300) / step**2
+    degrees = max(3 * (looks[-1] - looks[0]) / _SMOOTHED_S - 3 * rows.shape[1], 1.0)
+    interval = _T_95 * max(
+        float(np.std(lags, ddof=1)) / math.sqrt(_PARTS), math.sqrt(2 * left(best) / (curve * degrees))
+    )
+    if not interval < _WIDEST_S:
+        raise CompensationError(
+            f"the motion is too slow to tell (± {interval * 1e3:.0f} ms): shake the sensor faster, two to "
+            "five times a second in all directions"
+        )
+    return Lag(best, interval, explained)
+
+
+def _smoothed(columns: Array, window: Array) -> Array:
+    return np.stack([np.convolve(column, window, "same") for column in columns.T], axis=1)
+
+
+def _at(looks: Array, times: Array, columns: Array) -> Array:
+    """Columns at other times, less their means."""
+    found = np.stack([np.interp(looks, times, column) for column in columns.T], axis=1)
+    centered: Array = found - found.mean(axis=0)
+    return centered
+
+
+def _lowest(left: Callable[[float], float], start: float, step: float) -> float:
+    """The minimum of a function near `start`, by parabolas."""
+    for _ in range(6):
+        before, at, after = left(start - step), left(start), left(start + step)
+        curve = before - 2 * at + after
+        start += step * min(max((before - after) / (2 * curve), -1.0), 1.0) if curve > 0 else 0.0
+        step /= 2
+    return start

@@ -1,0 +1,283 @@
+"""The node's process: signals, the scheduling of its threads, executors that stop, Fast DDS's profile."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import subprocess
+import sys
+import threading
+import types
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.executors import SingleThreadedExecutor
+
+from bota_ethercat.client import Scheduling
+from bridge import process
+from bridge.client import PROFILES, use_own_profiles
+from bridge.parameters.table import DEFAULTS
+from bridge.spinning import PartExecutor, Spinner
+from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
+from tests.bridge.scripted_server import ScriptedServer
+from tests.rights import needs_root, skip_if_forbidden
+from tests.server.running import wait_until
+
+PROGRAM = """
+import sys, types
+from bridge import process
+
+def monotonic():
+    seen = now  # the test sets it on as soon as it reads the line
+    print("looked at the time", flush=True)
+    return seen
+
+now = 100.0
+process.time = types.SimpleNamespace(monotonic=monotonic)
+process.block_stop_signals()
+process.call_on_stop_signal(lambda number: print("called", int(number), flush=True))
+print("ready", flush=True)
+for line in sys.stdin:
+    now = float(line)
+    print("time passes", flush=True)
+"""
+
+
+def test_a_second_signal_counts_only_when_it_is_meant() -> None:
+    """With a clock of its own, so that the machine may be busy."""
+    command = [sys.executable, "-c", PROGRAM]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, bufsize=1) as program:
+        assert program.stdin is not None
+        assert program.stdout is not None
+
+        def says(words: str) -> None:
+            assert program.stdout is not None
+            assert program.stdout.readline() == f"{words}\n"
+
+        says("ready")
+        program.send_signal(2)
+        says("called 2")
+        says("looked at the time")
+        for number, now in ((2, 100.9), (15, 101.0)):  # a terminal and a launcher may each send theirs
+            program.send_signal(number)
+            says("looked at the time")
+            program.stdin.write(f"{now}\n")
+            says("time passes")
+        program.send_signal(15)
+        assert program.wait(timeout=30) == 128 + 15
+
+
+DEFAULT = DEFAULTS.rt_priority
+BELOW = DEFAULT - 1
+
+
+@needs_root
+def test_the_stream_is_real_time_no_service_is(server: ScriptedServer, start_process: StartProcess) -> None:
+    cpu = min(os.sched_getaffinity(0))
+    node = start_process(server.port, cpu=cpu)
+    node.says("connected to")
+    node.says("the stream has ")
+    skip_if_forbidden(node.log)
+    assert f"the stream has SCHED_FIFO {DEFAULT}, CPU {cpu}, memory locked" in node.log
+    found: Counter[tuple[str, int, object, bool]] = Counter()
+    for task in Path(f"/proc/{node.process.pid}/task").iterdir():
+        name, number = (task / "comm").read_text().strip(), int(task.name)
+        policy, priority = os.sched_getscheduler(number), os.sched_getparam(number).sched_priority
+        found[name.split(".")[0], policy, priority, len(os.sched_getaffinity(number)) == 1] += 1
+        assert number != node.process.pid or policy == os.SCHED_OTHER, "the services' executor"
+    anywhere = os.cpu_count() == 1
+    names = {name for name, *_ in found} - {"dds"}
+    assert sum(found[name, os.SCHED_FIFO, DEFAULT, True] for name in names) == 1
+    assert sum(found[name, os.SCHED_FIFO, BELOW, anywhere] for name in names) == len(process.BESIDE)
+    assert {key[1:3] for key in found if key[0] == "dds"} == {(os.SCHED_FIFO, BELOW)}
+    assert {key[1:3] for key in found} == {
+        (os.SCHED_OTHER, 0), (os.SCHED_FIFO, BELOW), (os.SCHED_FIFO, DEFAULT)
+    }  # fmt: skip
+
+
+@pytest.fixture
+def stream(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Thread]:
+    """A thread of the stream's name, and no way to change the process of the tests."""
+    over = threading.Event()
+    thread = threading.Thread(target=over.wait, name=process.STREAM)
+    thread.start()
+    for owner, name in ((sys, "setswitchinterval"), (os, "sched_setscheduler"), (gc, "freeze")):
+        monkeypatch.setattr(owner, name, lambda *_: pytest.fail("nothing was granted"))
+    yield thread
+    over.set()
+    thread.join()
+
+
+def test_a_refusal_is_a_warning_and_no_change(
+    stream: threading.Thread, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[int, int, int]] = []
+
+    def refuse(priority: int, cpu: int, *, thread: int) -> Scheduling:
+        asked.append((priority, cpu, thread))
+        return Scheduling(refused=(f"SCHED_FIFO {priority} (a remedy)",))
+
+    monkeypatch.setattr(process, "make_real_time", refuse)
+    lines = Log(None)
+    process.prepare(40, 1, lines)
+    assert asked == [(40, 1, stream.native_id)]
+    assert lines.warnings == [
+        "the stream has ordinary scheduling; not granted: SCHED_FIFO 40 (a remedy); samples may be late on a "
+        "busy machine"
+    ]
+
+
+@pytest.mark.usefixtures("stream")
+def test_nothing_is_said_where_nothing_was_asked_for() -> None:
+    lines = Log(None)
+    process.prepare(0, -1, lines)
+    assert not lines.lines
+
+
+def test_a_thread_that_fails_says_so() -> None:
+    def fail() -> None:
+        raise LookupError("a defect")
+
+    heard: list[str] = []
+    worker = process.Worker("reader", fail, heard.append)
+    worker.start()
+    assert worker.has_ended()
+    assert heard == ["the reader failed: LookupError: a defect"]
+
+
+# Executors run until they are told to stop, and keep nothing of what they have handled.
+
+
+class Bench:
+    """A node with a spinner in a thread."""
+
+    def __init__(self) -> None:
+        self.node = rclpy.create_node("spinning")
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.spinner = Spinner(self.executor)
+        self.ticks = 0
+        self.thread = threading.Thread(target=self.spinner.run, daemon=True)
+
+    def count(self, ticks: int) -> None:
+        """Let so many timer callbacks pass."""
+        wanted = self.ticks + ticks
+        wait_until(lambda: self.ticks >= wanted, f"{ticks} callbacks")
+
+    def tick(self) -> None:
+        self.ticks += 1
+
+    def ends(self) -> bool:
+        self.spinner.stop()
+        self.thread.join(PATIENCE_S)
+        return not self.thread.is_alive()
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    made = Bench()
+    yield made
+    assert made.thread.ident is None or made.ends()
+    made.executor.shutdown()
+    made.node.destroy_node()
+
+
+def functions() -> int:
+    gc.collect()
+    return sum(isinstance(thing, types.FunctionType) for thing in gc.get_objects())
+
+
+def test_nothing_is_kept_of_what_was_handled(bench: Bench) -> None:
+    bench.node.create_timer(0.0002, bench.tick)
+    bench.thread.start()
+    bench.count(100)
+    before = functions()
+    bench.count(500)
+    assert functions() - before < 100
+    assert bench.ends()
+
+
+def test_an_executor_ends_whenever_it_is_told(bench: Bench) -> None:
+    bench.thread.start()
+    bench.thread.join(0.2)
+    assert bench.thread.is_alive()
+    assert bench.ends()
+
+
+def test_told_before_and_once_more_after_the_end(bench: Bench) -> None:
+    bench.spinner.stop()
+    bench.spinner.run()
+    bench.executor.shutdown()
+    bench.spinner.stop()
+
+
+def test_a_callback_that_raises_ends_it_and_is_told(bench: Bench) -> None:
+    def fail() -> Any:
+        raise LookupError("of the callback")
+
+    bench.node.create_timer(0.001, fail)
+    with pytest.raises(LookupError, match="of the callback"):
+        bench.spinner.run()
+    bench.spinner.stop()
+
+
+def test_what_waits_for_no_others_has_an_executor_of_its_own(bench: Bench) -> None:
+    node, group = bench.node, MutuallyExclusiveCallbackGroup()
+    own = node.create_timer(60.0, bench.tick, group)
+    common = node.create_timer(60.0, bench.tick)
+    prompt = PartExecutor(node)
+    ordinary = PartExecutor(node, prompt)
+    (mine,), (others,) = prompt.get_nodes(), ordinary.get_nodes()
+    assert (mine.timers, others.timers) == ([own], [common])
+    assert not mine.services
+    assert others.services == list(node.services) != []
+    prompt.shutdown()
+    ordinary.shutdown()
+
+
+# The profile for Fast DDS.
+
+
+NAME = "FASTRTPS_DEFAULT_PROFILES_FILE"
+SPACE = "{http://www.eprosima.com}"
+READER_ASKS_AFTER_NS = 5_000_000
+
+
+def test_the_profile_and_who_names_it() -> None:
+    for before in ({}, {NAME: ""}):
+        environment = dict(before)
+        use_own_profiles(environment)
+        assert environment == {NAME: str(PROFILES)}
+    own = {NAME: "/etc/mine.xml"}
+    use_own_profiles(own)
+    assert own == {NAME: "/etc/mine.xml"}
+    writers = ET.parse(PROFILES).getroot().findall(f".//{SPACE}data_writer")
+    assert [writer.get("is_default_profile") for writer in writers] == ["true"]
+    (nanoseconds,) = writers[0].findall(f".//{SPACE}nackSupressionDuration/{SPACE}nanosec")
+    assert 0 < int(nanoseconds.text or 0) < READER_ASKS_AFTER_NS
+
+
+def test_fast_dds_understands_it(
+    server: ScriptedServer, start_process: StartProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In processes: the middleware reads its profiles once. And a signal ends one as it should."""
+    monkeypatch.delenv(NAME, raising=False)
+    node = start_process(server.port)
+    node.says("connected to")
+    assert "XMLPARSER" not in node.log
+    node.process.send_signal(signal.SIGTERM)
+    assert node.ends() == 0
+    assert "Traceback" not in node.log
+    assert server.disconnected.wait(PATIENCE_S)
+    wrong = tmp_path / "wrong.xml"
+    wrong.write_text(PROFILES.read_text().replace("nackSupressionDuration", "nackDuration"))
+    monkeypatch.setenv(NAME, str(wrong))
+    start_process(server.port).says("XMLPARSER")  # this is how it would have said so
