@@ -267,7 +267,8 @@ class ClockSimulation:
                 continue
             if due_ns > self.now_ns:
                 self.now_ns = self._awake(due_ns + self._chance.expovariate(1) * self.machine.wake_ns)
-                timing.woke_late_ns = self.now_ns - due_ns
+                if timing.woke_late_ns is None:
+                    timing.woke_late_ns = self.now_ns - due_ns
             self._send()
             self.now_ns += _SEND_NS
         return self

@@ -18,12 +18,12 @@ from concurrent.futures import Future
 
 from bota_ethercat.control import Event, event
 from bota_ethercat.settings import SettingValue
-from ethercat_server.acquisition.stream import Made
+from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.serving.transport import SocketTransport, Transport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor import bus as virtual
-from ethercat_server.virtual_sensor.options import BusOptions, SensorOptions
+from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.server.running import PATIENCE_S, Client, free_port
 from tests.simulation import Simulation
 
@@ -34,7 +34,7 @@ class _Backend(MemoryBackend):
     def __init__(self, *sensors: SensorOptions) -> None:
         super().__init__(*sensors)
         self.clock = SimulatedClock(Machine(), time.monotonic_ns())
-        self.sensors = virtual.Bus(BusOptions(sensors or (SensorOptions(),)), self.clock.now_ns)
+        self.sensors = virtual.Bus(sensors or (SensorOptions(),), self.clock.now_ns)
 
 
 class _Transport(SocketTransport):
@@ -68,7 +68,7 @@ class ServedSimulation(Simulation):
     def listen(self) -> Transport:
         return _Transport(self.clock, self.port)
 
-    def note(self, made: Sequence[Made]) -> None:
+    def note(self, made: Sequence[OutgoingFrame]) -> None:
         """Nothing is kept: it may run for long."""
 
     def serves(self, until_ns: int, serve: Callable[[int], None]) -> None:

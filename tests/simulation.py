@@ -10,27 +10,45 @@
 
 Time passes while a client waits for something, and by `run`. Nothing really waits, nothing else runs: a
 failure is repeated by the same arguments, step by step in a debugger.
+
+For the tool and the doctor: within `simulated_bus` whatever opens an interface gets these virtual sensors;
+within `simulated_server` whatever connects to a server gets one that streams them.
+
+    with simulated_bus("--serial", "10,20") as bus:
+        bus.command("power cycle 0.5")
+        result = run_here(main, "plan", bus.near, "--set", "fir=on")
+        assert bus.written(1) == []
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import json
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import pytest
 
-from bota_ethercat.control import request
+from bota_ethercat import client as blocking
 from bota_ethercat.errors import ConnectionFailedError, UnreachableError
-from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder
 from bota_ethercat.pdo import LAYOUTS
 from bota_ethercat.settings import SettingValue, start_up_defaults
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.acquisition.start_up import Wanted
-from ethercat_server.acquisition.stream import Made
+from ethercat_server.access import private_server, sensors
+from ethercat_server.access.sensors import Sensors
+from ethercat_server.acquisition.start_up import AsFound, Wanted
+from ethercat_server.acquisition.stream import OutgoingFrame
+from ethercat_server.doctor import bus_checks
+from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.datagrams import ByPosition
+from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.ethercat.slave.coe import finish
+from ethercat_server.ethercat.slave.sii import read_sii
+from ethercat_server.process import realtime
+from ethercat_server.sensor import scan
 from ethercat_server.sensor.sensor import Identity
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
@@ -38,12 +56,16 @@ from ethercat_server.serving.in_memory import InMemoryStream, InMemoryTransport
 from ethercat_server.serving.transport import Transport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
-from ethercat_server.virtual_sensor.measurement.signals import ClockReading, decode_clock
+from ethercat_server.virtual_sensor.cli import build_parser, options_from
+from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.sensor import Firmware
+from ethercat_server.virtual_sensor.signals import ClockReading, decode_clock
+from tests.server.running import OLD, Commanded, FramedClient
 
 PATIENCE_S = 60.0
 """Simulated time that anything may take."""
-OLD = int(DataFlag.REPEATED | DataFlag.INVALID)
+AT_REST = SensorOptions(signal="rest")
 _EXCUSE = int(DataFlag.GAP | DataFlag.REPEATED)
 
 
@@ -74,7 +96,7 @@ class RecordingHub(Hub):
         super().__init__(simulation.listen(), simulation.clock.monotonic_ns)
         self._simulation = simulation
 
-    def publish(self, made: Sequence[Made], now_ns: int) -> None:
+    def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
         self._simulation.note(made)
         super().publish(made, now_ns)
 
@@ -83,10 +105,29 @@ class RecordingHub(Hub):
 
     def broadcast(self, message: JsonObject) -> None:
         self._simulation.events.append(message)
+        self._simulation.announced_ns.append(self._simulation.clock.now_ns)
         super().broadcast(message)
 
 
-class SimulatedBus:
+def life_of(backend: MemoryBackend, number: int = 0) -> Firmware:
+    """The firmware of a sensor that has power."""
+    life = backend.sensors.sensors[number].life
+    assert life is not None
+    return life
+
+
+def chain(text: str) -> MemoryBackend:
+    """A bus with these slaves."""
+    return MemoryBackend(*slaves_in(parse_chain(text)))
+
+
+def registers(backend: MemoryBackend) -> list[bytes]:
+    """All registers of every slave."""
+    lives = [slave.life for slave in backend.sensors.slaves]
+    return [bytes(life.esc.memory[: reg.REGISTERS_END]) for life in lives if life is not None]
+
+
+class SimulatedBus(Commanded):
     """Virtual sensors in memory."""
 
     near = "lo"
@@ -96,7 +137,6 @@ class SimulatedBus:
         self.backend, self.clock = backend, backend.clock
 
     def command(self, line: str) -> str:
-        """Have a fault command of the virtual sensor obeyed now; returns its answer."""
         answer = self.backend.command(line)
         assert answer.startswith("ok"), answer
         return answer[3:]
@@ -111,19 +151,32 @@ class SimulatedBus:
         self.command("power cycle 0.1")
         self.clock.sleep(0.2)
 
-    def stats(self, position: int = 0) -> dict[str, Any]:
-        """What a virtual sensor says of itself."""
-        found: dict[str, Any] = json.loads(self.command("stats"))["sensors"][position]
-        return found
 
-    def stats_of_foreign(self, place: int) -> dict[str, Any]:
-        """What the foreign slave at this position says of itself."""
-        found: dict[str, Any] = json.loads(self.command("stats"))["foreign"][str(place)]
-        return found
+class Exchange:
+    """Sends the process data of `bus`, and waits for it."""
 
-    def written(self, position: int = 0) -> list[tuple[str, int, str]]:
-        """The SDO writes so far: index, sub-index, data."""
-        return [(row["index"], row["subindex"], row["hex"]) for row in self.stats(position)["sdo_writes"]]
+    def __init__(self, bus: Bus) -> None:
+        self.bus = bus
+        self.inputs: dict[int, bytes] = {}
+        """Of each sensor, as of the last exchange that came back."""
+
+    def __call__(self, timeout_s: float = 0.01) -> int:
+        """The working counter of all frames; -1 if one did not come back in time."""
+        process_data, clock = self.bus.process_data, self.bus.clock
+        until_ns = clock.monotonic_ns() + round(timeout_s * 1e9)
+        began_ns, awaited, total = clock.monotonic_ns(), len(process_data.inputs), 0
+        process_data.send()
+        while awaited:
+            left_ns = until_ns - clock.monotonic_ns()
+            if left_ns <= 0 or (frame := self.bus.backend.receive(left_ns * 1e-9)) is None:
+                return -1
+            answer = process_data.take(frame, clock.monotonic_ns())
+            if answer is not None and answer.sent_ns > began_ns:
+                awaited -= 1
+                total += answer.wkc
+                for at in process_data.inputs[answer.which]:
+                    self.inputs[at.number] = frame[at.start : at.end]
+        return total
 
 
 class Simulation(SimulatedBus):
@@ -146,6 +199,8 @@ class Simulation(SimulatedBus):
         self.published_ns: list[int] = []
         """When each was handed out."""
         self.events: list[JsonObject] = []
+        self.announced_ns: list[int] = []
+        """When each was announced."""
         self._decoder = FrameDecoder()
         self._awaited: Callable[[], object] = lambda: False
         self.on_serve: Callable[[int], None] = lambda _: None
@@ -155,6 +210,8 @@ class Simulation(SimulatedBus):
         self.sensors, self.streams, self.others = self.server.sensors, self.server.streams, self.server.others
         self.recovery, self.jobs, self.cycle = self.server.recovery, self.server.jobs, self.server.cycle
         self.clients: list[Client] = []
+        self.hangs = False
+        """Whether somebody has stopped it; time passes all the same."""
 
     def listen(self) -> Transport:
         """Where its clients come from."""
@@ -162,7 +219,7 @@ class Simulation(SimulatedBus):
 
     # -- what the loop hands to its clients
 
-    def note(self, made: Sequence[Made]) -> None:
+    def note(self, made: Sequence[OutgoingFrame]) -> None:
         """Keep the frames of an exchange."""
         for frame, _, _ in made:
             self._decoder.feed(frame)
@@ -183,6 +240,12 @@ class Simulation(SimulatedBus):
     def connect(self, uid: int | None = 0, *, buffer_size: int = 65536) -> Client:
         """A client of user `uid`, on a framed connection."""
         return Client(self, uid, buffer_size)
+
+    def subscribe(self, uid: int | None = 0, *, buffer_size: int = 65536, **keys: object) -> Client:
+        """A client that has subscribed."""
+        client = self.connect(uid, buffer_size=buffer_size)
+        assert client.ask("subscribe", **keys)["ok"]
+        return client
 
     def run(self, seconds: float) -> None:
         """Let the loop run for this simulated time."""
@@ -206,7 +269,10 @@ class Simulation(SimulatedBus):
             assert met or condition(), f"{what}: not within {seconds} s; events: {self.events[-6:]}"
 
     def go_on(self, until: Callable[[], object], seconds: float) -> None:
-        """Let the loop run until something is so, for this time at most."""
+        """Let the loop run until something is so, for this time at most; not where it hangs."""
+        if self.hangs:
+            self.clock.sleep(seconds)
+            return
         until_ns = self.clock.now_ns + round(seconds * 1e9)
         self.run_until(lambda: until() or self.clock.now_ns >= until_ns, "the end of a wait", seconds + 1)
 
@@ -223,20 +289,15 @@ class Simulation(SimulatedBus):
         self.bus.close()
 
 
-class Client:
-    """A framed connection that keeps everything; simulated time passes while it waits for something."""
+class Client(FramedClient):
+    """One in memory; simulated time passes while it waits for something."""
 
     def __init__(self, simulation: Simulation, uid: int | None, buffer_size: int) -> None:
         self.simulation = simulation
         self.stream = simulation.transport.connect(uid, buffer_size=buffer_size)
-        self.frames: list[DataMessage] = []
-        self.events: list[JsonObject] = []
-        """Those that `wait_event` has not returned."""
-        self.replies: list[JsonObject] = []
+        super().__init__(self.stream.send, simulation.run_until)
         self.reads = True
         """Whether it takes what arrives."""
-        self._decoder = FrameDecoder()
-        self._id = 0
         simulation.clients.append(self)
 
     def receive(self) -> None:
@@ -245,63 +306,12 @@ class Client:
             return
         self._decoder.feed(self.stream.recv_all())
         while (message := self._decoder.take_data(self.frames)) is not None:
-            (self.events if "event" in message else self.replies).append(message)
+            self.keep(message)
 
     @property
     def at_end(self) -> bool:
         """Whether the server has closed the connection."""
         return self.stream.at_end
-
-    def send(self, action: str, **keys: object) -> int:
-        """Send a request; returns its id."""
-        self._id += 1
-        self.stream.send(encode_json(request(action, self._id, **keys)))
-        return self._id
-
-    def ask(self, action: str, **keys: object) -> dict[str, Any]:
-        """The reply to a request."""
-        return self.reply(self.send(action, **keys))
-
-    def reply(self, number: int) -> dict[str, Any]:
-        """Wait for the reply to the request with this id."""
-
-        def found() -> list[JsonObject]:
-            return [reply for reply in self.replies if reply.get("id") == number]
-
-        self.simulation.run_until(found, f"the reply to request {number}")
-        return found()[0]
-
-    def wait_event(self, name: str, sensor: int = 0) -> JsonObject:
-        """The first event of this name that has not been returned yet."""
-
-        def found() -> list[JsonObject]:
-            return [e for e in self.events if e["event"] == name and e.get("sensor", sensor) == sensor]
-
-        self.simulation.run_until(found, name)
-        event = found()[0]
-        self.events.remove(event)
-        return event
-
-    def collect(self, count: int) -> list[DataMessage]:
-        """The next `count` frames."""
-        self.frames.clear()
-        self.simulation.run_until(lambda: len(self.frames) >= count, f"{count} frames")
-        return self.frames[:count]
-
-    def fresh(self, count: int) -> list[DataMessage]:
-        """The next `count` frames that are new and valid samples."""
-        self.frames.clear()
-        found: list[DataMessage] = []
-        looked_at = 0
-
-        def enough() -> bool:
-            nonlocal looked_at
-            found.extend(fresh(self.frames[looked_at:]))
-            looked_at = len(self.frames)
-            return len(found) >= count
-
-        self.simulation.run_until(enough, f"{count} new samples")
-        return found[:count]
 
     def close(self) -> None:
         """Disconnect."""
@@ -309,8 +319,23 @@ class Client:
         self.simulation.clients.remove(self)
 
 
+class Bench(Simulation):
+    """A server, by default on a stationary sensor, with a client that listens and one that asks."""
+
+    def __init__(self, *sensors: SensorOptions, **more: Any) -> None:
+        super().__init__(*(sensors or (AT_REST,)), **more)
+        self.listener, self.asking = self.subscribe(), self.connect()
+        self.ask, self.refused, self.described = self.asking.ask, self.asking.refused, self.asking.described
+        self.listener.fresh(50)
+
+    def start_again(self, **more: Any) -> Bench:
+        """End this server and start another one on the same sensors; see `Simulation`."""
+        self.close()
+        return Bench(backend=self.backend, **more)
+
+
 class MemoryChannel:
-    """A `Channel` to `server`, which may be stopped (`hangs`) and killed; time passes while its client waits.
+    """A `Channel` to `server`, which may hang and be killed; time passes while its client waits.
 
     with StreamClient(12001, channel=MemoryChannel(server)).connect() as client: ...
     """
@@ -318,10 +343,9 @@ class MemoryChannel:
     is_near = True
     own = ("memory", 0)
 
-    def __init__(self, server: Simulation, *, buffer_size: int = 65536) -> None:
+    def __init__(self, server: Simulation) -> None:
         self.server: Simulation | None = server
-        self.hangs = False
-        self._clock, self._buffer_size = server.clock, buffer_size
+        self._clock = server.clock
         self._stream: InMemoryStream | None = None
 
     def kill(self) -> None:
@@ -344,7 +368,7 @@ class MemoryChannel:
         """See `Channel`."""
         if self.server is None:
             raise UnreachableError("Connection refused")
-        self._stream = self.server.transport.connect(0, buffer_size=self._buffer_size)
+        self._stream = self.server.transport.connect(0, buffer_size=1 << 20)
         return True
 
     def receive(self, buffer: memoryview, timeout_s: float) -> int:
@@ -382,10 +406,10 @@ class MemoryChannel:
         return -1
 
     def _pass(self, until: Callable[[], object], seconds: float) -> None:
-        if self.server is None or self.hangs:
+        if self.server is None:
             self._clock.sleep(seconds)
         elif not until():
-            self.server.go_on(lambda: until() or self.hangs or self.server is None, seconds)
+            self.server.go_on(lambda: until() or self.server is None or self.server.hangs, seconds)
 
 
 def more_if_long(usual: Collection[Any], every: Iterable[Any]) -> list[Any]:
@@ -431,3 +455,101 @@ def check_frames(frames: Iterable[DataMessage], *, complete: bool = True) -> Non
             unflagged += after.number != before.number + 1 and not visible
         new, visible, count = frame, False, count + 1
     assert unflagged == 0, f"{unflagged} of {count} follow a loss without a flag"
+
+
+# -- the buses of the tool and the doctor
+
+SINC_LENGTH, RATE_HZ = 512, 100
+"""What a server sets the sensors to: the fewer samples, the faster it is simulated."""
+_READ_IMAGE = scan.read_image
+
+
+def _read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda: None) -> bytes:
+    """The SII, on which most of a start would be spent; nothing else reads it like this."""
+    finish(read_sii(ByPosition(bus), position, 0, 4), clock=bus.clock)
+    assert isinstance(bus.backend, MemoryBackend)
+    life = bus.backend.sensors.slaves[position].life
+    return _READ_IMAGE(bus, position, check_interrupt) if life is None else life.esc.sii.image
+
+
+@contextlib.contextmanager
+def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterator[SimulatedBus]:
+    """Sensors as `ethercat-virtual-sensor IFACE arguments...` simulates; nobody writes their calibration."""
+    slaves = options_from(build_parser().parse_args(["lo", *map(str, arguments)]))
+    bus = SimulatedBus(MemoryBackend(*slaves, machine=machine))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scan, "read_image", _read_image)
+        for module in (private_server, bus_checks):
+            patch.setattr(module, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
+
+        def private(_ifname: str, *, force: bool = False, **_: object) -> PrivateServer:
+            server = PrivateServer(bus, AsFound(force=force))
+            patch.setattr(Sensors, "clock", server.clients_clock)
+            return server
+
+        patch.setattr(sensors, "PrivateServer", private)
+        patch.setattr(realtime, "prepare", lambda _priority, _cpu: None)
+        yield bus
+    numbers = range(len(bus.backend.sensors.sensors))
+    assert not any(bus.stats(position)["calibration_writes"] for position in numbers)
+
+
+class SimulatedServer(Simulation):
+    """A server that streams the sensors of a bus, while somebody waits for something from it."""
+
+    address = "localhost:12001"
+
+    def __init__(self, bus: SimulatedBus, wanted: Wanted | None = None) -> None:
+        # Here a message comes a period late, because time passes while the server serves: ages mean nothing.
+        super().__init__(
+            backend=bus.backend, settings={"sinc_length": SINC_LENGTH}, wanted=wanted, boot_id="simulated"
+        )
+        self.clients_clock = _ServersClock(self)
+
+    def client(self) -> blocking.Client:
+        """A client for this test's own requests."""
+        return blocking.Client(12001, stream=False, channel=MemoryChannel(self)).connect()
+
+
+class PrivateServer(SimulatedServer):
+    """One that a program has for itself."""
+
+    error = None
+    real_time = True
+
+    def __init__(self, bus: SimulatedBus, wanted: Wanted) -> None:
+        super().__init__(bus, wanted)
+        self.channel = MemoryChannel(self)
+
+    def interrupt(self) -> None:
+        """See `PrivateServer`."""
+        self.server.jobs.interrupt(private_server.STOPPED)
+
+
+@contextlib.contextmanager
+def simulated_server(bus: SimulatedBus) -> Iterator[SimulatedServer]:
+    """A server that streams from `bus`, behind every address."""
+    server = SimulatedServer(bus)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("bota_ethercat.client.client.TcpChannel", lambda *_: MemoryChannel(server))
+        patch.setattr(Sensors, "clock", server.clients_clock)
+        yield server
+
+
+class _ServersClock:
+    """A client's time: while it sleeps, the server goes on."""
+
+    def __init__(self, server: SimulatedServer) -> None:
+        self._server = server
+
+    def monotonic_ns(self) -> int:
+        """See `Clock`."""
+        return self._server.clock.monotonic_ns()
+
+    def time_ns(self) -> int:
+        """See `Clock`."""
+        return self._server.clock.time_ns()
+
+    def sleep(self, seconds: float, /) -> None:
+        """See `Clock`."""
+        self._server.go_on(lambda: False, seconds)

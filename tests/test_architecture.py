@@ -97,9 +97,9 @@ PACKAGES: Final[dict[str, set[str]]] = {
 """Everything that is not the standard library, and which modules may load it."""
 
 WITHOUT_ROS: Final = (
-    "bridge.stream", "bridge.client", "bridge.middleware", "bridge.signals", "bridge.parameters.table",
+    "bridge.stream", "bridge.client", "bridge.process", "bridge.parameters.table",
     "bridge.compensating.tool_sources",
-    "bridge.diagnostics.health", "bridge.diagnostics.observer",
+    "bridge.diagnostics.health",
 )  # fmt: skip
 """What can run, and be tested, where there is no ROS; `bridge.client` loads it later."""
 SOCKETS: Final = {"socket", "socketserver", "select", "selectors", "asyncio", "ssl"}

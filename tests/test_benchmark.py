@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import itertools
@@ -17,7 +16,7 @@ import sys
 import threading
 import time
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -28,12 +27,11 @@ from rich.console import Console
 
 from bota_ethercat.framing import DataMessage, FrameDecoder
 from bota_ethercat.pdo import SampleDecoder, encode
-from ethercat_server.virtual_sensor.measurement.signals import decode_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.signals import decode_clock
+from scripts.benchmarks import modes, statistics
 from scripts.benchmarks import program as benchmark
-from scripts.benchmarks import statistics
-from scripts.benchmarks.chain import ScriptError, Setup
-from scripts.benchmarks.modes import comparison, server
+from scripts.benchmarks.chain import ScriptError, Setup, Turn
 from scripts.benchmarks.processes import masters, recorder
 from scripts.benchmarks.records import Recording, began, write
 from scripts.benchmarks.statistics import Arrivals, Ints
@@ -114,7 +112,7 @@ def test_summary_of_two_sensors() -> None:
     assert len(ages) == 5
 
 
-def turn(median_us: float, lost: int, cpu: float) -> comparison.Turn:
+def turn(median_us: float, lost: int, cpu: float) -> Turn:
     ages = np.array([median_us * 1000] * 3)
     counts = {"made": 100, "lost": lost, "machine_stops": 1, "longest_stop_us": 10.0 * lost}
     return {**counts, "age_us": statistics.spread_us(ages), "cpu_percent": {"server": cpu}}, ages
@@ -123,25 +121,25 @@ def turn(median_us: float, lost: int, cpu: float) -> comparison.Turn:
 def test_turns_are_pooled_and_their_ratios_are_medians() -> None:
     ours = [turn(100, 1, 10), turn(120, 0, 12), turn(900, 5, 20)]
     theirs = [turn(100, 0, 5), turn(100, 0, 5), turn(450, 0, 5)]
-    figures, ages = comparison.together(ours)
+    figures, ages = modes.together(ours)
     assert (figures["made"], figures["lost"], figures["machine_stops"]) == (300, 6, 3)
     assert (figures["longest_stop_us"], figures["cpu_percent"]["server"]) == (50.0, 12.0)
     assert (figures["age_us"]["p50"], len(ages)) == (120.0, 9)
-    found = comparison.ratios(ours, theirs)
+    found = modes.ratios(ours, theirs)
     assert (found["age_p50"], found["cpu"]) == (1.2, 2.4)
 
 
 def test_a_repeated_sample_is_as_old_as_when_it_was_returned_first() -> None:
     number = np.array([1, 1, 2, 4, 4, 4])
     received = number * PERIOD + [300, 1550, 400, 500, 1750, 3000]
-    found = comparison.first_ages(Arrivals(number, number * PERIOD, 0 * number, received))
+    found = modes.first_ages(Arrivals(number, number * PERIOD, 0 * number, received))
     assert found.tolist() == [300, 400, 500]
 
 
 def test_memory_slope_leaves_the_start_out() -> None:
     seconds = np.arange(0, 3600.0, 10)
     rss = np.where(seconds < 300, 10e6, 20e6 + seconds / 3600 * 5000)
-    assert server.slope_kb_per_hour(seconds, rss) == pytest.approx(5.0)
+    assert modes.slope_kb_per_hour(seconds, rss) == pytest.approx(5.0)
 
 
 # -- table, page, command line
@@ -152,19 +150,19 @@ COUNTS = {"made": 200, "lost": 1, "lost_in_stops": 1}
 ROWS: list[dict[str, Any]] = [
     {**ABOUT, "program": "this", **COUNTS, "age_us": AGES, "cpu_percent": {"server": 9.0}},
     {**ABOUT, "program": "bare C", **COUNTS, "age_us": {"p50": 40.0, "p99": 60.0}},
-    {**ABOUT, "program": "this / C", "ratio": dict(zip(comparison.RATIOS, (2, 3, 4, 5), strict=True))},
+    {**ABOUT, "program": "this / C", "ratio": dict(zip(modes.RATIOS, (2, 3, 4, 5), strict=True))},
     {**ABOUT, "program": "Bota's driver", "missing": "it cannot be had"},
 ]
 
 
 def test_the_table_has_what_there_is() -> None:
-    this, bare_c, ratio, driver = benchmark.cells(comparison.MODE, ROWS)
+    this, bare_c, ratio, driver = benchmark.cells(modes.MODES["comparison"], ROWS)
     assert this == ["800 Hz, 1", "this", "1 (1) of 200", "80.0", "120", "150", "-", "9.0", "-"]
     assert bare_c[3:6] == ["40.0", "60.0", "-"]
     assert ratio[2:] == ["", "2.00", "3.00", "4.00", "", "5.00", ""]
     assert driver[2] == "it cannot be had"
     shown = io.StringIO()
-    Console(file=shown, width=108).print(benchmark.table(comparison.MODE, ROWS))
+    Console(file=shown, width=108).print(benchmark.table(modes.MODES["comparison"], ROWS))
     assert "…" not in shown.getvalue(), "it fits the narrowest table"
 
 
@@ -227,12 +225,12 @@ def clock_data(number: int, instant: int | None = None) -> bytes:
     return encode(61, dict(zip(("force.x", "force.y", "force.z", "torque.x"), values, strict=True)))
 
 
-def recorded(program: Callable[..., None], path: Path, seconds: float, **options: object) -> threading.Thread:
+def recorded(kind: str, path: Path, seconds: float, *options: object) -> threading.Thread:
     """A recorder in a thread."""
 
     def run() -> None:
         recording = Recording(path, 0.0, seconds)
-        program(argparse.Namespace(**options), recording)
+        recorder.KINDS[kind](recording, *options)
         recording.write()
 
     thread = threading.Thread(target=run)
@@ -270,7 +268,7 @@ def test_a_client_records_every_sample_and_its_age(
     path = tmp_path / "records"
     with served(SensorOptions(signal="clock"), sinc_length=256) as running:
         if client == "Python":
-            recorded(recorder.tcp, path, 0.1, port=running.port).join(PATIENCE_S)
+            recorded("tcp", path, 0.1, running.port).join(PATIENCE_S)
         else:
             command = [request.getfixturevalue("c_program"), "client", str(running.port), path, "0", "0.1"]
             subprocess.run(command, check=True, timeout=PATIENCE_S)
@@ -285,7 +283,7 @@ def test_a_client_records_every_sample_and_its_age(
 def test_the_polling_client_takes_what_is_there_when_it_looks(tmp_path: Path) -> None:
     path, count = tmp_path / "records", itertools.count()
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        looks = recorded(recorder.polling, path, 0.05, port=listener.getsockname()[1], rate=1000)
+        looks = recorded("polling", path, 0.05, "1000", listener.getsockname()[1])
         sender, _ = listener.accept()
         with sender, contextlib.suppress(ConnectionError):
             while looks.is_alive():
@@ -358,10 +356,9 @@ def test_what_is_measured_is_shown_and_written(
 ) -> None:
     figures, ages = statistics.summary([arrivals(range(5, 105))], PERIOD, NO_STOPS)
     measured = {**figures, "rss_mb": {"server": 40.0}, "cpu_percent": {"server": 5.0}}, ages
-    for program in ("bare_c", "project", "polling", "vendor"):
-        monkeypatch.setattr(comparison, program, lambda *_, **__: measured)
-    monkeypatch.setattr(comparison, "build", lambda _: tmp_path)
-    monkeypatch.setattr(comparison, "VENDOR", tmp_path)
+    monkeypatch.setattr(modes, "turn", lambda *_: measured)
+    monkeypatch.setattr(modes, "build", lambda _: tmp_path)
+    monkeypatch.setattr(modes, "VENDOR", tmp_path)
     if installed:
         (tmp_path / "has-bota-driver==1").touch()
     monkeypatch.setenv("DEMO_DIRECTORY", str(tmp_path))
@@ -385,20 +382,6 @@ def test_what_is_measured_is_shown_and_written(
     assert (tmp_path / "b.png").exists() == (find_spec("matplotlib") is not None)
 
 
-def run(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
-    """The benchmark in a network namespace of its own."""
-    command = ["unshare", "--net", sys.executable, "-m", "scripts.benchmarks.program"]
-    return subprocess.Popen(
-        [*command, "--json", str(tmp_path / "b.json"), *arguments],
-        cwd=ROOT,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "TMPDIR": str(tmp_path)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-
-
 def numbers(content: Any) -> Iterator[float]:
     if isinstance(content, dict | list):
         for item in content.values() if isinstance(content, dict) else content:
@@ -415,9 +398,13 @@ def numbers(content: Any) -> Iterator[float]:
 def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
     page = shutil.copy(ROOT / "docs" / "benchmark.md", tmp_path)
-    running = run(tmp_path, "--seconds", "1", "--rates", "400", "--page", str(page))
-    said, _ = running.communicate(timeout=400)
-    assert running.returncode == 0, said
+    arguments = ("--json", tmp_path / "b.json", "--seconds", "1", "--rates", "400", "--page", page)
+    done = subprocess.run(
+        ["unshare", "--net", sys.executable, "-m", "scripts.benchmarks.program", *map(str, arguments)],
+        cwd=ROOT, env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "TMPDIR": str(tmp_path)},
+        capture_output=True, text=True, check=False, timeout=400,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
     text = Path(page).read_text()
     for what in ("400 Hz, 2 | this, ROS", "400 Hz, 4 loops: wrench, "):
         assert f"| {what}" in text, what

@@ -35,7 +35,7 @@ def defined(path: Path) -> set[str]:
     """The functions, classes, methods and constants in a file."""
     text = path.read_text()
     if path.suffix != ".py":
-        return set(re.findall(r"^(?:class|struct|inline \w+) (\w+)", text, re.MULTILINE))
+        return set(re.findall(r"^(?:class|struct|inline [\w:]+) (\w+)", text, re.MULTILINE))
     names = set()
     for node in ast.parse(text).body:
         match node:

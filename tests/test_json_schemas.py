@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bota_clients.identify.program import run as identify
+from bota_clients.identify.cli import main as identify
 from bota_clients.monitor.model import State
 from bota_clients.monitor.words import json_line
 from bota_clients.report.cli import main as report
@@ -19,7 +19,7 @@ from tests.clients.recordings import frame, record
 from tests.clients.test_identify import posed
 from tests.ended import run_here
 from tests.json_schema import SCHEMAS, problems
-from tests.simulated_links import simulated_bus
+from tests.simulation import simulated_bus
 from tests.tool.running import tool_here
 
 

@@ -25,7 +25,7 @@ from tests.ended import run_here
 ROOT: Final = Path(__file__).parent.parent
 SCRIPTS: Final[dict[str, str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 PROGRAMS: Final = {name: entry for name, entry in SCRIPTS.items() if name != "bridge-client"}
-CLIENTS: Final = [name for name, entry in PROGRAMS.items() if entry.startswith("clients.")]
+CLIENTS: Final = [name for name, entry in PROGRAMS.items() if entry.startswith("bota_clients.")]
 UNKNOWN: Final = "numpy is not installed: in this project's folder run PIP '.[client]'"
 EXTRA: Final = ("jinja2", "matplotlib", "mcap", "numpy", "rich", "textual", "zstandard")
 

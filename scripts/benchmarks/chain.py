@@ -36,6 +36,7 @@ WARM_UP_S: Final = 1.0
 _START_TIMEOUT_S: Final = 30.0
 _STOP_TIMEOUT_S: Final = 8.0
 Figures = dict[str, Any]
+Turn = tuple[Figures, Floats]  # of one run, with all ages in ns
 
 
 class ScriptError(Exception):
@@ -65,9 +66,6 @@ class Setup:
     def sinc(self) -> int:
         """The SINC length that gives the rate."""
         return OVERSAMPLING_HZ // self.rate_hz
-
-    def __str__(self) -> str:
-        return f"{self.rate_hz} Hz, {self.sensors} sensor{'s' * (self.sensors > 1)}"
 
 
 class Child:
@@ -107,24 +105,16 @@ class Child:
         return None if code == 0 else f"{self.name} ended with exit code {code}"
 
 
-class Usage:
-    """What a process uses from now on."""
+def used_s(pid: int) -> float:
+    """CPU time of a process, s; finer than the ticks of `stat`."""
+    return (
+        sum(int(task.read_text().split()[0]) for task in Path(f"/proc/{pid}/task").glob("*/schedstat")) / 1e9
+    )
 
-    def __init__(self, pid: int) -> None:
-        self._folder = Path(f"/proc/{pid}")
-        self._began_s, self._before_s = time.monotonic(), self._used_s()
 
-    def cpu_percent(self) -> float:
-        """Of one CPU."""
-        return round(100 * (self._used_s() - self._before_s) / (time.monotonic() - self._began_s), 1)
-
-    def _used_s(self) -> float:
-        threads = self._folder.glob("task/*/schedstat")  # finer than the ticks of `stat`
-        return sum(int(thread.read_text().split()[0]) for thread in threads) * 1e-9
-
-    def rss(self) -> float:
-        """Resident memory now, bytes."""
-        return float((self._folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+def rss(pid: int) -> float:
+    """Resident memory of a process, bytes."""
+    return float(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 class Chain(contextlib.ExitStack):
@@ -134,13 +124,15 @@ class Chain(contextlib.ExitStack):
         super().__init__()
         self.setup = setup
         self.children: list[Child] = []
-        self.watched: dict[str, int] = {}  # process ids
+        self._watched: dict[str, int] = {}  # process ids
         self._canaries: list[Child] = []
+        self._link: Client | None = None
         self.directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
         self.callback(shutil.rmtree, self.directory, ignore_errors=True)
         self.callback(self.stop)
         if title:
-            print(f"{setup}: {title}", file=sys.stderr, flush=True)
+            sensors = f"{setup.sensors} sensor{'s' * (setup.sensors > 1)}"
+            print(f"{setup.rate_hz} Hz, {sensors}: {title}", file=sys.stderr, flush=True)
 
     def bus(self) -> str:
         """Start a virtual bus and the canaries; its interface. The sensors have a CPU to themselves."""
@@ -150,16 +142,16 @@ class Chain(contextlib.ExitStack):
         bus = self.enter_context(VirtualBus(arguments, setup.priority))
         self.callback(self.stop)  # before the bus
         os.sched_setaffinity(bus.pid, own_cpus()[:1])
-        self.watched["sensor"] = bus.pid
+        self._watched["sensor"] = bus.pid
         self.canaries()
         return bus.ifname
 
     def start(self, name: str, *command: object, result: Path | None = None, watch: bool = True) -> Child:
-        """Start any program; `watch`: `record` measures its CPU and memory."""
+        """Start any program; `watch`: `measure` has its CPU and memory."""
         child = Child(name, list(map(str, command)), self.directory, result)
         self.children.append(child)
         if watch:
-            self.watched[name] = child.pid
+            self._watched[name] = child.pid
         return child
 
     def python(self, name: str, module: str, *arguments: object, **how: Any) -> Child:
@@ -185,27 +177,26 @@ class Chain(contextlib.ExitStack):
         )  # fmt: skip
         return self.connect(self.setup.sensors)
 
-    def master(self, *c_program: object) -> Child:
+    def master(self, *c_program: object) -> None:
         """Start what stands in place of the server, on its CPU: the C program, or the polling loop."""
         path, bus = self.directory / "master", self.bus()
         how = (path, bus, self.setup.rate_hz, *c_program)
         child = self.python("server", f"{PROCESSES}.masters", *how, result=path)
         os.sched_setaffinity(child.pid, own_cpus()[1:])
-        return child
 
     def connect(self, sensors: int) -> Client:
         """Connect as soon as the server describes this number of sensors; closed with the chain."""
-        found: list[Client] = []
 
         def ready() -> bool:
             with contextlib.suppress(ProtocolError):
-                found.append(Client(PORT, stream=False, raw=True, reconnect=False).connect())
-                self.callback(found[-1].close)
-                return len(found[-1].description["sensors"]) == sensors
+                self._link = Client(PORT, stream=False, raw=True, reconnect=False).connect()
+                self.callback(self._link.close)
+                return len(self._link.description["sensors"]) == sensors
             return False
 
         self.wait(ready, "the server was not ready")
-        return found[-1]
+        assert self._link is not None
+        return self._link
 
     def node(self, *parameters: str, position: int = 0) -> None:
         """Start the ROS 2 node of a sensor, with these parameters."""
@@ -214,14 +205,14 @@ class Chain(contextlib.ExitStack):
                  for word in ("-p", each)]  # fmt: skip
         self.python(name, "bridge.client", "--ros-args", "-r", f"__node:=bridge_{position}", *given)
 
-    def recorder(self, kind: str, *arguments: object) -> Child:
+    def recorder(self, kind: str, *arguments: object, priority: int = 0) -> Child:
         """Start a recorder (processes/recorder.py, or of kind `c` the program given) that ends by itself."""
         path = self.directory / f"{kind}-{len(self.children)}"
         times = (path, WARM_UP_S, self.setup.seconds)
         if kind == "c":
             return self.start(path.name, *arguments, PORT, *times, result=path, watch=False)
-        module = f"{PROCESSES}.recorder"
-        return self.python(path.name, module, kind, *times, *arguments, result=path, watch=False)
+        how = (kind, *times, priority, *arguments)
+        return self.python(path.name, f"{PROCESSES}.recorder", *how, result=path, watch=False)
 
     def wait(self, done: Callable[[], bool], what: str = "a program did not get ready",
              seconds: float = _START_TIMEOUT_S) -> None:  # fmt: skip
@@ -239,36 +230,50 @@ class Chain(contextlib.ExitStack):
         end = time.monotonic() + seconds
         self.wait(lambda: time.monotonic() > end, seconds=seconds + 5)
 
-    def record(self, recorder: Child, memory: list[tuple[float, float]] | None = None) -> Figures:
-        """Wait for a recording to be complete; CPU and memory of each program meanwhile.
+    def measure(self, recorder: Child, memory: list[tuple[float, float]] | None = None) -> Turn:
+        """Wait for a recording to be complete and end everything; what was recorded, and what it took.
 
         `memory` gets the server's with the time, s and bytes.
         """
         path, seconds = recorder.result, self.setup.seconds
         self.wait(began(path).exists, "nothing was received")
-        uses = {name: Usage(pid) for name, pid in self.watched.items()}
-        machine, end = cpu_of_machine(), time.monotonic() + seconds - 0.1
+        watched, machine, start = self._watched.copy(), cpu_of_machine(), time.monotonic()
+        before_s = {name: used_s(pid) for name, pid in watched.items()}
 
         def is_over() -> bool:
             if memory is not None:
-                memory.append((time.monotonic(), uses["server"].rss()))
-            return time.monotonic() > end or path.exists()
+                memory.append((time.monotonic(), rss(watched["server"])))
+            return time.monotonic() > start + seconds - 0.1 or path.exists()
 
         self.wait(is_over, seconds=seconds + 5)
-        usage = {
-            "cpu_percent": {name: use.cpu_percent() for name, use in uses.items()},
-            "rss_mb": {name: round(use.rss() / 1e6, 1) for name, use in uses.items()},
+        percent = 100 / (time.monotonic() - start)
+        usage: Figures = {
+            "cpu_percent": {n: round((used_s(pid) - before_s[n]) * percent, 1) for n, pid in watched.items()},
+            "rss_mb": {name: round(rss(pid) / 1e6, 1) for name, pid in watched.items()},
             "stolen_percent": stolen_percent(machine),
         }
         self.wait(path.exists, "the recording did not end")
-        return usage
+        if self._link:
+            status = self._link.ask("status")
+            names = ("wake_us", "exchange_us", "missed_deadlines", "lost_frames")
+            usage["server"] = {name: status[name] for name in names}
+            usage["hand_out_us"] = status["sensors"][0]["age_us"]
+        self.stop()
+        if (loop := self.directory / "master").exists():
+            late, exchange = statistics.read_numbers(loop, 2).astype(float).T
+            spreads = map(statistics.spread_us, (late, exchange))
+            usage["server"] = dict(zip(("wake_us", "exchange_us"), spreads, strict=True))
+        stopped = self.stops()
+        result, ages = statistics.summary(statistics.read_arrivals(path), self.setup.period_ns, stopped)
+        longest = round(float(np.max(np.diff(stopped))) / 1000, 1) if len(stopped) else 0.0
+        return {**result, "machine_stops": len(stopped), "longest_stop_us": longest, **usage}, ages
 
     def stop(self) -> list[str]:
         """End everything, the last first; what was wrong about how they ended."""
         troubles = []
         while self.children:
             troubles.append(self.children.pop().stop())
-        self.watched.clear()
+        self._watched.clear()
         return [trouble for trouble in troubles if trouble]
 
     def stops(self) -> Ints:
@@ -279,15 +284,6 @@ class Chain(contextlib.ExitStack):
                 canary.stop()
         pauses = [statistics.read_numbers(each.result, 2) for each in self._canaries if each.result.exists()]
         return statistics.stops(pauses, self.setup.period_ns)
-
-    def figures(self, recorder: Child, usage: Figures) -> tuple[Figures, Floats]:
-        """End everything; figures of what was recorded, and all ages in ns."""
-        self.stop()
-        stopped = self.stops()
-        arrivals = statistics.read_arrivals(recorder.result)
-        result, ages = statistics.summary(arrivals, self.setup.period_ns, stopped)
-        longest = round(float(np.max(np.diff(stopped))) / 1000, 1) if len(stopped) else 0.0
-        return {**result, "machine_stops": len(stopped), "longest_stop_us": longest, **usage}, ages
 
 
 def own_cpus() -> tuple[int, int]:
@@ -317,8 +313,11 @@ def loopback_up() -> None:
         fcntl.ioctl(any_socket, siocsifflags, struct.pack("16sh14x", b"lo", flags | iff_up))
 
 
-def stoppable(run: Callable[[], int], program: str, stopped: Callable[[], int]) -> int:
-    """Run a program, whose directory is removed however it ends; its exit code."""
+def stoppable(run: Callable[[], int], program: str, sentence: str, code: int) -> int:
+    """Run a program, whose directory is removed however it ends; its exit code.
+
+    If it is stopped, the sentence is said and the code returned.
+    """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _on_signal)
     os.environ.setdefault("DEMO_DIRECTORY", tempfile.mkdtemp())
@@ -326,16 +325,16 @@ def stoppable(run: Callable[[], int], program: str, stopped: Callable[[], int]) 
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
         return run()
     except Stopped:
-        return stopped()
+        print(sentence, file=sys.stderr if code else sys.stdout)
+        return code
     except BrokenPipeError:  # nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
     except (ScriptError, ServerError, OSError) as error:
         print(f"{program}: {error}", file=sys.stderr)
-        return 1
     finally:
         ignore_signals()
         shutil.rmtree(os.environ.pop("DEMO_DIRECTORY"), ignore_errors=True)
+    return 1
 
 
 def _on_signal(_number: int, _frame: FrameType | None) -> None:

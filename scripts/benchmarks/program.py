@@ -11,8 +11,8 @@ import re
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -21,6 +21,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from bota_clients.arguments import number, typed
 from scripts.benchmarks.chain import (
     OVERSAMPLING_HZ,
     Figures,
@@ -31,40 +32,16 @@ from scripts.benchmarks.chain import (
     stolen_percent,
     stoppable,
 )
-from scripts.benchmarks.modes import comparison, path, server
-from scripts.benchmarks.modes.mode import Mode
+from scripts.benchmarks.modes import MODES, Mode, answer
 from scripts.benchmarks.plot import draw
 from scripts.benchmarks.records import may_be_real_time
 
-# Each is an option that measures only this, but for the comparison, which is made without one.
-MODES: Final[Mapping[str, Mode]] = {
-    "comparison": comparison.MODE,
-    "load": server.LOAD,
-    "path": path.MODE,
-    "soak": server.SOAK,
-}
 MOST_CPUS: Final = 4  # CPUs used: each of them runs a canary
 _WIDTH: Final = 108  # minimum width of the tables
 _QUICK_SECONDS: Final = 3.0
 _LATENCY: Final = Path("/dev/cpu_dma_latency")
 _BLOCK: Final = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-_ON_PAGE: Final = ("comparison", *(name for name, mode in MODES.items() if mode.page))
-
-
-@contextmanager
-def no_idle_states() -> Iterator[bool]:
-    """An idle CPU spins as long as this lasts, as with cyclictest; yields False where that is not allowed.
-
-    A halted CPU takes tens of µs to wake, and in a virtual machine as long as the host is busy with others.
-    """
-    try:
-        device = _LATENCY.open("wb", buffering=0)
-    except OSError:
-        yield False
-        return
-    with device:
-        device.write(struct.pack("=i", 0))  # µs that a wake-up may take, until the file is closed
-        yield True
+_ON_PAGE: Final = {"comparison": False, **{name: mode.page for name, mode in MODES.items() if mode.page}}
 
 
 def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> None:
@@ -85,7 +62,7 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
         options.ros = False
     wanted = {options.mode: options.argument}
     if options.page:
-        wanted |= {name: MODES[name].page for name in _ON_PAGE[1:]}
+        wanted = {**_ON_PAGE, **wanted}
     began, machine = time.monotonic(), cpu_of_machine()
     results = {name: measure(name, argument, options) for name, argument in wanted.items()}
     ages: dict[tuple[int, int], dict[str, Any]] = {}
@@ -138,8 +115,8 @@ def cells(mode: Mode, rows: Sequence[Figures]) -> list[list[str]]:
 def table(mode: Mode, rows: Sequence[Figures]) -> Table:
     """For a terminal."""
     made = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
-    for number, name in enumerate(mode.columns):
-        made.add_column(name, justify="right" if number > 1 else "left")
+    for at, name in enumerate(mode.columns):
+        made.add_column(name, justify="right" if at > 1 else "left")
     for line in cells(mode, rows):
         made.add_row(*line)
     return made
@@ -175,7 +152,7 @@ def renew(path: Path, content: Mapping[str, Any]) -> None:
         name = match[2]
         text = markdown(MODES[name], content[name])
         if name == "comparison":
-            text = "\n\n".join((comparison.answer(content[name]), text, where))
+            text = "\n\n".join((answer(content[name]), text, where))
         return f"{match[1]}{text}\n{match[3]}"
 
     path.write_text(_BLOCK.sub(measured, path.read_text(encoding="utf-8")), encoding="utf-8")
@@ -188,17 +165,18 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         description="Measure this project beside a bare C program and a polling design.",
     )
     parser.add_argument("--quick", action="store_true", help="one configuration only, in half a minute")
-    parser.add_argument("--seconds", type=_seconds, help="how long each chain is measured (6)")
+    parser.add_argument("--seconds", type=number(0.5, 3600), help="how long each chain is measured (6)")
     parser.add_argument("--json", type=Path, default="benchmark-results/benchmark.json", metavar="FILE",
                         help="where the figures go, and beside it the plot (%(default)s)")  # fmt: skip
     parser.add_argument("--page", type=Path, metavar="FILE.md",
                         help="measure all that this page has (docs/benchmark.md), and renew it")  # fmt: skip
     parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver, too")
     rates = [OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512)]
-    parser.add_argument("--rates", type=_numbers(rates), metavar="HZ,...", help="sample rates (800,1600)")
-    parser.add_argument(
-        "--sensors", type=_numbers(range(1, 17)), metavar="N,...", help="sensors on the bus (1,2)"
-    )
+    for name, metavar, what, among in (
+        ("--rates", "HZ,...", "sample rates (800,1600)", rates),
+        ("--sensors", "N,...", "sensors on the bus (1,2)", range(1, 17)),
+    ):
+        parser.add_argument(name, type=_numbers(among), metavar=metavar, help=what)
     only = parser.add_mutually_exclusive_group()
     for name, mode in list(MODES.items())[1:]:
         only.add_argument(f"--{name}", help=mode.help, **(mode.argument or {"action": "store_true"}))
@@ -214,38 +192,35 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     return options
 
 
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0.5 <= value <= 3600:
-        raise argparse.ArgumentTypeError("must be from 0.5 to 3600")
-    return value
-
-
 def _numbers(allowed: Sequence[int]) -> Callable[[str], list[int]]:
     def numbers(text: str) -> list[int]:
         found = [int(word) for word in text.split(",")]
         if not set(found) <= set(allowed):
-            raise argparse.ArgumentTypeError(f"must be among {', '.join(map(str, sorted(allowed)))}")
+            raise ValueError
         return found
 
-    return numbers
+    return typed(numbers, f"among {', '.join(map(str, sorted(allowed)))}")
 
 
 def _benchmark() -> int:
-    options = parse()
-    with no_idle_states() as held:
-        run(options, Console(width=max(Console().width, _WIDTH)), idle_states=not held)
+    """Idle CPUs spin meanwhile, as with cyclictest, if that is allowed.
+
+    A halted CPU takes tens of µs to wake, and in a virtual machine as long as the host is busy with others.
+    """
+    options, console = parse(), Console(width=max(Console().width, _WIDTH))
+    device = None
+    with suppress(OSError):
+        device = _LATENCY.open("wb", buffering=0)
+    with device or nullcontext():
+        if device:
+            device.write(struct.pack("=i", 0))  # µs that a wake-up may take, until the file is closed
+        run(options, console, idle_states=not device)
     return 0
-
-
-def _stopped() -> int:
-    print("stopped; nothing is written", file=sys.stderr)
-    return 130
 
 
 def main() -> int:
     """Run; returns the exit code."""
-    return stoppable(_benchmark, "benchmark", _stopped)
+    return stoppable(_benchmark, "benchmark", "stopped; nothing is written", 130)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import math
 from array import array
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -49,32 +49,30 @@ class Summary(NamedTuple):
 class Measurement:
     """Takes samples and messages as they come; not locked, so call it from one thread at a time."""
 
-    def __init__(self, rate_hz: float = 0.0) -> None:
+    def __init__(self, rate_hz: float) -> None:
         """`rate_hz` is the sensor's: a gap is as long as its rate has it."""
         self.rate_hz = rate_hz
         self.latest: Sample | None = None
-        self.age_ns = 0  # of the newest message on its arrival
-        self._stream = StreamAccounting()
-        self._made_ns = array("q")  # of each sample that came from the server
-        self._known: OrderedDict[tuple[float, ...], int] = OrderedDict()  # its index there
-        self._waiting: deque[tuple[tuple[float, ...], int]] = deque()  # messages whose sample has not come
-        self._indices = array("q")  # of the samples that came as messages
-        self._last_ns = 0
         self.begin()
 
     def begin(self) -> None:
         """Count from here: what came while things were starting is none of the figures."""
-        self._missing_before = self._stream.counts.missing
+        self._stream = StreamAccounting()
+        self._stream.rate_hz = self.rate_hz
         # Messages, those of a sample that an earlier one had, those that equal no sample.
         self.messages = self.repeated = self._not_finite = self._unknown = 0
+        self.age_ns = 0  # of the newest message on its arrival
+        self._passed_ns = 0  # samples up to this instant have come from the server, if not withheld
         self._missing_ns: list[float] = []  # when the missing samples were made
-        self._ages_ns, self._tcp_ages_ns = array("q"), array("q")
-        self._indices = self._indices[-1:]
-        self._first_ns = self._last_ns
+        # Of each sample that came from the server: when it was made, and its age then.
+        self._made_ns, self._tcp_ages_ns = array("q"), array("q")
+        self._known: dict[tuple[float, ...], int] = {}  # by its values: its index there
+        self._waiting: deque[tuple[tuple[float, ...], int]] = deque()  # messages whose sample has not come
+        self._indices, self._arrived_ns = array("q"), array("q")  # of the samples that came as messages
 
     def take_frame(self, frame: DataMessage, now_ns: int) -> None:
         """A frame came from the server."""
-        before, self._stream.rate_hz = self._stream.counts.missing, self.rate_hz
+        before = self._stream.counts.missing
         kind = self._stream.take(frame.sequence, frame.monotonic_ns, frame.flags)
         if missing := self._stream.counts.missing - before:
             self._missing_ns += np.linspace(self._passed_ns, frame.monotonic_ns, missing + 2)[1:-1].tolist()
@@ -82,18 +80,14 @@ class Measurement:
             return
         self.latest = _decoder(len(frame.process_data)).decode(frame.process_data)
         values = tuple(self.latest.array)
+        self._known.pop(values, None)
         self._known[values] = len(self._made_ns)
-        self._known.move_to_end(values)
         if len(self._known) > _REMEMBERED:
-            self._known.popitem(last=False)
-        self._made_ns.append(frame.monotonic_ns)
+            del self._known[next(iter(self._known))]
+        self._passed_ns = frame.monotonic_ns
+        self._made_ns.append(self._passed_ns)
         self._tcp_ages_ns.append(now_ns - frame.monotonic_ns)
         self._look_up()
-
-    @property
-    def _passed_ns(self) -> int:
-        """Samples up to this instant have come from the server, if they were not withheld."""
-        return self._made_ns[-1] if self._made_ns else 0
 
     def take_message(self, values: Sequence[float], now_ns: int) -> None:
         """A message came on the ROS topic."""
@@ -105,17 +99,14 @@ class Measurement:
         while self._waiting:
             values, arrived_ns = self._waiting[0]
             if (index := self._known.get(values)) is not None:
-                if not self._indices:
-                    self._first_ns = arrived_ns
-                elif index <= self._indices[-1]:
-                    self.repeated += 1
+                self.repeated += self.began and index <= self._indices[-1]
                 self.messages += 1
                 self._indices.append(index)
-                self._last_ns, self.age_ns = arrived_ns, arrived_ns - self._made_ns[index]
-                self._ages_ns.append(self.age_ns)
+                self._arrived_ns.append(arrived_ns)
+                self.age_ns = arrived_ns - self._made_ns[index]
             elif self._passed_ns <= arrived_ns:
                 return  # its sample may still come
-            elif self._indices:  # before the first match the two streams need not overlap
+            elif self.began:  # before the first match the two streams need not overlap
                 self.messages += 1
                 self._unknown += 1
             self._waiting.popleft()
@@ -128,29 +119,32 @@ class Measurement:
     @property
     def lost_before(self) -> int:
         """Samples since `begin` that were lost or withheld before they could become a message."""
-        return self._stream.counts.missing - self._missing_before
+        return self._stream.counts.missing
 
     @property
     def lost(self) -> int:
         """Samples, from the first message's to the last's, that came from the server but not on the topic."""
         found = self._indices
-        return found[-1] - found[0] + 1 - len(set(found)) if found else 0
+        return found[-1] - found[0] + 1 - len(found) + self.repeated if found else 0
 
     def summary(self, stops: Ints = NO_STOPS) -> Summary:
         """The figures so far; `stops` of the machine, (n, 2), begin and end in CLOCK_MONOTONIC ns."""
-        found, seconds = self._indices, (self._last_ns - self._first_ns) / 1e9
-        lost = set(range(found[0], found[-1])).difference(found) if found else ()
-        missing = np.array([*self._missing_ns, *(self._made_ns[n] for n in lost)])
+        index, made, arrived = (
+            np.array(a, np.int64) for a in (self._indices, self._made_ns, self._arrived_ns)
+        )
+        lost = np.setdiff1d(np.arange(*index[[0, -1]]), index) if self.began else index
+        missing_ns = np.array([*self._missing_ns, *made[lost]])
+        seconds = np.ptp(arrived) / 1e9 if self.began else 0.0
         return Summary(
             messages=self.messages,
-            rate_hz=(len(found) - 1) / seconds if seconds > 0 else 0.0,
-            lost=self.lost,
+            rate_hz=(len(index) - 1) / seconds if seconds else 0.0,
+            lost=len(lost),
             lost_before=self.lost_before,
-            lost_in_stops=in_stops(missing, 1e9 / self.rate_hz, stops) if self.rate_hz else 0,
+            lost_in_stops=in_stops(missing_ns, 1e9 / self.rate_hz, stops),
             stops=len(stops),
             longest_stop_ms=float(np.max(np.diff(stops), initial=0)) / 1e6,
             repeated=self.repeated,
-            age_ms=_median_and_p99_ms(self._ages_ns),
+            age_ms=_median_and_p99_ms(arrived - made[index]),
             tcp_age_ms=_median_and_p99_ms(self._tcp_ages_ns),
             all_finite=self._not_finite == 0,
             # Where samples were withheld from the server's client, a message may be one of them.
@@ -158,8 +152,10 @@ class Measurement:
         )
 
 
-def _median_and_p99_ms(ages_ns: array[int]) -> list[float]:
-    points: list[float] = (np.percentile(ages_ns or [0], (50, 99), method="higher") / 1e6).tolist()
+def _median_and_p99_ms(ages_ns: Ints | array[int]) -> list[float]:
+    points: list[float] = (
+        np.percentile(ages_ns if len(ages_ns) else [0], (50, 99), method="higher") / 1e6
+    ).tolist()
     return points
 
 

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from bota_clients.arguments import number
 from bota_ethercat.client import Client
 from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from scripts.benchmarks.chain import (
@@ -193,28 +194,17 @@ def run(seconds: float | None) -> int:
     return 0
 
 
-def _seconds(text: str) -> float:
-    with contextlib.suppress(ValueError):
-        if 0.5 <= float(text) <= 1e6:
-            return float(text)
-    raise argparse.ArgumentTypeError(f"{text!r}: it must be a number of seconds from 0.5 to 1000000")
-
-
 def _demo() -> int:
+    seconds = number(0.5, 1e6, "a number of seconds from 0.5 to 1000000")
     parser = argparse.ArgumentParser(prog="scripts/demo", description="The whole chain, without hardware.")
-    parser.add_argument("--seconds", type=_seconds, help="end after this number of seconds, not at Ctrl-C")
+    parser.add_argument("--seconds", type=seconds, help="end after this number of seconds, not at Ctrl-C")
     return run(parser.parse_args().seconds)
-
-
-def _stopped() -> int:
-    print("stopped before anything was measured")
-    return 0
 
 
 def main() -> int:
     """Parse the arguments and run."""
     sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
-    return stoppable(_demo, "demo", _stopped)
+    return stoppable(_demo, "demo", "stopped before anything was measured", 0)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,15 @@
 """Records when each sample arrives: at a TCP client, at a ROS 2 subscriber, or at a client that polls.
 
 All of them note the time before anything is decoded.
+
+Arguments: KIND FILE WARM_UP_S SECONDS PRIORITY, then of `polling` its rate, of `ros` the topics of arrays.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
 import select
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,18 +19,18 @@ from bota_ethercat.client import make_real_time
 from bota_ethercat.control import request
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from bota_ethercat.pdo import SampleDecoder
-from ethercat_server.virtual_sensor.measurement.signals import decode_clock
+from ethercat_server.virtual_sensor.signals import decode_clock
 from scripts.benchmarks.records import PORT, Recording, connect, sleep_until
 
 SIZE: Final = 61
 _DEPTH: Final = 50
 
 
-def tcp(arguments: argparse.Namespace, recording: Recording) -> None:
+def tcp(recording: Recording, port: int = PORT) -> None:
     """A client of ethercat-server."""
     frames, decode = FrameDecoder(), SampleDecoder(SIZE).decode
     old = DataFlag.REPEATED | DataFlag.INVALID
-    with connect(arguments.port) as connection:
+    with connect(port) as connection:
         connection.sendall(encode_json(request("subscribe")))
         while data := connection.recv(65536):
             now = time.monotonic_ns()
@@ -41,10 +43,10 @@ def tcp(arguments: argparse.Namespace, recording: Recording) -> None:
                     return
 
 
-def polling(arguments: argparse.Namespace, recording: Recording) -> None:
+def polling(recording: Recording, rate_hz: str, port: int = PORT) -> None:
     """A timer, and a look for one message at each tick."""
-    period_ns, decode = int(1e9 / arguments.rate), SampleDecoder(SIZE).decode
-    with connect(arguments.port) as connection:
+    period_ns, decode = int(1e9 / float(rate_hz)), SampleDecoder(SIZE).decode
+    with connect(port) as connection:
         due = now = time.monotonic_ns()
         while True:
             due += period_ns * max(1, (now - due) // period_ns)
@@ -55,8 +57,8 @@ def polling(arguments: argparse.Namespace, recording: Recording) -> None:
                 return
 
 
-def ros(arguments: argparse.Namespace, recording: Recording) -> None:
-    """A subscriber: of `wrench`, or of arrays.
+def ros(recording: Recording, *topics: str) -> None:
+    """A subscriber: of arrays, by the sensors' positions, or of `wrench`.
 
     It waits for and takes messages itself, because rclpy's executor takes longer for that than everything
     else on the way: what is measured is to be the way to the subscriber, not the subscriber.
@@ -71,7 +73,7 @@ def ros(arguments: argparse.Namespace, recording: Recording) -> None:
         return force.x, force.y, force.z, torque.x
 
     kinds: list[tuple[Any, str, Callable[[Any], Any]]]
-    kinds = [(Float64MultiArray, topic, lambda message: message.data) for topic in arguments.arrays]
+    kinds = [(Float64MultiArray, topic, lambda message: message.data) for topic in topics]
     kinds = kinds or [(WrenchStamped, "wrench", wrench)]
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
@@ -95,25 +97,17 @@ def ros(arguments: argparse.Namespace, recording: Recording) -> None:
     rclpy.try_shutdown()
 
 
-def main() -> None:
+KINDS: Final[dict[str, Callable[..., None]]] = {"tcp": tcp, "polling": polling, "ros": ros}
+
+
+def main(kind: str, path: str, warm_up_s: str, seconds: str, priority: str, *arguments: str) -> None:
     """Record, then end."""
-    parser = argparse.ArgumentParser()
-    kinds = {"tcp": tcp, "polling": polling, "ros": ros}
-    parser.add_argument("kind", choices=kinds)
-    parser.add_argument("path", type=Path)
-    parser.add_argument("warm_up", type=float)
-    parser.add_argument("seconds", type=float)
-    parser.add_argument("--port", type=int, default=PORT)
-    parser.add_argument("--rate", type=float)
-    parser.add_argument("--rt-priority", type=int, default=0, help="of all its threads")
-    parser.add_argument("--arrays", nargs="*", default=(), help="topics of arrays; the sensors' positions")
-    arguments = parser.parse_args()
-    recording = Recording(arguments.path, arguments.warm_up, arguments.seconds)
+    recording = Recording(Path(path), float(warm_up_s), float(seconds))
     gc.disable()
-    make_real_time(arguments.rt_priority)  # the middleware's threads inherit it
-    kinds[arguments.kind](arguments, recording)
+    make_real_time(int(priority))  # of all threads: the middleware's inherit it
+    KINDS[kind](recording, *arguments)
     recording.write()
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

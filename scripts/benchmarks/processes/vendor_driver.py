@@ -18,7 +18,7 @@ from typing import Final
 
 import bota_driver  # type: ignore[import-not-found]
 
-from ethercat_server.virtual_sensor.measurement.signals import decode_clock
+from ethercat_server.virtual_sensor.signals import decode_clock
 from scripts.benchmarks.records import Recording, sleep_until, steady
 
 _ATTEMPTS: Final = 5

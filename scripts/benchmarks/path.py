@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from statistics import mean, median
 from types import FrameType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from bota_ethercat.control import request
 from bota_ethercat.framing import encode_json
@@ -23,17 +23,17 @@ from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.in_memory import InMemoryStream, InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.virtual_sensor.options import SensorOptions
-from scripts.benchmarks.chain import Figures, Setup
-from scripts.benchmarks.modes.mode import Mode
+from scripts.benchmarks.chain import Figures
 
 SETTLED_S: Final = 8.0
 SECONDS: Final = 1.0
 CLIENTS: Final = (1, 4)
 # What `--dc` of the virtual sensor says for each.
 CLOCKS: Final = {"with a distributed clock": "", "without": "none"}
-_ROOT: Final = Path(__file__).parents[3]
+_ROOT: Final = Path(__file__).parents[2]
 _COUNTED: Final = (f"{_ROOT}/ethercat_server/", f"{_ROOT}/protocol/")
 _NOT_COUNTED: Final = ("/simulation/", "/virtual_sensor/", "in_memory.py")
+# What each of these is in a server that has a network interface, and TCP.
 _SYSTEM_CALLS: Final = {
     (MemoryBackend, "send"): 1,
     (MemoryBackend, "receive"): 2,  # poll and recv, of which a look in vain needs the first only
@@ -42,19 +42,6 @@ _SYSTEM_CALLS: Final = {
     (InMemoryStream, "send"): 1,
     (InMemoryStream, "recv"): 1,
 }
-"""What each of these is in a server that has a network interface, and TCP."""
-
-
-class Way(NamedTuple):
-    """Figures of one new sample: most are like the median; the mean is what they cost."""
-
-    lines: float
-    mean_lines: float
-    calls: float
-    mean_calls: float
-    files: float
-    system_calls: float
-    mean_system_calls: float
 
 
 class _Tracer:
@@ -108,8 +95,11 @@ class _Tracer:
         return leaves
 
 
-def count(dc: str, clients: int, seconds: float = SECONDS) -> Way:
-    """The figures of one sensor, whose controller's clock is `dc` (`--dc`), with so many subscribers."""
+def count(dc: str, clients: int, seconds: float = SECONDS) -> dict[str, float]:
+    """Figures of a new sample of one sensor, whose controller's clock is `dc` (`--dc`), with so many clients.
+
+    Most are like the median; the mean is what they cost.
+    """
     backend = MemoryBackend(SensorOptions(ppm=150.0, dc=dc))
     transport = InMemoryTransport(backend.clock)
     server = Server(Bus(backend), Hub(transport, backend.clock.monotonic_ns), AsFound())
@@ -130,31 +120,17 @@ def count(dc: str, clients: int, seconds: float = SECONDS) -> Way:
         run(seconds)
     finally:
         sys.settrace(before)
-    lines, calls, files, system_calls = zip(*tracer.samples, strict=True)
-    return Way(
-        median(lines), mean(lines), median(calls), mean(calls), median(files),
-        median(system_calls), mean(system_calls),
-    )  # fmt: skip
+    found = dict(
+        zip(("lines", "calls", "files", "system_calls"), zip(*tracer.samples, strict=True), strict=True)
+    )
+    medians = {name: median(values) for name, values in found.items()}
+    return medians | {f"mean_{name}": mean(values) for name, values in found.items()}
 
 
-def measure(_setup: Setup, _: Any) -> list[Figures]:
+def measure() -> list[Figures]:
     """A row for each clock and number of clients."""
     return [
-        {"clock": clock, "clients": clients, **count(dc, clients)._asdict()}
+        {"clock": clock, "clients": clients, **count(dc, clients)}
         for clock, dc in CLOCKS.items()
         for clients in CLIENTS
     ]
-
-
-MODE: Final = Mode(
-    "only what a sample costs the server: source lines, calls, system calls",
-    measure,
-    {
-        "slave controller": lambda row: row["clock"],
-        "clients": lambda row: str(row["clients"]),
-        "source lines": lambda row: f"{row['lines']:.0f} / {row['mean_lines']:.0f}",
-        "calls": lambda row: f"{row['calls']:.0f} / {row['mean_calls']:.0f}",
-        "files": lambda row: f"{row['files']:.0f}",
-        "system calls": lambda row: f"{row['system_calls']:.0f} / {row['mean_system_calls']:.1f}",
-    },
-)

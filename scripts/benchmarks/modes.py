@@ -1,0 +1,280 @@
+"""What `scripts/benchmark` measures: a table of modes, each but the comparison an option.
+
+The comparison is of this project with a bare C program, Bota's driver and the polling design, on virtual
+sensors. This project and the C program alternate in short turns, so that the machine's noise meets both.
+Bota's closed Python driver (package bota-driver) is no dependency of the project: scripts/benchmark installs
+it into .venv-vendor before the program enters its network namespace.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from scripts.benchmarks import path, statistics
+from scripts.benchmarks.chain import PROCESSES, WARM_UP_S, Chain, Child, Figures, ScriptError, Setup, Turn
+from scripts.benchmarks.processes.masters import build
+from scripts.benchmarks.statistics import Arrivals, Floats
+
+REAL_TIME: Final = 40  # of the client, or of node and subscriber: the default of the node's `rt_priority`
+_MOST_TURNS: Final = 3
+_SETTLED: Final = 0.1  # the memory of this first part of a soak does not count: caches still fill
+_NONE: Final = "-"
+VENDOR: Final = Path(__file__).parents[2] / ".venv-vendor"
+# What the ROS packages in .venv set is not for another environment's Python.
+_WITHOUT_ROS: Final = ("env", "-u", "LD_LIBRARY_PATH", "-u", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
+THIS, C_CLIENT, BARE_C, BY_C = "this", "this, C client", "bare C", "this / C"
+DRIVER, POLLING, ROS = "Bota's driver", "polling", "this, ROS"
+RATIOS: Final = {
+    "age_p50": ("age_us", "p50"),
+    "age_p99": ("age_us", "p99"),
+    "age_p999": ("age_us", "p999"),
+    "cpu": ("cpu_percent", "server"),
+}
+_SUMMED: Final = {
+    *("made", "arrivals", "lost", "lost_in_stops", "repeated"),
+    *("machine_stops", "missed_deadlines", "lost_frames"),
+}
+
+
+def _start(name: str, chain: Chain) -> Child:
+    """Start what is compared; the recorder of what arrives."""
+    setup, yardstick = chain.setup, Path(os.environ["DEMO_DIRECTORY"]) / "yardstick"
+    if name == DRIVER:  # with the server's priority, for which it does not ask
+        file = chain.directory / "driver"
+        return chain.start(
+            "server", *_WITHOUT_ROS, VENDOR / "bin" / "python", "-m", f"{PROCESSES}.vendor_driver", file,
+            WARM_UP_S, setup.seconds, chain.bus(), setup.sinc, setup.rate_hz, setup.priority, result=file,
+        )  # fmt: skip
+    if name == POLLING:
+        chain.master()
+        return chain.recorder("polling", setup.rate_hz)
+    if name == BARE_C:
+        chain.master(yardstick, setup.priority)
+    else:
+        chain.server()
+    if name == ROS:
+        topics = [f"/benchmark_{position}" for position in range(setup.sensors)]
+        for position, topic in enumerate(topics):
+            chain.node(f"array_topic:={topic}", position=position)
+        return chain.recorder("ros", *topics)
+    return chain.recorder("tcp") if name == THIS else chain.recorder("c", yardstick, "client")
+
+
+def turn(setup: Setup, name: str) -> Turn:
+    """One run of what is compared."""
+    with Chain(setup, name) as chain:
+        recorder = _start(name, chain)
+        figures, ages = chain.measure(recorder)
+        if name == DRIVER:
+            ages = first_ages(statistics.read_arrivals(recorder.result)[0])
+            figures |= {"age_us": statistics.spread_us(ages), "every_age_us": figures["age_us"]}
+    return figures, ages
+
+
+def first_ages(arrivals: Arrivals) -> Floats:
+    """How old each sample was when it arrived first, ns."""
+    return arrivals.ages[np.unique(arrivals.number, return_index=True)[1]]
+
+
+def compare(setup: Setup, with_driver: bool) -> list[Figures]:
+    """A row for each program; `ages` are all of its ages, in ns."""
+    missing: dict[str, str] = {}
+    alternating = [THIS, C_CLIENT, BARE_C]
+    try:
+        build(Path(os.environ["DEMO_DIRECTORY"]))
+    except ScriptError as error:
+        missing[BARE_C], alternating = str(error), [THIS]
+    count = max(1, min(_MOST_TURNS, int(setup.seconds)))
+    short = replace(setup, seconds=setup.seconds / count)
+    rounds = [{name: turn(short, name) for name in alternating} for _ in range(count)]
+    taken = {name: together([each[name] for each in rounds]) for name in alternating}
+    one = setup.sensors == 1  # the others know one sensor only
+    if with_driver and one:
+        if [*VENDOR.glob("has-bota-driver*")]:
+            taken[DRIVER] = turn(setup, DRIVER)
+        else:
+            missing[DRIVER] = "bota-driver could not be installed by scripts/benchmark"
+    taken |= {name: turn(setup, name) for name, wanted in ((POLLING, one), (ROS, setup.ros)) if wanted}
+    rows: list[Figures] = []
+    for name, (figures, ages) in taken.items():
+        rows.append({"program": name, **figures, "ages": ages})
+        if name == BARE_C:
+            rows.append({"program": BY_C, "ratio": ratios(*([e[n] for e in rounds] for n in (THIS, BARE_C)))})
+    rows += [{"program": name, "missing": why} for name, why in missing.items()]
+    return [{"rate_hz": setup.rate_hz, "sensors": setup.sensors, **row} for row in rows]
+
+
+def together(turns: Sequence[Turn]) -> Turn:
+    """Counts are summed, ages pooled; of other figures it is the median, of the longest the longest."""
+    ages = np.concatenate([each for _, each in turns])
+    return {**_pool([figures for figures, _ in turns]), "age_us": statistics.spread_us(ages)}, ages
+
+
+def _pool(values: Sequence[Any], name: str = "") -> Any:
+    if isinstance(values[0], dict):
+        return {key: _pool([value[key] for value in values], key) for key in values[0]}
+    if not isinstance(values[0], int | float):
+        return values[-1]
+    if name in _SUMMED:
+        return sum(values)
+    if name == "max" or name.startswith("longest"):
+        return max(values)
+    return round(float(np.median(values)), 1)
+
+
+def ratios(ours: Sequence[Turn], theirs: Sequence[Turn]) -> dict[str, float]:
+    """This project by the C program: median of the turns."""
+    pairs = list(zip((a for a, _ in ours), (b for b, _ in theirs), strict=True))
+    return {
+        name: round(float(np.median([a[table][key] / b[table][key] for a, b in pairs])), 2)
+        for name, (table, key) in RATIOS.items()
+    }
+
+
+def answer(rows: Sequence[Figures]) -> str:
+    """The result of the comparison in a sentence, from the first configuration."""
+    ages = {row["program"]: row["age_us"] for row in reversed(rows) if "age_us" in row}
+
+    def age(name: str) -> str:
+        return f"{ages[name]['p50']:,.0f} µs (p99 {ages[name]['p99']:,.0f})"
+
+    others = {BARE_C: "A bare C program", DRIVER: "Bota's driver", POLLING: "polling at a fixed rate"}
+    beside = "; ".join(f"{text}: {age(name)}" for name, text in others.items() if name in ages)
+    return f"**Your controller gets a sample {age(THIS)} after it was measured.** {beside}."
+
+
+def load(setup: Setup, loops: int) -> list[Figures]:
+    """A row for each kind of client and of scheduling, beside endless loops."""
+    rows = []
+    for client in ("TCP", "wrench")[: 1 + setup.ros]:
+        for how, priority in (("ordinary", 0), ("real-time", REAL_TIME))[: 1 + bool(setup.priority)]:
+            with Chain(setup, f"{client}, {how}, beside {loops} loops") as chain:
+                chain.server()
+                if client == "wrench":
+                    chain.node(f"rt_priority:={priority}")
+                recorder = chain.recorder("ros" if client == "wrench" else "tcp", priority=priority)
+                for number in range(loops):
+                    chain.start(f"loop-{number}", sys.executable, "-c", "while True: pass", watch=False)
+                figures, _ = chain.measure(recorder)
+            about = {"rate_hz": setup.rate_hz, "loops": loops, "chain": f"{client}, {how}"}
+            rows.append({**about, **figures})
+    return rows
+
+
+def soak(setup: Setup, minutes: float) -> list[Figures]:
+    """One row: does the server lose samples for long, and does its memory grow?"""
+    memory: list[tuple[float, float]] = []
+    with Chain(replace(setup, seconds=minutes * 60), f"the server, for {minutes:g} minutes") as chain:
+        chain.server()
+        figures, _ = chain.measure(chain.recorder("tcp"), memory)
+    slope = round(slope_kb_per_hour(*np.array(memory).T), 1) + 0.0
+    about = {"seconds": minutes * 60, "rate_hz": setup.rate_hz, "sensors": setup.sensors}
+    return [{**about, **figures, "rss_slope_kb_per_hour": slope}]
+
+
+def slope_kb_per_hour(seconds: Floats, rss: Floats) -> float:
+    """How fast memory grows: a straight line through it, once settled."""
+    settled = seconds >= seconds[0] + _SETTLED * (seconds[-1] - seconds[0])
+    return float(np.polyfit(seconds[settled] - seconds[0], rss[settled], 1)[0]) * 3600 / 1000
+
+
+def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
+    def show(row: Figures) -> str:
+        if "ratio" in row:
+            return f"{row['ratio'][ratio]:.2f}" if ratio else ""
+        value = (row.get(table) or {}).get(key)
+        return _NONE if value is None else f"{value:.{1 if value < 100 else 0}f}"
+
+    return show
+
+
+def _points(row: Figures, name: str) -> str:
+    """Median and tails."""
+    return " / ".join(f"{row[name][point]:.0f}" for point in ("p50", "p99", "p999")) if row[name] else _NONE
+
+
+def _losses(row: Figures) -> str:
+    """Lost samples, of them those lost while the machine stopped."""
+    return f"{row['lost']} ({row['lost_in_stops']})" if row.get("lost") is not None else _NONE
+
+
+class Mode(NamedTuple):
+    """What can be measured."""
+
+    help: str
+    measure: Callable[[Setup, Any], list[Figures]]  # takes the option's argument, too; the rows of the result
+    columns: Mapping[str, Callable[[Figures], str]]  # of the table, by heading: how a row is shown
+    argument: Mapping[str, Any] | None = None  # how argparse takes the option's argument, if it has one
+    rates: tuple[int, ...] = (800,)
+    sensors: tuple[int, ...] = (1,)
+    seconds: float = 6.0
+    page: Any = None  # the argument with which the page is renewed; None: it is not on the page
+
+
+MODES: Final = {
+    "comparison": Mode(
+        "",
+        compare,
+        {
+            "sensors": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}",
+            "": lambda row: row["program"],
+            "lost (in stalls)": lambda row: (
+                f"{_losses(row)} of {row['made']}" if "made" in row else row.get("missing", "")
+            ),
+            "age p50, µs": _shown("age_us", "p50", "age_p50"),
+            "p99": _shown("age_us", "p99", "age_p99"),
+            "p99.9": _shown("age_us", "p999", "age_p999"),
+            "stamp error p99, µs": _shown("stamp_error_us", "p99_absolute"),
+            "CPU, %": _shown("cpu_percent", "server", "cpu"),
+            "memory, MB": _shown("rss_mb", "server"),
+        },
+        rates=(800, 1600),
+        sensors=(1, 2),
+    ),
+    "load": Mode(
+        "only ages beside N endless loops, ordinary and real-time",
+        load,
+        {
+            "beside loops": lambda row: f"{row['rate_hz']} Hz, {row['loops']} loops: {row['chain']}",
+            "lost (in stalls)": _losses,
+            "handed out, µs": lambda row: _points(row, "hand_out_us"),
+            "on arrival, µs": lambda row: _points(row, "age_us"),
+        },
+        argument={"type": int, "choices": range(1, 65), "metavar": "N"},
+        page=4,
+    ),
+    "path": Mode(
+        "only what a sample costs the server: source lines, calls, system calls",
+        lambda _setup, _argument: path.measure(),
+        {
+            "slave controller": lambda row: row["clock"],
+            "clients": lambda row: str(row["clients"]),
+            "source lines": lambda row: f"{row['lines']:.0f} / {row['mean_lines']:.0f}",
+            "calls": lambda row: f"{row['calls']:.0f} / {row['mean_calls']:.0f}",
+            "files": lambda row: f"{row['files']:.0f}",
+            "system calls": lambda row: f"{row['system_calls']:.0f} / {row['mean_system_calls']:.1f}",
+        },
+    ),
+    "soak": Mode(
+        "only the server: losses, memory",
+        soak,
+        {
+            "soak": lambda row: f"{row['seconds']:.0f} s, {row['rate_hz']} Hz, {row['sensors']}",
+            "lost (in stalls)": _losses,
+            "of": lambda row: str(row["made"]),
+            "repeated": lambda row: str(row["repeated"]),
+            "age, µs": lambda row: _points(row, "age_us"),
+            "CPU, %": lambda row: f"{row['cpu_percent']['server']}",
+            "memory, MB": lambda row: f"{row['rss_mb']['server']}",
+            "grows by, kB/h": lambda row: f"{row['rss_slope_kb_per_hour']}",
+        },
+        argument={"type": float, "metavar": "MINUTES"},
+    ),
+}
