@@ -6,6 +6,7 @@ Ten times a second the state is rendered as rows of text, and only rows that cha
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -101,6 +102,9 @@ class Monitor(App[None]):
 
     def draw(self) -> None:
         """Show the current state, or that of the time of the pause."""
+        if not self.is_headless and not os.isatty(0):
+            self.exit()  # the terminal was closed: Textual would block once 30 writes had failed
+            return
         now_s = self._clock()
         if ended := self.recorder.ended():
             self._say(*ended)
