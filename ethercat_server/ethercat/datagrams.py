@@ -7,7 +7,8 @@ is never taken for another one's answer.
 from __future__ import annotations
 
 import struct
-from typing import Final, Protocol
+from collections.abc import Callable
+from typing import Final, ParamSpec, Protocol, TypeVar
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend
@@ -34,6 +35,15 @@ _LATE_FACTOR: Final = 2.0
 _SHORTEST_TIMEOUT_S: Final = 0.0003
 
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def repeat(attempts: int, do: Callable[P, T | None], *args: P.args, **kwargs: P.kwargs) -> T | None:
+    """What `do` returns, called again while its datagram is lost: while it returns nothing, or False."""
+    return next(filter(None, (do(*args, **kwargs) for _ in range(attempts))), None)
+
+
 class Registers(Protocol):
     """How registers and mailboxes of slaves are reached: by number, as on a `Bus`, or `ByPosition`."""
 
@@ -49,33 +59,32 @@ class Registers(Protocol):
 
 
 class LateAnswers:
-    """The timeout of frames, of which `count` numbered from `first_index` on are told apart.
+    """The timeout of datagrams.
 
     It grows while answers come late, so that a slow machine reads its sensors slowly, not never: an answer
     that nobody waits for any more says how long a frame takes now.
     """
 
-    def __init__(self, clock: Clock, first_index: int, count: int) -> None:
+    def __init__(self, clock: Clock) -> None:
         self.timeout_s = 0.0  # the timeout at least; 0 on a bus that is in time
-        self._first_index = first_index
         self._monotonic_ns = clock.monotonic_ns
         # By index less the first: when a frame was sent that is not back; else 0.
-        self.pending_ns = [0] * count
+        self.pending_ns = [0] * _INDICES
 
     def note(self, answer: bytes) -> None:
         """An answer, not the one that is waited for."""
-        index = answer[DATAGRAM_INDEX] - self._first_index if len(answer) > DATAGRAM_INDEX else -1
-        if 0 <= index < len(self.pending_ns) and self.pending_ns[index]:
-            self.timeout_s = min(max(self.timeout_s, _LATE_FACTOR * self._took_s(index)), _LONGEST_TIMEOUT_S)
+        index = answer[DATAGRAM_INDEX] - FIRST_INDEX if len(answer) > DATAGRAM_INDEX else -1
+        if 0 <= index < _INDICES and self.pending_ns[index]:
+            self.timeout_s = min(max(self.timeout_s, self._least_s(index)), _LONGEST_TIMEOUT_S)
             self.pending_ns[index] = 0
 
     def in_time(self, index: int) -> None:
         """The answer that is waited for: wait less from now on, if it came sooner."""
-        timeout_s = min(max(self.timeout_s / 2, _LATE_FACTOR * self._took_s(index)), _LONGEST_TIMEOUT_S)
+        timeout_s = min(max(self.timeout_s / 2, self._least_s(index)), _LONGEST_TIMEOUT_S)
         self.timeout_s = timeout_s if timeout_s > _SHORTEST_TIMEOUT_S else 0.0
 
-    def _took_s(self, index: int) -> float:
-        return (self._monotonic_ns() - self.pending_ns[index]) * 1e-9
+    def _least_s(self, index: int) -> float:
+        return _LATE_FACTOR * (self._monotonic_ns() - self.pending_ns[index]) * 1e-9
 
 
 class Datagrams:
@@ -88,7 +97,7 @@ class Datagrams:
         self._send, self._receive = backend.send, backend.receive
         self._monotonic_ns = backend.clock.monotonic_ns
         self._index = 0
-        self._late = LateAnswers(backend.clock, FIRST_INDEX, _INDICES)
+        self._late = LateAnswers(backend.clock)
         self._pending_ns = self._late.pending_ns
         # Returns the next frame before an instant in ns, None for none; the loop that exchanges process data
         # puts its own here, and goes on meanwhile.
@@ -133,21 +142,19 @@ class Datagrams:
 
     def read_surely(self, number: int, address: int, size: int) -> bytes:
         """Read ESC registers of a sensor; BusError if it does not answer."""
-        for _ in range(_REGISTER_ATTEMPTS):
-            if (data := self.read_register(number, address, size)) is not None:
-                return data
+        if data := repeat(_REGISTER_ATTEMPTS, self.read_register, number, address, size):
+            return data
         raise BusError(f"sensor {number} does not answer: check cable and power")
 
     def read_surely_at(self, position: int, address: int, size: int) -> bytes:
         """Read ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
-        for _ in range(_REGISTER_ATTEMPTS):
-            if (data := self.read_at(position, address, size)) is not None:
-                return data
+        if data := repeat(_REGISTER_ATTEMPTS, self.read_at, position, address, size):
+            return data
         raise self._unanswered(position)
 
     def write_surely_at(self, position: int, address: int, data: bytes) -> None:
         """Write ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
-        if not any(self.write_at(position, address, data) for _ in range(_REGISTER_ATTEMPTS)):
+        if not repeat(_REGISTER_ATTEMPTS, self.write_at, position, address, data):
             raise self._unanswered(position)
 
     def _unanswered(self, position: int) -> BusError:

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from ethercat_server.errors import SetUpError
 from ethercat_server.ethercat.backend import Backend
-from ethercat_server.ethercat.datagrams import Datagrams
+from ethercat_server.ethercat.datagrams import Datagrams, repeat
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import (
     BYTE_NS,
@@ -75,8 +75,7 @@ def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
 
     `at` is where frames read what is latched.
     """
-    tries = (bus.read_register(number, reg.DC_OFFSET, _U64_U32.size) for _ in range(_ATTEMPTS))
-    if (data := next(filter(None, tries), None)) is None:
+    if not (data := repeat(_ATTEMPTS, bus.read_register, number, reg.DC_OFFSET, _U64_U32.size)):
         return None
     offset, delay = _U64_U32.unpack(data)
     return DistributedClock((offset - delay) % _WRAP, _behind_ns(bus, number), at * BYTE_NS + _SLACK_NS)
@@ -143,17 +142,12 @@ def make_frames(areas: Sequence[Sequence[Area]], stations: Sequence[int | None],
     of the sensors whose latched times are read, None for others. SetUpError if the inputs of a sensor are not
     in one frame.
     """
-    spans = _spans(areas, stations, lrw=lrw)
-    carried: list[list[int]] = [[] for _ in spans]
-    for number, each in enumerate(areas):
-        first, last = _inputs(each)
-        which = next((n for n, (start, end) in enumerate(spans) if start <= first and last <= end), None)
-        if which is None:
+    frames = [_frame(*span, areas, stations, lrw=lrw) for span in _spans(areas, stations, lrw=lrw)]
+    carried = [each.number for frame in frames for each in frame.inputs]
+    for number in range(len(areas)):
+        if carried.count(number) != 1:
             raise SetUpError(f"the process data of sensor {number} lies among that of others: start again")
-        carried[which].append(number)
-    return [
-        _frame(span, numbers, areas, stations, lrw=lrw) for span, numbers in zip(spans, carried, strict=True)
-    ]
+    return frames
 
 
 def fit_a_frame(areas: Sequence[Area], *, lrw: bool) -> bool:
@@ -162,7 +156,7 @@ def fit_a_frame(areas: Sequence[Area], *, lrw: bool) -> bool:
 
 
 def _size(length: int, latching: int, *, lrw: bool) -> int:
-    """Bytes of the datagrams that exchange so much process data, and the latched times of so many."""
+    """Bytes of the datagrams for `length` bytes of process data and `latching` sensors' latched times."""
     exchanged = (1 if lrw else 2) * (_AROUND_DATA + length)
     return exchanged + latching * LATCHED_SIZE + _AROUND_DATA + TAG_SIZE
 
@@ -183,52 +177,36 @@ def _spans(
     return spans
 
 
-def _inputs(areas: Sequence[Area]) -> tuple[int, int]:
-    """Where the inputs of a sensor begin and end."""
-    inputs = [area for area in areas if area.kind == reg.FMMU_READ]
-    return min(area.start for area in inputs), max(area.end for area in inputs)
-
-
 def _frame(
-    span: tuple[int, int],
-    numbers: Sequence[int],
-    areas: Sequence[Sequence[Area]],
-    stations: Sequence[int | None],
-    *,
-    lrw: bool,
+    start: int, end: int, areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool
 ) -> Frame:
-    """The frame for the logical addresses of `span`, with the inputs of the sensors with these `numbers`."""
-    start, length = span[0], span[1] - span[0]
-    end = FIRST_DATA + length
-    written = 0 if lrw else end + _AROUND_DATA + length
-    commands = (Command.LRW,) if lrw else (Command.LRD, Command.LWR)
-    datagrams: list[tuple[int, int, int, bytes]] = [
-        (command, start & 0xFFFF, start >> 16, bytes(length)) for command in commands
-    ]
-    content = bytearray(length)
-    inputs: list[Inputs] = []
-    at = (written or end) + COUNTER_SIZE + DATAGRAM_HEADER
-    for number in numbers:
-        for area in areas[number]:
-            if area.kind == reg.FMMU_READ:
-                content[area.start - start : area.end - start] = _NEVER * (area.end - area.start)
-        first, last = (each - start for each in _inputs(areas[number]))
+    """The frame for the logical addresses from `start` to `end`, with the inputs that lie in them."""
+    length, commands = end - start, (Command.LRW,) if lrw else (Command.LRD, Command.LWR)
+    datagrams = [(int(command), start & 0xFFFF, start >> 16, bytes(length)) for command in commands]
+    read = FIRST_DATA + length
+    written = 0 if lrw else read + _AROUND_DATA + length
+    at = (written or read) + COUNTER_SIZE + DATAGRAM_HEADER
+    data, inputs, counters = bytearray(length), [], []
+    for number, each in enumerate(areas):
+        kinds = {area.kind for area in each if start <= area.start < end}
+        counters.append(2 * (reg.FMMU_WRITE in kinds) + (reg.FMMU_READ in kinds))
+        read_areas = [area for area in each if area.kind == reg.FMMU_READ]
+        first, last = (
+            min(area.start for area in read_areas) - start,
+            max(area.end for area in read_areas) - start,
+        )
+        if first < 0 or last > length:
+            continue
+        for area in read_areas:
+            data[area.start - start : area.end - start] = _NEVER * (area.end - area.start)
         station, latched = stations[number], 0
         if station is not None:
             latched, at = at, at + LATCHED_SIZE
             datagrams += latched_datagrams(station)
-        inputs.append(
-            Inputs(number, first + FIRST_DATA, last + FIRST_DATA, bytes(content[first:last]), latched)
-        )
-    made = build(*datagrams, (Command.NOP, 0, 0, bytes(TAG_SIZE))).ljust(SHORTEST_FRAME, b"\0")
-    made[FIRST_DATA:end] = content
-    counters = [_working_counter(each, span) for each in areas]
-    return Frame(made, inputs, end, written, at, counters)
-
-
-def _working_counter(areas: Sequence[Area], span: tuple[int, int]) -> int:
-    kinds = {area.kind for area in areas if span[0] <= area.start < span[1]}
-    return 2 * (reg.FMMU_WRITE in kinds) + (reg.FMMU_READ in kinds)
+        inputs.append(Inputs(number, FIRST_DATA + first, FIRST_DATA + last, bytes(data[first:last]), latched))
+    content = build(*datagrams, (Command.NOP, 0, 0, bytes(TAG_SIZE))).ljust(SHORTEST_FRAME, b"\0")
+    content[FIRST_DATA:read] = data
+    return Frame(content, inputs, read, written, at, counters)
 
 
 # Single datagrams and SOEM use the indices below.
@@ -238,8 +216,8 @@ _INDICES: Final = 0x100
 MOST_IN_FLIGHT = 100
 # A frame that is not back after this time counts as lost: its index is used again.
 _LOST_NS: Final = 100_000_000
-_TAG: Final = struct.Struct("<I")
-_NOTHING: Final = (0, 0, -1)
+# By index: when a frame was sent that is not back, else 0; which it was; its tag.
+_NEVER_SENT: Final[tuple[int, int, bytes | None]] = (0, -1, None)
 _IMPOSSIBLE: Final = 0xFFFF
 
 
@@ -258,7 +236,17 @@ DUPLICATE: Final = Exchange(0, 0, b"", 0, 0)
 
 
 class ProcessData:
-    """The frames of an exchange, and those that are on the wire."""
+    """The frames of an exchange, and those that are on the wire.
+
+    Attributes:
+        inputs: by frame, the sensors whose inputs it carries.
+        wire_ns: by frame, what its bytes take on the wire.
+        counters: by sensor, what it adds to the working counter of each frame.
+        most_wkc: by frame, the highest working counter that there can be.
+        in_flight: frames that are not back, and not known to be lost.
+        duplicates: answers that came once more.
+        blocked_until_ns: nothing can be sent before, as long as nothing comes back.
+    """
 
     def __init__(
         self,
@@ -270,61 +258,49 @@ class ProcessData:
     ) -> None:
         """See `make_frames`."""
         self._send, self._monotonic_ns = backend.send, backend.clock.monotonic_ns
-        frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
-        self._lrw, self._command = lrw, int(Command.LRW if lrw else Command.LRD)
-        self._frames = [frame.content for frame in frames]
-        # By frame: what its bytes take on the wire.
+        self._frames = frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
+        self._command = int(Command.LRW if lrw else Command.LRD) if frames else -1  # no frame has that
+        self.inputs = [frame.inputs for frame in frames]
         self.wire_ns = [len(frame.content) * BYTE_NS for frame in frames]
-        self._ends = [frame.end for frame in frames]
-        self._written = [frame.written for frame in frames]
-        self._tags = [frame.tag for frame in frames] or [0]
-        self.inputs = [frame.inputs for frame in frames]  # by frame: the sensors whose inputs it carries
-        # What each sensor adds to the working counter of each frame.
         self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
-        # The highest working counter of each frame that there can be.
         self.most_wkc = [sum(frame.counters) for frame in frames]
-        # By frame: the highest counters of LRD and LWR.
-        self._most = [
-            (sum(each & 1 for each in frame.counters), sum(each >> 1 for each in frame.counters))
-            for frame in frames
-        ]
         self._index, self._number = FIRST_INDEX, 0
-        # By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 once it is lost.
-        self._sent = [_NOTHING] * _INDICES
-        self.in_flight = 0  # frames in flight: not back, and not known to be lost
+        self._sent = [_NEVER_SENT] * _INDICES
+        self.in_flight = 0
         self._lost = 0
-        self.duplicates = 0  # answers that came once more
-        self.blocked_until_ns = 0  # nothing can be sent before, as long as nothing comes back
+        self.duplicates = 0
+        self.blocked_until_ns = 0
 
     def read_latched(self, number: int, *, reads: bool) -> int | None:
         """Read what a sensor's controller latches, or no longer; where, or None if it latches nothing."""
-        for content, inputs in zip(self._frames, self.inputs, strict=True):
-            for each in inputs:
+        for frame in self._frames:
+            for each in frame.inputs:
                 if each.number == number and each.latched:
-                    switch_latched(content, each.latched, reads=reads)
+                    switch_latched(frame.content, each.latched, reads=reads)
                     return each.latched
         return None
 
     def send(self) -> int:
         """Send an exchange, unless too many are on the wire. Returns when."""
-        for which, frame in enumerate(self._frames):
+        sent = self._sent
+        for which, (content, _, _, _, at, _) in enumerate(self._frames):
             index = self._index
-            if self.in_flight >= MOST_IN_FLIGHT or self._sent[index][0]:
+            if self.in_flight >= MOST_IN_FLIGHT or sent[index][0]:
                 now_ns = self._monotonic_ns()
                 self._forget(now_ns)
                 if self.in_flight >= MOST_IN_FLIGHT:
-                    self.blocked_until_ns = min(sent[0] for sent in self._sent if sent[0]) + _LOST_NS
+                    self.blocked_until_ns = min(row[0] for row in sent if row[0]) + _LOST_NS
                     return now_ns
-                while self._sent[index][0]:
-                    index = max(FIRST_INDEX, (index + 1) % _INDICES)
-            self._index = max(FIRST_INDEX, (index + 1) % _INDICES)
-            self._number = number = (self._number + 1) & 0xFFFFFFFF
-            frame[DATAGRAM_INDEX] = index
-            _TAG.pack_into(frame, self._tags[which], number)
+                while sent[index][0]:
+                    index = index + 1 & 0xFF or FIRST_INDEX
+            self._index = index + 1 & 0xFF or FIRST_INDEX
+            self._number = number = self._number + 1
+            content[DATAGRAM_INDEX] = index
+            content[at : at + TAG_SIZE] = tag = (number & 0xFFFFFFFF).to_bytes(TAG_SIZE, "little")
             self.in_flight += 1
             now_ns = self._monotonic_ns()
-            self._send(frame)
-            self._sent[index] = now_ns, which, number
+            self._send(content)
+            sent[index] = now_ns, which, tag
         return now_ns
 
     def take(self, frame: bytes, back_ns: int) -> Exchange | None:
@@ -332,22 +308,22 @@ class ProcessData:
         if len(frame) <= DATAGRAM_INDEX or frame[FRAME_HEADER] != self._command:
             return None
         index = frame[DATAGRAM_INDEX]
-        sent_ns, which, number = self._sent[index]
-        at = self._tags[which]
-        if len(frame) < at + _TAG.size or _TAG.unpack_from(frame, at)[0] != number:  # an older one
+        sent_ns, which, tag = self._sent[index]
+        _, _, end, written, at, counters = self._frames[which]
+        if frame[at : at + TAG_SIZE] != tag:  # an older one
             return None
         if not sent_ns:
             self.duplicates += 1
             return DUPLICATE
-        self._sent[index], self.blocked_until_ns = (0, which, number), 0
+        self._sent[index], self.blocked_until_ns = (0, which, tag), 0
         self.in_flight -= 1
-        end = self._ends[which]
         wkc = frame[end] | frame[end + 1] << 8
-        if not self._lrw:  # an LRW would have counted 2
-            end = self._written[which]
-            written = frame[end] | frame[end + 1] << 8
-            reads, writes = self._most[which]
-            wkc = wkc + 2 * written if wkc <= reads and written <= writes else _IMPOSSIBLE
+        if written:  # an LRW would have counted 2
+            writes = frame[written] | frame[written + 1] << 8
+            possible = wkc <= sum(each & 1 for each in counters) and writes <= sum(
+                each >> 1 for each in counters
+            )
+            wkc = wkc + 2 * writes if possible else _IMPOSSIBLE
         return Exchange(sent_ns, back_ns, frame, wkc, which)
 
     @property
@@ -365,6 +341,6 @@ class ProcessData:
         """Give up the frames that have been away for too long."""
         for index, (sent_ns, _, _) in enumerate(self._sent):
             if sent_ns and now_ns - sent_ns >= _LOST_NS:
-                self._sent[index] = _NOTHING
+                self._sent[index] = _NEVER_SENT
                 self.in_flight -= 1
                 self._lost += 1

@@ -1,14 +1,18 @@
 """The backend and the master on pysoem: socket, scan, mapping. The only file that knows pysoem.
 
 What pysoem raises is translated here, and its traps end here: the descriptor that a failed open leaks, the
-close that must happen once, the scan that may take minutes, the mapping's error ring.
+close that must happen once, the scan that may take minutes, the mapping's error ring. SOEM waits for single
+datagrams in jiffies, and exchanges one frame at a time; so frames of our own go over its AF_PACKET socket,
+with indices that SOEM does not use and discards.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import select
 import socket
+import stat
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -19,11 +23,11 @@ import pysoem
 from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK, arrived_ns
 from ethercat_server.ethercat.nic import check_present, claimed, why_silent
-from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
-from ethercat_server.ethercat.slave.abort_codes import abort_meaning
+from ethercat_server.ethercat.slave.coe import abort_meaning
 
+_LONGEST_FRAME: Final = 1514
 _SCAN_TIMEOUT_S: Final = 15.0
 _IMAGE_BYTES: Final = 4096  # of pysoem's process image, whose end nothing checks
 _PYSOEM_ERRORS: Final = (
@@ -49,7 +53,8 @@ class SoemBackend:
         self._master: Any = pysoem.Master()
         self._opened = False
         self._abandoned = False  # a thread that never ended still uses the socket: it must not be closed
-        self._socket: RawSocket
+        self._fd: int  # SOEM's AF_PACKET socket, and a handle of our own to it
+        self._socket: socket.socket
 
     @property
     def master(self) -> Master:
@@ -69,25 +74,34 @@ class SoemBackend:
                 "check 'ip link' and the permissions"
             ) from None
         self._opened = True
-        self._socket = RawSocket((packet_sockets() - before).pop())
+        self._fd = (packet_sockets() - before).pop()
+        self._socket = socket.socket(fileno=os.dup(self._fd))
         try:
             self._ifindex = socket.if_nametoindex(self.ifname)
         except OSError:
             raise BusError(f"the interface {self.ifname} went away: connect it and start again") from None
         # Until SOEM had bound it to the interface, it received the EtherCAT frames of all others.
-        self._socket.discard()
+        while self.receive(0) is not None:
+            pass
 
     def send(self, frame: bytes | bytearray) -> None:
         """See `Backend`."""
-        self._socket.send(frame)
+        with contextlib.suppress(OSError):  # the link is down
+            self._socket.send(frame, socket.MSG_DONTWAIT)
 
     def receive(self, timeout_s: float) -> bytes | None:
         """See `Backend`."""
-        return self._socket.receive(timeout_s)
+        try:
+            # SO_RCVTIMEO is rounded up to jiffies, the time-out of `socket` to milliseconds; this is not.
+            if timeout_s <= 0 or select.select((self._fd,), (), (), timeout_s)[0]:
+                return self._socket.recv(_LONGEST_FRAME, socket.MSG_DONTWAIT)
+        except OSError:  # there is none, or the link is down
+            return None
+        return None
 
     def arrived_ns(self) -> int:
         """See `Backend`."""
-        return self._socket.arrived_ns()
+        return arrived_ns(self._fd)
 
     def check_present(self) -> None:
         """See `Backend`."""
@@ -128,15 +142,12 @@ class SoemBackend:
     def map_process_data(self, check_interrupt: CheckInterrupt) -> None:
         """See `Master`. SOEM requests SAFEOP, too."""
         check_interrupt()
-        self._socket.set_blocking(True)
         try:
             mapped = self._master.config_map()
         except pysoem.ConfigMapError as error:
             raise self._unmapped(_texts(error.error_list)) from None
         except _PYSOEM_ERRORS as error:
             raise self._unmapped(_texts([error])) from None
-        finally:
-            self._socket.set_blocking(False)
         if mapped > _IMAGE_BYTES:
             raise self._unmapped(f"its slaves say that they have {mapped} bytes")
 
@@ -177,3 +188,19 @@ def _text(error: Any) -> str:
     if str(error) == _UNEXPECTED:
         return "an emergency, or another message that was not asked for, came meanwhile"
     return str(getattr(error, "desc", None) or error).strip()
+
+
+def packet_sockets() -> set[int]:
+    """Descriptors of this process that are AF_PACKET sockets."""
+    found = set()
+    for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - plain descriptor numbers
+        fd = int(name)
+        try:
+            if not stat.S_ISSOCK(os.fstat(fd).st_mode):
+                continue
+        except OSError:
+            continue  # the descriptor of the listing itself
+        with socket.socket(fileno=os.dup(fd)) as duplicate:
+            if duplicate.family == socket.AF_PACKET:
+                found.add(fd)
+    return found

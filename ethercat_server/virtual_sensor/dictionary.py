@@ -13,8 +13,8 @@ from typing import Final
 
 from bota_ethercat.pdo import INPUT_OBJECT, LAYOUTS
 from bota_ethercat.settings import SETTINGS, SettingValue, sampling_rate_hz
-from ethercat_server.ethercat.slave.abort_codes import AbortCode
 from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.coe import AbortCode
 from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects import dictionary as table
 from ethercat_server.virtual_sensor.coe import Address, ObjectTable, SdoAbortError

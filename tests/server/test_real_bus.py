@@ -22,9 +22,8 @@ from ethercat_server.ethercat import soem
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.nic import claimed
-from ethercat_server.ethercat.raw_socket import packet_sockets
 from ethercat_server.ethercat.slave.sii import decode
-from ethercat_server.ethercat.soem import SoemBackend
+from ethercat_server.ethercat.soem import SoemBackend, packet_sockets
 from ethercat_server.sensor.sensor import Sensor
 from tests.server.running import (
     ATTEMPTS,

@@ -352,6 +352,7 @@ def test_little_is_exposed(unit: Path) -> None:
         (SERVER_UNIT, "LimitRTPRIO", ["99"]),
         (SERVER_UNIT, "LimitMEMLOCK", ["infinity"]),
         (SERVER_UNIT, "RuntimeDirectory", [nic.DIRECTORY.relative_to("/run").name]),
+        (SERVER_UNIT, "RuntimeDirectoryMode", ["0700"]),
         (SERVER_UNIT, "RuntimeDirectoryPreserve", ["yes"]),  # other instances use it
         (SERVER_UNIT, "Restart", ["on-failure"]),
         (BRIDGE_UNIT, "AmbientCapabilities", []),

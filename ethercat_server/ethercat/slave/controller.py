@@ -10,17 +10,17 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-from ethercat_server.errors import BusError, SetUpError
+from ethercat_server.errors import BusError, SdoAbortError, SetUpError
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.datagrams import Datagrams
+from ethercat_server.ethercat.datagrams import Datagrams, repeat
 from ethercat_server.ethercat.exchange import Area
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import ACKNOWLEDGE_S, STATE_S, AlState, AlStatus
-from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
-from ethercat_server.ethercat.slave.emergencies import Emergencies
+from ethercat_server.ethercat.slave.coe import Emergencies, MailboxSdo, Steps
 from ethercat_server.ethercat.slave.sii import OF_FIRMWARE
 
 _START_ATTEMPTS: Final = 20
+_MOST_BYTES: Final = 1486  # of process data in a frame
 _MAILBOXES_END: Final = 2 * reg.SYNC_MANAGER_SIZE
 _SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")  # length, control, activation
 _HARDWARE: Final = struct.Struct("<BBxxH")  # numbers of FMMUs and of sync managers, features
@@ -60,15 +60,12 @@ class SlaveController:
 
     def status(self) -> AlStatus | None:
         """Its AL status; None if it does not answer."""
-        for _ in range(self.attempts):
-            data = self._bus.read_register(self.number, reg.AL_STATUS, reg.AL_STATUS_SIZE)
-            if data is not None:
-                return AlStatus.parse(data)
-        return None
+        data = repeat(self.attempts, self._bus.read_register, self.number, reg.AL_STATUS, reg.AL_STATUS_SIZE)
+        return AlStatus.parse(data) if data else None
 
     def write(self, address: int, data: bytes) -> None:
         """Write registers; GoneError if it does not answer."""
-        if not any(self._bus.write_register(self.number, address, data) for _ in range(self.attempts)):
+        if not repeat(self.attempts, self._bus.write_register, self.number, address, data):
             raise self._gone()
 
     def go(self, state: AlState) -> Steps[None]:
@@ -98,6 +95,34 @@ class SlaveController:
         self.write(reg.SYNC_MANAGER, self._mailboxes.ljust(self._count * reg.SYNC_MANAGER_SIZE, b"\0"))
         self.write(reg.SII_OWNER, OF_FIRMWARE)  # a slave reads its SII on the way to PREOP
         yield from self.go(AlState.PREOP)
+
+    def mapped_size(self, assignment: int, in_sii: int) -> Steps[int]:
+        """Bytes of process data by the PDOs that the object `assignment` lists; `in_sii` if there is none.
+
+        BusError if it cannot be.
+        """
+        bits = 0
+        try:
+            for at in range(1, 1 + (yield from self._read_number(assignment, 0, 0xFF))):
+                pdo = yield from self._read_number(assignment, at, 0xFFFF)
+                for entry in range(1, 1 + (yield from self._read_number(pdo, 0, 0xFF))):
+                    bits += (yield from self._read_number(pdo, entry, 0xFFFFFFFF)) & 0xFF
+                    if bits > 8 * _MOST_BYTES:
+                        raise BusError(
+                            f"sensor {self.number} maps more than {_MOST_BYTES} bytes of process data, which "
+                            "fit no frame: power it off and on"
+                        )
+        except SdoAbortError:
+            return in_sii
+        return (bits + 7) // 8
+
+    def _read_number(self, index: int, subindex: int, most: int) -> Steps[int]:
+        if (value := int.from_bytes((yield from self.sdo.read(index, subindex)), "little")) > most:
+            raise BusError(
+                f"sensor {self.number} has {value:#x} in object 0x{index:04X}:{subindex}, which cannot be: "
+                "power it off and on"
+            )
+        return value
 
     def map(self, managers: bytes = b"", fmmus: bytes = b"") -> None:
         """Write sync managers from the third on, and FMMUs: by default those that `read_mapping` has read."""

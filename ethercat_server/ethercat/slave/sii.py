@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.datagrams import Registers
+from ethercat_server.ethercat.datagrams import Registers, repeat
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.registers import SII_CONTROL, SII_OWNER
 
@@ -199,7 +199,7 @@ def read_sii(bus: Registers, slave: int, word: int, count: int, owner: bytes = O
             data += yield from _read_word(bus, slave, word + len(data) // 2)
     finally:
         # No waiting here: the one who reads may have given up.
-        any(bus.write_register(slave, SII_OWNER, owner) for _ in range(_ATTEMPTS_TO_GIVE_BACK))
+        repeat(_ATTEMPTS_TO_GIVE_BACK, bus.write_register, slave, SII_OWNER, owner)
     return bytes(data[: 2 * count])
 
 
