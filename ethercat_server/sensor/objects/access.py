@@ -8,12 +8,10 @@ from typing import Any, Final
 from bota_ethercat.control import MAX_SDO_BYTES, ErrorCode
 from bota_ethercat.errors import RequestError
 from bota_ethercat.sensor.sdo_types import SDO_TYPES, SdoType
-from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import CutOffError, extended
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.objects import dictionary
-from ethercat_server.sensor.objects.dictionary import ObjectEntry
-from ethercat_server.sensor.objects.search import find_objects, full_name
+from ethercat_server.sensor.objects.dictionary import ObjectEntry, find_objects, full_name
 from ethercat_server.sensor.sensor import Sensor
 from ethercat_server.sensor.set_up import read_offset
 
@@ -84,7 +82,7 @@ def write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> S
     entry = dictionary.BY_ADDRESS.get((index, subindex))
     if entry is not None and entry.setting is not None:
         try:
-            value = entry.decode_setting(data, SETTINGS[entry.setting].is_bool)
+            value = entry.decode_setting(data)
         except ValueError:
             value = None
         if value is not None:
