@@ -1,4 +1,4 @@
-"""What a service needs besides its loop: readiness, a status line, a watchdog's food, reload.
+"""The service manager's side of the server: readiness, status line, watchdog, reload.
 
 SIGHUP reads command line and file again in a thread, because looking up user names can require a directory
 server; the loop applies the result within a second.
@@ -161,7 +161,7 @@ class Service:
         try:
             now.check_sensors({sensor.number: sensor.identity for sensor in self._server.sensors})
         except UsageError as error:
-            log.warning("%s", error)  # the other sensors get their settings all the same
+            log.warning("%s", error)  # the other sensors get their settings
         for number, settings in enumerate(changes):
             self._configure(number, settings)
 
@@ -187,7 +187,7 @@ class Service:
                 return
             log.info("sensor %d: applied %s", number, names)
             for name, value in changed.items():
-                if pending.get(name) == value:  # unless a later reload asked for another value meanwhile
+                if pending.get(name) == value:  # unless a later reload set another value
                     del pending[name]
 
         try:

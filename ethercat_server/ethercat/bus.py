@@ -38,7 +38,7 @@ class Bus(Datagrams):
     Attributes:
         positions: where the sensors are on the wire, by number.
         slaves: their slave controllers.
-        emergencies: what they report unasked.
+        emergencies: their CoE emergency messages.
         process_data: the exchange, once they are mapped.
     """
 
@@ -69,7 +69,7 @@ class Bus(Datagrams):
         """Number the sensors at these positions and take them to PREOP. `sii`: of every slave, theirs known.
 
         pysoem is the master where there are sensors only; other slaves are not written to. `again`: after a
-        failure, with the master that repeats what lost frames spoil.
+        failure, without pysoem, which does not repeat lost frames.
         """
         self._soem = self.backend.master if len(positions) == len(sii) and not again else None
         self.positions, self._sii, self.slaves = list(positions), sii, []

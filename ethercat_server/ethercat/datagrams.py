@@ -1,7 +1,7 @@
 """Single datagrams on the bus: registers of the slaves, by station address or position, and broadcast reads.
 
-Each is a frame of our own over the backend, matched with its answer by its index: a frame that comes too late
-is never taken for another one's answer.
+Each is a frame, matched with its answer by index, command and address: a late answer is not mistaken for that
+to another datagram.
 """
 
 from __future__ import annotations
@@ -45,24 +45,24 @@ def repeat(attempts: int, do: Callable[P, T | None], *args: P.args, **kwargs: P.
 
 
 class Registers(Protocol):
-    """How registers and mailboxes of slaves are reached: by number, as on a `Bus`, or `ByPosition`."""
+    """Access to registers and mailboxes of slaves: by sensor number, as on a `Bus`, or `ByPosition`."""
 
     @property
     def clock(self) -> Clock:
-        """The time that passes meanwhile."""
+        """The clock of the bus."""
 
     def read_register(self, number: int, address: int, size: int, /) -> bytes | None:
-        """None if the slave did not do it."""
+        """None if the slave did not execute it."""
 
     def write_register(self, number: int, address: int, data: bytes, /) -> bool:
-        """False if the slave did not do it."""
+        """False if the slave did not execute it."""
 
 
 class LateAnswers:
     """The timeout of datagrams.
 
-    It grows while answers come late, so that a slow machine reads its sensors slowly, not never: an answer
-    that nobody waits for any more says how long a frame takes now.
+    It grows while answers are late, so that a slow machine reads its sensors slowly rather than not at all:
+    an answer that arrives after its timeout shows the present round trip.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -72,14 +72,14 @@ class LateAnswers:
         self.pending_ns = [0] * _INDICES
 
     def note(self, answer: bytes) -> None:
-        """An answer, not the one that is waited for."""
+        """Take an answer that is not the one awaited."""
         index = answer[DATAGRAM_INDEX] - FIRST_INDEX if len(answer) > DATAGRAM_INDEX else -1
         if 0 <= index < _INDICES and self.pending_ns[index]:
             self.timeout_s = min(max(self.timeout_s, self._least_s(index)), _LONGEST_TIMEOUT_S)
             self.pending_ns[index] = 0
 
     def in_time(self, index: int) -> None:
-        """The answer that is waited for: wait less from now on, if it came sooner."""
+        """Take the awaited answer: the timeout falls if it was early."""
         timeout_s = min(max(self.timeout_s / 2, self._least_s(index)), _LONGEST_TIMEOUT_S)
         self.timeout_s = timeout_s if timeout_s > _SHORTEST_TIMEOUT_S else 0.0
 
@@ -99,8 +99,8 @@ class Datagrams:
         self._index = 0
         self._late = LateAnswers(backend.clock)
         self._pending_ns = self._late.pending_ns
-        # Returns the next frame before an instant in ns, None for none; the loop that exchanges process data
-        # puts its own here, and goes on meanwhile.
+        # Returns the next frame before an instant in ns, None if there is none. The acquisition loop replaces
+        # it by one that continues to exchange process data.
         self.next_frame = self.next_on_wire
         self.stations: list[int] = []  # configured station addresses of the sensors, by number
 
@@ -189,7 +189,7 @@ class Datagrams:
 
 
 class ByPosition:
-    """The registers of slaves that have no station address, in place of those of a `Bus`."""
+    """Registers of slaves by position, for those without a station address."""
 
     def __init__(self, bus: Datagrams) -> None:
         self.clock = bus.clock

@@ -1,5 +1,5 @@
-"""The exchange of process data: frames of our own, several at a time, each matched by its index; which
-process data, and whose latched times, each of them carries, and where.
+"""The exchange of process data: the layout of its frames, which process data and latched times each carries,
+and the frames in flight, matched with their answers by index and tag.
 
 Distributed clocks, by ETG.1000.4 and the data sheets of slave controllers: the local time counts ns from
 power-on; the system time is that and an offset, less a delay, which masters that synchronize slaves have
@@ -37,7 +37,7 @@ _MOST_BEHIND_NS: Final = 1_000_000
 _WRAP: Final = 1 << 32
 _TIME_SIZE: Final = 4
 _SLACK_NS: Final = 10_000
-# One lost frame is no reason to do without event times; many would hold up the loop.
+# A single lost frame must not disable event times; more attempts would delay the loop.
 _ATTEMPTS: Final = 3
 
 # System time when the frame arrived, a working counter; local time of the event PDI buffer change, a working
@@ -71,7 +71,7 @@ def switch_latched(frame: bytearray, at: int, *, reads: bool) -> None:
 
 
 def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
-    """What another master has left in a sensor's controller; None if it does not answer.
+    """The clock of a sensor's controller as another master has set it; None if it does not answer.
 
     `at` is where frames read what is latched.
     """
@@ -95,13 +95,13 @@ def _behind_ns(bus: Datagrams, number: int) -> int:
     return max((time for time in times if time < _MOST_BEHIND_NS), default=0)
 
 
-# Each frame carries its number in a last datagram (NOP), which comes back as it was sent: by the index
-# alone one that comes back very late would be taken for a later one.
+# The last datagram of each frame (NOP) carries its number as a tag, which slaves do not change: by the index
+# alone a very late answer would be mistaken for that to a later frame.
 TAG_SIZE: Final = 4
 _AROUND_DATA: Final = DATAGRAM_HEADER + COUNTER_SIZE
 # Bytes of datagrams that fit one frame.
 _LONGEST: Final = 1498
-# What is sent where the inputs will be; no sensor says it, for its numbers would be NaN throughout.
+# Sent in place of the inputs. No sensor sends this: all its values would be NaN.
 _NEVER: Final = b"\xff"
 
 
@@ -125,7 +125,7 @@ class Inputs(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """One of an exchange, as it is sent but for its index and number."""
+    """One frame of an exchange, as sent except for index and tag."""
 
     content: bytearray
     inputs: list[Inputs]
@@ -212,9 +212,9 @@ def _frame(
 # Single datagrams and SOEM use the indices below.
 FIRST_INDEX: Final = 0x90
 _INDICES: Final = 0x100
-# Frames on the wire; a limit for a bus that does not answer.
+# Limit of frames in flight on a bus that does not answer.
 MOST_IN_FLIGHT = 100
-# A frame that is not back after this time counts as lost: its index is used again.
+# A frame counts as lost after this time, and its index is used again.
 _LOST_NS: Final = 100_000_000
 # By index: when a frame was sent that is not back, else 0; which it was; its tag.
 _NEVER_SENT: Final[tuple[int, int, bytes | None]] = (0, -1, None)
@@ -222,21 +222,21 @@ _IMPOSSIBLE: Final = 0xFFFF
 
 
 class Exchange(NamedTuple):
-    """One that is back. Times are CLOCK_MONOTONIC ns."""
+    """An exchange whose answer has arrived. Times are CLOCK_MONOTONIC ns."""
 
     sent_ns: int
     back_ns: int
     frame: bytes
-    wkc: int  # working counter; 0xFFFF if it cannot be
+    wkc: int  # working counter; 0xFFFF if it is impossible
     which: int  # number of the frame, of those that make up an exchange
 
 
-# An answer that was taken before.
+# An answer that has been taken before.
 DUPLICATE: Final = Exchange(0, 0, b"", 0, 0)
 
 
 class ProcessData:
-    """The frames of an exchange, and those that are on the wire.
+    """The frames of an exchange, and those in flight.
 
     Attributes:
         inputs: by frame, the sensors whose inputs it carries.
@@ -245,7 +245,7 @@ class ProcessData:
         most_wkc: by frame, the highest working counter that there can be.
         in_flight: frames that are not back, and not known to be lost.
         duplicates: answers that came once more.
-        blocked_until_ns: nothing can be sent before, as long as nothing comes back.
+        blocked_until_ns: until then nothing can be sent unless an answer arrives.
     """
 
     def __init__(
@@ -281,7 +281,7 @@ class ProcessData:
         return None
 
     def send(self) -> int:
-        """Send an exchange, unless too many are on the wire. Returns when."""
+        """Send an exchange unless too many frames are in flight. Returns the time."""
         sent = self._sent
         for which, (content, _, _, _, at, _) in enumerate(self._frames):
             index = self._index
@@ -304,7 +304,7 @@ class ProcessData:
         return now_ns
 
     def take(self, frame: bytes, back_ns: int) -> Exchange | None:
-        """Take a frame that has arrived; None if it is no answer that is awaited."""
+        """Take a frame that has arrived; None if it is not an awaited answer, DUPLICATE if taken before."""
         if len(frame) <= DATAGRAM_INDEX or frame[FRAME_HEADER] != self._command:
             return None
         index = frame[DATAGRAM_INDEX]
@@ -328,17 +328,17 @@ class ProcessData:
 
     @property
     def sent(self) -> int:
-        """Exchanges that were sent."""
+        """Number of exchanges sent."""
         return self._number // max(1, len(self._frames))
 
     @property
     def lost(self) -> int:
-        """Frames that did not come back."""
+        """Number of frames lost."""
         self._forget(self._monotonic_ns())
         return self._lost
 
     def _forget(self, now_ns: int) -> None:
-        """Give up the frames that have been away for too long."""
+        """Count frames as lost whose time has passed."""
         for index, (sent_ns, _, _) in enumerate(self._sent):
             if sent_ns and now_ns - sent_ns >= _LOST_NS:
                 self._sent[index] = _NEVER_SENT

@@ -153,7 +153,7 @@ def look_up(ifname: str) -> Interface:
 
 
 def trouble(ifname: str) -> str | None:
-    """What keeps frames from passing over `ifname`, and what to do; None if it is not the interface."""
+    """What prevents frames from passing `ifname`, and what to do; None if nothing does."""
     found = look_up(ifname)
     if not found.is_up:
         return f"{ifname} is down: bring it up with 'sudo ip link set {ifname} up'"
@@ -173,7 +173,7 @@ def trouble(ifname: str) -> str | None:
 
 
 def why_silent(ifname: str) -> str:
-    """Why no frame comes back, as far as the interface knows, and what to do."""
+    """The interface's part in frames not coming back, and what to do."""
     try:
         return trouble(ifname) or CHECK_CABLE
     except InterfaceError as error:
@@ -199,7 +199,7 @@ class Routes(NamedTuple):
     addresses: tuple[str, ...] = ()  # with the length of their prefix; link-local ones are not among them
     link_local: tuple[str, ...] = ()  # those that every interface may give itself, without a network
     default: bool = False  # the machine's default route goes here
-    others: tuple[str, ...] = ()  # destinations of the routes that somebody made
+    others: tuple[str, ...] = ()  # destinations of the routes that the kernel did not make
     # Those of the addresses that a network gave for some time: DHCP, or an IPv6 router.
     leased: tuple[str, ...] = ()
 
@@ -237,13 +237,11 @@ def find_routes(ifname: str) -> Routes:
 
 
 def network_trouble(ifname: str, routes: Routes) -> str | None:
-    """Why no EtherCAT frame belongs on `ifname`, and what to do; None if it may be used."""
+    """Why `ifname` must not carry EtherCAT frames, and what to do; None if it may."""
     other = "name the one that the sensor is connected to ('ethercat-sensor adapters' lists them)"
-    anyway = f"{ALLOW_IP} uses it all the same"
+    anyway = f"{ALLOW_IP} overrides this"
     if routes.default:
-        return (
-            f"{ifname} has the machine's default route, so it is no interface for a sensor: {other}; {anyway}"
-        )
+        return f"{ifname} has the machine's default route, so it is not for a sensor: {other}; {anyway}"
     if routes.leased:
         return (
             f"{ifname} has the IP address {routes.leased[0]} by DHCP, so it is part of a network: {other}, "
@@ -379,7 +377,7 @@ def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
 def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
     if not 0 < len(ifname.encode()) <= MAX_NAME_LENGTH or "/" in ifname:
         raise InterfaceError(
-            f"{ifname!r} is no name of a network interface: it must have 1 to {MAX_NAME_LENGTH} characters; "
+            f"{ifname!r} is not an interface name: it must have 1 to {MAX_NAME_LENGTH} characters; "
             "'ip link' lists them"
         )
     found = look_up(ifname)
@@ -391,7 +389,7 @@ def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
         except OSError as error:
             raise InterfaceError(
                 f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "
-                "uses it all the same"
+                "overrides this check"
             ) from None
         if problem := network_trouble(ifname, routes):
             raise InterfaceError(problem)

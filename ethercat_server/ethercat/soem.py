@@ -2,8 +2,8 @@
 
 What pysoem raises is translated here, and its traps end here: the descriptor that a failed open leaks, the
 close that must happen once, the scan that may take minutes, the mapping's error ring. SOEM waits for single
-datagrams in jiffies, and exchanges one frame at a time; so frames of our own go over its AF_PACKET socket,
-with indices that SOEM does not use and discards.
+datagrams in jiffies, and exchanges one frame at a time; so the server's own frames use its AF_PACKET socket
+directly, with indices that SOEM does not use and discards.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ethercat_server.ethercat.slave.coe import abort_meaning
 
 _LONGEST_FRAME: Final = 1514
 _SCAN_TIMEOUT_S: Final = 15.0
-_IMAGE_BYTES: Final = 4096  # of pysoem's process image, whose end nothing checks
+_IMAGE_BYTES: Final = 4096  # of pysoem's process image, which pysoem does not check
 _PYSOEM_ERRORS: Final = (
     pysoem.SdoError,
     pysoem.Emergency,
@@ -39,7 +39,7 @@ _PYSOEM_ERRORS: Final = (
     pysoem.ConfigMapError,
     pysoem.NetworkInterfaceNotOpenError,
 )
-# What pysoem makes of entries of its error ring that it does not expect after a mapping.
+# How pysoem reports unexpected entries of its error ring after a mapping.
 _UNEXPECTED: Final = "unexpected error"
 
 
@@ -53,7 +53,7 @@ class SoemBackend:
         self._master: Any = pysoem.Master()
         self._opened = False
         self._abandoned = False  # a thread that never ended still uses the socket: it must not be closed
-        self._fd: int  # SOEM's AF_PACKET socket, and a handle of our own to it
+        self._fd: int  # SOEM's AF_PACKET socket, and a second handle to it
         self._socket: socket.socket
 
     @property
@@ -112,9 +112,9 @@ class SoemBackend:
         return why_silent(self.ifname)
 
     def scan(self, positions: Sequence[int], check_interrupt: CheckInterrupt) -> None:
-        """See `Master`. SOEM takes every slave on the wire for its own."""
-        # SOEM tries every byte of the SII for long if a slave goes away meanwhile, two minutes in all, and no
-        # signal is noticed before it returns. So it runs in a thread, which can be left behind.
+        """See `Master`."""
+        # If a slave disappears during the scan, SOEM retries every byte of its SII, for two minutes, and no
+        # signal is noticed before it returns. So it runs in a thread, which can be abandoned.
         counts: list[int] = []
         thread = threading.Thread(
             target=lambda: counts.append(self._master.config_init(release_gil=True)), daemon=True
@@ -186,7 +186,7 @@ def _text(error: Any) -> str:
     if isinstance(error, pysoem.SdoError):
         return abort_meaning(error.abort_code & 0xFFFFFFFF)
     if str(error) == _UNEXPECTED:
-        return "an emergency, or another message that was not asked for, came meanwhile"
+        return "an emergency, or another message besides the answers, arrived"
     return str(getattr(error, "desc", None) or error).strip()
 
 

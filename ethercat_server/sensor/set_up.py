@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 
 def identify(sdo: Sdo, sii_name: str) -> Steps[Identity]:
-    """Ask the sensor who it is; what its firmware has no object for is left empty."""
+    """Read the sensor's identity; fields that its firmware has no object for are empty."""
     name = yield from _read_text(sdo, dictionary.DEVICE_NAME)
     hardware = yield from _read_text(sdo, dictionary.HARDWARE_VERSION)
     firmware = yield from _read_text(sdo, dictionary.FIRMWARE_VERSION)
@@ -81,7 +81,7 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
 
 
 def set_up_in_op(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    """After a change that was cut off in OP: write what is wanted, as far as OP takes it; see `set_up`."""
+    """After a change that was interrupted in OP: write the wanted settings that OP permits; see `set_up`."""
     yield from _write_differing(sdo, sensor, preop=False)
     yield from _finish_set_up(sdo, sensor)
 
@@ -267,7 +267,7 @@ def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
 
 
 def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    """Find out what is in force."""
+    """Read the settings in force."""
     held: dict[str, SettingValue] = {}
     for name in SETTINGS:
         data = yield from _read(sdo, dictionary.BY_SETTING[name].address)
@@ -298,7 +298,7 @@ def read_in_force(sdo: Sdo, sensor: Sensor, asked: Mapping[str, SettingValue] = 
 
 
 def read_sinc(sdo: Sdo) -> Steps[tuple[int | None, int | None, bool]]:
-    """What tells the SINC length in force: what it reads back, the sampling rate, CHOP. None: unreadable."""
+    """SINC length as read back, sampling rate, CHOP: they show the length in force. None: unreadable."""
     length = yield from _read(sdo, dictionary.BY_SETTING[_LAST].address)
     rate = yield from _read(sdo, dictionary.SAMPLING_RATE)
     chop = yield from _read(sdo, dictionary.BY_SETTING["chop"].address)

@@ -8,7 +8,7 @@ errors of the difference of the two means. The standard error of a mean is the l
 single samples, and from the means of eight parts of its window, which covers noise that the sensor's filters
 have correlated.
 
-At rest is judged apart from `ft_compensation`, in raw units and by sums, which hold up no exchange.
+Rest is judged here, not as in `ft_compensation`: in raw units, and by sums, which delay no exchange.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LEAST_SAMPLES: Final = 20  # fewer would not show whether the sensor is stationa
 
 
 class _Channel(NamedTuple):
-    """What is looked at, in its unit."""
+    """A quantity of the process data, in its unit."""
 
     name: str
     unit: str
@@ -48,7 +48,7 @@ _CHANNELS: Final = (
     *(_Channel(name, "Nm", 0.05, 0.01) for name in ("Mx", "My", "Mz")),
     *(_Channel(name, "deg/s", 3.0, math.inf) for name in ("Rx", "Ry", "Rz")),
 )
-# Of the mean angular rate: beyond it a robot is plainly moving. The residual tells what a slower turn costs.
+# Limit of the mean angular rate: above it the robot is moving. The residual shows slower motion.
 _REST_TURN_DPS: Final = math.degrees(0.5)
 _BY_CHANCE: Final = 5.0  # standard errors by which two means must differ to differ significantly
 _PARTS: Final = 8  # parts of a window whose means give the standard error of the whole window's
@@ -79,7 +79,7 @@ def tare(
     """Steps of the action `tare`; returns what its reply carries. RequestError if the sensor is not at rest,
     or cannot hold the offset, or if an axis is off target afterwards or worse than before.
 
-    If it fails half-way the old offset is put back. `on_offset` hears of either at once.
+    If it fails after that, the old offset is written again. `on_offset` is called after each write.
     """
     _check_fits(target, "the key 'target'")
     samples = max(samples, LEAST_SAMPLES)
@@ -167,7 +167,7 @@ def _moments(parts: Sequence[_Part], channel: int) -> tuple[float, float]:
 
 
 def _found(parts: Sequence[_Part], channel: int, start: float) -> _Found:
-    """In the parts of a window whose values are taken from `start` on."""
+    """One channel of a window, in whose sums values are relative to `start`."""
     samples, first = sum(part.taken for part in parts), parts[: _PARTS // 2]
     mean, variance = _moments(parts, channel)
     (one, noise), (other, more_noise) = _moments(first, channel), _moments(parts[_PARTS // 2 :], channel)

@@ -164,7 +164,7 @@ def test_a_drive_at_work_is_not_touched() -> None:
         contextlib.closing(Server(veth.near)) as refused,
     ):
         assert refused.wait() == 1
-        assert "no Bota sensors (position 1 in OP)" in refused.said()
+        assert "not Bota sensors (position 1 in OP)" in refused.said()
         assert sensor.stats_of_foreign(1)["write_count"] == 0
 
 

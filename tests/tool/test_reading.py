@@ -241,7 +241,7 @@ def test_a_drive_at_work_is_not_touched_by(command: str) -> None:
     with simulated_bus("--chain", "BOTA:OP,DRIVE:OP") as bus:
         before = registers(bus.backend)
         said = refused(command, bus.near, *FURTHER.get(command, []))
-        assert "has slaves at work that are no Bota sensors (position 1 in OP)" in said
+        assert "has slaves at work that are not Bota sensors (position 1 in OP)" in said
         option = "--take-over" if command in {"snapshot", "restore"} else "--force"
         assert f"; {option} takes them to PREOP" in said
         assert registers(bus.backend) == before

@@ -1,8 +1,8 @@
 """CoE, CAN objects over EtherCAT: SDO transfers by single datagrams, abort codes, emergency messages.
 
 Transfers are generators that yield after each datagram and end with the result, so that the acquisition loop
-goes on in between; at start-up `finish` runs the same steps to their end. Emergencies, which a slave sends
-unasked, are counted, the last one kept, and logged and told to others at a bounded rate.
+continues in between; at start-up `finish` runs the same steps to their end. Emergencies are counted, the last
+one is kept, and they are logged and reported at a bounded rate.
 
 Sources: ETG.1000.6 (abort codes: table "SDO Abort Codes"), CiA 301.
 """
@@ -26,7 +26,7 @@ from ethercat_server.ethercat.slave.registers import MAILBOX_FULL, MAILBOX_IN_ST
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-# Work in steps: yields when the loop should have its turn, returns the result.
+# An operation in steps: yields after each datagram, returns the result.
 Steps = Generator[None, None, T]
 
 _SHORTEST: Final = 16
@@ -47,7 +47,7 @@ _LONGEST_EXPEDITED: Final = 4
 _MOST_DRAINED: Final = 4
 _SIZE_BYTES: Final = 4  # the size goes before what is longer
 _ANSWER_S: Final = 0.7  # until the request is sent again
-_TRANSFER_S: Final = 2.1  # in all: frames lost for a moment are no refusal
+_TRANSFER_S: Final = 2.1  # in all: a short loss of frames is not an error
 
 
 class Sdo(Protocol):
@@ -55,7 +55,7 @@ class Sdo(Protocol):
 
     @property
     def clock(self) -> Clock:
-        """The time that passes meanwhile."""
+        """The clock of the bus."""
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """Upload an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
@@ -81,7 +81,7 @@ def finish(
                 return result
             clock.sleep(pause_s)
     finally:
-        steps.close()  # given up between two steps, they undo what is half done while the bus is open
+        steps.close()  # if aborted, it cleans up while the bus is open
 
 
 class AbortCode(IntEnum):
@@ -184,7 +184,7 @@ class Emergency(NamedTuple):
 
     @classmethod
     def parse(cls, body: bytes) -> Self | None:
-        """From a CoE message, without the mailbox header; None if it is no emergency."""
+        """From a CoE message, without the mailbox header; None if it is not an emergency."""
         if len(body) < _EMERGENCY.size:
             return None
         header, code, register = _EMERGENCY.unpack_from(body)
@@ -213,28 +213,28 @@ class Emergency(NamedTuple):
 
 
 class _OfSensor:
-    """What one sensor has reported."""
+    """The emergencies of one sensor."""
 
     def __init__(self) -> None:
         self.count = 0
         self.last: Emergency | None = None
         self.at_ns = 0
         self.logged_ns: dict[int, int] = {}  # when each code was logged, within `_LOG_EVERY_NS`
-        self.told = (-1, 0)  # the last code that was told, and when
-        self.told_until_ns = 0  # what was told takes up the time until then, at one each `_TELL_EVERY_NS`
+        self.told = (-1, 0)  # the last code that was reported, and when
+        self.told_until_ns = 0  # a leaky bucket: one report each `_TELL_EVERY_NS`
 
 
 class Emergencies:
-    """`note` takes each one, from whichever mailbox it was read."""
+    """The emergencies of all sensors."""
 
     def __init__(self, clock: Clock) -> None:
         self._monotonic_ns = clock.monotonic_ns
         self._sensors: defaultdict[int, _OfSensor] = defaultdict(_OfSensor)
-        # Told of them, except of a flood: number of the sensor, emergency, how many the sensor has sent.
+        # Called at a bounded rate: number of the sensor, emergency, how many the sensor has sent.
         self.tell: Callable[[int, Emergency, int], None] = lambda _number, _emergency, _count: None
 
     def note(self, number: int, emergency: Emergency) -> None:
-        """The sensor `number` has sent it."""
+        """Record an emergency of the sensor `number`."""
         sensor, now_ns = self._sensors[number], self._monotonic_ns()
         sensor.count += 1
         sensor.last, sensor.at_ns = emergency, now_ns
@@ -273,14 +273,14 @@ class Emergencies:
 
 
 class MessageLostError(Exception):
-    """A message was taken from the mailbox and lost on its way."""
+    """A message was read from the mailbox, and the frame with it was lost."""
 
 
 class MailboxSdo:
-    """The mailboxes of slave `number`. A slave has one of these, whoever uses it: it drops a message that
-    reuses the last counter.
+    """The mailboxes of slave `number`.
 
-    Emergencies come in among the answers: each is noted.
+    There is one object for each slave, because the slave drops a message that reuses the last counter.
+    Emergencies that arrive among the answers are recorded.
     """
 
     def __init__(
@@ -329,13 +329,13 @@ class MailboxSdo:
         yield from self._transfer(index, subindex, command, data)
 
     def look(self) -> None:
-        """Read what the slave says unasked. Who waits for an answer does that too: it is left to them."""
+        """Read a message if one is there, unless a transfer is under way, which reads them itself."""
         if not self._in_use:
             with contextlib.suppress(MessageLostError):
                 self._take()
 
     def drain(self, most: int = _MOST_DRAINED) -> Steps[None]:
-        """Read away what is there: `most` messages at most."""
+        """Discard the messages that are there, at most `most`."""
         for _ in range(most):
             with contextlib.suppress(MessageLostError):
                 if self._take() is None:
@@ -377,9 +377,9 @@ class MailboxSdo:
         raise SetUpError(self._unanswered(doing, index, subindex, "no answer"))
 
     def _answer(self, index: int, subindex: int, expected: int) -> tuple[int, bytes] | None:
-        """Command and data of the answer if it is there; other messages are dropped.
+        """Command and data of the answer if it is there.
 
-        Such as the late answer to a request that was repeated: about the same object, but another command's.
+        Others are dropped, such as the late answer to another command about the same object.
         """
         body = self._take()
         if body is None or len(body) < _SDO_HEADER.size + 4:
@@ -394,7 +394,7 @@ class MailboxSdo:
 
     def _put(self, body: bytes) -> bool:
         """Send a CoE message; False if that failed. It has another counter than the one before."""
-        self._counter = max(2, self._counter + 1 & 7)  # 1 is left to SOEM, whose mapping begins with it
+        self._counter = max(2, self._counter + 1 & 7)  # SOEM's mapping begins with 1
         header = _HEADER.pack(len(body), 0, 0, _TYPE_COE | self._counter << 4)
         return self._bus.write_register(self._number, self._out, (header + body).ljust(self._out_size, b"\0"))
 

@@ -27,7 +27,7 @@ _HARDWARE: Final = struct.Struct("<BBxxH")  # numbers of FMMUs and of sync manag
 
 
 class GoneError(SetUpError):
-    """The slave stopped answering in the middle."""
+    """The slave stopped answering during an operation."""
 
 
 class SlaveController:
@@ -35,10 +35,10 @@ class SlaveController:
 
     Attributes:
         number: of the sensor.
-        attempts: how often a datagram is sent until it is answered; more than one only while nothing streams.
-        sdo: its mailbox, whoever uses it.
+        attempts: how often an unanswered datagram is sent; more than once only while nothing streams.
+        sdo: its mailbox.
         areas: its process data in the logical address space, as `read_mapping` has found it.
-        features: what the controller can do, from then on.
+        features: of the controller (register 0x0008), from then on.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class SlaveController:
                 )
 
     def enter_preop(self) -> Steps[None]:
-        """By way of INIT: what another master has set up (FMMUs, sync managers, SYNC0) is cleared."""
+        """Through INIT, clearing what another master has set up (FMMUs, sync managers, SYNC0)."""
         yield from self.go(AlState.INIT)
         self._read_hardware()
         self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
@@ -132,7 +132,7 @@ class SlaveController:
     def read_mapping(self) -> int:
         """Read back how a master has mapped the process data; returns the bytes of the inputs.
 
-        SetUpError if something was not written: SOEM writes it once, and does not look whether that worked.
+        SetUpError if something was not written: SOEM writes it once and does not verify it.
         """
         self._read_hardware()
         self._fmmus = self._bus.read_surely(self.number, reg.FMMU, self._units * reg.FMMU_SIZE)
@@ -154,9 +154,9 @@ class SlaveController:
         return sum(area.end - area.start for area in self.areas if area.kind == reg.FMMU_READ)
 
     def latch_events(self) -> bool:
-        """Have the controller latch when samples come to be; False if it has no distributed clock.
+        """Have the controller latch the times of new samples; False if it has no distributed clock.
 
-        Another master may end that at any time.
+        Another master may switch that off at any time.
         """
         if self._latch is None:
             return False
@@ -164,7 +164,7 @@ class SlaveController:
         return True
 
     def enter_op(self) -> Steps[None]:
-        """From PREOP with the process data mapped, which has to be exchanged meanwhile."""
+        """From PREOP, with the process data mapped and being exchanged."""
         yield from self.go(AlState.SAFEOP)
         yield from self.go(AlState.OP)
 
@@ -173,7 +173,7 @@ class SlaveController:
         return SetUpError(f"sensor {self.number} did not answer when it was mapped: check cable and power")
 
     def _acknowledge(self, status: AlStatus) -> Steps[None]:
-        # The request waits until the error is gone: the slave sees only what was written to AL control last.
+        # The next request must wait for the error to clear: the slave sees only the last write to AL control.
         self.write(reg.AL_CONTROL, status.acknowledge())
         deadline = Deadline(self._bus.clock, ACKNOWLEDGE_S)
         while (now := (yield from self._next_status())).error:

@@ -102,7 +102,7 @@ class ObjectEntry:
     unit: str = ""
     setting: str | None = None  # name of the setting in `bota_ethercat.settings`
     codes: Mapping[SettingValue, int] | None = None  # wire value of each setting value, where they differ
-    values: Mapping[int, str] | None = None  # wire values that mean something, for what is no setting
+    values: Mapping[int, str] | None = None  # meanings of wire values, for entries that are not settings
 
     @property
     def address(self) -> tuple[int, int]:
@@ -169,7 +169,7 @@ SAVE_PARAMETERS: Final = 1
 
 
 def _calibration_type(subindex: int) -> ObjectType:
-    """REAL32 but for a password, the offsets, range and gains of the converters, and the bridges' DACs."""
+    """REAL32, except the password, the converters' offsets, range and gains, and the bridges' DACs."""
     if subindex == 0x01 or 0x27 <= subindex <= 0x2C or 0x4C <= subindex <= 0x51:
         return U32
     if subindex == 0x2D:
@@ -305,7 +305,7 @@ def find_objects(text: str) -> list[ObjectEntry]:
     """The entries that `text` names, in order of address; none if nothing is called so.
 
     Only letters and digits count: `SINC length` and `sinc_length` are the same. An address that the
-    dictionary does not have names an entry of its own: it can be read all the same.
+    dictionary does not have gives an entry without a type: it can be read too.
     """
     if (address := _ADDRESS.fullmatch(text.strip())) is None:
         return _BY_NAME.get(_plain(text), [])
