@@ -216,8 +216,9 @@ _INDICES: Final = 0x100
 MOST_IN_FLIGHT = 100
 # A frame counts as lost after this time, and its index is used again.
 _LOST_NS: Final = 100_000_000
-# By index: when a frame was sent that is not back, else 0; which it was; its tag.
-_NEVER_SENT: Final[tuple[int, int, bytes | None]] = (0, -1, None)
+_pack_tag_into, _unpack_tag_from = struct.Struct("<I").pack_into, struct.Struct("<I").unpack_from
+# By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 if there is none.
+_NOT_SENT: Final = (0, 0, -1)
 _IMPOSSIBLE: Final = 0xFFFF
 
 
@@ -264,8 +265,15 @@ class ProcessData:
         self.wire_ns = [len(frame.content) * BYTE_NS for frame in frames]
         self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
         self.most_wkc = [sum(frame.counters) for frame in frames]
-        self._index, self._number = FIRST_INDEX, 0
-        self._sent = [_NEVER_SENT] * _INDICES
+        # The highest counters of LRD and LWR.
+        self._most = [
+            (sum(each & 1 for each in frame.counters), sum(each >> 1 for each in frame.counters))
+            for frame in frames
+        ]
+        self._tagged = [(frame.content, frame.tag) for frame in frames]
+        self._offsets = [(frame.tag, frame.end, frame.written) for frame in frames]
+        self._index, self._tag = FIRST_INDEX, 0
+        self._sent = [_NOT_SENT] * _INDICES
         self.in_flight = 0
         self._lost = 0
         self.duplicates = 0
@@ -283,7 +291,7 @@ class ProcessData:
     def send(self) -> int:
         """Send an exchange unless too many frames are in flight. Returns the time."""
         sent = self._sent
-        for which, (content, _, _, _, at, _) in enumerate(self._frames):
+        for which, (content, tag_at) in enumerate(self._tagged):
             index = self._index
             if self.in_flight >= MOST_IN_FLIGHT or sent[index][0]:
                 now_ns = self._monotonic_ns()
@@ -294,9 +302,9 @@ class ProcessData:
                 while sent[index][0]:
                     index = index + 1 & 0xFF or FIRST_INDEX
             self._index = index + 1 & 0xFF or FIRST_INDEX
-            self._number = number = self._number + 1
+            self._tag = tag = self._tag + 1 & 0xFFFFFFFF
             content[DATAGRAM_INDEX] = index
-            content[at : at + TAG_SIZE] = tag = (number & 0xFFFFFFFF).to_bytes(TAG_SIZE, "little")
+            _pack_tag_into(content, tag_at, tag)
             self.in_flight += 1
             now_ns = self._monotonic_ns()
             self._send(content)
@@ -309,8 +317,8 @@ class ProcessData:
             return None
         index = frame[DATAGRAM_INDEX]
         sent_ns, which, tag = self._sent[index]
-        _, _, end, written, at, counters = self._frames[which]
-        if frame[at : at + TAG_SIZE] != tag:  # an older one
+        tag_at, end, written = self._offsets[which]
+        if len(frame) < tag_at + TAG_SIZE or _unpack_tag_from(frame, tag_at)[0] != tag:  # an older one
             return None
         if not sent_ns:
             self.duplicates += 1
@@ -320,16 +328,14 @@ class ProcessData:
         wkc = frame[end] | frame[end + 1] << 8
         if written:  # an LRW would have counted 2
             writes = frame[written] | frame[written + 1] << 8
-            possible = wkc <= sum(each & 1 for each in counters) and writes <= sum(
-                each >> 1 for each in counters
-            )
-            wkc = wkc + 2 * writes if possible else _IMPOSSIBLE
+            most_reads, most_writes = self._most[which]
+            wkc = wkc + 2 * writes if wkc <= most_reads and writes <= most_writes else _IMPOSSIBLE
         return Exchange(sent_ns, back_ns, frame, wkc, which)
 
     @property
     def sent(self) -> int:
         """Number of exchanges sent."""
-        return self._number // max(1, len(self._frames))
+        return self._tag // max(1, len(self._frames))
 
     @property
     def lost(self) -> int:
@@ -341,6 +347,6 @@ class ProcessData:
         """Count frames as lost whose time has passed."""
         for index, (sent_ns, _, _) in enumerate(self._sent):
             if sent_ns and now_ns - sent_ns >= _LOST_NS:
-                self._sent[index] = _NEVER_SENT
+                self._sent[index] = _NOT_SENT
                 self.in_flight -= 1
                 self._lost += 1

@@ -28,6 +28,7 @@ from ethercat_server.ethercat.nic import check_present, claimed, why_silent
 from ethercat_server.ethercat.slave.coe import abort_meaning
 
 _LONGEST_FRAME: Final = 1514
+_DONT_WAIT: Final = int(socket.MSG_DONTWAIT)
 _SCAN_TIMEOUT_S: Final = 15.0
 _IMAGE_BYTES: Final = 4096  # of pysoem's process image, which pysoem does not check
 _PYSOEM_ERRORS: Final = (
@@ -86,15 +87,17 @@ class SoemBackend:
 
     def send(self, frame: bytes | bytearray) -> None:
         """See `Backend`."""
-        with contextlib.suppress(OSError):  # the link is down
-            self._socket.send(frame, socket.MSG_DONTWAIT)
+        try:
+            self._socket.send(frame, _DONT_WAIT)
+        except OSError:  # the link is down: it is lost
+            return
 
     def receive(self, timeout_s: float) -> bytes | None:
         """See `Backend`."""
         try:
             # SO_RCVTIMEO is rounded up to jiffies, the time-out of `socket` to milliseconds; this is not.
             if timeout_s <= 0 or select.select((self._fd,), (), (), timeout_s)[0]:
-                return self._socket.recv(_LONGEST_FRAME, socket.MSG_DONTWAIT)
+                return self._socket.recv(_LONGEST_FRAME, _DONT_WAIT)
         except OSError:  # there is none, or the link is down
             return None
         return None
