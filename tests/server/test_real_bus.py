@@ -33,7 +33,6 @@ from tests.server.running import (
     Server,
     Veth,
     VirtualSensor,
-    has_ipv6,
     needs_bus,
     server,
     starved,
@@ -218,19 +217,6 @@ def test_samples_of_a_chain_arrive_in_order_with_settings_of_their_own(shared: S
             numbers = [reading(frame).number for frame in fresh(own)]
             missing = numbers[-1] - numbers[0] + 1 - len(numbers)
             assert missing <= counters["lost_samples"] + withheld or counters["recoveries"]
-
-
-@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
-def test_bare_json_works_with_a_plain_socket(shared: Shared, host: str) -> None:
-    if host == "::1" and not has_ipv6():
-        pytest.skip("no IPv6 on this machine")
-    with socket.create_connection((host, shared.running.port), timeout=30) as sock:
-        sock.sendall(b'{"action":"subscribe"}{"action":"status","id":"me"}')
-        lines = sock.makefile("rb")
-        refused, status = json.loads(lines.readline()), json.loads(lines.readline())
-        assert refused["error"]["code"] == "bad_request"
-        assert "framed" in refused["error"]["message"]
-        assert (status["id"], status["ok"]) == ("me", True)
 
 
 def test_systemd_is_told_and_the_watchdog_is_fed(shared: Shared) -> None:
