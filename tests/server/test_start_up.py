@@ -402,7 +402,7 @@ def test_a_drive_at_work_is_not_touched(drive: int, state: AlState) -> None:
     assert found.life is not None
     found.life.esc.memory[reg.AL_STATUS] = state
     before = registers(backend)
-    with pytest.raises(BusError, match=rf"no Bota sensors \(position {drive} in {state.name}\).*--force"):
+    with pytest.raises(BusError, match=rf"not Bota sensors \(position {drive} in {state.name}\).*--force"):
         bring_up(bus := Bus(backend), Asked(), lambda: None)
     bus.close()
     assert registers(backend) == before
@@ -616,6 +616,15 @@ def test_sensors_stream_as_if_alone(text: str) -> None:
     assert_left_alone(simulation, text)
     simulation.close()
     assert_left_alone(simulation, text)
+
+
+def test_pysoem_is_not_asked_to_scan_what_others_share() -> None:
+    """It would write to every slave before it counted them."""
+    backend = chain("BOTA,DRIVE:PREOP")
+    bus = Bus(backend)
+    backend.master = misled = Misled(bus, "scan")  # type: ignore[assignment]
+    assert bring_up(bus, Asked(), lambda: None).sensors[0].streams
+    assert not misled.failed
 
 
 def test_one_that_goes_away_is_told_and_costs_the_others_nothing(caplog: pytest.LogCaptureFixture) -> None:
