@@ -177,7 +177,12 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(copied: Stage, tmp_p
     said = fresh.run("--dry-run", "--keep-environment", "--bridge", "ens5")
     assert fresh.files() == {}
     assert "would write /etc/systemd/system/ethercat-bridge.service\n" in said
-    assert "next: systemctl enable --now 'ethercat-server@ens5' ethercat-bridge " in said.splitlines()[-2]
+    install, start, watch = said.splitlines()[-3:]
+    assert f"first: sudo {ROOT}/scripts/install-service " in install
+    assert start.startswith(
+        "install-service: next: systemctl enable --now 'ethercat-server@ens5' ethercat-bridge "
+    )
+    assert "then: journalctl -fu 'ethercat-server@ens5'" in watch
     before = copied.files()
     (copied.prefix / "pyvenv.cfg").touch()
     edited = copied.path / CONFIGURATION[1:]
@@ -189,25 +194,6 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(copied: Stage, tmp_p
     assert f"kept {CONFIGURATION}, which was edited" in said
     assert "would remove /etc/ethercat-server/ens5.env\n" in said
     assert "would remove /opt/ethercat-server\n" in said
-
-
-def test_a_dry_run_needs_no_systemd_and_ends_with_the_next_commands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    programs = tmp_path / "bin"
-    programs.mkdir()
-    for program in {*Path("/usr/bin").iterdir(), *Path("/usr/sbin").iterdir()}:
-        if not program.name.startswith("systemd") and not (programs / program.name).exists():
-            (programs / program.name).symlink_to(program)
-    monkeypatch.setenv("PATH", str(programs))
-    done = install_service("--bridge", "--dry-run", "sensor-0", "13000")
-    assert done.returncode == 0, done.stderr
-    assert "in /opt/ethercat-server, with those of requirements.txt\n" in done.stderr
-    unit = "ethercat-server@sensor\\x2d0"
-    install, start, watch = done.stderr.splitlines()[-3:]
-    assert install == f"install-service: first: sudo {ROOT}/scripts/install-service --bridge sensor-0 13000"
-    assert start.startswith(f"install-service: next: systemctl enable --now '{unit}' ethercat-bridge ")
-    assert watch.startswith(f"install-service: then: journalctl -fu '{unit}'")
 
 
 def test_edited_configuration_is_kept_and_an_old_unit_is_not(copied: Stage) -> None:
