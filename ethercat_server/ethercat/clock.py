@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
-import struct
 import time
 from typing import Final, Protocol
 
 _READS: Final = 5
-_SIOCGSTAMPNS: Final = 0x80108907
-_TIMESPEC: Final = struct.Struct("=qq")
 
 
 class Clock(Protocol):
@@ -73,17 +69,3 @@ class Deadline:
     def passed(self) -> bool:
         """Whether it is in the past."""
         return self._clock.monotonic_ns() > self._at_ns
-
-
-def arrived_ns(fd: int) -> int:
-    """CLOCK_MONOTONIC when the packet that was received last from the socket `fd` had arrived.
-
-    0 if the kernel does not say, as at the first call, which has it stamp packets. The stamp is in
-    CLOCK_REALTIME: it is wrong if that was set in between.
-    """
-    try:
-        seconds, ns = _TIMESPEC.unpack(fcntl.ioctl(fd, _SIOCGSTAMPNS, bytes(_TIMESPEC.size)))
-    except OSError:
-        return 0
-    waited_ns = time.time_ns() - int(seconds * 1_000_000_000 + ns)
-    return time.monotonic_ns() - waited_ns  # if anything comes between the two clocks, it is too late

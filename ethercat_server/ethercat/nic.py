@@ -56,6 +56,24 @@ def packet_sockets(path: str | Path = "/proc/self/net/packet") -> list[Listener]
     return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in table(path)]
 
 
+_SIOCGSTAMPNS: Final = 0x80108907
+_TIMESPEC: Final = struct.Struct("=qq")
+
+
+def arrived_ns(fd: int) -> int:
+    """CLOCK_MONOTONIC when the packet that was received last from the socket `fd` had arrived.
+
+    0 if the kernel does not say, as at the first call, which has it stamp packets. The stamp is in
+    CLOCK_REALTIME: it is wrong if that was set in between.
+    """
+    try:
+        seconds, ns = _TIMESPEC.unpack(fcntl.ioctl(fd, _SIOCGSTAMPNS, bytes(_TIMESPEC.size)))
+    except OSError:
+        return 0
+    waited_ns = time.time_ns() - int(seconds * 1_000_000_000 + ns)
+    return time.monotonic_ns() - waited_ns  # if anything comes between the two clocks, it is too late
+
+
 def users_of(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Process]:
     """The visible processes that have one of these sockets."""
     for process in processes.iterdir():
@@ -323,9 +341,11 @@ def _open_lock(name: str) -> int:
         DIRECTORY.mkdir(mode=0o700)
     parent = os.open(DIRECTORY, _FOLDER)
     try:
-        if os.fstat(parent).st_mode & 0o022:
+        mode = os.fstat(parent).st_mode
+        if mode & 0o022:
             raise PermissionError(f"{DIRECTORY} is writable for others")
-        os.fchmod(parent, 0o700)  # one that an older version made is readable
+        if mode & 0o077:  # an older version made it
+            os.fchmod(parent, 0o700)
         with contextlib.suppress(FileExistsError):
             os.mkdir(name, 0o755, dir_fd=parent)
         return os.open(name, _FOLDER, dir_fd=parent)

@@ -12,19 +12,19 @@ import contextlib
 import os
 import select
 import socket
-import stat
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import pysoem
 
 from ethercat_server.errors import BusError, SetUpError
+from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK, arrived_ns
-from ethercat_server.ethercat.nic import check_present, claimed, why_silent
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.slave.coe import abort_meaning
 
 _LONGEST_FRAME: Final = 1514
@@ -50,17 +50,13 @@ class SoemBackend:
     def __init__(self, ifname: str) -> None:
         self.ifname = ifname
         self.clock = SYSTEM_CLOCK
+        self.master: Master = self
         self._ifindex = 0
         self._master: Any = pysoem.Master()
         self._opened = False
         self._abandoned = False  # a thread that never ended still uses the socket: it must not be closed
         self._fd: int  # SOEM's AF_PACKET socket, and a second handle to it
         self._socket: socket.socket
-
-    @property
-    def master(self) -> Master:
-        """See `Backend`."""
-        return self
 
     def open(self) -> None:
         """See `Backend`."""
@@ -104,15 +100,15 @@ class SoemBackend:
 
     def arrived_ns(self) -> int:
         """See `Backend`."""
-        return arrived_ns(self._fd)
+        return nic.arrived_ns(self._fd)
 
     def check_present(self) -> None:
         """See `Backend`."""
-        check_present(self.ifname, self._ifindex)
+        nic.check_present(self.ifname, self._ifindex)
 
     def why_silent(self) -> str:
         """See `Backend`."""
-        return why_silent(self.ifname)
+        return nic.why_silent(self.ifname)
 
     def scan(self, positions: Sequence[int], check_interrupt: CheckInterrupt) -> None:
         """See `Master`."""
@@ -172,7 +168,7 @@ class SoemBackend:
 @contextlib.contextmanager
 def open_bus(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
     """The open bus on `ifname`; its sensors go to INIT at the end. Errors as `claimed`."""
-    with claimed(ifname, allow_ip=allow_ip):
+    with nic.claimed(ifname, allow_ip=allow_ip):
         backend = SoemBackend(ifname)
         with contextlib.closing(Bus(backend)) as bus:
             backend.open()
@@ -195,15 +191,10 @@ def _text(error: Any) -> str:
 
 def packet_sockets() -> set[int]:
     """Descriptors of this process that are AF_PACKET sockets."""
+    targets = {f"socket:[{row.inode}]" for row in nic.packet_sockets()}
     found = set()
-    for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - plain descriptor numbers
-        fd = int(name)
-        try:
-            if not stat.S_ISSOCK(os.fstat(fd).st_mode):
-                continue
-        except OSError:
-            continue  # the descriptor of the listing itself
-        with socket.socket(fileno=os.dup(fd)) as duplicate:
-            if duplicate.family == socket.AF_PACKET:
-                found.add(fd)
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # that of the listing itself
+            if str(descriptor.readlink()) in targets:
+                found.add(int(descriptor.name))
     return found

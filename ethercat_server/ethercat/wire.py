@@ -142,9 +142,3 @@ def is_answer(frame: bytes, sent: bytes | bytearray, size: int) -> bool:
     asked = _DATAGRAM.unpack_from(sent, FRAME_HEADER)
     same_station = adp == asked[2] or command not in _BY_STATION
     return same_station and (command, index, ado, length & _LENGTH_MASK) == (*asked[:2], asked[3], size)
-
-
-def working_counter(frame: bytes | bytearray | memoryview, datagram: Datagram) -> int:
-    """The working counter of one datagram."""
-    value: int = _U16.unpack_from(frame, datagram.end)[0]
-    return value
