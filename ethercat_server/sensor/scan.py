@@ -33,7 +33,6 @@ _ATTEMPTS: Final = 5
 _PROBE_BYTES: Final = 1
 _SII_PAUSE_S: Final = 0.0002  # between two questions whether an EEPROM has read a word: 1 to 3 ms
 _PAUSE_S: Final = 0.002
-_ACKNOWLEDGE: Final = 0x10
 # Start and length of a Bota sensor's sync managers 0 to 2, and start of the last one.
 _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
 _INPUTS: Final = 0x1180
@@ -192,8 +191,7 @@ def _has_sensors_managers(bus: Bus, position: int) -> bool:
 def _stopped(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:
     """Take a slave that is not Bota's to PREOP, as `force` permits."""
     position = slave.position
-    request = (AlState.PREOP | _ACKNOWLEDGE).to_bytes(2, "little")
-    bus.write_surely_at(position, reg.AL_CONTROL, request)
+    bus.write_surely_at(position, reg.AL_CONTROL, AlStatus(AlState.PREOP, error=True, code=0).acknowledge())
     deadline = Deadline(bus.clock, STATE_S[AlState.PREOP])
     while (now := look_at(bus, position)).at_work:
         check_interrupt()

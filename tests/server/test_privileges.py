@@ -347,15 +347,6 @@ def test_without_the_rights_to_the_interface_it_ends(spare: Veth, missing: str) 
         assert f"{missing} missing" in found.said()
 
 
-@on_a_bus
-@pytest.mark.parametrize("missing", ["real-time priority 80 (CAP_SYS_NICE)", "locked memory (CAP_IPC_LOCK)"])
-def test_without_the_rights_to_real_time_it_says_so_and_streams(spare: Veth, missing: str) -> None:
-    with server(spare.near, **confined(name for name in CAPABILITIES if name not in missing)) as found:
-        found.signal(signal.SIGTERM)
-        assert found.wait() == 0
-        assert f"not granted: {missing}; " in found.said()
-
-
 # -- what is asked of the kernel is granted where allowed, and said in one line where not
 
 PROBE = """
