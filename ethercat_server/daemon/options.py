@@ -45,7 +45,6 @@ class ServerSetting(NamedTuple):
     default: Any
     many: bool = False  # takes several values: a repeatable flag, a list in the file
     at_once: bool = False  # a reload (SIGHUP) applies a change; others need a restart
-    text: bool = False  # a single string
 
     @property
     def flag(self) -> str:
@@ -55,15 +54,9 @@ class ServerSetting(NamedTuple):
 
     def check(self, value: object) -> Any:
         """The value in a configuration file, checked; ArgumentTypeError says what it must be."""
-        if self.many:
-            if isinstance(value, list) and all(isinstance(item, str) for item in value):
-                return tuple(map(self.parse, value))
-            raise argparse.ArgumentTypeError('must be a list of strings, such as ["a", "b"]')
-        if self.text and not isinstance(value, str):
-            raise argparse.ArgumentTypeError('must be a string, such as "a"')
-        if not self.text and (isinstance(value, bool) or not isinstance(value, int | float)):
-            raise argparse.ArgumentTypeError("must be a number")
-        return self.parse(str(value))
+        values = value if self.many and isinstance(value, list) else [value]
+        checked = tuple(self.parse(str(each)) for each in values)
+        return checked if self.many else checked[0]
 
 
 def _checked(
@@ -111,12 +104,12 @@ _ROWS: Final = (
     ServerSetting(
         "user", "NAME", "user that a server started by root becomes before it serves clients (default: who "
         "ran sudo; 'root' to stay root)",
-        _NAME, None, text=True,
+        _NAME, None,
     ),
     ServerSetting(
         "unset_settings", "WHAT", f"what settings that nobody set become at start: '{DEFAULTS}' writes the "
         f"server's, '{KEEP}' leaves the sensor's",
-        _UNSET, DEFAULTS, at_once=True, text=True,
+        _UNSET, DEFAULTS, at_once=True,
     ),
     ServerSetting(
         "rt_priority", "N", "SCHED_FIFO priority, if permitted; 0 for ordinary scheduling",
@@ -312,7 +305,7 @@ def build_parser() -> argparse.ArgumentParser:
     for setting in SERVER_SETTINGS.values():
         text = setting.meaning + ("; repeatable" if setting.many else "")
         if not setting.many and setting.default is not None:
-            text += f" (default {setting.default if setting.text else format(setting.default, 'g')})"
+            text += f" (default {setting.default})"
         parser.add_argument(
             setting.flag, dest=setting.name, metavar=setting.metavar, help=text,
             type=setting.parse, action="append" if setting.many else "store",

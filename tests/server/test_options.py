@@ -128,8 +128,7 @@ def test_tables_that_contradict_one_another_for_one_sensor_are_named(configured:
         ("server = 1\n", "unexpected 'server'"),
         ("[server]\ncolour = 1\n", "no 'colour'"),
         ("[server]\nrt_priority = 100\n", "from 0 to 99"),
-        ("[server]\nrt_priority = true\n", "a number"),
-        ("[server]\ncontrol_users = 'anna'\n", "a list of strings"),
+        ("[server]\nrt_priority = true\n", "a whole number"),
         ("[server]\nhosts = ['localhost']\n", "an IP address"),
         ("[server]\nidle_timeout_s = 0\n", "seconds"),
         ("[server]\nunset_settings = 'perhaps'\n", "must be 'defaults' or 'keep'"),
@@ -152,6 +151,7 @@ def test_the_servers_own_settings_from_file_and_command_line(configured: Configu
     from_file = configured(text).server
     assert (from_file["control_users"], from_file["rt_priority"]) == (("anna", "ben"), 50)
     assert from_file["stall_timeout_s"] == 2.5
+    assert configured('[server]\ncontrol_users = "anna"\n').server["control_users"] == ("anna",)
     both = configured(text, "--rt-priority", "0", "--control-user", "carl").server
     assert (both["control_users"], both["rt_priority"]) == (("carl",), 0), "the command line wins"
     hosts = parse_options(["ens5", "1", "--host", "10.0.0.1", "--host", "::1"]).server["hosts"]
