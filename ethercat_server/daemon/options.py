@@ -41,7 +41,7 @@ class ServerSetting(NamedTuple):
     name: str
     metavar: str
     meaning: str
-    parse: Callable[[str], Any]  # ArgumentTypeError says what a value must be
+    parse_argument: Callable[[str], Any]  # ArgumentTypeError says what a value must be
     default: Any
     many: bool = False  # takes several values: a repeatable flag, a list in the file
     at_once: bool = False  # a reload (SIGHUP) applies a change; others need a restart
@@ -55,7 +55,7 @@ class ServerSetting(NamedTuple):
     def check(self, value: object) -> Any:
         """The value in a configuration file, checked; ArgumentTypeError says what it must be."""
         values = value if self.many and isinstance(value, list) else [value]
-        checked = tuple(self.parse(str(each)) for each in values)
+        checked = tuple(self.parse_argument(str(each)) for each in values)
         return checked if self.many else checked[0]
 
 
@@ -308,7 +308,7 @@ def build_parser() -> argparse.ArgumentParser:
             text += f" (default {setting.default})"
         parser.add_argument(
             setting.flag, dest=setting.name, metavar=setting.metavar, help=text,
-            type=setting.parse, action="append" if setting.many else "store",
+            type=setting.parse_argument, action="append" if setting.many else "store",
         )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     add_completion(parser)
