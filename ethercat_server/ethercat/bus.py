@@ -71,7 +71,8 @@ class Bus(Datagrams):
         pysoem is the master where there are sensors only; other slaves are not written to. `again`: after a
         failure, without pysoem, which does not repeat lost frames.
         """
-        self._soem = self.backend.master if len(positions) == len(sii) and not again else None
+        shared = len(positions) < len(sii)
+        self._soem = None if shared or again else self.backend.master
         self.positions, self._sii, self.slaves = list(positions), sii, []
         if self._soem is not None:
             self._soem.scan(positions, check_interrupt)
