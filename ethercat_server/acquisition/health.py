@@ -20,7 +20,7 @@ from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.slave_clock import Verdict
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import FIRST_INDEX
-from ethercat_server.ethercat.slave.emergencies import Emergency
+from ethercat_server.ethercat.slave.coe import Emergency
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
 from ethercat_server.sensor.sensor import Sensor
 
