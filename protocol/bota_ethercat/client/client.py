@@ -245,6 +245,11 @@ class Client:
         """The sample in `frame`."""
         return self._decoders[len(frame.process_data)].decode(frame.process_data)
 
+    def measured_ns(self, frame: DataMessage, channel: str = "force_torque") -> int | None:
+        """As `Reading.measured_ns`, of a frame that came just now."""
+        delay_ns = getattr(self.session.state(frame.sensor).delay_ns, channel)
+        return None if delay_ns is None else frame.stamp_ns - delay_ns
+
     # -- requests
 
     def ask(self, action: str, timeout_s: float = ANSWER_TIMEOUT_S, **values: object) -> JsonObject:

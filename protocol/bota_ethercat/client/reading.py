@@ -6,6 +6,7 @@ Conditions, their numbers and the rules are those of the C++ header (`reading.hp
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import Final, NamedTuple
 
@@ -13,9 +14,11 @@ from bota_ethercat.accounting import FrameKind, StreamAccounting
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.sensor.warnings_register import WarningFlag
+from bota_ethercat.text.untrusted import number
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
+_MOST_MS: Final = 1e5  # a longer delay is no filter's
 _LEAST_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
 _WARNINGS: Final = slice(
@@ -60,6 +63,20 @@ _MEANINGS: Final = {
 }
 
 
+class Delays(NamedTuple):
+    """Group delay of each channel's filters, ns; None: unknown."""
+
+    force_torque: int | None = None
+    acceleration: int | None = None
+    angular_rate: int | None = None
+
+    @classmethod
+    def parse(cls, delay_ms: Mapping[str, object]) -> Delays:
+        """From `delay_ms` in a message."""
+        values = (number(delay_ms.get(channel)) for channel in cls._fields)
+        return cls(*(round(ms * 1e6) if ms is not None and 0 <= ms < _MOST_MS else None for ms in values))
+
+
 class Reading(NamedTuple):
     """What is known of a sensor at the moment of a call."""
 
@@ -73,6 +90,15 @@ class Reading(NamedTuple):
     gap: bool  # samples were lost or withheld, or the connection was made anew, since the reading before
     passed_over: int  # new samples since the reading before that came before this one
     warnings_seen: int  # warnings registers of all of them, joined by OR: a warning can last one sample
+    delay_ns: Delays  # of the filters with which the sample was made
+
+    def measured_ns(self, channel: str = "force_torque") -> int | None:
+        """CLOCK_REALTIME of what the sample measured: `frame.stamp_ns` less the channel's delay.
+
+        `acceleration` and `angular_rate` are the other channels. None: no sample, or an unknown delay.
+        """
+        delay_ns = getattr(self.delay_ns, channel)
+        return None if self.frame is None or delay_ns is None else self.frame.stamp_ns - delay_ns
 
     @property
     def fresh(self) -> bool:
@@ -99,6 +125,7 @@ class SensorState:
         self._same_clock = self._anew = self._gap = False
         self._carried = 0
         self._warnings = 0
+        self.delay_ns = self._sampled_delay_ns = Delays()
 
     def begin(self) -> None:
         """A new connection."""
@@ -131,6 +158,7 @@ class SensorState:
             self.lost = False
         self._flags, self._same_clock = flags, same_clock
         self._sampled, self._received_ns, self._sampled_received_ns = frame, received_ns, received_ns
+        self._sampled_delay_ns = self.delay_ns
         self.unread += 1
         if (warnings := process_data[_WARNINGS]) != _NO_WARNINGS:
             self._warnings |= int.from_bytes(warnings, "little")
@@ -155,7 +183,7 @@ class SensorState:
             condition = self.why_old(silence_ns, now_ns, connected=connected, ahead=ahead)
         reading = Reading(
             condition, self.sensor, sample, frame, self.unread > 0, age_ns * 1e-9,
-            self._gap or self._carried != 0, max(0, self.unread - 1), self._warnings,
+            self._gap or self._carried != 0, max(0, self.unread - 1), self._warnings, self._sampled_delay_ns,
         )  # fmt: skip
         self.unread = self._warnings = 0
         self._gap = False

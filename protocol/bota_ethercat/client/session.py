@@ -20,7 +20,7 @@ from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import boot_id
-from bota_ethercat.client.reading import SensorState
+from bota_ethercat.client.reading import Delays, SensorState
 from bota_ethercat.control import Event, check_version, request
 from bota_ethercat.errors import (
     BadMessageError,
@@ -33,7 +33,7 @@ from bota_ethercat.framing import DataMessage, FrameDecoder, encode_json
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.sensor_choice import MOST_PLACES
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import printable, rows
+from bota_ethercat.text.untrusted import number, printable, rows
 
 _FIRST_RETRY_NS: Final = 100_000_000
 _LONGEST_RETRY_NS: Final = 1_000_000_000
@@ -256,8 +256,8 @@ class Session:
         self.description = description
         for row in rows(description.get("sensors")):
             if (position := _position(row)) is not None:
-                self.state(position)
-            self._take_rate(row)
+                self.state(position).delay_ns = Delays()
+            self._take_in_force(row)
 
     def _take_event(self, message: JsonObject) -> None:
         state = self.sensors.get(position) if (position := _position(message)) is not None else None
@@ -265,13 +265,19 @@ class Session:
             state.lost = True
         elif state is not None and message["event"] in (Event.SENSOR_BACK, Event.RECONFIGURED):
             state.lost = False
-            self._take_rate(message)
+            self._take_in_force(message)
         self.items.append(message)
 
-    def _take_rate(self, message: JsonObject) -> None:
-        position, rate_hz = _position(message), message.get("rate_hz")
-        if position in self.sensors and isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ:
-            self.sensors[position].accounting.rate_hz = float(rate_hz)
+    def _take_in_force(self, message: JsonObject) -> None:
+        """The rate and the delays that a description or an event gives; others stay as they were."""
+        state = self.sensors.get(position) if (position := _position(message)) is not None else None
+        if state is None:
+            return
+        rate_hz, delay_ms = number(message.get("rate_hz")), message.get("delay_ms")
+        if rate_hz is not None and 0 < rate_hz <= _MOST_HZ:
+            state.accounting.rate_hz = rate_hz
+        if isinstance(delay_ms, dict):
+            state.delay_ns = Delays.parse(delay_ms)
 
     # -- what is known
 
@@ -303,7 +309,7 @@ class Session:
         if self._begun_ns < 0:
             self._begun_ns = newest_ns
         for state in awaited:
-            if newest_ns - max(state.accounting.new_ns, state.told_ns, self._begun_ns) > timeout_ns:
+            if newest_ns - max(state.accounting.new_ns, state.told_ns, self._begun_ns) >= timeout_ns:
                 state.told_ns = newest_ns
                 return state.sensor
         return None

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
+#include <optional>
 
 #include "bota_ethercat/connection.hpp"
 
@@ -127,6 +128,7 @@ struct Reading {
     std::uint64_t sequence = 0;      ///< of the sample
     std::uint64_t stamp_ns = 0;      ///< of the sample, CLOCK_REALTIME
     std::uint64_t monotonic_ns = 0;  ///< of the sample, CLOCK_MONOTONIC of the server's machine
+    Delays delay_ns{};               ///< of the filters with which the sample was made
     std::int64_t received_ns = 0;    ///< when it was read from the socket, CLOCK_MONOTONIC here
     std::int64_t age_ns = std::numeric_limits<std::int64_t>::max();  ///< of the sample, now; max = not known
     bool age_is_lower_bound = false;                                 ///< it counts from the arrival
@@ -144,6 +146,13 @@ struct Reading {
     /// The one thing to ask before a sample is used to control something: it is recent, finite and not saturated. Who wants
     /// saturated samples too, to see which way an overload goes, asks for `condition == Condition::saturated`.
     bool fresh() const noexcept { return condition == Condition::fresh; }
+
+    /// CLOCK_REALTIME of what the sample measured: `stamp_ns` less the channel's delay. None: no sample, or an unknown delay.
+    std::optional<std::uint64_t> measured_ns(Channel channel = Channel::force_torque) const noexcept {
+        const auto delay = delay_ns[static_cast<std::size_t>(channel)];
+        if (!has_sample || !delay) return std::nullopt;
+        return stamp_ns - static_cast<std::uint64_t>(*delay);
+    }
 };
 
 /// Counts of one sensor since the client was made.
@@ -158,6 +167,7 @@ namespace detail {
 class SensorState {
 public:
     StreamAccounting accounting;
+    Delays delay_ns{};
     bool lost = false;                  // says the server
     std::uint64_t all_passed_over = 0;  // in readings so far
 
@@ -188,6 +198,7 @@ public:
         next_.stamp_ns = frame.stamp_ns;
         next_.monotonic_ns = frame.monotonic_ns;
         next_.received_ns = received_ns;
+        next_.delay_ns = delay_ns;
         next_.age_is_lower_bound = !same_clock;  // another connection may lead to another machine
         next_.warnings_seen |= little_endian<std::uint32_t>(frame.process_data + kWarningsAt);
         next_.gap = next_.gap || carried_gap_;

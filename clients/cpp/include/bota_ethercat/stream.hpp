@@ -187,7 +187,7 @@ private:
             sensors_[place].lost = false;
             for (std::size_t i = 0; i < description_.sensor_count; ++i)
                 if (description_.sensors[i].sensor == place) read_in_force(message, description_.sensors[i]);
-            take_rates();
+            take_in_force();
         }
     }
 
@@ -213,14 +213,15 @@ private:
         connection_.error.clear();
         ++connections_;
         for (SensorState& each : sensors_) each.begin(connection_.options.every, connection_.options.fresh_only);
-        take_rates();
+        take_in_force();
     }
 
     /// A rate that is not known is what it was.
-    void take_rates() noexcept {
+    void take_in_force() noexcept {
         for (std::size_t i = 0; i < description_.sensor_count; ++i) {
             const SensorInfo& info = description_.sensors[i];
             if (info.rate_hz > 0.0) sensors_[info.sensor].accounting.rate_hz = info.rate_hz;
+            sensors_[info.sensor].delay_ns = info.delay_ns;
         }
     }
 
