@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.address import boot_id
-from bota_ethercat.framing import DataFlag, DataMessage, encode_data, encode_json
+from bota_ethercat.errors import BadMessageError, RemoteProtocolError
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
 from bota_ethercat.pdo import Sample, encode
-from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject
 
 _FOLDER: Final = Path(__file__).parent / "protocol" / "golden"
 
@@ -191,6 +192,25 @@ def expected(vectors: Sequence[Vector]) -> list[Outcome]:
         found.append(vector.outcome)
         if vector.outcome == "broken":
             break
+    return found
+
+
+def outcomes(chunks: Sequence[bytes], max_json_length: int = MAX_JSON_LENGTH) -> list[Outcome]:
+    """What the Python decoder makes of these bytes."""
+    decoder, found = FrameDecoder(max_json_length=max_json_length), list[Outcome]()
+    for chunk in chunks:
+        decoder.feed(chunk)
+        while True:
+            try:
+                message = decoder.next_message()
+            except BadMessageError:
+                found.append("refused")
+                continue
+            except RemoteProtocolError:
+                return [*found, "broken"]
+            if message is None:
+                break
+            found.append(message)
     return found
 
 

@@ -11,8 +11,6 @@ from itertools import pairwise
 import pytest
 
 from bota_ethercat.address import Address
-from bota_ethercat.client import connect
-from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.cpp_programs import (
@@ -121,27 +119,6 @@ def count(reading: Reading, total: dict[str, int | bool]) -> None:
     total["gap"] = total["gap"] or reading["gap"]
 
 
-def test_a_stuck_sensor_and_one_that_is_lost() -> None:
-    with served(sinc_length=SLOW) as server, driver(server.port, **STRICT_AGE) as running:
-        running.connect()
-        running.until(lambda r: r["fresh"], "samples")
-        server.command("stick")
-        stuck = running.until(lambda r: r["condition"] == "repeated", "repeated samples")
-        assert stuck["flags"] & DataFlag.REPEATED
-        assert not running.latest()["is_new"]
-        server.command("unstick")
-        before = new_again(running, stuck)
-        server.command("power off")
-        lost = running.until(lambda r: r["condition"] == "sensor_lost", "the loss of the sensor")
-        assert lost["flags"] & DataFlag.INVALID
-        assert not lost["fresh"]
-        assert "sensor 0 is lost" in running.info()["error"]
-        server.command("power on")
-        after = new_again(running, lost)
-        assert after["connection"] == 1
-        assert after["sequence"] > before["sequence"]
-
-
 # -- a healthy server
 
 
@@ -194,43 +171,6 @@ def test_latest_in_a_loop_faster_and_slower_than_the_sensor(
         told = running.info()
         assert new + passed_over + 1 == told["samples"]
         assert (new > 0, hz >= 1000 or passed_over > 0, told["allocated"]) == (True, True, 0)
-
-
-def test_one_frame_in_ten(shared: ServedSimulation) -> None:
-    with driver(shared.port, every=10, **PATIENT) as running:
-        running.connect()
-        readings = [running.do("next", 60_000) for _ in range(10)]
-        for one, later in pairwise(readings):
-            assert later["sequence"] - one["sequence"] == 10 + later["withheld"]
-
-
-def test_a_server_that_is_stopped_and_goes_on(shared: ServedSimulation) -> None:
-    with driver(shared.port, **STRICT_AGE) as running:
-        running.connect()
-        before = running.until(lambda r: r["fresh"], "samples")
-        with shared.stopped():
-            silent = running.until(lambda r: r["condition"] == "silent", "silence")
-            assert not silent["fresh"]
-            assert silent["age_ns"] > STRICT_AGE["max_age_ms"] * 1e6
-            waited = running.do("next", 50)
-            assert (waited["is_new"], waited["fresh"]) == (False, False)
-        after = new_again(running, silent)
-        assert after["connection"] == 1, "a stopped server is not gone: its connection is kept"
-        assert after["monotonic_ns"] > before["monotonic_ns"]
-
-
-def test_a_server_of_another_machine_at_an_address_of_this_one(
-    shared: ServedSimulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As at this end of an SSH tunnel: C++ and Python count ages from the arrival."""
-    monkeypatch.setattr("ethercat_server.serving.actions.boot_id", lambda: "another machine's")
-    with served(sinc_length=SLOW) as far:
-        for server, is_far in ((far, True), (shared, False)):
-            with driver(server.port, **PATIENT) as running, connect(server.port) as client:
-                running.connect()
-                reading = running.do("next", 60_000)
-                assert (reading["fresh"], reading["age_is_lower_bound"]) == (True, is_far)
-                assert client.session.same_machine is not is_far
 
 
 # -- requests

@@ -10,10 +10,8 @@ import json
 import os
 import random
 import struct
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import pytest
@@ -390,46 +388,3 @@ def test_a_broken_decoder_keeps_nothing_it_is_still_given(make: Callable[[], Dec
         decoder.feed(bytes(10_000))
     assert decoder.pending == 0
     assert len(decoder._buffer) <= BUFFER
-
-
-# -- many, fast
-
-
-def resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def storm(count: int, seed: int) -> None:
-    """Streams of valid, hostile and mutated messages, `count` in all; memory stays what it was."""
-    rng, done, resident = random.Random(seed), 0, 0.0
-    sides = (client_side, FRAMED), (server_side, FRAMED[:-2]), (bare_side, BARE)
-    while done < count:
-        make, good = rng.choice(sides)
-        valid = b"".join(rng.choices(good, k=rng.randint(0, 4)))
-        rest = []
-        for _ in range(rng.randint(1, 6)):
-            piece = rng.choice(good)
-            if rng.random() < 0.05:
-                piece = rng.choice(HOSTILE_TEXTS)
-                piece = piece if good is BARE else framed(piece)
-            rest.append(mutate(rng, piece, good) if rng.random() < 0.6 and piece else piece)
-        spoilt = b"".join(rest)
-        check(make, valid, spoilt, in_chunks(rng, valid + spoilt))
-        if done < count // 4 <= done + len(rest):
-            resident = resident_mb()
-        done += len(rest)
-    assert resident_mb() - resident < 4, f"memory grew from {resident} MB"
-
-
-def test_a_storm_of_mutations() -> None:
-    storm(2_000, SEED)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(900)
-def test_a_million_mutations() -> None:
-    print(f"FUZZ_SEED={SEED}")
-    began = time.monotonic()
-    storm(1_000_000, SEED)
-    print(f"{time.monotonic() - began:.0f} s")

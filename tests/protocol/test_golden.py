@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +12,7 @@ import pytest
 import bota_ethercat.accounting
 from bota_ethercat.accounting import StreamAccounting, StreamCounts
 from bota_ethercat.client import Client
-from bota_ethercat.errors import BadMessageError, RemoteProtocolError
-from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data
+from bota_ethercat.framing import DataMessage, encode_data
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
 from bota_ethercat.text.json_text import JsonObject
 from tests.golden_vectors import (
@@ -27,31 +25,13 @@ from tests.golden_vectors import (
     READ,
     STREAMS,
     AccountedStream,
-    Outcome,
     ReadStream,
     Vector,
     expected,
+    outcomes,
     same_sample,
 )
 from tests.protocol.scripted_channel import MemoryServer, ScriptedChannel
-
-
-def outcomes(chunks: Sequence[bytes]) -> list[Outcome]:
-    decoder, found = FrameDecoder(), list[Outcome]()
-    for chunk in chunks:
-        decoder.feed(chunk)
-        while True:
-            try:
-                message = decoder.next_message()
-            except BadMessageError:
-                found.append("refused")
-                continue
-            except RemoteProtocolError:
-                return [*found, "broken"]
-            if message is None:
-                break
-            found.append(message)
-    return found
 
 
 def test_each_alone() -> None:
