@@ -29,8 +29,8 @@ from typing import Final
 
 from bota_ethercat.framing import DataFlag
 
+# Either of these flags says that a frame brings no new sample.
 NOT_NEW: Final = int(DataFlag.REPEATED | DataFlag.INVALID)
-"""Either of these flags says that a frame brings no new sample."""
 _INVALID: Final = int(DataFlag.INVALID)
 _GAP: Final = int(DataFlag.GAP)
 
@@ -79,10 +79,8 @@ class StreamAccounting:
     ) -> None:
         """`every` and `fresh_only` as subscribed; `counts` to add to, by default new ones."""
         self.counts: StreamCounts = StreamCounts() if counts is None else counts
-        self.rate_hz = 0.0
-        """The sensor's sampling rate; 0 if it is unknown."""
-        self.new_ns = -1
-        """`monotonic_ns` of the newest new frame; -1: none since the subscription began."""
+        self.rate_hz = 0.0  # the sensor's sampling rate; 0 if it is unknown
+        self.new_ns = -1  # `monotonic_ns` of the newest new frame; -1: none since the subscription began
         self._every = every
         self._fresh_only = fresh_only
         self.begin()

@@ -48,8 +48,8 @@ class Event(StrEnum):
     SHUTTING_DOWN = "shutting_down"
 
 
+# Returns the checked value; raises SettingError, or ValueError whose text is what is allowed.
 Check = Callable[[object], Any]
-"""Returns the checked value; raises SettingError, or ValueError whose text is what is allowed."""
 
 
 class Parameter(NamedTuple):

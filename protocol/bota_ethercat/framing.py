@@ -54,8 +54,8 @@ _DATA_MESSAGE: Final = struct.Struct(">IBQQQBBH")
 _DATA: Final = int(MessageType.DATA)
 _TYPE_SIZE: Final = 1
 _BODY_OFFSET: Final = _PREFIX.size
+# Offset of the flags byte in an encoded DATA message.
 DATA_FLAGS_OFFSET: Final = _PREFIX.size + struct.calcsize(">QQQB")
-"""Offset of the flags byte in an encoded DATA message."""
 _LENGTH_SIZE: Final = _LENGTH.size
 _UNPACK_DATA: Final = {
     _TYPE_SIZE + _DATA_HEADER.size + size: struct.Struct(f">{_PREFIX.size}xQQQBBH{size}s").unpack_from

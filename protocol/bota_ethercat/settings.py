@@ -21,8 +21,8 @@ class Setting(NamedTuple):
     """One setting. `choices` are its allowed values, None for bool."""
 
     name: str
+    # What the server writes at start-up unless configured otherwise; None = not written.
     default: SettingValue | None
-    """What the server writes at start-up unless configured otherwise; None = not written."""
     choices: range | tuple[int, ...] | None
     meaning: str
     preop_only: bool  # can be written in PREOP only
@@ -89,8 +89,8 @@ SETTINGS: Final[Mapping[str, Setting]] = {
 
 BASE_SAMPLING_RATE_HZ: Final = 51200  # the ADC's rate: sampling rate = 51200 / SINC length
 
+# By how much CHOP may divide the sampling rate; no source says whether it does, so object 0x8011 decides.
 _MOST_DIVIDED: Final = 8
-"""By how much CHOP may divide the sampling rate; no source says whether it does, so object 0x8011 decides."""
 
 PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
     length: row.rate_hz for length, row in FORCE_TORQUE_FILTERS.items()

@@ -85,8 +85,8 @@ class Reading(NamedTuple):
     sample: Sample | None  # the newest new and valid one; None before the first
     frame: DataMessage | None  # what it came in: sequence, stamps, flags
     is_new: bool  # no earlier reading had it
+    # Of the sample, now; infinity if unknown. From its arrival where the server's clock is not ours.
     age_s: float
-    """Of the sample, now; infinity if unknown. From its arrival where the server's clock is not ours."""
     gap: bool  # samples were lost or withheld, or the connection was made anew, since the reading before
     passed_over: int  # new samples since the reading before that came before this one
     warnings_seen: int  # warnings registers of all of them, joined by OR: a warning can last one sample
@@ -111,13 +111,10 @@ class SensorState:
 
     def __init__(self, sensor: int, *, every: int, fresh_only: bool, imu_units: ImuUnits) -> None:
         self.accounting = StreamAccounting(every=every, fresh_only=fresh_only)
-        self.lost = False
-        """The server says so."""
+        self.lost = False  # the server says so
         self.sensor = sensor
-        self.unread = 0
-        """New samples since the last reading."""
-        self.told_ns = -1
-        """Up to this instant, of the server's clock, it was told to be silent."""
+        self.unread = 0  # new samples since the last reading
+        self.told_ns = -1  # up to this instant, of the server's clock, it was told to be silent
         self._decoders = {size: SampleDecoder(size, imu_units) for size in LAYOUTS}
         self._flags = 0
         self._received_ns = self._sampled_received_ns = 0

@@ -5,7 +5,7 @@ The rules it keeps:
 - A connection begins with `describe`: the version is checked, and of the sensors asked for, those that are
   there are subscribed to. If none is there, or at first not all are, the connection has failed.
 - Whoever has the socket passes what arrives to `received` and sends what is returned.
-- After a connection that ended the next attempt is due at `retry_at_ns`: later each time, at once after one
+- After a connection that ended the next attempt is due at `retry_at_ns`: later each time, and soon after one
   that lasted.
 - What is known of a sensor is kept over connections; the first sample of a new one has GAP.
 - Frames that are no news are not handed out, unless `raw`.
@@ -37,8 +37,8 @@ from bota_ethercat.text.untrusted import number, printable, rows
 
 _FIRST_RETRY_NS: Final = 100_000_000
 _LONGEST_RETRY_NS: Final = 1_000_000_000
+# After a connection that lasted this long the next attempt follows as soon as after the first.
 _LASTED_NS: Final = 1_000_000_000
-"""A connection that lasted this long was a good one: the next attempt follows at once."""
 _MOST_HZ: Final = 1e6
 _MOST_ITEMS: Final = 65536  # kept while nobody takes them; a tare of 20,000 samples needs fewer
 _HANDSHAKE_NS: Final = 5_000_000_000
@@ -62,8 +62,8 @@ class Disconnected(NamedTuple):
     was_connected: bool
 
 
+# What the client tells of its connection, and the server's events as they came.
 ClientEvent = Connected | Disconnected | JsonObject
-"""What the client tells of its connection, and the server's events as they came."""
 
 
 class Session:

@@ -81,10 +81,9 @@ def _cutoff_text(row: ForceTorqueFilter) -> str:
 class Meaning(NamedTuple):
     """What a set of settings means. None: not in the tables, or not among the settings."""
 
-    rate_hz: int | None
-    """Sampling rate."""
+    rate_hz: int | None  # Sampling rate
+    # Of force and torque. None with FAST on, which switches between the two cut-offs, and with CHOP on.
     cutoff_hz: float | None
-    """Of force and torque. None with FAST on, which switches between the two cut-offs, and with CHOP on."""
     force_torque: Response
     acceleration: ImuFilter | None
     angular_rate: ImuFilter | None
