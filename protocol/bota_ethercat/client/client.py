@@ -24,16 +24,10 @@ from bota_ethercat.address import Address
 from bota_ethercat.client.channel import RECEIVE_BUFFER, Channel, TcpChannel
 from bota_ethercat.client.reading import Condition, Reading
 from bota_ethercat.client.real_time import Scheduling, make_real_time
-from bota_ethercat.client.session import ClientEvent, Session
-from bota_ethercat.errors import (
-    ConnectionFailedError,
-    NoReplyError,
-    ProtocolError,
-    RefusedError,
-    UnreachableError,
-)
+from bota_ethercat.client.session import ClientEvent, Session, check_granted
+from bota_ethercat.errors import ConnectionFailedError, NoReplyError, ProtocolError, UnreachableError
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
+from bota_ethercat.pdo import ImuUnits, Sample
 from bota_ethercat.text.json_text import JsonObject
 
 ANSWER_TIMEOUT_S: Final = 5.0
@@ -124,7 +118,6 @@ class Client:
             sensors, every=every, fresh_only=fresh_only, raw=raw, stream=stream, imu_units=imu_units
         )
         self.channel: Channel = TcpChannel(host, port, receive_buffer) if channel is None else channel
-        self._decoders = {size: SampleDecoder(size, imu_units) for size in LAYOUTS}
         self._reconnect, self._timeout_s = reconnect, timeout_s
         self._open = False
         self._failed: ProtocolError | None = None
@@ -165,7 +158,7 @@ class Client:
     @property
     def description(self) -> JsonObject:
         """The server's newest description; empty before the first connection."""
-        return self.session.description or {}
+        return self.session.description
 
     # -- samples
 
@@ -243,7 +236,7 @@ class Client:
 
     def decode(self, frame: DataMessage) -> Sample:
         """The sample in `frame`."""
-        return self._decoders[len(frame.process_data)].decode(frame.process_data)
+        return self.session.state(frame.sensor).decode(frame)
 
     def measured_ns(self, frame: DataMessage, channel: str = "force_torque") -> int | None:
         """As `Reading.measured_ns`, of a frame that came just now."""
@@ -274,8 +267,7 @@ class Client:
         finally:
             self.session.forget(future)
         reply = future.result()
-        if reply.get("ok") is not True:
-            raise RefusedError.of(reply)
+        check_granted(reply)
         return reply
 
     def request(self, action: str, **values: object) -> Future[JsonObject]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
@@ -71,7 +71,7 @@ class Session:
 
     Attributes:
         connected: whether there is a connection and its subscription is granted.
-        description: the server's newest description; None before the first connection.
+        description: the server's newest description; empty before the first connection.
         items: what has arrived and was not taken yet, in order: new and valid frames, or all of them if
             `raw`; the server's events; `Connected` and `Disconnected`.
         same_machine: whether the server's CLOCK_MONOTONIC is this machine's.
@@ -94,7 +94,7 @@ class Session:
         """What to subscribe to, `sensors` None for all; nothing unless `stream`."""
         self.wanted = None if sensors is None else tuple(sensors)
         self.connected = self.same_machine = False
-        self.description: JsonObject | None = None
+        self.description: JsonObject = {}
         self.items: deque[DataMessage | ClientEvent] = deque(maxlen=_MOST_ITEMS)
         self.sensors: dict[int, SensorState] = {}
         self.connections = 0
@@ -109,8 +109,7 @@ class Session:
         self._batch: list[DataMessage] = []
         self._ids = itertools.count(1)
         self._replies: dict[int, Future[JsonObject]] = {}
-        self._describing: Future[JsonObject] | None = None
-        self._subscribing: Future[JsonObject] | None = None
+        self._handshake: tuple[Future[JsonObject], Callable[[JsonObject], bytes]] | None = None
         self._missing: tuple[int, ...] = ()
         self._retry_ns = _FIRST_RETRY_NS
         self._opened_ns = 0
@@ -123,15 +122,14 @@ class Session:
         self._open, self._opened_ns = True, now_ns
         self.same_machine = is_near
         self._decoder = FrameDecoder()
-        self._describing, sent = self.ask("describe")
-        return sent
+        return self._ask_first(self._described, "describe")
 
     def ended(self, reason: str, now_ns: int, *, reachable: bool = True) -> None:
         """The connection has ended, or none could be made."""
         was_connected = self.connected
         lasted = self._open and now_ns - self._opened_ns >= _LASTED_NS
         self.connected = self._open = False
-        self._describing = self._subscribing = None
+        self._handshake = None
         self._retry_ns = _FIRST_RETRY_NS if lasted else self._retry_ns
         self.retry_at_ns = now_ns + self._retry_ns
         self._retry_ns = min(self._retry_ns * 3 // 2, _LONGEST_RETRY_NS)
@@ -204,26 +202,25 @@ class Session:
         future = self._replies.pop(identifier, None) if type(identifier) is int else None
         if future is not None:
             future.set_result(message)
-        if future is None:
+        if future is None or self._handshake is None or future is not self._handshake[0]:
             return b""
-        if future is self._describing:
-            self._describing = None
-            return self._described(message)
-        if future is self._subscribing:
-            self._subscribing = None
-            self._granted(message)
-        return b""
+        check_granted(message)
+        return self._handshake[1](message)
+
+    def _ask_first(self, then: Callable[[JsonObject], bytes], action: str, **values: object) -> bytes:
+        """A request of the handshake, `then` being what its reply goes to."""
+        future, sent = self.ask(action, **values)
+        self._handshake = future, then
+        return sent
 
     def _described(self, reply: JsonObject) -> bytes:
-        _check_granted(reply)
         check_version(reply)
         theirs, ours = reply.get("boot_id"), boot_id()
         if isinstance(theirs, str) and ours is not None:
             self.same_machine = theirs == ours
         self.describe(reply)
         if not self._stream:
-            self._begin()
-            return b""
+            return self._begin()
         there = [position for row in rows(reply.get("sensors")) if (position := _position(row)) is not None]
         values: dict[str, Any] = {"every": self._every, "fresh_only": self._fresh_only}
         if self.wanted is not None:
@@ -234,22 +231,21 @@ class Session:
                 has = ", ".join(map(str, there[:16])) or "none"
                 raise ConnectionFailedError(f"the server has no sensor {text} (it has: {has})")
             values["sensors"] = found
-        self._subscribing, sent = self.ask("subscribe", **values)
-        return sent
+        return self._ask_first(self._granted, "subscribe", **values)
 
-    def _granted(self, reply: JsonObject) -> None:
-        _check_granted(reply)
+    def _granted(self, reply: JsonObject) -> bytes:
         self.describe(reply)
-        self._begin()
+        return self._begin()
 
-    def _begin(self) -> None:
+    def _begin(self) -> bytes:
+        self._handshake = None
         self._begun_ns = -1
         for state in self.sensors.values():
             state.begin()
-        assert self.description is not None
         self.connected, self.problem = True, ""
         self.connections += 1
         self.items.append(Connected(self.description, self.connections > 1, self._missing))
+        return b""
 
     def describe(self, description: JsonObject) -> None:
         """Take a description of the server, which may be newer than that of the connection."""
@@ -315,7 +311,8 @@ class Session:
         return None
 
 
-def _check_granted(reply: JsonObject) -> None:
+def check_granted(reply: JsonObject) -> None:
+    """RefusedError unless the server granted it."""
     if reply.get("ok") is not True:
         raise RefusedError.of(reply)
 
