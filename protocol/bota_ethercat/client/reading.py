@@ -18,12 +18,12 @@ from bota_ethercat.text.untrusted import number
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
+_MOST_HZ: Final = 1e6  # a higher rate is no sensor's
 _MOST_MS: Final = 1e5  # a longer delay is no filter's
 _LEAST_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
-_WARNINGS: Final = slice(
-    LAYOUTS[min(LAYOUTS)].offsets["warnings"], LAYOUTS[min(LAYOUTS)].offsets["warnings"] + 4
-)
+_WARNINGS_AT: Final = LAYOUTS[min(LAYOUTS)].offsets["warnings"]
+_WARNINGS: Final = slice(_WARNINGS_AT, _WARNINGS_AT + 4)
 _NO_WARNINGS: Final = bytes(4)
 
 
@@ -123,6 +123,14 @@ class SensorState:
         self._carried = 0
         self._warnings = 0
         self.delay_ns = self._sampled_delay_ns = Delays()
+
+    def take_in_force(self, message: Mapping[str, object]) -> None:
+        """The rate and the delays that a description or an event gives; others stay as they were."""
+        rate_hz, delay_ms = number(message.get("rate_hz")), message.get("delay_ms")
+        if rate_hz is not None and 0 < rate_hz <= _MOST_HZ:
+            self.accounting.rate_hz = rate_hz
+        if isinstance(delay_ms, dict):
+            self.delay_ns = Delays.parse(delay_ms)
 
     def begin(self) -> None:
         """A new connection."""

@@ -33,13 +33,12 @@ from bota_ethercat.framing import DataMessage, FrameDecoder, encode_json
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.sensor_choice import MOST_PLACES
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import number, printable, rows
+from bota_ethercat.text.untrusted import printable, rows
 
 _FIRST_RETRY_NS: Final = 100_000_000
 _LONGEST_RETRY_NS: Final = 1_000_000_000
 # After a connection that lasted this long the next attempt follows as soon as after the first.
 _LASTED_NS: Final = 1_000_000_000
-_MOST_HZ: Final = 1e6
 _MOST_ITEMS: Final = 65536  # kept while nobody takes them; a tare of 20,000 samples needs fewer
 _HANDSHAKE_NS: Final = 5_000_000_000
 _LEAST_TIMEOUT_S: Final = 0.02
@@ -109,6 +108,7 @@ class Session:
         self._batch: list[DataMessage] = []
         self._ids = itertools.count(1)
         self._replies: dict[int, Future[JsonObject]] = {}
+        # The request that is to be granted next, and what its reply goes to.
         self._handshake: tuple[Future[JsonObject], Callable[[JsonObject], bytes]] | None = None
         self._missing: tuple[int, ...] = ()
         self._retry_ns = _FIRST_RETRY_NS
@@ -127,18 +127,17 @@ class Session:
     def ended(self, reason: str, now_ns: int, *, reachable: bool = True) -> None:
         """The connection has ended, or none could be made."""
         was_connected = self.connected
-        lasted = self._open and now_ns - self._opened_ns >= _LASTED_NS
+        if self._open and now_ns - self._opened_ns >= _LASTED_NS:
+            self._retry_ns = _FIRST_RETRY_NS
         self.connected = self._open = False
         self._handshake = None
-        self._retry_ns = _FIRST_RETRY_NS if lasted else self._retry_ns
         self.retry_at_ns = now_ns + self._retry_ns
         self._retry_ns = min(self._retry_ns * 3 // 2, _LONGEST_RETRY_NS)
         self.problem = reason
+        error = ConnectionFailedError(f"the connection ended before the reply: {reason}")
         for identifier in list(self._replies):
             if (future := self._replies.pop(identifier, None)) is not None:
-                future.set_exception(
-                    ConnectionFailedError(f"the connection ended before the reply: {reason}")
-                )
+                future.set_exception(error)
         self.items.append(Disconnected(reason, reachable, was_connected))
 
     def get_buffer(self) -> memoryview:
@@ -208,7 +207,6 @@ class Session:
         return self._handshake[1](message)
 
     def _ask_first(self, then: Callable[[JsonObject], bytes], action: str, **values: object) -> bytes:
-        """A request of the handshake, `then` being what its reply goes to."""
         future, sent = self.ask(action, **values)
         self._handshake = future, then
         return sent
@@ -218,9 +216,9 @@ class Session:
         theirs, ours = reply.get("boot_id"), boot_id()
         if isinstance(theirs, str) and ours is not None:
             self.same_machine = theirs == ours
-        self.describe(reply)
         if not self._stream:
-            return self._begin()
+            return self._granted(reply)
+        self.describe(reply)
         there = [position for row in rows(reply.get("sensors")) if (position := _position(row)) is not None]
         values: dict[str, Any] = {"every": self._every, "fresh_only": self._fresh_only}
         if self.wanted is not None:
@@ -235,9 +233,6 @@ class Session:
 
     def _granted(self, reply: JsonObject) -> bytes:
         self.describe(reply)
-        return self._begin()
-
-    def _begin(self) -> bytes:
         self._handshake = None
         self._begun_ns = -1
         for state in self.sensors.values():
@@ -253,7 +248,7 @@ class Session:
         for row in rows(description.get("sensors")):
             if (position := _position(row)) is not None:
                 self.state(position).delay_ns = Delays()
-            self._take_in_force(row)
+                self.state(position).take_in_force(row)
 
     def _take_event(self, message: JsonObject) -> None:
         state = self.sensors.get(position) if (position := _position(message)) is not None else None
@@ -261,19 +256,8 @@ class Session:
             state.lost = True
         elif state is not None and message["event"] in (Event.SENSOR_BACK, Event.RECONFIGURED):
             state.lost = False
-            self._take_in_force(message)
+            state.take_in_force(message)
         self.items.append(message)
-
-    def _take_in_force(self, message: JsonObject) -> None:
-        """The rate and the delays that a description or an event gives; others stay as they were."""
-        state = self.sensors.get(position) if (position := _position(message)) is not None else None
-        if state is None:
-            return
-        rate_hz, delay_ms = number(message.get("rate_hz")), message.get("delay_ms")
-        if rate_hz is not None and 0 < rate_hz <= _MOST_HZ:
-            state.accounting.rate_hz = rate_hz
-        if isinstance(delay_ms, dict):
-            state.delay_ns = Delays.parse(delay_ms)
 
     # -- what is known
 
