@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import subprocess
-import time
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -15,11 +13,9 @@ from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.cpp_programs import (
     SOURCES,
-    Driver,
     Reading,
     assert_no_faults,
     build,
-    check,
     driver,
     needs_gxx,
     patient,
@@ -31,9 +27,6 @@ pytestmark = [needs_gxx, patient]
 
 PATIENT = {"max_age_ms": 60_000}
 """For what must not depend on how busy this machine is."""
-STRICT_AGE = {"max_age_ms": 300}
-SLOW = 512
-"""SINC length for 100 Hz, where the rate does not matter."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -48,37 +41,7 @@ def shared() -> Iterator[ServedSimulation]:
         yield running
 
 
-def new_again(running: Driver, after: Reading) -> Reading:
-    """The first fresh reading with a sample that was made after this one."""
-    return running.until(
-        lambda r: r["fresh"] and r["monotonic_ns"] > after["monotonic_ns"], "samples after the trouble"
-    )
-
-
 # -- trouble, with servers of their own
-
-
-def test_a_server_killed_and_started_again() -> None:
-    with contextlib.ExitStack() as ends:
-        first = ends.enter_context(served(sinc_length=SLOW))
-        running = ends.enter_context(driver(first.port, reconnect_every_ms=50, **STRICT_AGE))
-        running.connect()
-        before = running.until(lambda r: r["fresh"], "samples")
-        first.kill()
-        gone = running.until(lambda r: r["condition"] == "disconnected", "the loss of the connection")
-        assert gone["has_sample"]
-        # As long as there is no server the last sample only grows older.
-        for _ in range(20):
-            reading = running.latest()
-            assert not reading["is_new"]
-            assert not reading["fresh"]
-            assert reading["age_ns"] >= gone["age_ns"]
-            assert reading["monotonic_ns"] == gone["monotonic_ns"]
-        ends.enter_context(served(port=first.port, sinc_length=SLOW))
-        back = new_again(running, before)
-        assert back["connection"] == 2
-        assert running.info()["link"] == "up"
-        assert running.do("next", 60_000)["is_new"]
 
 
 def test_a_client_that_did_not_read_is_told_what_it_missed() -> None:
@@ -148,29 +111,6 @@ def test_every_sample_in_order_and_the_same_as_in_python(shared: ServedSimulatio
         told = running.info()
         assert (told["passed_over"], told["allocated"]) == (0, 0)
         assert told["names"] == ["BFT-SENS-ECAT-M8"]
-
-
-@pytest.mark.parametrize(("count", "hz"), [(500, 1000), (20, 50)])
-def test_latest_in_a_loop_faster_and_slower_than_the_sensor(
-    shared: ServedSimulation, count: int, hz: int
-) -> None:
-    """Every sample is either seen once as new, or passed over; the age is never told too small."""
-    with driver(shared.port, **STRICT_AGE) as running:
-        running.connect()
-        last = running.do("next", 60_000)
-        new = passed_over = 0
-        for _ in range(count):
-            time.sleep(1 / hz)
-            before_ns = time.monotonic_ns()
-            reading = running.latest()
-            check(reading)
-            assert reading["age_ns"] >= before_ns - reading["monotonic_ns"]
-            assert not reading["withheld"] or reading["gap"]
-            assert reading["is_new"] == (reading["monotonic_ns"] > last["monotonic_ns"])
-            new, passed_over, last = new + reading["is_new"], passed_over + reading["passed_over"], reading
-        told = running.info()
-        assert new + passed_over + 1 == told["samples"]
-        assert (new > 0, hz >= 1000 or passed_over > 0, told["allocated"]) == (True, True, 0)
 
 
 # -- requests

@@ -29,8 +29,8 @@ from bota_ethercat.framing import (
     encode_data,
     encode_json,
 )
-from bota_ethercat.text.bare_json import BareJsonDecoder, encode_bare_json
 from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject, parse_json_object
+from ethercat_server.serving.bare_json import BareJsonDecoder, encode_bare_json
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, in_chunks, mutate
 
 SEED: Final = int(os.environ.get("FUZZ_SEED", "20261121"))
@@ -113,13 +113,6 @@ def test_messages_on_the_wire_are_as_the_contract_says() -> None:
     assert wire[DATA_FLAGS_OFFSET] == DataFlag.GAP
     assert len(encode_data(*WITH_ORIENTATION)) == MAX_DATA_MESSAGE_SIZE == 110
     assert encode_json({"action": "shutdown"}) == b'\x00\x00\x00\x16\x02{"action":"shutdown"}'
-
-
-def test_bytes_that_follow_wait() -> None:
-    decoder = FrameDecoder()
-    decoder.feed(encode_json(JSON) + b"\x00\x00\x00")
-    assert list(decoder) == [JSON]
-    assert decoder.pending == 3
 
 
 def test_reading_into_the_decoders_own_buffer() -> None:
@@ -286,19 +279,6 @@ def test_a_bare_line_may_be_as_long_as_allowed_and_longer_is_final() -> None:
             with pytest.raises(RemoteProtocolError, match="64"):
                 decoder.next_message()
         assert decoder.pending == 0
-
-
-simple_objects = st.dictionaries(
-    st.text(), st.text() | st.integers() | st.lists(st.text(), max_size=3), max_size=4
-)
-
-
-@given(st.lists(simple_objects, max_size=5), st.integers(1, 50), st.booleans())
-def test_bare_round_trip_in_any_pieces(messages: list[Any], size: int, newline: bool) -> None:
-    lines = [encode_bare_json(message) for message in messages]
-    stream = b"".join(lines if newline else map(bytes.rstrip, lines))
-    chunks = [stream[at : at + size] for at in range(0, len(stream), size)]
-    assert outcomes(BareJsonDecoder(), chunks) == messages
 
 
 # -- any bytes: found by hypothesis
