@@ -225,15 +225,6 @@ class Client:
         self.session.items.clear()
         return items
 
-    def frames(self) -> Iterator[DataMessage]:
-        """The frames as they come; without end, or with `reconnect` False until the connection ends."""
-        while True:
-            try:
-                frames = self.poll(_AGAIN_S)
-            except ConnectionFailedError:
-                return
-            yield from frames
-
     def decode(self, frame: DataMessage) -> Sample:
         """The sample in `frame`."""
         return self.session.state(frame.sensor).decode(frame)
