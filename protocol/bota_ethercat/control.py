@@ -223,7 +223,7 @@ def parse_request(message: JsonObject) -> Request:
     """
     name, bad = message.get("action"), functools.partial(RequestError, ErrorCode.BAD_REQUEST)
     if not isinstance(name, str):
-        raise bad("the key 'action' must be a string that says what to do")
+        raise bad("the key 'action' is missing or no string: say what to do")
     action = ACTIONS.get(name)
     if action is None:
         known = ", ".join(ACTIONS)
