@@ -223,7 +223,8 @@ def parse_request(message: JsonObject) -> Request:
     """
     name, bad = message.get("action"), functools.partial(RequestError, ErrorCode.BAD_REQUEST)
     if not isinstance(name, str):
-        raise bad("the key 'action' is missing or no string: say what to do")
+        wrong = "is missing: say what to do" if name is None else "must be a string"
+        raise bad(f"the key 'action' {wrong}")
     action = ACTIONS.get(name)
     if action is None:
         known = ", ".join(ACTIONS)
