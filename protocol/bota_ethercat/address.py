@@ -47,8 +47,8 @@ class Address(NamedTuple):
 def boot_id() -> str | None:
     """The name of this process's CLOCK_MONOTONIC, `boot_id` in messages; None if it cannot be known.
 
-    The kernel's boot id: whoever has the same has the same clock. In a time namespace that shifts the clock
-    the offset follows, in s and ns.
+    The kernel's boot id: processes with the same one have the same clock. In a time namespace that shifts
+    the clock the offset follows, in s and ns.
     """
     try:
         text = _BOOT_ID.read_text()

@@ -23,7 +23,7 @@ using bota_ethercat::Vector3;
 /// m/s, along the sensor's axes.
 void send_to_robot(const Vector3& /*velocity*/) {}
 
-/// An admittance without mass: so many m/s for each N beyond a dead band, limited.
+/// An admittance without mass: m/s per N beyond a dead band, limited.
 Vector3 follow(const Vector3& force) {
     constexpr double kDeadBand = 2.0, kGain = 0.01, kLimit = 0.1;  // N, m/s per N, m/s
     Vector3 velocity{};

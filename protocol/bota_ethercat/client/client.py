@@ -6,9 +6,9 @@
         for sample in sensor:  # NoSampleError when there is none for some periods, and it says why
             print(sample.force, sample.torque)
 
-No REPEATED or INVALID frame passes for a sample. A connection that ends is made anew while one of `latest`,
-`receive`, `poll` and the iteration is called; they are for one thread, `ask` is for any. If it is read more
-slowly than the sensor samples, the server withholds samples and sets GAP in `frame.flags`.
+REPEATED and INVALID frames are no samples. `latest`, `receive`, `poll` and the iteration reconnect where
+necessary; they are for one thread, `ask` is for any. A client that reads more slowly than the sensor samples
+has samples withheld, and GAP in `frame.flags`.
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ class Client:
     ) -> None:
         """Nothing is sent yet.
 
-        `sensors`: by position on the bus, of those that are there; None for all. `every`: one frame in so
-        many. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames come, too.
+        `sensors`: by position on the bus, of those that are there; None for all. `every`: one frame in
+        `every`. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames come, too.
         `stream` False: no frames, only requests and events. `reconnect` False: ConnectionFailedError tells
         that the only connection has ended. `timeout_s`: how long `receive` waits for a sample; by default 5
         periods, at least 20 ms. `channel`: another one than TCP.
@@ -145,7 +145,7 @@ class Client:
         return self
 
     def close(self) -> None:
-        """End the connection for good. From any thread, which ends a wait and fails requests that wait."""
+        """End the connection, and do not reconnect. From any thread; waiting calls and requests fail."""
         self._closing.set()
         self.channel.shutdown()
         if not self._stepping:  # else the thread that is there closes the socket, which it may be reading
@@ -167,7 +167,7 @@ class Client:
     ) -> Reading:
         """The newest sample of a sensor, by default the first, and whether it may be used; for control loops.
 
-        Takes all that has arrived; with `timeout_s` waits at most so long for a sample that no reading had.
+        Takes all that has arrived; with `timeout_s` waits at most that long for a sample that no reading had.
         Tells by `condition` what is wrong, and does not raise.
         """
         session = self.session

@@ -87,7 +87,7 @@ class Reading(NamedTuple):
     is_new: bool  # no earlier reading had it
     # Of the sample, now; infinity if unknown. From its arrival where the server's clock is not ours.
     age_s: float
-    gap: bool  # samples were lost or withheld, or the connection was made anew, since the reading before
+    gap: bool  # samples were lost or withheld, or the connection was lost, since the reading before
     passed_over: int  # new samples since the reading before that came before this one
     warnings_seen: int  # warnings registers of all of them, joined by OR: a warning can last one sample
     delay_ns: Delays  # of the filters with which the sample was made
@@ -119,7 +119,7 @@ class SensorState:
         self._flags = 0
         self._received_ns = self._sampled_received_ns = 0
         self._sampled: DataMessage | None = None
-        self._same_clock = self._anew = self._gap = False
+        self._same_clock = self._reconnected = self._gap = False
         self._carried = 0
         self._warnings = 0
         self.delay_ns = self._sampled_delay_ns = Delays()
@@ -134,7 +134,7 @@ class SensorState:
 
     def begin(self) -> None:
         """A new connection."""
-        self._anew = self.accounting.counts.frames > 0  # what was lost meanwhile is not known
+        self._reconnected = self.accounting.counts.frames > 0  # what was lost meanwhile is not known
         self.accounting.begin()
         self.lost = False
 
@@ -145,14 +145,14 @@ class SensorState:
         """
         sequence, _, monotonic_ns, _, flags, _, process_data = frame
         accounting = self.accounting
-        unusual = flags or self._anew or self._carried or self.lost
+        unusual = flags or self._reconnected or self._carried or self.lost
         if unusual or not accounting.take_next(sequence, monotonic_ns):
             restarts = accounting.counts.restarts
             kind = accounting.take(sequence, monotonic_ns, flags)
             if kind is FrameKind.OLD:
                 return None
-            if self._anew or accounting.counts.restarts > restarts:
-                self._anew, self._carried = False, _GAP
+            if self._reconnected or accounting.counts.restarts > restarts:
+                self._reconnected, self._carried = False, _GAP
             if kind is not FrameKind.NEW:
                 self._flags, self._received_ns = flags, received_ns
                 self._carried |= flags & _GAP

@@ -4,7 +4,7 @@ The rules it keeps:
 
 - A connection begins with `describe`: the version is checked, and of the sensors asked for, those that are
   there are subscribed to. If none is there, or at first not all are, the connection has failed.
-- Whoever has the socket passes what arrives to `received` and sends what is returned.
+- The owner of the socket passes what arrives to `received` and sends what is returned.
 - After a connection that ended the next attempt is due at `retry_at_ns`: later each time, and soon after one
   that lasted.
 - What is known of a sensor is kept over connections; the first sample of a new one has GAP.
@@ -39,7 +39,7 @@ _FIRST_RETRY_NS: Final = 100_000_000
 _LONGEST_RETRY_NS: Final = 1_000_000_000
 # After a connection that lasted this long the next attempt follows as soon as after the first.
 _LASTED_NS: Final = 1_000_000_000
-_MOST_ITEMS: Final = 65536  # kept while nobody takes them; a tare of 20,000 samples needs fewer
+_MOST_ITEMS: Final = 65536  # kept until they are taken; a tare of 20,000 samples needs fewer
 _HANDSHAKE_NS: Final = 5_000_000_000
 _LEAST_TIMEOUT_S: Final = 0.02
 _TIMEOUT_PERIODS: Final = 5
@@ -187,7 +187,7 @@ class Session:
         return future, encode_json(request(action, identifier, **values))
 
     def forget(self, future: Future[JsonObject]) -> None:
-        """Nobody waits for this reply any more; from any thread."""
+        """Drop the reply to this request; from any thread."""
         for identifier, waiting in list(self._replies.items()):
             if waiting is future:
                 self._replies.pop(identifier, None)

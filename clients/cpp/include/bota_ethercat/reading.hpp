@@ -134,7 +134,7 @@ struct Reading {
     bool age_is_lower_bound = false;                                 ///< it counts from the arrival
 
     // Since the reading of this sensor before this one:
-    bool gap = false;                   ///< samples were lost or withheld, or the connection was made anew
+    bool gap = false;                   ///< samples were lost or withheld, or the connection was lost
     std::uint64_t withheld = 0;         ///< frames that the server had and this client did not read in time
     std::uint64_t lost = 0;             ///< samples that the server never had; an estimate, at least one a gap
     std::uint64_t passed_over = 0;      ///< samples that came and that `latest` left out for a newer one
@@ -173,7 +173,7 @@ public:
 
     /// The sensor of a new connection.
     void begin(std::uint32_t every, bool fresh_only) noexcept {
-        anew_ = accounting.counts.frames() > 0;  // nobody knows what was lost meanwhile
+        reconnected_ = accounting.counts.frames() > 0;  // what was lost meanwhile is not known
         accounting.begin();
         accounting.every = every;
         accounting.fresh_only = fresh_only;
@@ -186,8 +186,8 @@ public:
         const std::uint64_t restarts = accounting.counts.restarts;
         const FrameKind kind = accounting.take(frame.sequence, frame.monotonic_ns, frame.flags);
         if (kind == FrameKind::old) return;
-        if (anew_ || accounting.counts.restarts > restarts || (frame.flags & kGap) != 0) carried_gap_ = true;
-        anew_ = false;
+        if (reconnected_ || accounting.counts.restarts > restarts || (frame.flags & kGap) != 0) carried_gap_ = true;
+        reconnected_ = false;
         next_.flags = frame.flags;
         next_.wkc = frame.wkc;
         received_ns_ = received_ns;
@@ -258,7 +258,7 @@ private:
     std::array<std::uint8_t, kPdoSizeWithOrientation> process_data_{};  // of the newest sample
     std::size_t size_ = 0;
     std::int64_t received_ns_ = 0;  // of the newest frame of any kind
-    bool anew_ = false, carried_gap_ = false;
+    bool reconnected_ = false, carried_gap_ = false;
     StreamCounts read_;  // when the last reading was taken
 };
 

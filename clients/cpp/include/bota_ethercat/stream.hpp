@@ -26,7 +26,7 @@ public:
         return connection_.connect(timeout, [this](std::string_view text) { take(text); });
     }
 
-    /// A step of making a lost connection anew, without waiting, one attempt per `reconnect_every`; true once connected.
+    /// A step of reconnecting, without waiting, one attempt per `reconnect_every`; true once connected.
     /// With `Reconnect::when_told` only this and `connect` do so: call it every few milliseconds.
     bool reconnect() noexcept {
         connection_.now_ns = monotonic_now_ns();
