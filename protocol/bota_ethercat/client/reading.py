@@ -33,34 +33,26 @@ class Condition(IntEnum):
     0 to 2: there is a sample no older than `max_age_s`, and they say what it is worth. Others: there is none.
     """
 
-    FRESH = 0
-    SATURATED = 1
-    NOT_FINITE = 2
-    LATE = 3
-    BAD_CLOCK = 4
-    REPEATED = 5
-    INVALID = 6
-    SILENT = 7
-    SENSOR_LOST = 8
-    DISCONNECTED = 9
+    meaning: str
+    FRESH = 0, "fresh"
+    SATURATED = 1, "saturated: the sensor is overloaded"
+    NOT_FINITE = 2, "not finite: the sensor sends NaN or infinity"
+    LATE = 3, "late: what arrives is too old"
+    BAD_CLOCK = 4, "bad clock: the server's stamps are ahead of this machine's"
+    REPEATED = 5, "repeated: the sensor gives nothing new"
+    INVALID = 6, "invalid: the sensor does not answer on the bus"
+    SILENT = 7, "silent: nothing arrives from the server"
+    SENSOR_LOST = 8, "lost: the server says that the sensor is lost"
+    DISCONNECTED = 9, "disconnected"
+
+    def __new__(cls, number: int, meaning: str) -> Condition:
+        """A number with its meaning."""
+        member = int.__new__(cls, number)
+        member._value_, member.meaning = number, meaning
+        return member
 
     def __str__(self) -> str:
-        """What it means."""
-        return _MEANINGS[self]
-
-
-_MEANINGS: Final = {
-    Condition.FRESH: "fresh",
-    Condition.SATURATED: "saturated: the sensor is overloaded",
-    Condition.NOT_FINITE: "not finite: the sensor sends NaN or infinity",
-    Condition.LATE: "late: what arrives is too old",
-    Condition.BAD_CLOCK: "bad clock: the server's stamps are ahead of this machine's",
-    Condition.REPEATED: "repeated: the sensor gives nothing new",
-    Condition.INVALID: "invalid: the sensor does not answer on the bus",
-    Condition.SILENT: "silent: nothing arrives from the server",
-    Condition.SENSOR_LOST: "lost: the server says that the sensor is lost",
-    Condition.DISCONNECTED: "disconnected",
-}
+        return self.meaning
 
 
 class Delays(NamedTuple):
