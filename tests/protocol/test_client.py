@@ -31,7 +31,6 @@ from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.bridge.scripted_server import ScriptedServer, description, process_data
 from tests.golden_vectors import odd_messages
 from tests.protocol.scripted_channel import MemoryServer, ScriptedChannel
-from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port
 from tests.simulation import MemoryChannel, Simulation
 
@@ -357,21 +356,6 @@ def test_what_waits_for_a_slow_reader_is_bounded() -> None:
             most = max(most, waiting)
             waiting -= reader.receive(buffer, PATIENCE_S)
     assert most < 340_000, "a second of two sensors at 1600 Hz"
-
-
-def test_every_sample_of_a_whole_server_once_and_in_order() -> None:
-    with served(sinc_length=256) as server, connect(server.port, timeout_s=PATIENCE_S) as sensor:
-        assert sensor.description["sensors"][0]["rate_hz"] == 200
-        numbers = []
-        for sample in sensor:
-            assert sensor.frame is not None
-            assert sample.is_finite
-            numbers.append(sensor.frame.sequence)
-            if len(numbers) == 100:
-                break
-        assert numbers == sorted(set(numbers))
-        assert sensor.ask("status")["ok"]
-        assert sensor.receive(PATIENCE_S)
 
 
 def examples() -> list[str]:
