@@ -50,13 +50,13 @@ class DataMessage(NamedTuple):
 _LENGTH: Final = struct.Struct(">I")
 _PREFIX: Final = struct.Struct(">IB")
 _DATA_MESSAGE: Final = struct.Struct(">IBQQQBBH")
+_DATA_OVERHEAD: Final = _DATA_MESSAGE.size - _LENGTH.size  # what `length` counts beside the process data
 _DATA: Final = int(MessageType.DATA)
 _TYPE_SIZE: Final = 1
 # Offset of the flags byte in an encoded DATA message.
 DATA_FLAGS_OFFSET: Final = _PREFIX.size + struct.calcsize(">QQQB")
 _UNPACK_DATA: Final = {
-    _DATA_MESSAGE.size - _LENGTH.size + size: struct.Struct(f">{_PREFIX.size}xQQQBBH{size}s").unpack_from
-    for size in LAYOUTS
+    _DATA_OVERHEAD + size: struct.Struct(f">{_PREFIX.size}xQQQBBH{size}s").unpack_from for size in LAYOUTS
 }
 """The fields of a whole DATA message, by its length."""
 _DATA_LENGTHS: Final = frozenset(_UNPACK_DATA)
@@ -67,7 +67,7 @@ def encode_data(
     sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, process_data: bytes
 ) -> bytes:
     """A whole DATA message, ready to send. struct.error if a number does not fit its field."""
-    length = _DATA_MESSAGE.size - _LENGTH.size + len(process_data)
+    length = _DATA_OVERHEAD + len(process_data)
     head = _DATA_MESSAGE.pack(length, _DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
     return head + process_data
 

@@ -39,8 +39,8 @@ class WarningMeaning(NamedTuple):
 
 
 WARNINGS: Final = tuple(
-    WarningMeaning(flag, severity, meaning, remedy)
-    for flag, severity, meaning, remedy in (
+    WarningMeaning(*row)
+    for row in (
         (WarningFlag.FORCE_TORQUE_SATURATED, Severity.ERROR,
          "Force/torque (ADC) saturated", "Reduce sensor loading"),
         (WarningFlag.ACCELERATION_SATURATED, Severity.ERROR,
