@@ -20,7 +20,6 @@ from rich.table import Table
 
 from bota_clients.arguments import number
 from bota_ethercat.client import Client
-from bota_ethercat.errors import ConnectionFailedError
 from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from scripts.benchmarks.chain import (
     Chain,
@@ -56,12 +55,10 @@ def listening(client: Client, measurement: Measurement, lock: threading.Lock) ->
     from bridge.spinning import Spinner  # noqa: PLC0415
 
     def receive() -> None:
-        with contextlib.suppress(ConnectionFailedError):
-            while True:
-                frames, now_ns = client.poll(0.5), time.monotonic_ns()
-                with lock:
-                    for frame in frames:
-                        measurement.take_frame(frame, now_ns)
+        for frame in client.frames():
+            now_ns = time.monotonic_ns()
+            with lock:
+                measurement.take_frame(frame, now_ns)
 
     def on_message(message: Any) -> None:
         now_ns = time.monotonic_ns()

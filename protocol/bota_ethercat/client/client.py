@@ -13,6 +13,7 @@ has samples withheld, and GAP in `frame.flags`.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -224,6 +225,12 @@ class Client:
         items = list(self.session.items)
         self.session.items.clear()
         return items
+
+    def frames(self) -> Iterator[DataMessage]:
+        """The frames as they come; without end, or with `reconnect` False until the connection ends."""
+        with contextlib.suppress(ConnectionFailedError):
+            while True:
+                yield from self.poll(_AGAIN_S)
 
     def decode(self, frame: DataMessage) -> Sample:
         """The sample in `frame`."""

@@ -50,6 +50,11 @@ class Level(IntEnum):
         """For programs, and for style sheets."""
         return self.name.lower().replace("_", "-")
 
+    @property
+    def symbol(self) -> str:
+        """A symbol beside the words, so that nothing depends on color."""
+        return "✓-?i!✗"[self]
+
 
 class About(Enum):
     """What a finding is about."""
