@@ -16,11 +16,11 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Temperature
 
+from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import encode
 from bridge.node import StartError
 from bridge.parameters.table import PARAMETERS, ParameterError, gather, parse_frames
-from bridge.publishing.cdr import StampedNumbers
 from bridge.publishing.compensated_wrench import make_frames
 from ft_compensation.outputs import FilterSettings, WrenchFilter
 from tests.bridge.fake_tf import FakeTf

@@ -21,6 +21,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from bota_ethercat.pdo import Vector3
+from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bridge.compensating.tool_sources import Filters, ImuSource, ListenerSource, Oriented, Source
 from bridge.parameters.table import TOPIC_SOURCES, OrientationParameters, ParameterError, Parameters
 from ft_compensation.quantities import Quaternion, unit_quaternion
@@ -29,17 +30,6 @@ _TF_PERIOD_S: Final = 0.005
 _NS_PER_S: Final = 1_000_000_000
 # How long an executor may take to release the previous subscription: DDS has one type per topic.
 _LET_GO_S: Final = 1.0
-# z of the IMU from the wrench origin, m, from the drawings in Bota's URDFs, by the model's letters, as in
-# BFT-SENS-ECAT-M8. There is no rotation between the two frames.
-_IMU_HEIGHTS: Final = {
-    "SENS": 0.0093 - 0.035,
-    "ROKS": 0.0098 - 0.032,
-    "ROKA": 0.0098 - 0.032,
-    "MEDS": 0.0098 - 0.032,
-    "MEDA": 0.0098 - 0.032,
-    "LAXS": 0.01195 - 0.0445,
-    "MEGS": 0.0134 - 0.059,
-}
 # Type of the messages, and the quaternion in one, by the value of the parameter `gravity_source`.
 TOPIC_KINDS: Final[dict[str, tuple[Any, Callable[[Any], Any]]]] = {
     "topic_pose": (PoseStamped, attrgetter("pose.orientation")),
@@ -231,7 +221,7 @@ class SourceChoice:
         # As given, else as the drawings of the model have it.
         position = wanted.imu_position
         if not any(position):
-            position = 0.0, 0.0, _IMU_HEIGHTS.get(model[4:8], 0.0)
+            position = 0.0, 0.0, IMU_HEIGHTS.get(model[4:8], 0.0)
         opened = (wanted.accelerometer, position, wanted.payload.center) if name == "imu" else listened
         if opened == self._opened:
             return

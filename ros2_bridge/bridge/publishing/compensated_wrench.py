@@ -15,12 +15,12 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
+from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample, Vector3
 from bridge.compensating.orientations import LookUp, UnusableError, check_tf, follow_tf
 from bridge.compensating.tool_sources import Source
 from bridge.parameters.table import Parameters
-from bridge.publishing.cdr import StampedNumbers
 from bridge.publishing.messages import Topic
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages

@@ -20,10 +20,10 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
+from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample
 from bridge.parameters.table import Numbers, Parameters
-from bridge.publishing.cdr import StampedNumbers
 from bridge.stream.reader import Output
 
 # The label of the array's one dimension: what its values are, in order.
