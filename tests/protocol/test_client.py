@@ -67,7 +67,7 @@ def test_units_and_sizes(server: MemoryServer) -> None:
     assert next(iter(sensor)).acceleration[0] == 3.0 + 6 / 16
 
 
-def test_a_frame_tells_when_what_it_measured_was_so(server: MemoryServer) -> None:
+def test_a_frame_was_measured_before_its_stamp_by_the_delay_of_the_filters(server: MemoryServer) -> None:
     sensor = client_of(server)
     server.send_sample(1.0)
     (frame,) = sensor.receive()

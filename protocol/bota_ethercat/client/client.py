@@ -237,7 +237,7 @@ class Client:
         return self.session.state(frame.sensor).decode(frame)
 
     def measured_ns(self, frame: DataMessage, channel: str = "force_torque") -> int | None:
-        """As `Reading.measured_ns`, of a frame that came just now."""
+        """As `Reading.measured_ns`, with the filters as of now."""
         delay_ns = getattr(self.session.state(frame.sensor).delay_ns, channel)
         return None if delay_ns is None else frame.stamp_ns - delay_ns
 

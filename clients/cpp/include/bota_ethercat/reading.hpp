@@ -147,7 +147,7 @@ struct Reading {
     /// saturated samples too, to see which way an overload goes, asks for `condition == Condition::saturated`.
     bool fresh() const noexcept { return condition == Condition::fresh; }
 
-    /// CLOCK_REALTIME of what the sample measured: `stamp_ns` less the channel's delay. None: no sample, or an unknown delay.
+    /// When it was measured, CLOCK_REALTIME: `stamp_ns` less the group delay. None: no sample, or the delay is not known.
     std::optional<std::uint64_t> measured_ns(Channel channel = Channel::force_torque) const noexcept {
         const auto delay = delay_ns[static_cast<std::size_t>(channel)];
         if (!has_sample || !delay) return std::nullopt;
