@@ -85,7 +85,7 @@ class Reading(NamedTuple):
     delay_ns: Delays  # of the filters with which the sample was made
 
     def measured_ns(self, channel: str = "force_torque") -> int | None:
-        """When it was measured, CLOCK_REALTIME: `frame.stamp_ns` less the group delay of the channel's filters.
+        """When it was measured, CLOCK_REALTIME: `frame.stamp_ns` less the group delay of the filters.
 
         `acceleration` and `angular_rate` are the other channels. None: no sample, or an unknown delay.
         """
