@@ -38,7 +38,7 @@ from tests.server.running import PATIENCE_S, free_port, wait_until
 from tests.simulation import simulated_bus, simulated_server
 
 SENSORS = [SensorOptions(model=model, pdo_size=77) for model in ("BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8")]
-COMMAND = (sys.executable, "-m", "bota_clients.monitor.cli")
+COMMAND = str(Path(sys.executable).with_name("ethercat-monitor"))
 LEAVE_ALTERNATE_SCREEN = b"\x1b[?1049l"
 SHOW_CURSOR = b"\x1b[?25h"
 
@@ -88,7 +88,7 @@ class Terminal:
         self.far = far
         self.seen = b""
         self.process = subprocess.Popen(
-            [*COMMAND, *arguments], stdin=far, stdout=far, stderr=far, start_new_session=True, cwd=cwd,
+            [COMMAND, *arguments], stdin=far, stdout=far, stderr=far, start_new_session=True, cwd=cwd,
             env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "", "LINES": "", **environment},
         )  # fmt: skip
 
@@ -205,7 +205,7 @@ def documented_keys() -> set[str]:
 
 
 def test_a_reader_that_goes_is_no_traceback(shared: ServedSimulation) -> None:
-    command = f"set -o pipefail; {' '.join(COMMAND)} --json {shared.port} | head -n 1"
+    command = f"set -o pipefail; {COMMAND} --json {shared.port} | head -n 1"
     done = subprocess.run(
         ["bash", "-c", command], check=False, capture_output=True, text=True, timeout=PATIENCE_S
     )

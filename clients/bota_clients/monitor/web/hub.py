@@ -316,6 +316,7 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
     sample, rate_hz = sensor.sample, sensor.nominal_hz
     stream = {
         "Rate": words.rate(sensor),
+        "Filter delay": words.delays(sensor),
         "Age": words.times(sensor.age_us),
         "Age at hand-out": words.times(sensor.hand_out_us),
         "Jitter": words.jitter(sensor),
@@ -327,7 +328,7 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
             stream["Orientation xyzw"] = " ".join(f"{part:+.2f}" for part in sample.orientation)
     return {
         "position": sensor.position,
-        "identity": "  ".join(part for part in (words.who(sensor), sensor.al_state) if part),
+        "identity": words.identity(sensor),
         "old": None if sensor.old_s is None else duration(sensor.old_s),
         "has_sample": sample is not None,
         "nominal_hz": rate_hz,
