@@ -182,8 +182,8 @@ def test_each_page_gets_the_sensor_that_it_shows(web: Harness) -> None:
     other = web.join()
     web.take(other, sensor=1)
     states = web.states()
-    assert states[web.page]["sensor"]["identity"].startswith("Sensor 0  one")
-    assert states[other]["sensor"]["identity"].startswith("Sensor 1  two")
+    assert states[web.page]["sensor"]["identity"].startswith("Sensor 0  OP  one")
+    assert states[other]["sensor"]["identity"].startswith("Sensor 1  OP  two")
     web.model.take([frame(k, sensor=s) for k in range(40) for s in (0, 1)], START_S + 0.05)
     sent = {page: [each["points"] for each in batches] for page, batches in web.points(START_S + 1).items()}
     assert sent == {web.page: [0], other: [1]}

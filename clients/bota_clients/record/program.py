@@ -15,11 +15,12 @@ from functools import partial
 from typing import Final
 
 from rich.console import Console
+from rich.filesize import decimal
 from rich.live import Live
 from rich.text import Text
 
 from bota_clients.errors import RecordingError
-from bota_clients.numbers import count, data_size, duration
+from bota_clients.numbers import count, duration
 from bota_clients.program import Signals, say
 from bota_clients.record.cli import RecordOptions
 from bota_clients.record.recorder import BATCH_S, Batch, Parts, Recorder, Source
@@ -66,7 +67,7 @@ class Progress:
             self._seen[position] = sensor.frames
         self._seen_at += passed
         state = f"{' + '.join(rates) or '0'} frames/s" if connected else "no server, reconnecting"
-        size, lost = data_size(recorder.bytes_written), recorder.tally.brief()
+        size, lost = decimal(recorder.bytes_written), recorder.tally.brief()
         whole = duration(self._seen_at - self._began) + self._of
         line = f"{self._name}: {whole}, {recorder.saved} frames, {size}, {state}, {lost}"
         if self.live:
@@ -141,7 +142,7 @@ def _record(source: Source, options: RecordOptions, parts: Parts, signals: Signa
     files = str(parts.made[0]) if len(parts.made) == 1 else f"{parts.made[0]} to {parts.made[-1].name}"
     frames = f"{recorder.saved} frames of {count(len(recorder.tally.sensors), 'sensor')}"
     losses = ", ".join(recorder.tally.losses()) or "nothing was lost"
-    _say(f"{files}: {duration(seconds)}, {frames}, {data_size(recorder.bytes_written)}; {losses}")
+    _say(f"{files}: {duration(seconds)}, {frames}, {decimal(recorder.bytes_written)}; {losses}")
     return int(recorder.error is not None)
 
 

@@ -20,7 +20,6 @@ from bota_clients.recording.columns import Floats
 from bota_clients.report.measure import (
     FEWEST_WINDOWS,
     Noise,
-    measure_drift,
     measure_noise,
     measure_spectrum,
 )
@@ -48,7 +47,6 @@ class Examination:
         self.series = Series(subject)
         self.noise = measure_noise(self.series)
         self.spectrum = measure_spectrum(self.series)
-        self.drift = measure_drift(self.series)
         # Of the judge of all programs; the checks beyond it are this report's own.
         self.stream = judge(_observe(self.series))
         self.checks = [check for each in _CHECKS if (check := _made(each, self)) is not None]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -117,7 +117,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def make(options: ReportOptions) -> tuple[str, int]:
     """Write the report; the words for the standard output, and the exit code."""
-    from bota_clients.report import checks, page, subjects  # noqa: PLC0415 - needs the extra
+    from rich.console import Console  # noqa: PLC0415 - needs the extra, and so do these
+    from rich.progress import Progress  # noqa: PLC0415
+
+    from bota_clients.report import checks, page, subjects  # noqa: PLC0415
 
     interrupt_on_signals()
     with NewFile(options.output, force=options.force) as file:
@@ -126,28 +129,17 @@ def make(options: ReportOptions) -> tuple[str, int]:
             found = subjects.of_recording(options.recording, *which)
         else:
             assert options.server is not None
-            with _progress(options.seconds) as progress:
-                found = subjects.of_server(options.server, options.seconds, *which, progress)
+            console = Console(stderr=True)
+            with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+                task = progress.add_task("listening", total=options.seconds)
+                show = partial(progress.update, task)
+                found = subjects.of_server(options.server, options.seconds, *which, show)
         examinations = [checks.Examination(each) for each in found]
         now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         file.write(page.render(examinations, made=now, program=f"{_PROGRAM} {VERSION}", note=options.note))
         file.finish()
     words = page.as_json(examinations) if options.json else "\n".join(map(_summary, examinations))
     return words, int(any(each.level is Level.TROUBLE for each in examinations))
-
-
-@contextlib.contextmanager
-def _progress(seconds: float) -> Iterator[Callable[[float], None]]:
-    """Shows the remaining time on a terminal, on a line that is cleared at the end."""
-
-    def show(text: str) -> None:
-        if sys.stderr.isatty():
-            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-
-    try:
-        yield lambda passed: show(f"listening, {seconds - passed:.0f} s left")
-    finally:
-        show("")
 
 
 def _summary(examination: Examination) -> str:

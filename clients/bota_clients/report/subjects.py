@@ -176,9 +176,9 @@ def of_server(
     seconds: float,
     choice: SensorChoice | None,
     imu_units: ImuUnits,
-    progress: Callable[[float], None],
+    show: Callable[..., None],
 ) -> list[Subject]:
-    """The server's sensors, or those chosen, after `seconds`; `progress` gets the time listened so far, s.
+    """The server's sensors, or those chosen, after `seconds`; `show` gets the time so far, s, as `completed`.
 
     ConnectionFailedError or RefusedError if there is no stream; ReportError if there is no such sensor.
     """
@@ -192,7 +192,7 @@ def of_server(
         if not rows:
             known = [(position, row.get("name"), row.get("serial")) for position, row in there.items()]
             raise _no_sensor(str(address), choice, known)
-        received, remark = _listen(client, seconds, progress)
+        received, remark = _listen(client, seconds, show)
         if not remark:
             now = _rows(client.ask("describe"))
             if any(now.get(at, {}).get("settings") != row.get("settings") for at, row in rows.items()):
@@ -217,12 +217,12 @@ def _rows(description: JsonObject) -> dict[int, dict[str, Any]]:
     }
 
 
-def _listen(client: Client, seconds: float, progress: Callable[[float], None]) -> tuple[_Received, str]:
+def _listen(client: Client, seconds: float, show: Callable[..., None]) -> tuple[_Received, str]:
     """What came in `seconds`, and why it ended early, if it did."""
     received = _Received()
     begin = time.monotonic()
     while (passed := time.monotonic() - begin) < seconds:
-        progress(passed)
+        show(completed=passed)
         try:
             frames = client.poll(min(_BATCH_S, seconds - passed))
         except ConnectionFailedError as error:
