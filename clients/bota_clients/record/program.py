@@ -67,7 +67,7 @@ class Progress:
             self._seen[position] = sensor.frames
         self._seen_at += passed
         state = f"{' + '.join(rates) or '0'} frames/s" if connected else "no server, reconnecting"
-        size, lost = decimal(recorder.bytes_written), recorder.tally.brief()
+        size, lost = decimal(recorder.bytes_written), recorder.tally.losses()
         whole = duration(self._seen_at - self._began) + self._of
         line = f"{self._name}: {whole}, {recorder.saved} frames, {size}, {state}, {lost}"
         if self.live:
@@ -141,8 +141,8 @@ def _record(source: Source, options: RecordOptions, parts: Parts, signals: Signa
         _say(str(recorder.error))
     files = str(parts.made[0]) if len(parts.made) == 1 else f"{parts.made[0]} to {parts.made[-1].name}"
     frames = f"{recorder.saved} frames of {count(len(recorder.tally.sensors), 'sensor')}"
-    losses = ", ".join(recorder.tally.losses()) or "nothing was lost"
-    _say(f"{files}: {duration(seconds)}, {frames}, {decimal(recorder.bytes_written)}; {losses}")
+    size, lost = decimal(recorder.bytes_written), recorder.tally.losses()
+    _say(f"{files}: {duration(seconds)}, {frames}, {size}; {lost}")
     return int(recorder.error is not None)
 
 

@@ -370,7 +370,6 @@ _CHECKS: Final = (
     _Kind("Sampling rate", ["rate"], _FEWEST, _rate),
     _Kind("Gravity", [], 0, _gravity, "Gravity compensation subtracts the wrong weight."),
     _Kind("Temperature", ["temperature"], 0, _temperature),
-    _Kind("Age of samples", ["age"], 0, None),
     _Kind("Settings", ["calibration_matrix", "coordinate_system"], 0, None),
 )  # fmt: skip
 
@@ -390,7 +389,6 @@ def _observe(series: Series) -> Observation:
         silent_s=float(series.silences.max(initial=0.0)),
         rate_hz=1 / series.mean_period if judged else None,
         nominal_hz=1 / nominal if nominal else 0.0,
-        age_p99_us=series.subject.age_p99_us,
         not_finite=int(np.sum(series.not_finite)),
         warnings=bits(samples.warnings),
         force_torque_saturated=bits(samples.force_torque_saturated),

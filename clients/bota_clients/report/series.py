@@ -43,7 +43,6 @@ class Subject:
     settings: Mapping[str, SettingValue]  # those that exist and have a valid value
     columns: Columns
     source: str  # a file name or a server's address
-    age_p99_us: float | None = None  # of the samples on arrival; None from a recording, or another machine
     remarks: tuple[str, ...] = ()  # sentences about the recording for the reader of the report
 
     @property
