@@ -28,7 +28,6 @@ from bota_clients.monitor.tare import tare
 from bota_clients.recording.reader import RecordingError, open_recording
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
-from ethercat_server.serving.in_memory import ManualClock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.captures import DOCS
@@ -159,20 +158,6 @@ def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         parse(arguments)
     assert ended.value.code == 2
-
-
-def test_a_line_a_second_until_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = ManualClock()
-
-    def monotonic() -> float:
-        return clock.now_ns * 1e-9
-
-    monkeypatch.setattr(cli, "time", SimpleNamespace(sleep=clock.sleep, monotonic=monotonic))
-    times = []
-    for _ in cli.ticks(4.0):
-        times.append(round(monotonic() - 1.0, 3))
-        clock.sleep(1.8 if len(times) == 1 else 0.3)  # whoever is late does not hurry afterwards
-    assert times == [1.0, 2.8, 3.8]
 
 
 def test_json_has_the_documented_keys(shared: ServedSimulation, run: Run) -> None:

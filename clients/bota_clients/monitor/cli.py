@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import argparse
 import errno
+import itertools
+import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from bota_clients.arguments import add_imu_units, add_server, address, parser, seconds, server_of
@@ -158,7 +160,8 @@ def _each_second(options: Options, model: Model) -> int:
     from bota_clients.monitor.screen import line  # noqa: PLC0415
 
     was_wrong = False
-    for _ in ticks(options.seconds):
+    for _ in itertools.count() if options.seconds is None else range(math.ceil(options.seconds)):
+        time.sleep(_PERIOD_S)
         state, now = model.state(time.monotonic()), clock_text()
         wrong = trouble(state.server)
         if options.json:
@@ -170,17 +173,6 @@ def _each_second(options: Options, model: Model) -> int:
             _say(f"{now}  server {wrong}")
         was_wrong = wrong is not None
     return 0
-
-
-def ticks(limit_s: float | None) -> Iterator[None]:
-    """Once a second, until the limit; whoever is late does not hurry afterwards."""
-    start_s = due_s = time.monotonic()
-    while True:
-        due_s = max(due_s + _PERIOD_S, time.monotonic())
-        if limit_s is not None and due_s > start_s + limit_s + 0.5 * _PERIOD_S:
-            return
-        time.sleep(max(0.0, due_s - time.monotonic()))
-        yield
 
 
 def _say(*lines: str) -> None:
