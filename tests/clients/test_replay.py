@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 import signal
 import socket
-import subprocess
-import sys
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -371,9 +369,3 @@ def test_a_damaged_recording_ends_it_with_a_sentence(path: Path) -> None:
         list(client.frames())
         assert served.wait() == 1
         assert "is damaged at byte" in served.said()
-
-
-def test_it_needs_no_bus() -> None:
-    code = "import sys; from bota_clients import replay, record; import bota_clients.replay.program, "
-    code += "bota_clients.record.program; sys.exit('pysoem' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
