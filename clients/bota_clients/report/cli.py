@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bota_clients.arguments import add_force, add_imu_units, add_server, number, parser, server_of
-from bota_clients.errors import RecordingError, ReportError
-from bota_clients.program import discard_output, interrupt_on_signals, not_installed, say
+from bota_clients.errors import ReportError
+from bota_clients.program import discard_output, interrupt_on_signals, say, start
 from bota_ethercat.address import Address
-from bota_ethercat.errors import ConnectionFailedError, ProtocolError, UnreachableError
+from bota_ethercat.errors import UnreachableError
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.new_file import NewFile
@@ -91,28 +91,24 @@ def _choice(text: str) -> SensorChoice:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a report; returns the exit code."""
-    options = parse_options(argv)
+    return start(_PROGRAM, "report.cli", parse_options(argv))
+
+
+def run(options: ReportOptions) -> int:
+    """Make a report; returns the exit code."""
     try:
         words, exit_code = make(options)
-    except ImportError as error:
-        return not_installed(_PROGRAM, error)
     except KeyboardInterrupt:
-        sentence = "stopped: no report was written"
+        say(_PROGRAM, "stopped: no report was written")
+        return 1
     except UnreachableError as error:
-        sentence = f"{error.at(options.server)}, or give its HOST:PORT"
-    except ConnectionFailedError as error:
-        sentence = f"the server at {options.server} cannot be used: {error}"
-    except (RecordingError, ReportError, ProtocolError) as error:
-        sentence = str(error)
-    else:
-        try:
-            print(words, flush=True)
-        except BrokenPipeError:
-            discard_output()  # the report is written all the same
-        say(_PROGRAM, f"the report is in {options.output}")
-        return exit_code
-    say(_PROGRAM, sentence)
-    return 1
+        raise ReportError(f"{error.at(options.server)}, or give its HOST:PORT") from None
+    try:
+        print(words, flush=True)
+    except BrokenPipeError:
+        discard_output()  # the report is written all the same
+    say(_PROGRAM, f"the report is in {options.output}")
+    return exit_code
 
 
 def make(options: ReportOptions) -> tuple[str, int]:
