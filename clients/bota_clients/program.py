@@ -34,7 +34,7 @@ def missing(name: str) -> str:
 def start(program: str, module: str, *arguments: object) -> int:
     """The exit code of `run` in a module that is imported only now: `--help` needs nothing of the extra.
 
-    What it raises of ours is said in its sentence.
+    Errors of this project become one sentence and exit code 1.
     """
     try:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)

@@ -398,7 +398,7 @@ def test_a_page_says_what_the_monitor_says() -> None:
         "settings"
     ]
     assert dict(sensor["stream"])["Temperature"] == "34.6 °C"
-    assert found["message"] == {"text": "Sensor 0 is not tared: it is not at rest", "bad": True}
+    assert found["message"] == {"text": "12:00:00 Sensor 0 is not tared: it is not at rest", "bad": True}
     assert (sensor["units"], sensor["imu_off"]) == (["N", "Nm"], False)
     raw = replace(state, settings={"calibration_matrix": False, "imu_active": 0})
     counts = json.loads(state_text(replace(made.troubled(), sensors=(raw,)), 0, 8))["sensor"]

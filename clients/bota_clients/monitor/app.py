@@ -113,7 +113,7 @@ class Monitor(App[None]):
             return
         now_s = self._clock()
         if ended := self.recorder.ended():
-            self._say(*ended)
+            self._model.say(*ended)
         state = self._model.state(now_s)
         if self._look.paused and self._state is not None:
             state = replace(self._state, message=state.message)
@@ -149,7 +149,7 @@ class Monitor(App[None]):
             self._look = replace(look, paused="" if look.paused else clock_text())
         elif key == "0":
             self._model.reset()
-            self._say("Peaks and past warnings are reset")
+            self._model.say("Peaks and past warnings are reset")
         elif key == "n":
             self._next()
         elif key in {"?", "h"}:
@@ -158,13 +158,10 @@ class Monitor(App[None]):
             self.exit()
         self.draw()
 
-    def _say(self, text: str, bad: bool = False) -> None:
-        self._model.say(f"{clock_text()} {text}", bad)
-
     def _ask_tare(self) -> None:
         state = self._state
         if state is None or not state.sensors or not state.server.connected:
-            self._say("No sensor to tare: not connected to the server", True)
+            self._model.say("No sensor to tare: not connected to the server", True)
             return
         self._to_tare = state.sensors[self._look.selected % len(state.sensors)].position
         answers = "y: yes, u: undo the last tare, c: clear it, any other key: no"
@@ -173,20 +170,20 @@ class Monitor(App[None]):
     def _answer(self, key: str) -> None:
         self._look = replace(self._look, question="")
         if key in _ANSWERS:
-            start_tare(self._address, self._to_tare, self._say, _ANSWERS[key])
+            start_tare(self._address, self._to_tare, self._model.say, _ANSWERS[key])
         else:
-            self._say("Not tared")
+            self._model.say("Not tared")
 
     def _record(self) -> None:
         if self.recorder.running:
             self.recorder.stop()
-            self._say("Stopping the recording")
+            self._model.say("Stopping the recording")
         else:
-            self._say(*self.recorder.start(self._clock()))
+            self._model.say(*self.recorder.start(self._clock()))
 
     def _next(self) -> None:
         count = len(self._state.sensors) if self._state else 0
         if count < 2:
-            self._say("There is only one sensor" if count else "There is no sensor")
+            self._model.say("There is only one sensor" if count else "There is no sensor")
         else:
             self._look = replace(self._look, selected=(self._look.selected + 1) % count)

@@ -198,7 +198,7 @@ class _Sensor:
         self.observer.forget()
 
     def describe(self, row: JsonObject, now_s: float, *, anew: bool) -> None:
-        """Take its row of `describe`; `anew`: the monitor has connected. What lies between is no loss."""
+        """Take its row of `describe`; `anew`: after connecting; nothing before counts as lost."""
         before, self._row = self._row, row
         if anew:
             self.lost, self._status, self.observer = None, {}, StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
@@ -420,9 +420,9 @@ class Model:
                 sensor.reset()
 
     def say(self, message: str, bad: bool = False) -> None:
-        """Set the message for the user."""
+        """Set the message for the user, with the time of day."""
         with self._lock:
-            self._message, self._message_ends_s = Message(text(message), bad), 0.0
+            self._message, self._message_ends_s = Message(f"{clock_text()} {text(message)}", bad), 0.0
 
     def state(self, now_s: float) -> State:
         """The current state."""

@@ -30,7 +30,7 @@ from bota_ethercat.pdo import STANDARD_GRAVITY
 
 
 class Check(NamedTuple):
-    """The outcome of one check. Texts are plain; whoever shows them escapes them."""
+    """The outcome of one check. Texts are plain: to be escaped where they are shown."""
 
     found: str  # with figures
     level: Level = Level.GOOD
@@ -90,7 +90,7 @@ class _Kind(NamedTuple):
     make: Callable[[Series, Noise, Sequence[Finding]], Check] | None
     matters: str = ""  # why it matters if something is found
     remedy: str = ""
-    good: str = ""  # what is said if nothing is found; `make` is not asked then
+    good: str = ""  # the outcome if nothing is found; `make` is not called then
 
 
 def _made(kind: _Kind, examination: Examination) -> Check | None:

@@ -106,7 +106,7 @@ def run(options: ReportOptions) -> int:
     try:
         print(words, flush=True)
     except BrokenPipeError:
-        discard_output()  # the report is written all the same
+        discard_output()  # the report is in its file
     say(_PROGRAM, f"the report is in {options.output}")
     return exit_code
 

@@ -170,10 +170,10 @@ def limit_origin(sinc_length: int) -> str:
 
 
 _LONG: Final = 2.5  # an interval of more than this many periods is none between two successive samples
-# A frame without a sample tells of a silence as far as this from a sample, ...
+# Beside a silence, samples are lost if more periods and more time than this pass without any frame; ...
 _COVERED_PERIODS: Final = 4
 _COVERED_S: Final = 0.01
-# ... and as far as this from the next such frame: the server looks less often after a sensor it has lost.
+# ... between two REPEATED or INVALID ones more time: the server polls a sensor that it has lost less often.
 _COVERED_BETWEEN_S: Final = 0.1
 # CLOCK_REALTIME that moves against CLOCK_MONOTONIC by more than this between two samples was adjusted.
 _STEP_NS: Final = 1_000_000
@@ -203,7 +203,7 @@ class Series:
         self.imu_off = subject.settings.get("imu_active") == 0
         self.intervals: Floats = np.diff(self.time)  # (n - 1,) s
         jumps = np.diff(frames.sequence)
-        self.step = max(1, int(np.median(jumps))) if len(jumps) else 1  # `every`: one sample in so many
+        self.step = max(1, int(np.median(jumps))) if len(jumps) else 1  # `every` of the subscription
         nominal = subject.nominal_period_s
         self.nominal_period = None if nominal is None else nominal * self.step  # s, by the settings
         forward = self.intervals[self.intervals > 0]
@@ -276,7 +276,7 @@ class Series:
 
 
 def _room(periods: Floats) -> Ints:
-    """How many samples have room in an interval of so many periods."""
+    """Samples missing in intervals of this many periods."""
     return np.round(np.clip(periods, 0, 1e12)).astype(np.int64) - 1
 
 
