@@ -293,6 +293,9 @@ struct SensorInfo {
     // Settings that decide what the numbers mean. None: the server does not say.
     std::optional<bool> calibration_matrix, coordinate_system, inertia_compensation, orientation_estimation;
     std::optional<int> imu_active;
+    std::optional<bool> fir;
+    /// Group delay of the filters; none: unknown.
+    std::optional<double> force_torque_delay_ms, acceleration_delay_ms;
 };
 
 /// What `describe` and `subscribe` answer.
@@ -320,6 +323,14 @@ inline void read_in_force(json::Value of, SensorInfo& into) noexcept {
         auto value = setting.value_or(0);
         if (settings[name].get(value)) setting = value;
     };
+    const auto get_delay = [&of](const char* channel, std::optional<double>& delay_ms) {
+        double value = 0.0;
+        if (of["delay_ms"]) delay_ms.reset();
+        if (of["delay_ms"][channel].get(value)) delay_ms = value;
+    };
+    get_delay("force_torque", into.force_torque_delay_ms);
+    get_delay("acceleration", into.acceleration_delay_ms);
+    get("fir", into.fir);
     get("calibration_matrix", into.calibration_matrix);
     get("coordinate_system", into.coordinate_system);
     get("inertia_compensation", into.inertia_compensation);
