@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from ethercat_server.ethercat import wire
-from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.application import Application
@@ -160,9 +159,7 @@ class Bus:
             if datagram.command:  # a NOP passes unchanged
                 # What it reads is of the moment at which it passes, not of the start of its frame. Frames of
                 # a simulated wire may overlap.
-                passes = now + datagram.header * BYTE_NS
-                if passes > self.now:
-                    self.now = passes
+                self.now = max(self.now, now + datagram.header * wire.BYTE_NS)
                 pass_through(intact, frame, datagram)
         if position is not None:  # the network card of the master throws it away
             self.frames_lost += 1
