@@ -187,8 +187,10 @@ def filtered(motion: signals.Motion, sinc: int, **changed: SettingValue) -> sign
     return source
 
 
-def responses(hz: float, sinc: int, channel: int, count: int, **changed: SettingValue) -> complex:
-    """What a channel makes of a sine: magnitude, and phase.
+def response_to(
+    hz: float, channel: int, step_s: float, count: int, sinc: int, **changed: SettingValue
+) -> complex:
+    """What a channel makes of a sine, by so many samples in whole periods: magnitude, and phase.
 
     The sensor pitches by 0.01 rad; force along x, acceleration along x, and angular rate about y follow.
     """
@@ -197,10 +199,10 @@ def responses(hz: float, sinc: int, channel: int, count: int, **changed: Setting
     def pitching(t: float) -> tuple[signals.Vector, signals.Vector]:
         return (0.0, 0.01 * math.sin(omega * t), 0.0), (0.0, 0.01 * omega * math.cos(omega * t), 0.0)
 
-    source, plain, period = filtered(pitching, sinc, **changed), quiet(pitching), sinc / 51200
+    source, plain = filtered(pitching, sinc, **changed), quiet(pitching)
     sums = [0j, 0j]
     for number in range(count):
-        seconds = 20.0 + number * period
+        seconds = 20.0 + number * step_s
         for which, each in enumerate((source, plain)):
             reading = each.reading(number, 0, seconds)
             value = (*reading.force_torque, *reading.acceleration, *reading.angular_rate)[channel]
@@ -213,10 +215,10 @@ def responses(hz: float, sinc: int, channel: int, count: int, **changed: Setting
 def test_a_sine_of_force_is_late_by_the_filters_delay(sinc: int, fir: bool) -> None:
     rate = 51200 / sinc
     response = force_torque_response({"sinc_length": sinc, "fir": fir})
-    # Whole periods in 400 samples; the last but one is about the cut-off without FIR.
+    # The last but one is about the cut-off frequency with FIR off.
     for cycles in (2, 8, 16, 105, 150):
         hz = cycles * rate / 400
-        found = responses(hz, sinc, 0, 400, fir=fir)
+        found = response_to(hz, 0, 1 / rate, 400, sinc, fir=fir)
         assert abs(found) == pytest.approx(response.gain(hz), abs=2e-3)
         if abs(found) > 0.1:
             assert response.delay_s is not None
@@ -236,8 +238,7 @@ def test_a_sine_of_motion_is_late_by_the_profiles_delay(
             hz = share * row.bandwidth_hz
             rest_s = row.delay_ms * 1e-3 - 1 / (math.tau * row.bandwidth_hz)
             expected = cmath.exp(-1j * math.tau * hz * rest_s) / (1 + 1j * share)
-            # Two phases of the sine, a quarter of a period apart, are enough.
-            found = responses(hz, 1, channel, round(51200 / hz) if hz < 5120 else 51200, **{setting: profile})
+            found = response_to(hz, channel, 1 / (8 * hz), 8, 64, **{setting: profile})
             assert abs(found - expected) < 0.03 * share, (profile, share)
 
 
