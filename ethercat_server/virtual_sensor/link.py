@@ -12,7 +12,6 @@ import os
 import select
 import socket
 import stat
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -28,10 +27,6 @@ from ethercat_server.virtual_sensor.options import SlaveOptions
 
 LONGEST_NAME: Final = 15  # characters in the name of a network interface
 _BUFFER = 2048
-_SOL_PACKET, _PACKET_AUXDATA, _ETH_P_ALL = 263, 8, 3
-_AUXDATA: Final = struct.Struct("=I12xHH")  # status, VLAN tag: control information and type
-_VLAN_VALID: Final = 0x10
-_ADDRESSES: Final = 12  # bytes of an Ethernet frame before its VLAN tag
 _IDLE_MS = 10
 _FRAMES_PER_TURN = 64
 _FIRST_HALF_NS: Final = 20_000.0
@@ -49,11 +44,8 @@ class LinkError(Exception):
     """The interface cannot be used, or no longer, or the control socket cannot be created."""
 
 
-def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
-    """A raw socket for frames on `ifname`; LinkError if it cannot be opened.
-
-    The kernel removes VLAN tags; what they were it says only to sockets for all protocols.
-    """
+def open_interface(ifname: str) -> socket.socket:
+    """A raw socket for EtherCAT frames on `ifname`; LinkError if it cannot be opened."""
     if not ifname or len(ifname.encode()) > LONGEST_NAME:
         raise LinkError(f"interface name {ifname!r}: it must have 1 to {LONGEST_NAME} characters")
     if not _index(ifname):
@@ -68,8 +60,7 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
             f"not allowed to open a raw socket on {ifname}: it needs CAP_NET_RAW, so run it as root"
         ) from None
     try:
-        raw.setsockopt(_SOL_PACKET, _PACKET_AUXDATA, 1)
-        raw.bind((ifname, protocol))
+        raw.bind((ifname, ETHERTYPE))
         raw.setblocking(False)
     except OSError as error:
         raw.close()
@@ -104,9 +95,6 @@ def run(
     """
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
-        # By it others see that the interface is in use for EtherCAT; nobody reads it.
-        shown = stack.enter_context(open_interface(ifname, ETHERTYPE))
-        shown.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
         on_open()
         bus = Bus(slaves, time.monotonic_ns())
         poller = select.poll()
@@ -261,22 +249,17 @@ class _Answers:
     def waiting(self) -> bool:
         """Answer a bounded number of waiting frames; False if the interface is down."""
         raw, bus, buffer = self._raw, self._bus, self._buffer
-        view, descriptor, space = memoryview(buffer), raw.fileno(), socket.CMSG_SPACE(_AUXDATA.size)
+        view, descriptor = memoryview(buffer), raw.fileno()
         for _ in range(_FRAMES_PER_TURN):
             try:
-                size, messages, _, _ = raw.recvmsg_into((buffer,), space)
+                size = raw.recv_into(buffer)
                 arrived, now = arrived_ns(descriptor), time.monotonic_ns()
                 if not now - _LONGEST_WAIT_NS < arrived < now:
                     arrived = now
                 middle = (arrived + now) // 2 + int(self._half_ns)
                 if bus.process(buffer, size, middle - size * BYTE_NS // 2):
                     half_ns = (time.monotonic_ns() - now) / 2
-                    status, control, kind = _AUXDATA.unpack(messages[0][2])
-                    if status & _VLAN_VALID:
-                        tag = struct.pack("!HH", kind, control)
-                        raw.sendmsg((view[:_ADDRESSES], tag, view[_ADDRESSES:size]))
-                    else:
-                        raw.send(view[:size])
+                    raw.send(view[:size])
                     self._half_ns *= 1 + _STEP if half_ns > self._half_ns else 1 - _STEP / _QUICK
             except BlockingIOError:
                 bus.prepare()

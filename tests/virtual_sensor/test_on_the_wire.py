@@ -6,7 +6,6 @@ What does not depend on SOEM or the kernel is tested in memory, in the other fil
 from __future__ import annotations
 
 import functools
-import socket
 import struct
 import subprocess
 import time
@@ -17,8 +16,6 @@ import pysoem
 import pytest
 
 from bota_ethercat.pdo import encode
-from ethercat_server.ethercat import wire
-from ethercat_server.ethercat.wire import Command
 from ethercat_server.sensor.objects.dictionary import Access
 from ethercat_server.virtual_sensor.dictionary import sensor_entries
 from ethercat_server.virtual_sensor.signals import decode_clock
@@ -219,31 +216,12 @@ def test_pysoem_reports_an_emergency_and_no_eeprom_write(bench: Bench) -> None:
     told: list[Any] = []
     slave.add_emergency_callback(told.append)
     master.state_check(pysoem.PREOP_STATE, 2_000_000)
-    for line in ("emergency 0x8130 0x11 0102030405", "on-request emergency 0x8130 0x11 0102030405"):
-        told.clear()
-        sensor.command(line)
-        assert read(slave, 0x1008, 0).rstrip(b"\0") == b"BFT-SENS-ECAT-M8"
-        assert [(e.error_code, e.error_reg) for e in told] == [(0x8130, 0x11)]
+    sensor.command("emergency 0x8130 0x11 0102030405")
+    assert read(slave, 0x1008, 0).rstrip(b"\0") == b"BFT-SENS-ECAT-M8"
+    assert [(e.error_code, e.error_reg) for e in told] == [(0x8130, 0x11)]
     sensor.command("emergency 0x8131")
     patiently(master.config_map)
     assert master.state_check(pysoem.SAFEOP_STATE, 2_000_000) == pysoem.SAFEOP_STATE
-
-
-@pytest.mark.parametrize("tag", ["8100e000", "81006005", "88a80005"])
-def test_an_answer_has_the_vlan_tag_of_its_frame(tag: str, veth: tuple[str, str], start: Start) -> None:
-    start(veth[0])
-    frame = wire.build((Command.BRD, 0, 0x0000, bytes(34)))
-    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as raw:
-        raw.setsockopt(SOL_PACKET, PACKET_AUXDATA, 1)
-        raw.bind((veth[1], ETH_P_ALL))
-        raw.settimeout(_PATIENCE)
-        raw.send(frame[:12] + bytes.fromhex(tag) + frame[12:])
-        while (answer := raw.recvmsg(2048, 64))[0][12:14] != frame[12:14]:
-            pass
-    data, [(_, _, auxiliary)], *_ = answer
-    assert wire.working_counter(data, wire.parse(data, len(data))[0]) == 1
-    *_, control, kind = struct.unpack("=IIIHHHH", auxiliary)
-    assert f"{kind:04x}{control:04x}" == tag
 
 
 def test_an_interface_down_for_a_while(veth: tuple[str, str], bench: Bench) -> None:
