@@ -9,11 +9,14 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from ethercat_server.ethercat.wire import BYTE_NS, Command, Datagram
 from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, DistributedClock
+
+if TYPE_CHECKING:
+    from ethercat_server.virtual_sensor.application import Application
 
 _U16, _AL_STATUS = struct.Struct("<H"), struct.Struct("<HHH")
 _REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
@@ -147,7 +150,8 @@ class SyncManager:
 
     def access(self, offset: int, length: int) -> bool:
         """The master accesses the buffer; False if it may not now."""
-        if self.locked or (self.mailbox and self.full == self.master_writes):
+        inside = offset >= 0 and offset + length <= self.length
+        if not inside or self.locked or (self.mailbox and self.full == self.master_writes):
             return False
         may = self.open or offset == 0
         self.open = may and offset + length < self.length
@@ -229,23 +233,10 @@ class SiiInterface:
             self._show(0 if operation in (_NO_OPERATION, _RELOAD) else _ERROR_COMMAND)
 
 
-class _Pdi(Protocol):
-    """The firmware behind the controller: see `Application`."""
-
-    clock: Callable[[], int]
-
-    def al_control(self, control: int) -> None: ...
-    def sync_managers_changed(self) -> None: ...
-    def mailbox_exchanged(self) -> None: ...
-    def repeat_requested(self) -> None: ...
-    def inputs(self) -> bytes: ...
-    def outputs(self, data: bytes) -> None: ...
-
-
 class Esc:
     """Registers and memory of one controller."""
 
-    def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
+    def __init__(self, pdi: Application, sii_image: bytes, sii_read_ns: int = 0) -> None:
         """`sii_read_ns` is how long reading from the EEPROM takes."""
         self._pdi = pdi
         self.memory = reg.power_on_values()
@@ -314,58 +305,33 @@ class Esc:
         for manager in self.sync_managers:
             if manager.active and manager.start == address and manager.length == length:
                 return self._read_manager(manager, 0, length)
-        result, any_read = bytearray(current), False
-        part: bytes | bytearray | None
-        for start, stop, owner in self._regions(address, end):
-            if owner is not None:
-                part = self._read_manager(owner, start - owner.start, stop - start)
-            elif start < _REGISTERS_END:
-                part = self.read_registers(start, stop)
-            else:
-                part = self.memory[start:stop]
-            if part is not None:
-                result[start - address : stop - address] = part
-                any_read = True
-        return result if any_read else None
+        if address < _REGISTERS_END:  # it ends in the memory, which is not read
+            return self.read_registers(address, _REGISTERS_END) + current[_REGISTERS_END - address :]
+        owner = self._owner(address, end)
+        if owner is not None:
+            return self._read_manager(owner, address - owner.start, length)
+        part = self.memory[address:end]
+        return part + current[len(part) :] if part else None
 
     def write(self, address: int, data: bytes) -> bool:
         """Write `data` as a master does; False if it may write none of it."""
         if self.record is not None:
             self.record(address, data)
-        end, any_written = address + len(data), False
+        end = address + len(data)
         for manager in self.sync_managers:
             if manager.active and manager.start == address and manager.end == end:
                 return self._write_manager(manager, 0, data)
-        for start, stop, owner in self._regions(address, end):
-            part = data[start - address : stop - address]
-            if owner is not None:
-                any_written |= self._write_manager(owner, start - owner.start, part)
-            elif start < _REGISTERS_END:
-                any_written |= self._write_registers(start, part)
-            else:
-                self.memory[start:stop] = part
-                any_written = True
-        return any_written
+        if address < _REGISTERS_END:
+            return self._write_registers(address, data[: _REGISTERS_END - address])
+        owner = self._owner(address, end)
+        if owner is not None:
+            return self._write_manager(owner, address - owner.start, data)
+        self.memory[address:end] = data[: reg.MEMORY_END - address]
+        return address < reg.MEMORY_END and bool(data)
 
-    def _regions(self, start: int, end: int) -> list[tuple[int, int, SyncManager | None]]:
-        """Split an access into registers, what each active sync manager guards, and free memory."""
-        end = min(end, reg.MEMORY_END)
-        regions: list[tuple[int, int, SyncManager | None]] = []
-        if start < _REGISTERS_END:
-            regions.append((start, min(end, _REGISTERS_END), None))
-            start = _REGISTERS_END
-        if start < end:
-            for manager in sorted((m for m in self.sync_managers if m.active), key=lambda m: m.start):
-                if manager.end <= start or manager.start >= end:
-                    continue
-                if manager.start > start:
-                    regions.append((start, manager.start, None))
-                    start = manager.start
-                stop = min(manager.end, end)
-                regions.append((start, stop, manager))
-                start = stop
-            regions.append((start, end, None))
-        return [region for region in regions if region[0] < region[1]]
+    def _owner(self, start: int, end: int) -> SyncManager | None:
+        """The first active sync manager that guards any of this memory."""
+        return next((m for m in self.sync_managers if m.active and m.start < end and start < m.end), None)
 
     def _read_manager(self, manager: SyncManager, offset: int, length: int) -> bytes | None:
         if manager.master_writes or not manager.access(offset, length):
