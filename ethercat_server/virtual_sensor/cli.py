@@ -79,7 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
         prog="ethercat-virtual-sensor",
         description="Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
         "and other slaves beside them.",
-        epilog=f"commands, one per line on stdin or on the --control socket:\n{commands}\n\n"
+        epilog=f"commands, one per line on stdin:\n{commands}\n\n"
         f"of a distributed clock, in --dc or as a command:\n{words}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -90,7 +90,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data")
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
     parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of the scene")
-    parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     add_completion(parser)
@@ -183,7 +182,6 @@ def main(
                 args.iface,
                 slaves,
                 stop=stopped,
-                control_path=args.control,
                 commands=sys.stdin,
                 exit_on_eof=args.exit_on_eof,
                 on_open=on_open,

@@ -1,4 +1,4 @@
-"""The raw socket: frames from a network interface go through the bus; commands come by a stream and a socket.
+"""The raw socket: frames from a network interface go through the bus; commands come by a stream.
 
 One thread, which polls for frames and commands, and checks watchdogs.
 """
@@ -11,12 +11,10 @@ import gc
 import os
 import select
 import socket
-import stat
 import threading
 import time
 from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Final, Self, TextIO
+from typing import Final, TextIO
 
 from ethercat_server.ethercat.nic import look_up
 from ethercat_server.ethercat.raw_socket import arrived_ns
@@ -36,12 +34,11 @@ _STEP: Final = 0.001
 # Quantile of half the time that an answer takes, followed in steps of `_STEP`: a master estimates the round
 # trip from its quickest frames.
 _QUICK: Final = 1 / 16
-_MOST_CONNECTIONS: Final = 16
 _CHUNK: Final = 4096
 
 
 class LinkError(Exception):
-    """The interface cannot be used, or no longer, or the control socket cannot be created."""
+    """The interface cannot be used, or no longer."""
 
 
 def open_interface(ifname: str) -> socket.socket:
@@ -80,7 +77,6 @@ def run(
     ifname: str,
     slaves: Iterable[SlaveOptions],
     *,
-    control_path: str | None = None,
     commands: TextIO | None = None,
     exit_on_eof: bool = False,
     on_open: Callable[[], None] = lambda: None,
@@ -89,23 +85,21 @@ def run(
 ) -> None:
     """Answer EtherCAT frames on `ifname` until stopped.
 
-    Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the
-    end of `commands` if `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is
-    only down is waited for), or `control_path` cannot be used.
+    Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the end of `commands` if
+    `exit_on_eof`. LinkError if the interface cannot be used, or disappears; one that is down is waited for.
     """
-    with contextlib.ExitStack() as stack:
-        raw = stack.enter_context(open_interface(ifname))
+    with open_interface(ifname) as raw, contextlib.suppress(QuitCommand):
         on_open()
         bus = Bus(slaves, time.monotonic_ns())
-        poller = select.poll()
+        poller, channel = select.poll(), _Commands(bus, commands)
         poller.register(raw, select.POLLIN)
-        channel = stack.enter_context(CommandChannel(bus, poller, control_path, commands))
+        if channel.descriptor >= 0:
+            poller.register(channel.descriptor, select.POLLIN)
         # All that is loaded need never be looked through again, which takes some 20 ms.
         gc.collect()
         gc.freeze()
         on_ready()
         answers, index, up = _Answers(raw, bus, ifname), _index(ifname), True
-        stack.enter_context(contextlib.suppress(QuitCommand))
         while not stop.is_set() and not (exit_on_eof and channel.ended):
             ready = [descriptor for descriptor, _ in poller.poll(_IDLE_MS)]
             if not ready:
@@ -113,125 +107,51 @@ def run(
                 # Down is like an unplugged cable: it may come back, unless the interface was deleted.
                 if not up and _index(ifname) != index:
                     raise LinkError(f"interface {ifname} has disappeared: create it again, and restart")
-            for descriptor in ready:
-                if descriptor != raw.fileno():
-                    bus.set_time(time.monotonic_ns())
-                    channel.handle(descriptor)
+            if channel.descriptor in ready:
+                bus.set_time(time.monotonic_ns())
+                channel.take()
+                if channel.ended:
+                    poller.unregister(channel.descriptor)
             if raw.fileno() in ready:
                 up = answers.waiting()
 
 
-class CommandChannel:
-    """Reads commands and writes one line of answer to each."""
+class _Commands:
+    """Commands from a stream, a line each, with one line of answer to each on standard output."""
 
-    def __init__(
-        self, bus: Bus, poller: select.poll, control_path: str | None, commands: TextIO | None
-    ) -> None:
-        """LinkError if `control_path` cannot be used."""
+    def __init__(self, bus: Bus, stream: TextIO | None) -> None:
         self._bus = bus
-        self._poller = poller
-        self._path = control_path
-        self._listener: socket.socket | None = None
-        self._connections: dict[int, socket.socket] = {}
-        self._pending: dict[int, bytes] = {}  # the beginning of a line, by descriptor
-        self.ended = False  # the text stream has
-        if control_path is not None:
-            self._listener = _listen(control_path)
-            poller.register(self._listener, select.POLLIN)
-        if commands is not None:
+        self._pending = b""  # the beginning of a line
+        self.descriptor = -1
+        self.ended = False
+        if stream is not None:
             with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
-                self._pending[commands.fileno()] = b""
-                poller.register(commands, select.POLLIN)
+                self.descriptor = stream.fileno()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for connection in self._connections.values():
-            connection.close()
-        self._connections.clear()
-        if self._listener is not None and self._path is not None:
-            self._listener.close()
-            with contextlib.suppress(OSError):
-                Path(self._path).unlink()
-
-    def handle(self, descriptor: int) -> None:
-        """Handle what has come on `descriptor`. QuitCommand if the command was `quit`."""
-        if descriptor in self._pending:
-            self._read(descriptor)
-        elif self._listener is not None and descriptor == self._listener.fileno():
-            with contextlib.suppress(OSError):
-                self._add(self._listener.accept()[0])
-
-    def _add(self, connection: socket.socket) -> None:
-        if len(self._connections) >= _MOST_CONNECTIONS:
-            connection.close()
-            return
-        connection.setblocking(False)
-        self._connections[connection.fileno()] = connection
-        self._pending[connection.fileno()] = b""
-        self._poller.register(connection, select.POLLIN)
-
-    def _read(self, descriptor: int) -> None:
+    def take(self) -> None:
+        """Execute what has come. QuitCommand if a command was `quit`."""
         try:
-            data = os.read(descriptor, _CHUNK)
+            data = os.read(self.descriptor, _CHUNK)
         except BlockingIOError:
             return
         except OSError:
             data = b""
-        ended = not data
-        for line in self._lines(descriptor, data or (b"\n" if self._pending[descriptor] else b"")):
-            try:
-                answer = obey(self._bus, line)
-            except QuitCommand:
-                self._answer(descriptor, "ok")
-                raise
-            # Disconnected, or not reading: its commands are executed nevertheless.
-            ended = not self._answer(descriptor, answer) or ended
-        if ended:
-            self._poller.unregister(descriptor)
-            del self._pending[descriptor]
-            if descriptor in self._connections:
-                self._connections.pop(descriptor).close()
-            else:
-                self.ended = True
+        self.ended = not data
+        *lines, self._pending = (self._pending + (data or b"\n")).split(b"\n")
+        if len(self._pending) > LONGEST_LINE:
+            lines.append(self._pending)
+            self._pending = b""
+        for line in lines:
+            if line.strip():
+                self._execute(line[:LONGEST_LINE].decode(errors="replace"))
 
-    def _answer(self, descriptor: int, answer: str) -> bool:
-        """Whether the source goes on: the text stream does without its answers."""
-        connection = self._connections.get(descriptor)
+    def _execute(self, line: str) -> None:
+        answer = "ok"
         try:
-            if connection is not None:
-                connection.sendall(answer.encode() + b"\n")
-            else:
+            answer = obey(self._bus, line)
+        finally:
+            with contextlib.suppress(OSError):  # nobody reads the answers
                 os.write(1, answer.encode() + b"\n")
-        except OSError:
-            return connection is None
-        return True
-
-    def _lines(self, descriptor: int, data: bytes) -> list[str]:
-        *lines, rest = (self._pending[descriptor] + data).split(b"\n")
-        if len(rest) > LONGEST_LINE:
-            lines.append(rest)
-            rest = b""
-        self._pending[descriptor] = rest
-        return [line[:LONGEST_LINE].decode(errors="replace") for line in lines if line.strip()]
-
-
-def _listen(path: str) -> socket.socket:
-    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        # Remove a stale socket, left by a killed process; nothing else.
-        if stat.S_ISSOCK(Path(path).stat().st_mode) and probe.connect_ex(path) != 0:
-            Path(path).unlink()
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        listener.bind(path)
-        Path(path).chmod(0o600)
-        listener.listen()
-        listener.setblocking(False)
-    except OSError as error:
-        listener.close()
-        raise LinkError(f"cannot create the control socket {path!r}: {error.strerror or error}") from None
-    return listener
 
 
 class _Answers:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -99,43 +97,17 @@ def test_each_interface_has_serial_numbers_of_its_own(veth: tuple[str, str], sta
 
 
 @pytest.mark.bus
-def test_the_control_socket(veth: tuple[str, str], start: Start, tmp_path: Path) -> None:
-    path = tmp_path / "control"
-    sensor = start(veth[0], "--control", str(path))
-    sensor.command("lose 1")
+def test_it_goes_on_without_input(veth: tuple[str, str], start: Start) -> None:
+    sensor = start(veth[0])
     assert sensor.process.stdin is not None
-    sensor.process.stdin.close()  # it goes on without input
-    with socket.socket(socket.AF_UNIX) as one, socket.socket(socket.AF_UNIX) as other:
-        for peer in (one, other):
-            peer.connect(str(path))
-        other.sendall(b"sta")
-        one.sendall(b"nonsense\nhear\n")
-        with one.makefile() as answers, other.makefile() as other_answers:
-            assert answers.readline().startswith("error: ")
-            assert answers.readline() == "ok\n"
-            other.sendall(b"ts\n")
-            assert json.loads(other_answers.readline().removeprefix("ok "))["frames"] == 0
-            one.sendall(b"quit\n")
-            assert answers.readline() == "ok\n"
-    assert sensor.wait() == 0
-    assert not path.exists(), "nothing is left behind"
-
-
-@pytest.mark.bus
-def test_a_control_socket_in_use_and_one_left_behind(
-    veth: tuple[str, str], start: Start, tmp_path: Path
-) -> None:
-    path, left, not_ours = (tmp_path / name for name in ("control", "left", "file"))
-    not_ours.write_text("precious")
-    start(veth[0], "--control", str(path))
-    for used in (path, not_ours):
-        second = start(veth[1], "--control", str(used), ready=False)
-        assert second.wait() == 1
-        assert str(used) in second.said()
-    assert not_ours.read_text() == "precious"
-    with socket.socket(socket.AF_UNIX) as dead:
-        dead.bind(str(left))
-    start(veth[1], "--control", str(left))
+    sensor.process.stdin.write("nonsense\nstats\nlose 1")  # the end of input ends the line too
+    sensor.process.stdin.close()
+    sensor.wait_for("ok\n")
+    _ready, refused, stats, lost = sensor.said().splitlines()
+    assert refused.startswith("error: ")
+    assert json.loads(stats.removeprefix("ok "))["frames"] == 0
+    assert lost == "ok"
+    assert sensor.process.poll() is None
 
 
 @pytest.mark.bus
