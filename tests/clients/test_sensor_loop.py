@@ -20,7 +20,6 @@ from bota_clients.identify.cli import main as identify
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
-from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.sensor.response import force_lag_s
 from ft_compensation.alignment import Alignment, alignment_taps
 from ft_compensation.compensator import Compensator
@@ -226,6 +225,11 @@ def test_no_time_limit(running: Loop) -> None:
 # -- the tool
 
 
+# Of the drawings in Bota's URDFs, mm from the mounting face: wrench origin and IMU.
+HEIGHTS = {
+    "SENS": (35, 9.3), "ROKS": (32, 9.8), "ROKA": (32, 9.8), "MEDS": (32, 9.8), "MEDA": (32, 9.8),
+    "LAXS": (44.5, 11.95), "MEGS": (59, 13.4), "NONE": (0, 0),
+}  # fmt: skip
 MASS, CENTER = 1.25, (0.01, -0.02, 0.08)
 OFFSET, SCALE = (0.3, -0.2, 0.1), (1.01, 0.99, 1.002)
 TOOL = {
@@ -247,7 +251,7 @@ def moving(rate_hz: float, count: int) -> Iterator[tuple[float, tuple[float, ...
         yield time_s, tuple(math.nan if number == 160 and axis == 4 else v for axis, v in enumerate(values))
 
 
-@pytest.mark.parametrize("model", [f"BFT-{name}-ECAT-M8" for name in (*IMU_HEIGHTS, "NONE")])
+@pytest.mark.parametrize("model", HEIGHTS)
 @pytest.mark.parametrize(
     ("sinc_length", "rate_hz", "fir"),
     [(32, 1600, False), (64, 800, False), (512, 100, False), (64, 800, True), (205, 250, True)],
@@ -258,12 +262,15 @@ def test_the_load_of_the_tool_is_that_of_the_node(
     assert running.new(**TOOL) == ""
     samples = list(moving(rate_hz, 200))
     settings = {"sinc_length": sinc_length, "fir": fir, "acceleration_filter": 1}
-    running.begin("tool", model, force_lag_s(settings, rate_hz), int(fir), rate_hz, len(samples))
+    running.begin(
+        "tool", f"BFT-{model}-ECAT-M8", force_lag_s(settings, rate_hz), int(fir), rate_hz, len(samples)
+    )
     for time_s, values in samples:
         running.begin(repr(time_s), *map(repr, values))
     found = running.answer()
-    height = IMU_HEIGHTS.get(model[4:8], 0.0)
-    imu = ImuSpecificForce((CENTER[0], CENTER[1], CENTER[2] - height), Accelerometer(OFFSET, SCALE))
+    origin, imu_at = HEIGHTS[model]
+    lever = (CENTER[0], CENTER[1], CENTER[2] - (imu_at - origin) / 1000)
+    imu = ImuSpecificForce(lever, Accelerometer(OFFSET, SCALE))
     alignment = Alignment(alignment_taps(settings, rate_hz), 1 / rate_hz)
     compensator = Compensator(Payload(MASS, CENTER))
     for number, (time_s, (ax, ay, az, wx, wy, wz)) in enumerate(samples):

@@ -377,9 +377,10 @@ private:
                                                  : "the sensor's settings were changed, and are accepted");
         max_age_ns_ = std::llround(bota_ethercat_hardware::max_age(parameters_, *found) * 1e9);
         client_.set_max_age(std::chrono::nanoseconds(max_age_ns_));
-        const double lag_ms = found->force_torque_delay_ms.value_or(0.0) - found->acceleration_delay_ms.value_or(0.0);
-        if (parameters_.has_payload)
-            tool_.emplace(parameters_.payload, found->name.view(), lag_ms / 1e3, found->fir.value_or(false), found->rate_hz);
+        if (!parameters_.has_payload) return;
+        const auto& [force_ns, acceleration_ns, _] = found->delay_ns;
+        const double lag_s = force_ns && acceleration_ns ? seconds(*force_ns - *acceleration_ns) : 0.0;
+        tool_.emplace(parameters_.payload, found->name.view(), lag_s, found->fir.value_or(false), found->rate_hz);
     }
 
     /// Log why there is no connection, and what the controllers see, when it changes and has been quiet for a while.
