@@ -20,11 +20,6 @@ from bota_clients.identify.cli import main as identify
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
-from bota_ethercat.sensor.response import force_lag_s
-from ft_compensation.alignment import Alignment, alignment_taps
-from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import ZERO, Accelerometer, Payload
-from ft_compensation.specific_force import ImuSpecificForce
 from tests.clients.cpp_programs import (
     ROOT,
     SANITIZED,
@@ -225,62 +220,55 @@ def test_no_time_limit(running: Loop) -> None:
 # -- the tool
 
 
-# Of the drawings in Bota's URDFs, mm from the mounting face: wrench origin and IMU.
-HEIGHTS = {
-    "SENS": (35, 9.3), "ROKS": (32, 9.8), "ROKA": (32, 9.8), "MEDS": (32, 9.8), "MEDA": (32, 9.8),
-    "LAXS": (44.5, 11.95), "MEGS": (59, 13.4), "NONE": (0, 0),
-}  # fmt: skip
-MASS, CENTER = 1.25, (0.01, -0.02, 0.08)
-OFFSET, SCALE = (0.3, -0.2, 0.1), (1.01, 0.99, 1.002)
 TOOL = {
-    "tool_mass": MASS,
+    "tool_mass": 1.25,
     "tool_center_of_gravity": "[0.01,-0.02,0.08]",
     "accelerometer.offset": "0.3,-0.2,0.1",
     "accelerometer.scale": "1.01,0.99,1.002",
 }
+# mm from the mounting face, of the drawings in Bota's URDFs: wrench origin, IMU.
+HEIGHTS = {
+    "SENS": (35, 9.3), "ROKS": (32, 9.8), "ROKA": (32, 9.8), "MEDS": (32, 9.8), "MEDA": (32, 9.8),
+    "LAXS": (44.5, 11.95), "MEGS": (59, 13.4), "NONE": (0, 0),
+}  # fmt: skip
+# By ft_compensation for `TOOL` on a SENS, of the samples of `moving`: specific force, alignment, compensator.
+LOADS = json.loads((Path(__file__).parent / "golden_loads.json").read_text())
 
 
-def moving(rate_hz: float, count: int) -> Iterator[tuple[float, tuple[float, ...]]]:
+def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
     """Times, acceleration, angular rate: with lost samples, a long gap, a NaN, a clock that stood still."""
     random_ = random.Random(7)
     time_s = 1000.0
-    for number in range(count):
-        time_s += {50: 3, 90: 7, 120: 200, 121: 0}.get(number, 1) / rate_hz * random_.uniform(0.98, 1.02)
+    for number in range(60):
+        time_s += {28: 3, 36: 7, 44: 200, 45: 0}.get(number, 1) / rate_hz * random_.uniform(0.98, 1.02)
         swing = [math.sin((3 + axis) * time_s + axis) for axis in range(6)]
         values = [*(9 * each for each in swing[:3]), *(2 * each for each in swing[3:])]
-        yield time_s, tuple(math.nan if number == 160 and axis == 4 else v for axis, v in enumerate(values))
+        yield time_s, tuple(math.nan if number == 50 and axis == 4 else v for axis, v in enumerate(values))
 
 
-@pytest.mark.parametrize("model", HEIGHTS)
-@pytest.mark.parametrize(
-    ("sinc_length", "rate_hz", "fir"),
-    [(32, 1600, False), (64, 800, False), (512, 100, False), (64, 800, True), (205, 250, True)],
-)
-def test_the_load_of_the_tool_is_that_of_the_node(
-    running: Loop, model: str, sinc_length: int, rate_hz: int, fir: bool
-) -> None:
-    assert running.new(**TOOL) == ""
-    samples = list(moving(rate_hz, 200))
-    settings = {"sinc_length": sinc_length, "fir": fir, "acceleration_filter": 1}
-    running.begin(
-        "tool", f"BFT-{model}-ECAT-M8", force_lag_s(settings, rate_hz), int(fir), rate_hz, len(samples)
-    )
+def loads(running: Loop, model: str, lag_s: float, fir: bool, rate_hz: float, *samples: Any) -> Any:
+    """What the tool of `new` loads a sensor of this model with in each sample."""
+    running.begin("tool", f"BFT-{model}-ECAT-M8", lag_s, int(fir), rate_hz, len(samples))
     for time_s, values in samples:
         running.begin(repr(time_s), *map(repr, values))
-    found = running.answer()
-    origin, imu_at = HEIGHTS[model]
-    lever = (CENTER[0], CENTER[1], CENTER[2] - (imu_at - origin) / 1000)
-    imu = ImuSpecificForce(lever, Accelerometer(OFFSET, SCALE))
-    alignment = Alignment(alignment_taps(settings, rate_hz), 1 / rate_hz)
-    compensator = Compensator(Payload(MASS, CENTER))
-    for number, (time_s, (ax, ay, az, wx, wy, wz)) in enumerate(samples):
-        force = imu.follow((ax, ay, az), (wx, wy, wz), time_s)
-        load = found[6 * number : 6 * number + 6]
-        if force is None:
-            assert load == [None] * 6
-        else:
-            tool = compensator.compensate(ZERO, ZERO, alignment.follow(force, time_s)).tool
-            assert load == pytest.approx(tool.values, abs=1e-9), number
+    return running.answer()
+
+
+@pytest.mark.parametrize("row", LOADS, ids=lambda row: f"{row['rate_hz']} Hz, FIR {row['fir']}")
+def test_the_load_of_the_tool_is_that_of_the_golden_table(running: Loop, row: dict[str, Any]) -> None:
+    assert running.new(**TOOL) == ""
+    found = loads(running, "SENS", row["lag_s"], row["fir"], row["rate_hz"], *moving(row["rate_hz"]))
+    for number, (load, expected) in enumerate(zip(found, row["loads"], strict=True)):
+        assert (load is None) == (expected is None), number
+        assert load is None or load == pytest.approx(expected, abs=1e-9), number
+
+
+@pytest.mark.parametrize(("model", "heights"), HEIGHTS.items())
+def test_the_imu_is_where_the_model_has_it(running: Loop, model: str, heights: tuple[float, float]) -> None:
+    running.new(tool_mass=2)
+    force = loads(running, model, 0, False, 800, (1.0, (0.0, 0.0, 9.0, 3.0, 0.0, 0.0)))[2]
+    origin, imu_at = heights
+    assert force == pytest.approx(-2 * (9.0 - 3.0**2 * (origin - imu_at) / 1000))
 
 
 def test_the_compensated_wrench_is_without_bias_and_tool(running: Loop) -> None:
@@ -296,13 +284,12 @@ def test_the_payload_from_the_file_of_an_identification(running: Loop, tmp_path:
     assert run_here(identify, recording, "--yaml", path).code == 0
     (parameters,) = yaml.safe_load(path.read_text()).values()
     given = {name: parameters["ros__parameters"][name] for name in TOOL}
-    loads = []
+    found = []
     for asked in ({"payload_file": path}, {k: str(v).replace(" ", "") for k, v in given.items()}):
         assert running.new(**asked) == ""
-        running.begin("tool", "BFT-SENS-ECAT-M8", 0, 0, 800, 1)
-        loads.append(running.do("1 0.1 0.2 9.8 0 0 0"))
-    assert loads[0] == pytest.approx(loads[1])
-    assert loads[0][2] == pytest.approx(-given["tool_mass"] * 9.8, rel=0.05)
+        found.append(loads(running, "SENS", 0, False, 800, (1.0, (0.1, 0.2, 9.8, 0.0, 0.0, 0.0))))
+    assert found[0] == pytest.approx(found[1])
+    assert found[0][2] == pytest.approx(-given["tool_mass"] * 9.8, rel=0.05)
     path.write_text("/**:\n  ros__parameters:\n    tool_mass: heavy\n")
     for file in (path, tmp_path / "none.yaml"):
         assert "allowed: a file that ethercat-identify --yaml" in running.new(payload_file=file)
