@@ -65,12 +65,6 @@ def _clock(number: int, instant: int) -> Iterable[float]:
 FORMULAS: Final = {
     "clock": Formula(_clock, exact=True),
     "ramp": Formula(lambda k, _: (((k + 100 * i) % 1024) / 64 - 8 for i in range(6))),
-    "sine": Formula(
-        lambda k, _: (
-            amplitude * math.sin(math.tau * (k % 1000 / 1000 + i / 6))
-            for i, amplitude in enumerate((10.0, 20.0, 30.0, 1.0, 2.0, 3.0))
-        )
-    ),
     "constant": Formula(lambda *_: CONSTANT),
     # The sample number in the temperature: steps of 2**-18 °C, from 32 to 48 °C, are exact in REAL32.
     "rest": Formula(lambda *_: CONSTANT, lambda k: 32 + k % 2**22 / 2**18),

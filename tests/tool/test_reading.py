@@ -174,7 +174,7 @@ def test_watch_shows_each_block_and_writes_nothing(bench: SimulatedBus) -> None:
 
 
 def test_watch_gives_si_units_rate_and_warnings() -> None:
-    with simulated_bus("--signal", "sine", "--pdo", "77", "--sinc", "128") as bus:
+    with simulated_bus("--signal", "ramp", "--pdo", "77", "--sinc", "128") as bus:
         bus.command("warn 0x20")
         ended = tool_here("watch", bus.near, "--samples", 200, "--interval", 10, "--json")
     (row,) = map(json.loads, ended.out.splitlines())

@@ -1,7 +1,6 @@
 """Samples: the clock, the formulas, the scene's physics, and what settings do to them."""
 
 import cmath
-import itertools
 import math
 import statistics
 import struct
@@ -72,17 +71,6 @@ def test_the_newest_sample_is_what_a_frame_carries() -> None:
         previous = number
 
 
-def test_polling_at_the_nominal_rate_sees_the_beat_of_two_clocks() -> None:
-    master = RawMaster(SensorOptions(signal="clock", ppm=300.0)).go(OP)
-    seen = []
-    for _ in range(8000):
-        master.wait(PERIOD - 1000)
-        seen.append(decode_clock(load(master.inputs())).number)
-    steps = {b - a for a, b in itertools.pairwise(seen)}
-    assert steps == {1, 2}
-    assert seen[-1] - seen[0] - 7999 in (2, 3), "300 ppm of 8000"
-
-
 def test_the_same_sample_is_the_same_bytes_also_if_computed_ahead() -> None:
     plain, ahead = (RawMaster(SensorOptions(noise=False)).go(OP) for _ in range(2))
     before = b""
@@ -99,8 +87,7 @@ def test_the_same_sample_is_the_same_bytes_also_if_computed_ahead() -> None:
 
 
 def test_formulas() -> None:
-    amplitudes = (10.0, 20.0, 30.0, 1.0, 2.0, 3.0)
-    for signal in ("ramp", "sine", "rest"):
+    for signal in ("ramp", "rest"):
         master = RawMaster(SensorOptions(signal=signal)).go(OP)
         for _ in range(30):
             master.wait(37 * PERIOD)
@@ -108,7 +95,6 @@ def test_formulas() -> None:
             sample = RAW.decode(master.inputs())
             expected = {
                 "ramp": [((k + 100 * i) % 1024) / 64 - 8 for i in range(6)],
-                "sine": [a * math.sin(2 * math.pi * (k / 1000 + i / 6)) for i, a in enumerate(amplitudes)],
                 "rest": CONSTANT,
             }[signal]
             assert (*sample.force, *sample.torque) == pytest.approx(expected, abs=1e-4)
@@ -378,12 +364,3 @@ def test_imu_off_calibration_off_orientation_on() -> None:
     assert sample.orientation
     assert sample.force[2] == pytest.approx(calibrated.force[2] * 10_000, rel=1e-2)
     assert sample.force[2].is_integer()
-
-
-def test_sinc_changes_the_rate() -> None:
-    master = RawMaster(SensorOptions(signal="clock")).go(PREOP)
-    master.download(0x8006, 1, struct.pack("<H", 128))
-    master.go(OP)
-    first = decode_clock(load(master.inputs())).number
-    master.wait(1_000_000_000)
-    assert decode_clock(load(master.inputs())).number - first in (400, 401)
