@@ -66,7 +66,11 @@ class LoadFilter:
 class ImuFilterProfile:
     """Of accelerometer or gyroscope: a first-order low-pass filter, and the rest of the table's delay."""
 
-    def __init__(self, row: ImuFilter) -> None:
+    def __init__(self, row: ImuFilter | None) -> None:
+        """None: it measures at once."""
+        if row is None:
+            self._instants, self._weights = [0.0], [1.0]
+            return
         constant_s = 1 / (math.tau * row.bandwidth_hz)
         rest_s = row.delay_ms * 1e-3 - constant_s
         self._instants = [rest_s + constant_s * x for x, _ in _EXPONENTIAL]
@@ -75,3 +79,6 @@ class ImuFilterProfile:
     def at(self, signal: Signal, seconds: float) -> tuple[float, ...]:
         """The signal as it is measured at this time."""
         return weighted(self._weights, [signal(max(0.0, seconds - before)) for before in self._instants])
+
+
+UNFILTERED: Final = ImuFilterProfile(None)

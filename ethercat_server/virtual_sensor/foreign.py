@@ -112,21 +112,18 @@ class Drive(Application):
     def take_outputs(self, data: bytes) -> None:
         """See `Application`."""
         super().take_outputs(data)
-        self._obey_objects()
+        self._obey()
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
         """See `Application`."""
         super().write(index, subindex, data)
-        self._obey_objects()
+        self._obey()
 
-    def _obey_objects(self) -> None:
-        word, velocity = (int(self.objects.number(row.address)) for row in (_CONTROLWORD, _VELOCITY))
-        self._command(word, velocity)
-
-    def _command(self, controlword: int, velocity: int) -> None:
+    def _obey(self) -> None:
         self._move()
+        controlword, self._velocity = (int(self.objects.number(o.address)) for o in (_CONTROLWORD, _VELOCITY))
         reset = controlword & ~self._controlword & _FAULT_RESET
-        self._controlword, self._velocity = controlword, velocity
+        self._controlword = controlword
         if reset:
             self._error = 0
         if reset or self.drive_state is not DriveState.FAULT:
@@ -145,7 +142,7 @@ class Drive(Application):
 
     def work(self) -> None:
         """Be at work in OP: the other master has enabled it, and it turns."""
-        self._command(_ENABLE, _VELOCITY_AT_WORK)
+        self.take_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
 
     def read(self, index: int, subindex: int) -> bytes:
         """See `Application`; some objects the drive itself changes."""

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
-from ethercat_server.virtual_sensor.filters import ImuFilterProfile, LoadFilter
+from ethercat_server.virtual_sensor.filters import UNFILTERED, ImuFilterProfile, LoadFilter
 
 Vector = tuple[float, float, float]
 
@@ -234,8 +234,9 @@ class Scene:
         self._motion = motion
         self._gauss = random.Random(seed).gauss
         self._noise = noise
-        self._filters: tuple[LoadFilter, ImuFilterProfile, ImuFilterProfile] | None = None
         self._settings: tuple[SettingValue, ...] = ()  # of the filters
+        self._load_filter: LoadFilter | None = None
+        self._acceleration_filter = self._rate_filter = UNFILTERED
         self.set_sinc_length(_REFERENCE_SINC)
 
     def set_sinc_length(self, sinc_length: int) -> None:
@@ -251,11 +252,10 @@ class Scene:
         self._settings = wanted
         self.set_sinc_length(sinc_length)
         fir, acceleration, rate = wanted[1:]
-        self._filters = (
-            LoadFilter(self.load, self._load_noise, sinc_length / BASE_SAMPLING_RATE_HZ, fir=bool(fir)),
-            ImuFilterProfile(ACCELERATION_FILTERS[acceleration]),
-            ImuFilterProfile(ANGULAR_RATE_FILTERS[rate]),
-        )
+        period_s = sinc_length / BASE_SAMPLING_RATE_HZ
+        self._load_filter = LoadFilter(self.load, self._load_noise, period_s, fir=bool(fir))
+        self._acceleration_filter = ImuFilterProfile(ACCELERATION_FILTERS[acceleration])
+        self._rate_filter = ImuFilterProfile(ANGULAR_RATE_FILTERS[rate])
 
     def specific_force(self, seconds: float) -> Vector:
         """m/s²."""
@@ -282,16 +282,12 @@ class Scene:
 
     def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
         """See `Formula`."""
-        load: Sequence[float]
-        force: Sequence[float]
-        rate: Sequence[float]
-        if self._filters is None:
+        if self._load_filter is None:
             load = tuple(map(operator.add, self.load(seconds), self._load_noise()))
-            force, rate = self.specific_force(seconds), self.rate(seconds)
         else:
-            of_load, of_acceleration, of_rate = self._filters
-            load = of_load.at(number, seconds)
-            force, rate = of_acceleration.at(self.specific_force, seconds), of_rate.at(self.rate, seconds)
+            load = self._load_filter.at(number, seconds)
+        force = self._acceleration_filter.at(self.specific_force, seconds)
+        rate = self._rate_filter.at(self.rate, seconds)
         values = [*load, *(a / STANDARD_GRAVITY for a in force), *map(math.degrees, rate)]
         if self._noise:
             for axis in range(6, 9):

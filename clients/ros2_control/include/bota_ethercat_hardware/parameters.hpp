@@ -68,12 +68,12 @@ bool number(std::string_view text, Number least, Number most, Number& into) noex
 
 /// As many numbers as `into` has, with blanks or commas between them, in brackets or not.
 template <std::size_t Size>
-bool numbers(std::string_view text, std::array<double, Size>& into) noexcept {
+bool numbers(std::string_view text, std::array<double, Size>& into, double least = -1e6) noexcept {
     constexpr std::string_view kBetween = " \t\r\n,[]";
     std::size_t count = 0;
     for (std::size_t at = 0; (at = text.find_first_not_of(kBetween, at)) != text.npos; ++count) {
         const std::size_t end = std::min(text.find_first_of(kBetween, at), text.size());
-        if (count == Size || !number(text.substr(at, end - at), -1e6, 1e6, into[count])) return false;
+        if (count == Size || !number(text.substr(at, end - at), least, 1e6, into[count])) return false;
         at = end;
     }
     return count == Size;
@@ -120,10 +120,7 @@ inline constexpr Row kRows[] = {
      [](S t, P& p) { return p.has_payload = p.wants_imu = number(t, 0.0, 1000.0, p.payload.mass); }},
     {"tool_center_of_gravity", "three numbers (m)", [](S t, P& p) { return numbers(t, p.payload.center); }},
     {"accelerometer.offset", "three numbers (m/s^2)", [](S t, P& p) { return numbers(t, p.payload.accelerometer_offset); }},
-    {"accelerometer.scale", "three numbers, about 1", [](S t, P& p) {
-         const Vector3& scale = p.payload.accelerometer_scale;
-         return numbers(t, p.payload.accelerometer_scale) && *std::min_element(scale.begin(), scale.end()) > 0.1;
-     }},
+    {"accelerometer.scale", "three numbers, about 1", [](S t, P& p) { return numbers(t, p.payload.accelerometer_scale, 0.1); }},
     {"bias", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.bias); }},
 };
 inline constexpr std::size_t kOfTool = 5;  // the last rows
