@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from ethercat_server.ethercat.slave.abort_codes import AbortCode, abort_meaning
 from ethercat_server.ethercat.slave.al import AlState
@@ -16,9 +16,6 @@ from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry
 from ethercat_server.sensor.objects.search import TITLES
 from ethercat_server.virtual_sensor.device import Device
 from ethercat_server.virtual_sensor.mailbox import INVALID_HEADER, TOO_SHORT, MailboxError
-
-if TYPE_CHECKING:
-    from ethercat_server.virtual_sensor.application import Application
 
 Address = tuple[int, int]  # index and sub-index of an object entry
 
@@ -85,6 +82,15 @@ _DOWNLOADED = 3
 _SIZE_INDICATED, _EXPEDITED, _COMPLETE, _TOGGLE = 0x01, 0x02, 0x10, 0x10
 
 
+class _Objects(Protocol):
+    """What the server reads and writes: see `Application`."""
+
+    def read(self, index: int, subindex: int) -> bytes: ...
+    def length(self, index: int, subindex: int) -> int: ...
+    def check_download(self, index: int, subindex: int, length: int) -> None: ...
+    def write(self, index: int, subindex: int, data: bytes) -> None: ...
+
+
 @dataclass
 class _Transfer:
     """A segmented transfer under way."""
@@ -103,7 +109,7 @@ class CoeServer:
     `information` answers requests to the SDO Information service.
     """
 
-    def __init__(self, objects: Application, information: Callable[[bytes, int], list[bytes]]) -> None:
+    def __init__(self, objects: _Objects, information: Callable[[bytes, int], list[bytes]]) -> None:
         self._objects = objects
         self._information = information
         self._transfer: _Transfer | None = None

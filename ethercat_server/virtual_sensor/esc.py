@@ -9,14 +9,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from ethercat_server.ethercat.wire import BYTE_NS, Command, Datagram
 from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, DistributedClock
-
-if TYPE_CHECKING:
-    from ethercat_server.virtual_sensor.application import Application
 
 _U16, _AL_STATUS = struct.Struct("<H"), struct.Struct("<HHH")
 _REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
@@ -233,10 +230,23 @@ class SiiInterface:
             self._show(0 if operation in (_NO_OPERATION, _RELOAD) else _ERROR_COMMAND)
 
 
+class _Pdi(Protocol):
+    """The firmware behind the controller: see `Application`."""
+
+    clock: Callable[[], int]
+
+    def al_control(self, control: int) -> None: ...
+    def sync_managers_changed(self) -> None: ...
+    def mailbox_exchanged(self) -> None: ...
+    def repeat_requested(self) -> None: ...
+    def inputs(self) -> bytes: ...
+    def outputs(self, data: bytes) -> None: ...
+
+
 class Esc:
     """Registers and memory of one controller."""
 
-    def __init__(self, pdi: Application, sii_image: bytes, sii_read_ns: int = 0) -> None:
+    def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
         """`sii_read_ns` is how long reading from the EEPROM takes."""
         self._pdi = pdi
         self.memory = reg.power_on_values()
