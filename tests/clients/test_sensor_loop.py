@@ -240,7 +240,7 @@ def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
     random_ = random.Random(7)
     time_s = 1000.0
     for number in range(60):
-        time_s += {28: 3, 36: 7, 44: 200, 45: 0}.get(number, 1) / rate_hz * random_.uniform(0.98, 1.02)
+        time_s += {28: 5, 36: 6, 44: 200, 45: 0}.get(number, 1) / rate_hz * random_.uniform(0.98, 1.02)
         swing = [math.sin((3 + axis) * time_s + axis) for axis in range(6)]
         values = [*(9 * each for each in swing[:3]), *(2 * each for each in swing[3:])]
         yield time_s, tuple(math.nan if number == 50 and axis == 4 else v for axis, v in enumerate(values))
