@@ -184,7 +184,7 @@ def test_a_tare_of_a_moving_sensor_is_refused(motion: str) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_tare_that_is_stopped_changes_nothing(number: signal.Signals) -> None:
-    with simulated_bus("--signal", "sine") as bus:
+    with simulated_bus("--signal", "ramp") as bus:
         states: list[str] = []
 
         def stop() -> None:

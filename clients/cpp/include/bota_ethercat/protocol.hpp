@@ -300,6 +300,7 @@ struct SensorInfo {
     // Settings that decide what the numbers mean. None: the server does not say.
     std::optional<bool> calibration_matrix, coordinate_system, inertia_compensation, orientation_estimation;
     std::optional<int> imu_active;
+    std::optional<bool> fir;
 };
 
 /// What `describe` and `subscribe` answer.
@@ -341,6 +342,7 @@ inline void read_in_force(json::Value of, SensorInfo& into) noexcept {
     get("inertia_compensation", into.inertia_compensation);
     get("orientation_estimation", into.orientation_estimation);
     get("imu_active", into.imu_active);
+    get("fir", into.fir);
 }
 
 /// False if this is no description, or one of another protocol version.
