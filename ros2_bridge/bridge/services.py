@@ -33,7 +33,7 @@ from bridge.stream.link import (
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
-from ft_compensation.identification.poses import Pose, coverage, pose_of
+from ft_compensation.identification.poses import Coverage, Pose, coverage, pose_of
 from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, length, wrench_text
 
 _TARE_S: Final = 0.5  # how long a tare of the sensor averages
@@ -93,7 +93,7 @@ class SensorServices:
 
     def _get_settings(self) -> str:
         info = find_sensor(self._link.ask("describe", DESCRIBE_TIMEOUT_S), self._link.sensor)
-        return json.dumps({**info.settings, "rate_hz": info.rate})
+        return json.dumps({**info.settings, "rate_hz": info.rate_hz})
 
     def _apply_settings(self) -> str:
         return f"sensor {self._link.sensor} has these settings now: {json.dumps(self._settings.apply())}"
@@ -170,14 +170,14 @@ class IdentifyServices:
         _create_triggers(node, "identify/", *acts)
 
     def _start(self) -> str:
-        if self._control.parameters.orientation.source == "none":
+        if self._control.parameters.gravity_source == "none":
             raise CompensationError("gravity_source is none, so a pose says nothing: set it, such as to imu")
         before = "" if self._poses is None else f", the {len(self._poses)} poses before are dropped"
         self._poses, self._result = [], None
         self._sensor = self._sensor_now()
         return (
             f"identification started{before}; gravity is known by {self._control.choice.source.describe}; "
-            f"{coverage([]).next_pose}, hold it still with nothing touching the tool, and call "
+            f"{self._coverage([]).next_pose}, hold it still with nothing touching the tool, and call "
             "identify/add_pose"
         )
 
@@ -186,13 +186,14 @@ class IdentifyServices:
         window = take_window(self._control, needs_tool=True)
         means = window.means()
         x, y, z = window.specific_force()
-        magnitude = length(self._control.parameters.gravity)
-        poses.append(pose_of(means, None if window.source.is_imu else (-x, -y, -z), magnitude))
+        parameters = self._control.parameters
+        gravity = None if window.source.is_imu else (-x, -y, -z)
+        poses.append(pose_of(means, gravity, length(parameters.gravity)))
         self._result = None
         x, y, z = (round(part, 2) + 0.0 for part in poses[-1].up)
         return (
             f"pose {len(poses)} taken (up is {x:.2f}, {y:.2f}, {z:.2f} in the sensor's frame); "
-            f"{coverage(poses).advice}"
+            f"{self._coverage(poses).advice}"
         )
 
     def _drop_pose(self) -> str:
@@ -201,10 +202,11 @@ class IdentifyServices:
             raise CompensationError("there is no pose to take back")
         poses.pop()
         self._result = None
-        return f"the pose is dropped, {len(poses)} are left; {coverage(poses).advice}"
+        return f"the pose is dropped, {len(poses)} are left; {self._coverage(poses).advice}"
 
     def _solve(self) -> str:
-        result = self._result = identify(self._started())
+        one_axis = self._control.parameters.identify_one_axis
+        result = self._result = identify(self._started(), one_axis=one_axis)
         parts = [summary(result), *details(result)]
         return ". ".join([*parts, f"{self._write(result, parts)}; identify/apply puts it in force"])
 
@@ -228,6 +230,9 @@ class IdentifyServices:
         poses = self._started()
         self._poses = self._result = None
         return f"identification cancelled, {len(poses)} poses dropped; nothing was changed"
+
+    def _coverage(self, poses: list[Pose]) -> Coverage:
+        return coverage(poses, one_axis=self._control.parameters.identify_one_axis)
 
     def _started(self) -> list[Pose]:
         now = self._sensor_now()
@@ -282,7 +287,7 @@ def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow
 
     CompensationError or RequestFailedError if they do not come or mean nothing.
     """
-    if (conflict := control.conflict(needs_tool=needs_tool)) is not None:
+    if conflict := control.conflict(needs_tool=needs_tool):
         raise CompensationError(conflict)
     link, clock = control.link, control.link.clock
     if not link.is_connected:

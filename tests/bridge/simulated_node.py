@@ -29,7 +29,7 @@ from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 from bota_ethercat.framing import FrameDecoder
 from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
-from bridge.diagnostics.monitor import TICK_S
+from bridge.diagnostics import TICK_S
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from tests.bridge.real_node import PATIENCE_S, Asking, LoggedNode, retire
 from tests.bridge.scripted_server import Script, description

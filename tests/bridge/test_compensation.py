@@ -480,9 +480,7 @@ def test_saturated_samples_can_be_left_out(weighed: Node, fresh: Server) -> None
     weighed.set("on_saturation", "stop")
     weighed.statuses()  # the next one comes after what follows
     assert saturate() == (10, 7)
-    weighed.until(
-        "3 samples were not compensated, because force or torque was saturated", compensation="warn"
-    )
+    weighed.until("3 samples were not compensated: force or torque was saturated", compensation="warn")
     fresh.changes = {"process_data": saturated()}
     array = weighed.until(
         "has stopped: force or torque is saturated, and on_saturation is stop", compensation="error"

@@ -16,8 +16,7 @@ from sensor_msgs.msg import Imu
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.text.json_text import JsonObject
-from bridge.compensating.orientations import multiply
-from bridge.compensating.tool_sources import ImuSource, ListenerSource, Oriented
+from bridge.compensating.sources import ImuSource, Oriented, RobotSource, multiply
 from bridge.node import StartError
 from bridge.parameters.table import DEFAULTS
 from ft_compensation.quantities import length, unit_quaternion
@@ -269,7 +268,7 @@ def test_an_orientation_through_dds(listener: Listener, server: ScriptedServer, 
     def is_taken() -> bool:
         publisher.publish(message)
         source: Any = node.node.compensation.choice.source
-        latest = source._listener.latest
+        latest = source.latest
         return latest is not None and latest.stamp_ns == 5 * 10**9
 
     wait_until(is_taken, "the orientation to be taken")
@@ -328,11 +327,10 @@ def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque()
 
 
 def test_a_clock_that_goes_back_does_not_stop_a_source_for_ever() -> None:
-    listening = Pose()
-    listening.latest = Oriented(UPRIGHT, 5_000 * 10**9)
-    source = ListenerSource(DEFAULTS, listening)
+    source = RobotSource(DEFAULTS, "topic /pose")
+    source.latest = Oriented(UPRIGHT, 5_000 * 10**9)
     assert source.specific_force(sample(), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, 9.80665))
-    listening.latest = Oriented(TILTED, 100 * 10**9)
+    source.latest = Oriented(TILTED, 100 * 10**9)
     assert source.specific_force(sample(), 100.0, 100.0) == pytest.approx((9.80665, 0.0, 0.0))
 
 
@@ -344,19 +342,11 @@ def test_rotations_multiply_in_the_order_that_is_said() -> None:
     assert weight(UP)[2] < 0
 
 
-class Pose:
-    """A topic's listener."""
-
-    latest: Oriented | None = None
-    problem, describe = "", "topic /pose"
-
-
 @pytest.mark.parametrize("set_by_s", [0.0, -3600.0, -0.05, 0.05, 3600.0])
 def test_an_orientation_of_a_topic_is_carried_on_to_the_sample(set_by_s: float) -> None:
     """The robot turns by 2 rad/s about x and tells its pose 20 ms late, twenty times a second; meanwhile the
     wall clock, by which poses are stamped, is set."""
-    listening: Any = Pose()
-    source, speed, begin_s, wall_s = ListenerSource(DEFAULTS, listening), 2.0, 1000.0, 1e9
+    source, speed, begin_s, wall_s = RobotSource(DEFAULTS, "topic /pose"), 2.0, 1000.0, 1e9
     for step in range(100):
         t = step * 0.01
         if step == 50:
@@ -364,7 +354,7 @@ def test_an_orientation_of_a_topic_is_carried_on_to_the_sample(set_by_s: float) 
         if step % 5 == 2:
             half = 0.5 * speed * (t - 0.02)
             stamp_ns = round((wall_s + t - 0.02) * 1e9)
-            listening.latest = Oriented((math.sin(half), 0.0, 0.0, math.cos(half)), stamp_ns)
+            source.latest = Oriented((math.sin(half), 0.0, 0.0, math.cos(half)), stamp_ns)
         got = source.specific_force(sample(angular_rate=(speed, 0.0, 0.0)), begin_s + t, wall_s + t)
         if step > 2:
             wanted = 0.0, STANDARD_GRAVITY * math.sin(speed * t), STANDARD_GRAVITY * math.cos(speed * t)

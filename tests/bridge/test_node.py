@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from bota_ethercat.text.json_text import JsonObject
-from bridge.node import SERVER_GOES_ON, SUPERVISOR_TOPIC, StartError, run
+from bridge.node import SERVER_GOES_ON, StartError, run
 from tests.bridge.real_node import Listener, Start, StartProcess, establish
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import Node, Server
@@ -113,7 +113,7 @@ def supervised(server: Server, exit_code: int = 0) -> Node:
     """A node that has been told to stop, and what it has said."""
     with Node(server) as node:
         node.run(0.1)
-        (subscription,) = [s for s in node.node.subscriptions if s.topic_name == SUPERVISOR_TOPIC]
+        (subscription,) = [s for s in node.node.subscriptions if s.topic_name == "/supervisor_status_data"]
         codes = []
         for key, value in (("ft_sensors", "0"), ("camera", "1"), ("ft_sensors", "11"), ("ft_sensors", "1")):
             subscription.callback(KeyValue(key=key, value=value))

@@ -22,6 +22,7 @@ from bota_ethercat.pdo import encode
 from bridge.node import StartError
 from bridge.parameters.table import PARAMETERS, ParameterError, gather, parse_frames
 from bridge.publishing.compensated_wrench import make_frames
+from bridge.publishing.messages import Stamps
 from ft_compensation.outputs import FilterSettings, WrenchFilter
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.real_node import retire
@@ -102,13 +103,13 @@ def test_every_topic_of_one_sample(published: Published) -> None:
 
 def test_orientation_where_the_sensor_estimates_one(published: Published) -> None:
     heard = published.of(
-        {"process_data": encode(77, QUATERNION | {"acceleration.z": 0.5}), "stamp_ns": 7},
+        {"process_data": encode(77, QUATERNION | {"acceleration.z": 0.5}), "stamp_ns": 7 * 10**9},
         {"process_data": encode(77, {"force.x": 1.0})},  # no estimate
         {"process_data": process_data(1.0, 61)},
-        {"process_data": encode(77, QUATERNION), "stamp_ns": 9},
+        {"process_data": encode(77, QUATERNION), "stamp_ns": 9 * 10**9},
     )
     oriented, raw = heard["imu/data"], heard["imu/data_raw"]
-    assert [stamp_ns(message) for message in oriented] == [7, 9]
+    assert [stamp_ns(message) for message in oriented] == [7 * 10**9, 9 * 10**9]
     for message in oriented:
         q = message.orientation
         assert (q.x, q.y, q.z, q.w) == (0.5, -0.5, 0.5, 0.5)
@@ -423,7 +424,7 @@ def test_tf_in_a_real_executor(server: Sensor, tf: FakeTf) -> None:
     executor.add_node(node)
     tf.error = None
     defaults = {row.name: row.default for row in PARAMETERS}
-    (topic,) = make_frames(node, gather(defaults | {"wrench_frames": ("base",)}))
+    (topic,) = make_frames(node, gather(defaults | {"wrench_frames": ("base",)}), Stamps(node.get_logger()))
     heard: list[Any] = []
 
     def publishes() -> bool:

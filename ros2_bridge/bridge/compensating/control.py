@@ -13,9 +13,8 @@ from typing import Any, Final
 from rclpy.node import Node
 
 from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper, OwnOffset
-from bridge.compensating.orientations import SourceChoice
-from bridge.compensating.tool_sources import IMU_IS_OFF
-from bridge.diagnostics.health import CompensationState
+from bridge.compensating.sources import IMU_IS_OFF, SourceChoice
+from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import LiveParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
@@ -47,7 +46,7 @@ class CompensationControl:
         self.sensors = 1  # how many have been there: what was measured on one is of no use with another
         self._model = ""  # of the sensor that is or was there
         self._log = node.get_logger()
-        self.choice = SourceChoice(node, parameters.frame_id, self.link)
+        self.choice = SourceChoice(node, self.link)
         self.keeper = BiasKeeper(self._log)
         self.own_offset = OwnOffset(self.link)
         # Origin of the bias that is being put in force, and what it was taken with if by a tare.
@@ -93,7 +92,7 @@ class CompensationControl:
         age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
         parts = ["bias"] if bias != NO_WRENCH else []
         if payload.mass:
-            parts.append("weight and inertia of the tool" if source.is_imu else "weight of the tool")
+            parts.append("weight and inertia of the tool" if source.has_inertia else "weight of the tool")
         none = "nothing is subtracted: there is no bias and no tool_mass"
         good = f"subtracted: {', '.join(parts)}" if parts else none
         return CompensationState(
@@ -113,21 +112,18 @@ class CompensationControl:
                 "compensated": output.published,
                 "withheld": output.withheld,
             },
-            has_subscribers=has_subscribers,
-            has_tool=payload.mass > 0.0,
-            source=source.describe,
-            withheld=output.withheld,
-            why_stopped=self._why_stopped(),
-            why_partly=output.problem,
-            stops_on_saturation=output.stops_on_saturation,
-            problem=self.conflict()
+            stopped=self._why_stopped() or output.problem,
+            doubtful=self.conflict()
             or self.own_offset.doubt()
             or self._ramp.taken.doubt(payload)
             or self.keeper.problem
             or (self._payload_watch.finding if self._payload_watch is not None else ""),
+            follows_imu=source.is_imu and payload.mass > 0.0,
+            withheld=output.withheld,
+            why_withheld=output.why_withheld,
         )
 
-    def conflict(self, *, needs_tool: bool = False) -> str | None:
+    def conflict(self, *, needs_tool: bool = False) -> str:
         """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
         specific force in the frame of the wrench, a sentence that says what to do."""
         settings = self.link.settings
@@ -141,37 +137,36 @@ class CompensationControl:
                 "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
                 "or set tool_mass to 0"
             )
-        return self._blind() if needs_tool else None
+        return self._blind() if needs_tool else ""
 
-    def _blind(self) -> str | None:
-        if self.parameters.orientation.source != "imu":
-            return None
+    def _blind(self) -> str:
+        if self.parameters.gravity_source != "imu":
+            return ""
         if self.link.settings.get("coordinate_system") is True:
             return (
                 "settings.coordinate_system is on, so the wrench is in a frame configured in the sensor, and "
                 "the rotation from the IMU to it is unknown: switch it off, or take the orientation of that "
                 "frame from the robot (gravity_source)"
             )
-        return IMU_IS_OFF if self.link.settings.get("imu_active") == 0 else None
+        return IMU_IS_OFF if self.link.settings.get("imu_active") == 0 else ""
 
     def _hold(self) -> None:
         """Publish nothing while the specific force is needed and cannot be known."""
-        self.output.hold = self._blind() if self.parameters.payload.mass else None
+        self.output.hold = self._blind() if self.parameters.payload.mass else ""
 
-    def _why_stopped(self) -> str | None:
+    def _why_stopped(self) -> str:
         """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
         output, source, watch = self.output, self.choice.source, self.reader.watch
-        sample, stamp_s = output.sample, output.stamp_s
+        why, sample, stamp_s = output.hold, output.sample, output.stamp_s
         if not output.has_subscribers:
-            if not self.parameters.payload.mass:
-                return output.hold
-            sample, stamp_s = watch.sample, watch.stamp_ns * 1e-9
-        elif not output.is_stopped:
-            return None
-        elif output.is_saturated:
-            return output.hold or "force or torque is saturated, and on_saturation is stop"
-        why = source.why_none(sample, stamp_s) if sample is not None else ""
-        return output.hold or why or ("what is known of the tool is too old" if output.is_stopped else None)
+            if not why and self.parameters.payload.mass and watch.sample is not None:
+                why = source.why_none(watch.sample, watch.stamp_ns * 1e-9)
+            return why and f"wrench_compensated could not be published if somebody subscribed: {why}"
+        if not output.is_stopped:
+            return ""
+        if not why and not output.is_saturated and sample is not None:
+            why = source.why_none(sample, stamp_s)
+        return f"wrench_compensated has stopped: {why or output.why_withheld}"
 
     def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
         """Put a bias in force, `taken` by a tare, and keep it if that is asked for."""

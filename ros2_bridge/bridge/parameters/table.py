@@ -62,6 +62,7 @@ class Row(NamedTuple):
     choices: tuple[str, ...] = ()
     lengths: tuple[int, ...] = _COVARIANCE_LENGTHS
     live: bool = True
+    optional: bool = False  # whether a text may be empty
 
     def check(self, value: object) -> ParameterValue:
         """Return `value`, a whole number as float where one is meant; ParameterError if it cannot be."""
@@ -87,7 +88,7 @@ class Row(NamedTuple):
         if type(item) is not kind and (kind, type(item)) != (float, int):
             return False
         if isinstance(item, str):
-            return item in self.choices if self.choices else several or bool(item)
+            return item in self.choices if self.choices else several or self.optional or bool(item)
         if isinstance(item, bool) or not isinstance(item, int | float):
             return True
         return self.low <= (abs(item) if several else item) <= self.high  # nor is it a NaN
@@ -103,7 +104,7 @@ class Row(NamedTuple):
                 return "3 numbers, the variances, or 9, the covariance row by row"
             return f"{self.lengths[0]} numbers, none beyond {self.high:g} either way"
         if isinstance(self.default, str):
-            return "text that is not empty"
+            return "text" if self.optional else "text that is not empty"
         if isinstance(self.default, bool):
             return "true or false"
         kind = "a whole number" if isinstance(self.default, int) else "a number"
@@ -121,6 +122,11 @@ PARAMETERS: Final = (
     Row("cpu", -1, "CPU of the stream's thread; -1 = any", -1, 1023, live=False),
     Row("publishing_frequency", 0.0, "Most messages a second, always the newest; 0 = every sample", 0, 1e6),
     Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray", live=False),
+    Row("supervisor_topic", "/supervisor_status_data", "Topic that stops server and node; empty = none",
+        live=False, optional=True),
+    Row("stamp", "sample",
+        "What stamps are the time of: the sample, or the measurement, earlier by the sensor's filter delay",
+        choices=("sample", "measurement")),
     Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature",
         live=False),
     Row("wrench_frames", NO_TEXTS,
@@ -159,12 +165,13 @@ PARAMETERS: Final = (
     Row("bias_directory", AUTO,
         "Where it is kept; auto = bota-ethercat-bridge in $XDG_STATE_HOME or ~/.local/state"),
     Row("imu_position", ZERO,
-        "Position of the IMU in frame_id, m; zeros = that of the sensor's model", 0, 1, lengths=(3,)),
+        "Position in frame_id of the IMU that gravity_source names, m; zeros = that of the sensor's model",
+        0, 1, lengths=(3,)),
     Row("on_saturation", "publish",
         "What wrench_compensated does on samples whose force or torque is saturated",
         choices=("publish", "stop")),
     Row("gravity_source", "imu",
-        "Where the tool's weight is from: imu (with its inertia), or an orientation of the robot's",
+        "Where the tool's weight and inertia are from: the sensor's IMU, or the robot (topics, TF)",
         choices=("none", "imu", *TOPIC_SOURCES, "tf")),
     Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
     Row("orientation.base_frame", "base_link", "Frame that gravity is given in, for the source tf"),
@@ -197,17 +204,8 @@ PARAMETERS: Final = (
     Row("filter.dead_band_torque", 0.0, "Subtracted from the magnitude of its torque, Nm; 0 = none", 0, 1e6),
     Row("identify.file", AUTO,
         "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bias_directory"),
+    Row("identify.one_axis", False, "Whether ~/identify/solve takes poses that turn about one axis only"),
 )  # fmt: skip
-
-
-class OrientationParameters(NamedTuple):
-    """Where the orientation comes from."""
-
-    source: str
-    topic: str
-    base_frame: str
-    mounting: Quaternion
-    stale_after: float
 
 
 class WrenchFrame(NamedTuple):
@@ -218,7 +216,7 @@ class WrenchFrame(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """The parameters' values, checked."""
+    """The parameters' values, checked; `a.b` is `a_b`, unless it is part of a group that has its own type."""
 
     server_host: str
     server_port: int
@@ -227,6 +225,8 @@ class Parameters(NamedTuple):
     cpu: int
     publishing_frequency: float
     array_topic: str
+    supervisor_topic: str
+    stamp: str
     imu_units: ImuUnits
     frame_id: str
     imu_frame_id: str
@@ -244,11 +244,16 @@ class Parameters(NamedTuple):
     bias_directory: str
     imu_position: Vector3
     on_saturation: str
-    orientation: OrientationParameters
+    gravity_source: str
+    orientation_topic: str
+    orientation_base_frame: str
+    orientation_mounting: Quaternion
+    orientation_stale_after: float
     accelerometer: Accelerometer
     rest_duration: float
     rest: StationaryLimits
     identify_file: str
+    identify_one_axis: bool
     filter: FilterSettings
 
 
@@ -293,20 +298,18 @@ def gather(given: Mapping[str, Any]) -> Parameters:
         return {name.removeprefix(prefix): values.pop(name) for name in given if name.startswith(prefix)}
 
     rest = group("rest.")
-    return Parameters(
-        limits=LIMITS._replace(**group("diagnostics.")),
-        imu_units=ImuUnits(values.pop("imu_raw_units")),
-        wrench_frames=parse_frames(values.pop("wrench_frames")),
-        payload=Payload(values.pop("tool_mass"), values.pop("tool_center_of_gravity")),
-        bias=Wrench.of(values.pop("bias")),
-        orientation=OrientationParameters(values.pop("gravity_source"), **group("orientation.")),
-        accelerometer=Accelerometer(**group("accelerometer.")),
-        rest_duration=rest.pop("duration"),
-        rest=StationaryLimits(**rest),
-        identify_file=values.pop("identify.file"),
-        filter=FilterSettings(**group("filter.")),
-        **values,
-    )
+    groups: dict[str, Any] = {
+        "limits": LIMITS._replace(**group("diagnostics.")),
+        "imu_units": ImuUnits(values.pop("imu_raw_units")),
+        "wrench_frames": parse_frames(values.pop("wrench_frames")),
+        "payload": Payload(values.pop("tool_mass"), values.pop("tool_center_of_gravity")),
+        "bias": Wrench.of(values.pop("bias")),
+        "accelerometer": Accelerometer(**group("accelerometer.")),
+        "rest_duration": rest.pop("duration"),
+        "rest": StationaryLimits(**rest),
+        "filter": FilterSettings(**group("filter.")),
+    }
+    return Parameters(**groups, **{name.replace(".", "_"): value for name, value in values.items()})
 
 
 def parse_frames(texts: Sequence[str]) -> tuple[WrenchFrame, ...]:

@@ -18,10 +18,9 @@ from rclpy.node import Node
 from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample, Vector3
-from bridge.compensating.orientations import LookUp, UnusableError, check_tf, follow_tf
-from bridge.compensating.tool_sources import Source
+from bridge.compensating.sources import LookUp, Source, UnusableError, check_tf, follow_tf
 from bridge.parameters.table import Parameters
-from bridge.publishing.messages import Topic
+from bridge.publishing.messages import Stamps, Topic
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.outputs import FilterSettings, WrenchFilter, WrenchTransform
@@ -41,9 +40,9 @@ class WrenchTopic(Topic):
     takes_all = False  # whether `note` wants what `publishing_frequency` leaves out
     problem = ""  # why nothing is published, a sentence
 
-    def __init__(self, node: Node, topic: str, frame_id: str, stage: str = "final") -> None:
+    def __init__(self, node: Node, topic: str, frame_id: str, stamps: Stamps, stage: str = "final") -> None:
         super().__init__(node, WrenchStamped, topic)
-        self._pack = StampedNumbers(frame_id, 6).pack
+        self._pack, self._stamps = StampedNumbers(frame_id, 6).pack, stamps
         self.index = Stages._fields.index(stage)
 
     def configure(self, parameters: Parameters) -> None:
@@ -54,14 +53,14 @@ class WrenchTopic(Topic):
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Publish a force, N, and a torque, Nm."""
-        self._send(self._pack(frame.stamp_ns, *force, *torque))
+        self._send(self._pack(frame.stamp_ns - self._stamps.wrench_ns, *force, *torque))
 
 
 class FixedFrameTopic(WrenchTopic):
     """`wrench_compensated/NAME` in a frame fixed to the sensor's."""
 
-    def __init__(self, node: Node, name: str, transform: WrenchTransform) -> None:
-        super().__init__(node, f"wrench_compensated/{name}", name)
+    def __init__(self, node: Node, name: str, stamps: Stamps, transform: WrenchTransform) -> None:
+        super().__init__(node, f"wrench_compensated/{name}", name, stamps)
         self._transform = transform
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
@@ -72,8 +71,8 @@ class FixedFrameTopic(WrenchTopic):
 class TfFrameTopic(WrenchTopic):
     """`wrench_compensated/NAME` in a frame known to TF: `look` is for one thread, `send` the reader's."""
 
-    def __init__(self, node: Node, name: str, parameters: Parameters) -> None:
-        super().__init__(node, f"wrench_compensated/{name}", name)
+    def __init__(self, node: Node, name: str, stamps: Stamps, parameters: Parameters) -> None:
+        super().__init__(node, f"wrench_compensated/{name}", name, stamps)
         self._name, self._source = name, parameters.frame_id
         self.wanted = False  # whether anybody had subscribed at the last look
         self.on_change: Callable[[], object] = lambda: None  # called when that changes
@@ -83,7 +82,7 @@ class TfFrameTopic(WrenchTopic):
 
     def configure(self, parameters: Parameters) -> None:
         """Take the limit of the age."""
-        self._limit_ns = parameters.orientation.stale_after * _NS_PER_S
+        self._limit_ns = parameters.orientation_stale_after * _NS_PER_S
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed."""
@@ -130,16 +129,17 @@ class TfFrameTopic(WrenchTopic):
         )
 
 
-def make_frames(node: Node, parameters: Parameters) -> list[WrenchTopic]:
+def make_frames(node: Node, parameters: Parameters, stamps: Stamps) -> list[WrenchTopic]:
     """A topic for each of the parameter `wrench_frames`; ParameterError if one needs TF and there is none."""
     frames = parameters.wrench_frames
     by_tf = [frame.name for frame in frames if frame.fixed is None]
     if by_tf:
         check_tf(f"parameter wrench_frames has {by_tf[0]!r} by TF", f"give its pose: '{by_tf[0]} x y z'")
-    followed = [TfFrameTopic(node, name, parameters) for name in by_tf]
+    followed = [TfFrameTopic(node, name, stamps, parameters) for name in by_tf]
     if followed:
         _follow_tf(node, followed)
-    return [*(FixedFrameTopic(node, name, fixed) for name, fixed in frames if fixed is not None), *followed]
+    fixed = [FixedFrameTopic(node, name, stamps, pose) for name, pose in frames if pose is not None]
+    return [*fixed, *followed]
 
 
 def _follow_tf(node: Node, topics: Sequence[TfFrameTopic]) -> None:
@@ -171,9 +171,12 @@ class FilteredTopic:
     index = Stages._fields.index("final")
     takes_all = True
 
-    def __init__(self, node: Node, parameters: Parameters, rate_hz: Callable[[], float]) -> None:
+    def __init__(
+        self, node: Node, parameters: Parameters, stamps: Stamps, rate_hz: Callable[[], float]
+    ) -> None:
         """`rate_hz` tells the sensor's sampling rate, 0 if it is not known."""
-        self._node, self._frame_id, self._rate_hz = node, parameters.frame_id, rate_hz
+        self._node, self._frame_id, self._stamps = node, parameters.frame_id, stamps
+        self._rate_hz = rate_hz
         self.problem = ""
         self._topic: WrenchTopic | None = None
         self._filter = WrenchFilter()
@@ -184,7 +187,7 @@ class FilteredTopic:
         """Take other settings from the next sample on; for the executor's thread."""
         self._settings = parameters.filter
         if self._settings.cutoff and self._topic is None:
-            self._topic = WrenchTopic(self._node, "wrench_filtered", self._frame_id)
+            self._topic = WrenchTopic(self._node, "wrench_filtered", self._frame_id, self._stamps)
 
     def is_wanted(self) -> bool:
         """Whether it is configured and anybody has subscribed."""
@@ -280,23 +283,26 @@ class CompensatedOutput:
 
     fields = ("force", "torque")
 
-    def __init__(self, node: Node, parameters: Parameters, rate_hz: Callable[[], float]) -> None:
+    def __init__(
+        self, node: Node, parameters: Parameters, stamps: Stamps, rate_hz: Callable[[], float]
+    ) -> None:
         """ParameterError if a frame cannot be had. `rate_hz` as for `FilteredTopic`."""
         stages = {"wrench_compensated": "final", "compensation/bias": "bias", "compensation/tool": "tool"}
+        frame_id = parameters.frame_id
         self._all: tuple[WrenchTopic | FilteredTopic, ...] = (
-            *(WrenchTopic(node, topic, parameters.frame_id, stage) for topic, stage in stages.items()),
-            *make_frames(node, parameters),
-            FilteredTopic(node, parameters, rate_hz),
+            *(WrenchTopic(node, topic, frame_id, stamps, stage) for topic, stage in stages.items()),
+            *make_frames(node, parameters, stamps),
+            FilteredTopic(node, parameters, stamps, rate_hz),
         )
         self._wanted: tuple[WrenchTopic | FilteredTopic, ...] = ()
         self._noting: tuple[WrenchTopic | FilteredTopic, ...] = ()
         self.plan = Plan(Source(), Compensator(), BiasRamp(), has_tool=False)
         self.window: RestWindow | None = None  # the one that is open
-        self.hold: str | None = None  # why nothing may be published for now, whatever else is known
+        self.hold = ""  # why nothing may be published for now, whatever else is known
         # Whether saturated samples are not published, and whether the latest was one of them.
         self.stops_on_saturation = self.is_saturated = False
-        # Samples since the node started that were compensated, and that were not.
-        self.published = self.withheld = 0
+        # Samples since the node started that were compensated, and that were not; why the latest was not.
+        self.published, self.withheld, self.why_withheld = 0, 0, ""
         self.is_stopped = False  # whether the latest could not be compensated
         self.sample: Sample | None = None  # the latest that came here
         # Its time, s: by the server's monotonic clock, and since the Unix epoch.
@@ -331,7 +337,7 @@ class CompensatedOutput:
         """Give source, open window and filters a sample that is not published."""
         plan = self.plan
         felt = self._felt(plan, sample, frame)
-        if self._noting and felt is not None and self.hold is None:
+        if self._noting and felt is not None and not self.hold:
             stages = self._stages(plan, sample, felt, self.time_s)
             for topic in self._noting:
                 topic.note(*stages[topic.index], frame)
@@ -354,9 +360,13 @@ class CompensatedOutput:
         felt = self._felt(plan, sample, frame)
         time_s = self.time_s
         self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
-        if felt is None or self.hold is not None or self.is_saturated:
+        if felt is None or self.hold or self.is_saturated:
             self.is_stopped = True
             self.withheld += 1
+            saturated = (
+                "force or torque was saturated, and on_saturation is stop" if self.is_saturated else ""
+            )
+            self.why_withheld = self.hold or saturated or f"no current orientation ({plan.source.describe})"
             return
         self.is_stopped = False
         stages = self._stages(plan, sample, felt, time_s)

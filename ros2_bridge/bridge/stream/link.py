@@ -25,6 +25,7 @@ CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0
 SHUTDOWN_TIMEOUT_S: Final = 3.0
 _MOST_HZ: Final = 1e6
+LONGEST_DELAY_MS: Final = 1000
 
 
 class Clock:
@@ -53,19 +54,20 @@ class SensorInfo(NamedTuple):
     sensor: int
     name: str
     serial: str
-    rate_hz: str
     state: str
     hardware: str = "?"
     firmware: str = "?"
-    rate: float = 0.0  # `rate_hz` as a number; 0 if it is none
+    rate_hz: float = 0.0  # 0 if the server does not say
     settings: Mapping[str, SettingValue] = {}
+    delay_ms: Mapping[str, float] = {}  # of the filters, by channel, as far as it is known
     settling: bool = False  # whether its data has not settled
     # Its own force/torque offset, N and Nm; None if the server does not say.
     offset: tuple[float, ...] | None = None
 
     def __str__(self) -> str:
         """One phrase for the log."""
-        return f"sensor {self.sensor} ({self.name}, serial {self.serial}, {self.rate_hz} Hz, {self.state})"
+        rate_hz = f"{self.rate_hz:g}" if self.rate_hz else "?"
+        return f"sensor {self.sensor} ({self.name}, serial {self.serial}, {rate_hz} Hz, {self.state})"
 
 
 class Link:
@@ -81,6 +83,7 @@ class Link:
         # The sensor as the server described it last; kept when the connection ends.
         self.info: SensorInfo | None = None
         self.settings: Mapping[str, SettingValue] = {}  # the sensor's settings; empty without a connection
+        self.delay_ms: Mapping[str, float] = {}  # as in SensorInfo, with these settings
         # The sensor's own force/torque offset, part of every sample, N and Nm; None: not known.
         self.offset: tuple[float, ...] | None = None
         self.rate_hz = 0.0  # samples a second that are to be expected; 0 if the server does not say
@@ -96,7 +99,8 @@ class Link:
     def connected(self, description: JsonObject) -> SensorInfo:
         """The stream begins."""
         self.info = info = find_sensor(description, self.sensor)
-        self.settings, self.rate_hz, self.offset = info.settings, info.rate, info.offset
+        self.settings, self.rate_hz, self.offset = info.settings, info.rate_hz, info.offset
+        self.delay_ms = info.delay_ms
         self.connects += 1
         self.since_s = self.clock.monotonic()
         self.lost = None
@@ -150,15 +154,17 @@ class Link:
             self.rate_hz = rate_hz
             self.epoch += 1
         self.settings = found
+        if "delay_ms" in message:
+            self.delay_ms = known_delays(message["delay_ms"])
 
     def described(self, description: JsonObject) -> None:
         """Take a later reply to `describe`. Settings and offset come with events, which are never stale."""
         self.client.session.describe(description)
         with contextlib.suppress(RequestFailedError):  # not there any more: its frames will say so
             self.info = info = find_sensor(description, self.sensor)
-            if info.rate != self.rate_hz:
+            if info.rate_hz != self.rate_hz:
                 self.epoch += 1
-            self.rate_hz = info.rate
+            self.rate_hz = info.rate_hz
 
     # -- requests, from other threads than the reader's: every one answered, refused or timed out
 
@@ -215,6 +221,13 @@ def known_rate(rate_hz: object) -> float:
     return float(rate_hz) if isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ else 0.0
 
 
+def known_delays(delay_ms: object) -> Mapping[str, float]:
+    """The delays of the filters that a message gives, ms by channel; without those that it does not know."""
+    given = delay_ms if isinstance(delay_ms, dict) else {}
+    found = {channel: number(given.get(channel)) for channel in ("force_torque", "acceleration")}
+    return {channel: ms for channel, ms in found.items() if ms is not None and 0 <= ms <= LONGEST_DELAY_MS}
+
+
 def known_offset(offset: object) -> tuple[float, ...] | None:
     """The sensor's own offset from a message; None if missing or invalid."""
     try:
@@ -234,12 +247,13 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
     found = rows(description.get("sensors"))
     for row in found:
         if row.get("sensor") == sensor and not isinstance(row.get("sensor"), bool):
-            keys = "name", "serial", "rate_hz", "state", "hardware", "firmware"
+            keys = "name", "serial", "state", "hardware", "firmware"
             return SensorInfo(
                 sensor=sensor,
                 **{key: printable(row.get(key, "?"), 40) for key in keys},
-                rate=known_rate(row.get("rate_hz")),
+                rate_hz=known_rate(row.get("rate_hz")),
                 settings=known_settings(row.get("settings")),
+                delay_ms=known_delays(row.get("delay_ms")),
                 settling=row.get("settling") is True,
                 offset=known_offset(row.get("offset")),
             )

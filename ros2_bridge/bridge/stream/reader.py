@@ -24,11 +24,13 @@ from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
 from bridge.parameters.table import Parameters
 from bridge.process import Worker
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
-from bridge.stream.link import SYSTEM_CLOCK, Clock, Link, sentence
+from bridge.stream.link import LONGEST_DELAY_MS, SYSTEM_CLOCK, Clock, Link, sentence
 
 SILENCE_S: Final = 1.0
 _SILENCE_NS: Final = round(0.99e9 * SILENCE_S)  # a wait may end some microseconds early
-_LAST_STAMP_NS: Final = (2**31 - 1) * 10**9  # the latest time that a ROS message can carry
+# Times that a ROS message can carry, less the longest delay of a filter.
+_FIRST_STAMP_NS: Final = LONGEST_DELAY_MS * 10**6
+_LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
 _WARN_EVERY_S: Final = 10.0
 _MOST_NOTED: Final = 8192
 
@@ -235,7 +237,7 @@ class Reader:
             self._follow(frame)
         for frame in selected:
             sample = self._decoders[len(frame.process_data)].decode(frame.process_data)
-            if frame.stamp_ns > _LAST_STAMP_NS:
+            if not _FIRST_STAMP_NS <= frame.stamp_ns <= _LAST_STAMP_NS:
                 self._warn_sometimes(
                     f"a sample with the impossible time {frame.stamp_ns} ns was not published"
                 )
