@@ -56,7 +56,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.on_finish: Callable[[], None] = lambda: None
         self.parameters = parameters = declare(self)
         self.stamps = stamps = Stamps(self.get_logger())
-        compensated = CompensatedOutput(self, parameters, stamps, lambda: self.reader.link.rate_hz)
+        compensated = CompensatedOutput(self, parameters, stamps, lambda: self.reader.link.info.rate_hz)
         self.outputs = Outputs([*make_measured(self, parameters, stamps), compensated])
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
@@ -70,7 +70,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.monitor = Monitor(
             self, parameters.limits, self.reader, self.compensation.state, self.outputs, stamps, self.fail
         )
-        SensorServices(self, link, self.sensor_settings, self.compensation.own_offset.after_tare)
+        SensorServices(self, link, self.sensor_settings)
         BiasServices(self, self.compensation)
         IdentifyServices(self, self.compensation)
         warn_of_others(self)

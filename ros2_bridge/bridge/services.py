@@ -72,24 +72,19 @@ def _name(act: Callable[[], str]) -> str:
 class SensorServices:
     """What the server does, for every client."""
 
-    def __init__(
-        self, node: Node, link: Link, settings: SettingsParameters, after_tare: Callable[[], str]
-    ) -> None:
-        """`after_tare` says what a new offset in the sensor means for the rest of the node; "" if nothing."""
-        self._link, self._settings, self._after_tare = link, settings, after_tare
+    def __init__(self, node: Node, link: Link, settings: SettingsParameters) -> None:
+        self._link, self._settings = link, settings
         acts = self._sensor_tare, self._get_settings, self._apply_settings, self._save_settings
         _create_triggers(node, "", *acts)
 
     def _sensor_tare(self) -> str:
-        rate_hz = self._link.rate_hz or 800.0
+        rate_hz = self._link.info.rate_hz or 800.0
         samples = min(max(round(_TARE_S * rate_hz), _FEWEST_SAMPLES), _MOST_SAMPLES)
         timeout_s = _TARE_EXTRA_S + _TARE_PATIENCE * samples / rate_hz
         reply = self._link.ask("tare", timeout_s, sensor=self._link.sensor, samples=samples)
         titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
         parts = [f"{title} {offset_text(reply.get(key))}" for key, title in titles]
-        text = f"sensor {self._link.sensor} tared: " + "; ".join(parts)
-        also = self._after_tare()
-        return f"{text}. {also}" if also else text
+        return f"sensor {self._link.sensor} tared: " + "; ".join(parts)
 
     def _get_settings(self) -> str:
         info = find_sensor(self._link.ask("describe", DESCRIBE_TIMEOUT_S), self._link.sensor)
@@ -100,7 +95,7 @@ class SensorServices:
 
     def _save_settings(self) -> str:
         # `configure` wants at least one setting: one as it is.
-        setting = next(iter(self._link.settings.items()), None)
+        setting = next(iter(self._link.info.settings.items()), None)
         sensor = self._link.sensor
         if setting is None:
             raise RequestFailedError(
@@ -247,7 +242,7 @@ class IdentifyServices:
 
     def _sensor_now(self) -> tuple[int, object]:
         """What all poses must share: the sensor and its own offset."""
-        return self._control.sensors, self._control.link.offset
+        return self._control.sensors, self._control.link.info.offset
 
     def _write(self, result: Identified, comment: list[str]) -> str:
         try:
@@ -263,7 +258,7 @@ class IdentifyServices:
         parameters, info = self._control.parameters, self._control.link.info
         if parameters.identify_file != AUTO:
             return expand(parameters.identify_file, "identify.file")
-        serial = info.serial if info is not None and info.serial.isalnum() else "unknown"
+        serial = info.serial if info.serial.isalnum() else "unknown"
         return directory_of(parameters.bias_directory) / f"sensor-{serial}-payload.yaml"
 
 
@@ -297,7 +292,7 @@ def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow
     window = RestWindow(seconds, limits, control.choice.source)
     patience_s = 1.5 * seconds + _PATIENCE_S
     deadline_s = clock.monotonic() + patience_s
-    info, offset, bad = link.info, link.offset, control.reader.not_finite
+    info, offset, bad = link.info, link.info.offset, control.reader.not_finite
     control.output.window = window
     try:
         while not clock.wait(window.done, _LOOK_S):
@@ -310,9 +305,9 @@ def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow
     finally:
         control.output.window = None
     # By what the reader knows: the executor, which would count another sensor, is the one that waits here.
-    if info is not None and link.info is not None and info.serial != link.info.serial:
+    if info.serial != link.info.serial:
         raise CompensationError("the sensor was replaced by another meanwhile: call again")
-    if offset != link.offset:
+    if offset != link.info.offset:
         raise CompensationError("the sensor's own offset was changed meanwhile: call again")
     if bad := control.reader.not_finite - bad:
         raise CompensationError(

@@ -15,10 +15,12 @@ from geometry_msgs.msg import PoseStamped, QuaternionStamped
 from sensor_msgs.msg import Imu
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
+from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
 from bridge.compensating.sources import ImuSource, Oriented, RobotSource, multiply
 from bridge.node import StartError
 from bridge.parameters.table import DEFAULTS
+from bridge.stream.link import SensorInfo
 from ft_compensation.quantities import length, unit_quaternion
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.real_node import Listener, Start
@@ -139,6 +141,7 @@ def test_a_source_that_falls_silent_and_comes_back(robot: Robot, stages: Stages,
     robot.sending = True
     stages.forget()
     assert stages.first() == pytest.approx(ZERO6, abs=1e-3)  # never with the old pose
+    node.until(" samples were not compensated: no current orientation (topic ", compensation="warn")
     node.until(compensation="ok")
 
 
@@ -308,8 +311,8 @@ def test_the_source_tf(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque() -> None:
-    filters: Any = SimpleNamespace(settings={}, rate_hz=0.0)
-    source, number = ImuSource(DEFAULTS, (0.0, 0.0, 0.0), filters), itertools.count(1)
+    link: Any = SimpleNamespace(info=SensorInfo())
+    source, number = ImuSource(DEFAULTS, (0.0, 0.0, 0.0), link), itertools.count(1)
 
     def felt(count: int = 1) -> float:
         found = None
@@ -319,10 +322,10 @@ def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque()
         return found[0]
 
     assert felt() == 1.0, "nothing is known of them"
-    known = {"sinc_length": 512, "fir": False, "acceleration_filter": 1}
-    filters.settings, filters.rate_hz = known, 100
+    known: dict[str, SettingValue] = {"sinc_length": 512, "fir": False, "acceleration_filter": 1}
+    link.info = SensorInfo(settings=known, rate_hz=100)
     assert felt(20) == pytest.approx(21 - (15 - 1.94) / 10)
-    filters.settings = {**known, "chop": True}
+    link.info = SensorInfo(settings={**known, "chop": True}, rate_hz=100)
     assert felt() == 22.0, "how long CHOP delays is not known"
 
 

@@ -159,7 +159,7 @@ class OwnOffset:
     @property
     def now(self) -> Wrench | None:
         """The sensor's current offset; None if unknown."""
-        offset = self._link.offset
+        offset = self._link.info.offset
         return None if offset is None else Wrench.of(offset)
 
     @property
@@ -190,14 +190,6 @@ class OwnOffset:
             return ""
         if self._appeared:
             return "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare"
-        if self.of_bias is not None and self._link.offset is None:
+        if self.of_bias is not None and self._link.info.offset is None:
             return "the sensor's own offset is no longer known: the bias may be wrong, tare"
         return ""
-
-    def after_tare(self) -> str:
-        """What a tare of the sensor means for the bias, a sentence; empty if nothing."""
-        if not self.has_bias:
-            return ""
-        if self._link.offset is None:
-            return "The node's own bias was for the old offset: call ~/tare or ~/clear_tare"
-        return "The node's own bias was shifted by the change, so wrench_compensated is unchanged"

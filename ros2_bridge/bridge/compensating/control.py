@@ -25,6 +25,7 @@ from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
 
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
+_NOTHING_CURRENT: Final = "no current orientation"
 _LOOKING_UP: Final = "the bias of this sensor is being looked up"
 
 
@@ -120,13 +121,13 @@ class CompensationControl:
             or (self._payload_watch.finding if self._payload_watch is not None else ""),
             follows_imu=source.is_imu and payload.mass > 0.0,
             withheld=output.withheld,
-            why_withheld=output.why_withheld,
+            why_withheld=output.why_withheld or f"{_NOTHING_CURRENT} ({source.describe})",
         )
 
     def conflict(self, *, needs_tool: bool = False) -> str:
         """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
         specific force in the frame of the wrench, a sentence that says what to do."""
-        settings = self.link.settings
+        settings = self.link.info.settings
         if settings.get("calibration_matrix") is False:
             return (
                 "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
@@ -142,13 +143,13 @@ class CompensationControl:
     def _blind(self) -> str:
         if self.parameters.gravity_source != "imu":
             return ""
-        if self.link.settings.get("coordinate_system") is True:
+        if self.link.info.settings.get("coordinate_system") is True:
             return (
                 "settings.coordinate_system is on, so the wrench is in a frame configured in the sensor, and "
                 "the rotation from the IMU to it is unknown: switch it off, or take the orientation of that "
                 "frame from the robot (gravity_source)"
             )
-        return IMU_IS_OFF if self.link.settings.get("imu_active") == 0 else ""
+        return IMU_IS_OFF if self.link.info.settings.get("imu_active") == 0 else ""
 
     def _hold(self) -> None:
         """Publish nothing while the specific force is needed and cannot be known."""
@@ -157,16 +158,15 @@ class CompensationControl:
     def _why_stopped(self) -> str:
         """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
         output, source, watch = self.output, self.choice.source, self.reader.watch
-        why, sample, stamp_s = output.hold, output.sample, output.stamp_s
         if not output.has_subscribers:
+            why = output.hold
             if not why and self.parameters.payload.mass and watch.sample is not None:
                 why = source.why_none(watch.sample, watch.stamp_ns * 1e-9)
             return why and f"wrench_compensated could not be published if somebody subscribed: {why}"
-        if not output.is_stopped:
+        if not output.is_stopped or output.sample is None:
             return ""
-        if not why and not output.is_saturated and sample is not None:
-            why = source.why_none(sample, stamp_s)
-        return f"wrench_compensated has stopped: {why or output.why_withheld}"
+        why = output.why_withheld or source.why_none(output.sample, output.stamp_s) or _NOTHING_CURRENT
+        return f"wrench_compensated has stopped: {why}"
 
     def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
         """Put a bias in force, `taken` by a tare, and keep it if that is asked for."""
@@ -202,7 +202,7 @@ class CompensationControl:
     def _check(self, wanted: Parameters) -> None:
         """ParameterError if they cannot be had here."""
         self.choice.check(wanted)
-        if self.link.is_connected and (rate_hz := self.link.rate_hz):
+        if self.link.is_connected and (rate_hz := self.link.info.rate_hz):
             known = self.parameters.filter.problems(rate_hz)
             for problem in wanted.filter.problems(rate_hz):
                 if problem not in known:
@@ -251,15 +251,12 @@ class CompensationControl:
         self.output.plan = Plan(source, Compensator(payload), self._ramp, has_tool, self._payload_watch)
 
     def _is_same_sensor(self) -> bool:
-        info = self.link.info
-        return not self.link.is_connected or info is None or info.serial == self.keeper.serial
+        return not self.link.is_connected or self.link.info.serial == self.keeper.serial
 
     def _follow_sensor(self) -> None:
         """Find the bias of the sensor that is there now."""
         while not self._is_same_sensor():
             info = self.link.info
-            if info is None:
-                break
             is_another = self.keeper.serial is not None
             offset = self.own_offset.begin(self.bias)
             begin = self.keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)

@@ -89,8 +89,8 @@ class ImuSource(Source):
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """Of this sample."""
-        if self._link.settings is not self._settings:
-            self._settings, rate_hz = self._link.settings, self._link.rate_hz
+        if self._link.info.settings is not self._settings:
+            self._settings, rate_hz = self._link.info.settings, self._link.info.rate_hz
             taps = alignment_taps(self._settings, rate_hz) if rate_hz else NOT_DELAYED
             self._alignment = Alignment(taps, 1 / rate_hz if rate_hz else 0.0)
         found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
@@ -314,7 +314,7 @@ def read_message(message: Any, wanted: Parameters) -> Oriented:
                 apparent_gravity = -x, -y, -z
             elif message.orientation_covariance[0] == -1.0:
                 raise UnusableError(
-                    "its messages say that they have none (orientation_covariance[0] is -1), nor accelerations"
+                    "its messages say that they have none (orientation_covariance[0] is -1), nor acceleration"
                 )
         if not (stamp := stamp_ns(message.header.stamp)):
             raise UnusableError("its messages have no time stamp: the publisher must fill in header.stamp")

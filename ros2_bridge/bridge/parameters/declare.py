@@ -201,7 +201,7 @@ class SettingsParameters:
 
     def _follow(self) -> None:
         """Make the parameters what the settings are."""
-        in_force = self._link.settings
+        in_force = self._link.info.settings
         self._following = True
         try:
             for setting in SETTINGS.values():
@@ -227,7 +227,6 @@ class SettingsParameters:
 
     def _configure(self, wanted: dict[str, SettingValue]) -> None:
         reply = self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=self._link.sensor, settings=wanted)
-        self._link.take_settings(reply)
         in_force = known_settings(reply.get("settings"))
         for name, value in wanted.items():
             if (held := in_force.get(name)) != value:

@@ -37,7 +37,6 @@ _PORT: Final = 12001
 _COVARIANCE_LENGTHS: Final = (3, 9)
 _COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
 _LEAST_GRAVITY: Final = 0.1
-_LEAST_SCALE: Final = 0.5
 _FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _FARTHEST_M: Final = 10.0
 _REST: Final = StationaryLimits()
@@ -50,8 +49,8 @@ class ParameterError(Exception):
 class Row(NamedTuple):
     """One parameter. The default's type is the parameter's; a tuple is texts, or numbers, `lengths` how many.
 
-    `low` and `high` bound a number, or the magnitude of each of several. `live`: can be set while the node
-    runs; others are read-only.
+    `low` and `high` bound a number; of several, each from -`high` if `low` is 0. `live`: can be set while the
+    node runs; others are read-only.
     """
 
     name: str
@@ -91,7 +90,8 @@ class Row(NamedTuple):
             return item in self.choices if self.choices else several or self.optional or bool(item)
         if isinstance(item, bool) or not isinstance(item, int | float):
             return True
-        return self.low <= (abs(item) if several else item) <= self.high  # nor is it a NaN
+        # Nor is it a NaN.
+        return self.low <= (abs(item) if several and not self.low else item) <= self.high
 
     def allowed(self) -> str:
         """The values that it may have, in words."""
@@ -102,7 +102,7 @@ class Row(NamedTuple):
                 return "a list of texts"
             if self.lengths == _COVARIANCE_LENGTHS:
                 return "3 numbers, the variances, or 9, the covariance row by row"
-            return f"{self.lengths[0]} numbers, none beyond {self.high:g} either way"
+            return f"{self.lengths[0]} numbers from {self.low or -self.high:g} to {self.high:g}"
         if isinstance(self.default, str):
             return "text" if self.optional else "text that is not empty"
         if isinstance(self.default, bool):
@@ -180,7 +180,7 @@ PARAMETERS: Final = (
     Row("orientation.stale_after", 0.1,
         "Largest difference of the stamps of orientation and sample, s", 0.001, 10),
     Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
-    Row("accelerometer.scale", EXACT.scale, "Its scale factors; ~/identify finds them", 0, 2, lengths=(3,)),
+    Row("accelerometer.scale", EXACT.scale, "Its scale factors; ~/identify finds them", 0.5, 2, lengths=(3,)),
     Row("accelerometer.offset_interval", EXACT.offset_interval,
         "Half of the 95 % interval of its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
     Row("accelerometer.scale_interval", EXACT.scale_interval,
@@ -283,11 +283,6 @@ def gather(given: Mapping[str, Any]) -> Parameters:
         values["orientation.mounting"] = unit_quaternion(mounting)
     except ValueError as error:
         raise ParameterError(f"parameter orientation.mounting is {list(mounting)}: {error}") from None
-    if min(scale := values["accelerometer.scale"]) < _LEAST_SCALE:
-        raise ParameterError(
-            f"parameter accelerometer.scale is {list(scale)}: each must be at least {_LEAST_SCALE}; 1 is an "
-            "exact axis"
-        )
     for name, least in (("filter.cutoff", LEAST_CUTOFF_HZ), ("filter.notch", LEAST_NOTCH_HZ)):
         if 0.0 < values[name] < least:
             raise ParameterError(

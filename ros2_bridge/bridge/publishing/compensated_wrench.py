@@ -19,7 +19,7 @@ from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample, Vector3
 from bridge.compensating.sources import LookUp, Source, UnusableError, check_tf, follow_tf
-from bridge.parameters.table import Parameters
+from bridge.parameters.table import Parameters, WrenchFrame
 from bridge.publishing.messages import Stamps, Topic
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
@@ -32,6 +32,7 @@ from ft_compensation.stationary_limits import StationaryLimits
 # Failed lookups after the first subscription before it is a problem: TF has to arrive first.
 _PATIENCE: Final = 200
 _NS_PER_S: Final = 1_000_000_000
+_SATURATED: Final = "force or torque was saturated, and on_saturation is stop"
 
 
 class WrenchTopic(Topic):
@@ -56,27 +57,19 @@ class WrenchTopic(Topic):
         self._send(self._pack(frame.stamp_ns - self._stamps.wrench_ns, *force, *torque))
 
 
-class FixedFrameTopic(WrenchTopic):
-    """`wrench_compensated/NAME` in a frame fixed to the sensor's."""
+class FrameTopic(WrenchTopic):
+    """`wrench_compensated/NAME`: in a frame fixed to the sensor's, or known to TF.
 
-    def __init__(self, node: Node, name: str, stamps: Stamps, transform: WrenchTransform) -> None:
-        super().__init__(node, f"wrench_compensated/{name}", name, stamps)
-        self._transform = transform
+    `look` is for one thread, `send` the reader's.
+    """
 
-    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        """Publish them in this frame."""
-        super().send(*self._transform.apply(force, torque), frame)
-
-
-class TfFrameTopic(WrenchTopic):
-    """`wrench_compensated/NAME` in a frame known to TF: `look` is for one thread, `send` the reader's."""
-
-    def __init__(self, node: Node, name: str, stamps: Stamps, parameters: Parameters) -> None:
-        super().__init__(node, f"wrench_compensated/{name}", name, stamps)
-        self._name, self._source = name, parameters.frame_id
+    def __init__(self, node: Node, frame: WrenchFrame, stamps: Stamps, parameters: Parameters) -> None:
+        super().__init__(node, f"wrench_compensated/{frame.name}", frame.name, stamps)
+        self._name, self._source = frame.name, parameters.frame_id
         self.wanted = False  # whether anybody had subscribed at the last look
         self.on_change: Callable[[], object] = lambda: None  # called when that changes
-        self._found: tuple[WrenchTransform, int] | None = None  # 0: it holds at any time
+        # The transform, and of which time it is, ns; 0: it holds at any time.
+        self._found: tuple[WrenchTransform, int] | None = frame.fixed and (frame.fixed, 0)
         self._error, self._misses, self._asked_ns = "", 0, 0
         self.configure(parameters)
 
@@ -129,20 +122,17 @@ class TfFrameTopic(WrenchTopic):
         )
 
 
-def make_frames(node: Node, parameters: Parameters, stamps: Stamps) -> list[WrenchTopic]:
+def make_frames(node: Node, parameters: Parameters, stamps: Stamps) -> list[FrameTopic]:
     """A topic for each of the parameter `wrench_frames`; ParameterError if one needs TF and there is none."""
-    frames = parameters.wrench_frames
+    frames = {frame: FrameTopic(node, frame, stamps, parameters) for frame in parameters.wrench_frames}
     by_tf = [frame.name for frame in frames if frame.fixed is None]
     if by_tf:
         check_tf(f"parameter wrench_frames has {by_tf[0]!r} by TF", f"give its pose: '{by_tf[0]} x y z'")
-    followed = [TfFrameTopic(node, name, stamps, parameters) for name in by_tf]
-    if followed:
-        _follow_tf(node, followed)
-    fixed = [FixedFrameTopic(node, name, stamps, pose) for name, pose in frames if pose is not None]
-    return [*fixed, *followed]
+        _follow_tf(node, [topic for frame, topic in frames.items() if frame.fixed is None])
+    return list(frames.values())
 
 
-def _follow_tf(node: Node, topics: Sequence[TfFrameTopic]) -> None:
+def _follow_tf(node: Node, topics: Sequence[FrameTopic]) -> None:
     """Listen to TF while one of `topics` is wanted."""
     group, close = MutuallyExclusiveCallbackGroup(), list[Callable[[], None]]()
 
@@ -299,10 +289,10 @@ class CompensatedOutput:
         self.plan = Plan(Source(), Compensator(), BiasRamp(), has_tool=False)
         self.window: RestWindow | None = None  # the one that is open
         self.hold = ""  # why nothing may be published for now, whatever else is known
-        # Whether saturated samples are not published, and whether the latest was one of them.
-        self.stops_on_saturation = self.is_saturated = False
-        # Samples since the node started that were compensated, and that were not; why the latest was not.
-        self.published, self.withheld, self.why_withheld = 0, 0, ""
+        self.stops_on_saturation = False  # whether saturated samples are not published
+        # Samples since the node started that were compensated, and that were not.
+        self.published = self.withheld = 0
+        self.why_withheld = ""  # the latest of them; empty: the source knew nothing
         self.is_stopped = False  # whether the latest could not be compensated
         self.sample: Sample | None = None  # the latest that came here
         # Its time, s: by the server's monotonic clock, and since the Unix epoch.
@@ -359,14 +349,11 @@ class CompensatedOutput:
         plan = self.plan
         felt = self._felt(plan, sample, frame)
         time_s = self.time_s
-        self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
-        if felt is None or self.hold or self.is_saturated:
+        is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
+        if felt is None or self.hold or is_saturated:
             self.is_stopped = True
             self.withheld += 1
-            saturated = (
-                "force or torque was saturated, and on_saturation is stop" if self.is_saturated else ""
-            )
-            self.why_withheld = self.hold or saturated or f"no current orientation ({plan.source.describe})"
+            self.why_withheld = self.hold or (_SATURATED if is_saturated else "")
             return
         self.is_stopped = False
         stages = self._stages(plan, sample, felt, time_s)

@@ -72,7 +72,7 @@ class Stamps:
         self.kind = kind
         if not link.is_connected:
             return
-        delay_ms = link.delay_ms if kind == "measurement" else {"force_torque": 0.0, "acceleration": 0.0}
+        delay_ms = link.info.delay_ms if kind == "measurement" else {"force_torque": 0.0, "acceleration": 0.0}
         self.wrench_ns = round(1e6 * delay_ms.get("force_torque", 0.0))
         self.imu_ns = round(1e6 * delay_ms.get("acceleration", 0.0))
         named = {"force_torque": "wrench", "acceleration": "imu"}

@@ -188,9 +188,10 @@ class Reader:
             self._warn_of_aliases()
 
     def _warn_of_aliases(self) -> None:
-        if 0 < self._limit_hz < self.link.rate_hz:
+        rate_hz = self.link.info.rate_hz
+        if 0 < self._limit_hz < rate_hz:
             self._log.warning(
-                f"publishing_frequency {self._limit_hz:g} takes the newest of {self.link.rate_hz:g} samples "
+                f"publishing_frequency {self._limit_hz:g} takes the newest of {rate_hz:g} samples "
                 f"a second, without a low-pass: noise and vibration above {self._limit_hz / 2:g} Hz appear "
                 "at lower frequencies (aliasing); take every sample, or a longer sinc_length"
             )
@@ -274,9 +275,9 @@ class Reader:
             self._selector = FrameSelector(
                 self.counts, same_clock=self.client.session.same_machine, limit_hz=self._limit_hz
             )
-            info = link.connected(event.description)
+            link.connected(event.description)
             again = " again" if event.again else ""
-            self._log.info(f"connected{again} to {link.address}: {info}")
+            self._log.info(f"connected{again} to {link.address}: {link.info}")
             self._problem = None
             self._warn_of_aliases()
         elif isinstance(event, Disconnected):
@@ -285,7 +286,7 @@ class Reader:
             link.disconnected(event)
             self._log_problem(event)
         else:
-            before = link.settings
+            before = link.info.settings
             if not link.take_event(event):
                 return
             text = sentence(event, before)
