@@ -33,7 +33,7 @@ from bridge.stream.link import (
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
-from ft_compensation.identification.poses import Coverage, Pose, coverage, pose_of
+from ft_compensation.identification.poses import Pose, coverage, pose_of
 from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, length, wrench_text
 
 _TARE_S: Final = 0.5  # how long a tare of the sensor averages
@@ -172,7 +172,7 @@ class IdentifyServices:
         self._sensor = self._sensor_now()
         return (
             f"identification started{before}; gravity is known by {self._control.choice.source.describe}; "
-            f"{self._coverage([]).next_pose}, hold it still with nothing touching the tool, and call "
+            f"{coverage([]).next_pose}, hold it still with nothing touching the tool, and call "
             "identify/add_pose"
         )
 
@@ -188,7 +188,7 @@ class IdentifyServices:
         x, y, z = (round(part, 2) + 0.0 for part in poses[-1].up)
         return (
             f"pose {len(poses)} taken (up is {x:.2f}, {y:.2f}, {z:.2f} in the sensor's frame); "
-            f"{self._coverage(poses).advice}"
+            f"{coverage(poses).advice}"
         )
 
     def _drop_pose(self) -> str:
@@ -197,11 +197,10 @@ class IdentifyServices:
             raise CompensationError("there is no pose to take back")
         poses.pop()
         self._result = None
-        return f"the pose is dropped, {len(poses)} are left; {self._coverage(poses).advice}"
+        return f"the pose is dropped, {len(poses)} are left; {coverage(poses).advice}"
 
     def _solve(self) -> str:
-        one_axis = self._control.parameters.identify_one_axis
-        result = self._result = identify(self._started(), one_axis=one_axis)
+        result = self._result = identify(self._started())
         parts = [summary(result), *details(result)]
         return ". ".join([*parts, f"{self._write(result, parts)}; identify/apply puts it in force"])
 
@@ -225,9 +224,6 @@ class IdentifyServices:
         poses = self._started()
         self._poses = self._result = None
         return f"identification cancelled, {len(poses)} poses dropped; nothing was changed"
-
-    def _coverage(self, poses: list[Pose]) -> Coverage:
-        return coverage(poses, one_axis=self._control.parameters.identify_one_axis)
 
     def _started(self) -> list[Pose]:
         now = self._sensor_now()

@@ -30,6 +30,7 @@ from bota_ethercat.framing import FrameDecoder
 from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
 from bridge.diagnostics import TICK_S
+from bridge.parameters.table import PARAMETERS, gather
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from tests.bridge.real_node import PATIENCE_S, Asking, LoggedNode, retire
 from tests.bridge.scripted_server import Script, description
@@ -41,6 +42,7 @@ SETTINGS: JsonObject = {"sinc_length": 512, "fir": False, "acceleration_range_g"
 UP, SIDE, OVER = (0, 0, 1), (1, 0, 0), (0, 0, -1)
 ZERO6 = [0.0] * 6
 QUICK: dict[str, object] = {"rest.duration": 0.3, "bias_ramp_time": 0.0}
+DEFAULTS = gather({row.name: row.default for row in PARAMETERS})
 STEP_S = 0.01  # time passes in steps of this length: a sample each
 
 

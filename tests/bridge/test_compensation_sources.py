@@ -19,13 +19,13 @@ from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
 from bridge.compensating.sources import ImuSource, Oriented, RobotSource, multiply
 from bridge.node import StartError
-from bridge.parameters.table import DEFAULTS
 from bridge.stream.link import SensorInfo
 from ft_compensation.quantities import length, unit_quaternion
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.real_node import Listener, Start
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import (
+    DEFAULTS,
     OVER,
     QUICK,
     SIDE,
@@ -225,7 +225,6 @@ def test_the_orientation_is_taken_in_while_a_service_waits(robot: Robot, stages:
     ("name", "value", "words"),
     [
         ("orientation.topic", "no such name!", "'no such name!': topic name must not contain"),
-        ("orientation.topic", "wrench", "this node itself has that topic, with WrenchStamped messages"),
         ("gravity_source", "tf", "sudo apt install ros-$ROS_DISTRO-tf2-ros-py and source ROS 2, or take"),
     ],
 )

@@ -23,10 +23,10 @@ from rclpy.executors import SingleThreadedExecutor
 from bota_ethercat.client import Scheduling
 from bridge import process
 from bridge.client import PROFILES, use_own_profiles
-from bridge.parameters.table import DEFAULTS
 from bridge.spinning import PartExecutor, Spinner
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
+from tests.bridge.simulated_node import DEFAULTS
 from tests.rights import needs_root, skip_if_forbidden
 from tests.server.running import wait_until
 

@@ -70,7 +70,7 @@ class Source:
         )
 
     def age_s(self, time_s: float) -> float:  # noqa: ARG002
-        """How old what is used is; 0 where every sample brings its own, infinite where there is none."""
+        """How old the robot's orientation is; infinite where there is none."""
         return math.inf
 
 
@@ -103,10 +103,6 @@ class ImuSource(Source):
         if not any(sample.acceleration):
             return IMU_IS_OFF
         return "" if sample.is_finite else "the IMU sends NaN or infinity: see the status stream"
-
-    def age_s(self, time_s: float) -> float:  # noqa: ARG002
-        """Every sample brings its own."""
-        return 0.0
 
 
 class Oriented(NamedTuple):
@@ -353,19 +349,13 @@ class SourceChoice:
             check_tf()
         if wanted.gravity_source not in TOPIC_SOURCES:
             return
-        problem = f"parameter orientation.topic is {wanted.orientation_topic!r}: "
         try:
-            resolved = self._node.resolve_topic_name(wanted.orientation_topic)
+            self._node.resolve_topic_name(wanted.orientation_topic)
         except RuntimeError as error:  # rclpy has no public name for it
             reason = str(error).removeprefix("failed to resolve name: ").partition(", at /")[0]
-            raise ParameterError(problem + reason) from None
-        kind, _ = TOPIC_KINDS[wanted.gravity_source]
-        for own in self._node.publishers:
-            if own.topic_name == resolved and own.msg_type is not kind:  # DDS has one type for a topic
-                raise ParameterError(
-                    f"{problem}this node itself has that topic, with {own.msg_type.__name__} messages and "
-                    f"not {kind.__name__}"
-                )
+            raise ParameterError(
+                f"parameter orientation.topic is {wanted.orientation_topic!r}: {reason}"
+            ) from None
 
     def open(self, wanted: Parameters, model: str) -> None:
         """Open the source that is wanted, for a sensor of this model, unless it is open.

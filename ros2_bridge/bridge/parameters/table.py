@@ -204,7 +204,6 @@ PARAMETERS: Final = (
     Row("filter.dead_band_torque", 0.0, "Subtracted from the magnitude of its torque, Nm; 0 = none", 0, 1e6),
     Row("identify.file", AUTO,
         "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bias_directory"),
-    Row("identify.one_axis", False, "Whether ~/identify/solve takes poses that turn about one axis only"),
 )  # fmt: skip
 
 
@@ -253,7 +252,6 @@ class Parameters(NamedTuple):
     rest_duration: float
     rest: StationaryLimits
     identify_file: str
-    identify_one_axis: bool
     filter: FilterSettings
 
 
@@ -343,6 +341,3 @@ def _parse_frame(text: str) -> WrenchFrame:
             f"in m ({error})"
         ) from None
     return WrenchFrame(name, pose.inverse())
-
-
-DEFAULTS: Final = gather({row.name: row.default for row in PARAMETERS})

@@ -38,7 +38,6 @@ _SATURATED: Final = "force or torque was saturated, and on_saturation is stop"
 class WrenchTopic(Topic):
     """`geometry_msgs/WrenchStamped` of one stage of the compensation."""
 
-    takes_all = False  # whether `note` wants what `publishing_frequency` leaves out
     problem = ""  # why nothing is published, a sentence
 
     def __init__(self, node: Node, topic: str, frame_id: str, stamps: Stamps, stage: str = "final") -> None:
@@ -48,9 +47,6 @@ class WrenchTopic(Topic):
 
     def configure(self, parameters: Parameters) -> None:
         """Take other parameters from the next sample on; for the executor's thread."""
-
-    def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        """Take note of a sample that is not published."""
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Publish a force, N, and a torque, Nm."""
@@ -159,7 +155,6 @@ class FilteredTopic:
     """`wrench_filtered`, if configured, from every sample: `publishing_frequency` comes after it."""
 
     index = Stages._fields.index("final")
-    takes_all = True
 
     def __init__(
         self, node: Node, parameters: Parameters, stamps: Stamps, rate_hz: Callable[[], float]
@@ -279,13 +274,13 @@ class CompensatedOutput:
         """ParameterError if a frame cannot be had. `rate_hz` as for `FilteredTopic`."""
         stages = {"wrench_compensated": "final", "compensation/bias": "bias", "compensation/tool": "tool"}
         frame_id = parameters.frame_id
+        self._filtered = FilteredTopic(node, parameters, stamps, rate_hz)
         self._all: tuple[WrenchTopic | FilteredTopic, ...] = (
             *(WrenchTopic(node, topic, frame_id, stamps, stage) for topic, stage in stages.items()),
             *make_frames(node, parameters, stamps),
-            FilteredTopic(node, parameters, stamps, rate_hz),
+            self._filtered,
         )
         self._wanted: tuple[WrenchTopic | FilteredTopic, ...] = ()
-        self._noting: tuple[WrenchTopic | FilteredTopic, ...] = ()
         self.plan = Plan(Source(), Compensator(), BiasRamp(), has_tool=False)
         self.window: RestWindow | None = None  # the one that is open
         self.hold = ""  # why nothing may be published for now, whatever else is known
@@ -302,7 +297,6 @@ class CompensatedOutput:
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
         self._wanted = tuple(topic for topic in self._all if topic.is_wanted())
-        self._noting = tuple(topic for topic in self._wanted if topic.takes_all)
         if not self._wanted:
             self.is_stopped = False  # nobody misses anything
         return bool(self._wanted) or self.window is not None
@@ -324,13 +318,11 @@ class CompensatedOutput:
             topic.configure(parameters)
 
     def follow(self, sample: Sample, frame: DataMessage) -> None:
-        """Give source, open window and filters a sample that is not published."""
+        """Give source, open window and filter a sample that is not published."""
         plan = self.plan
         felt = self._felt(plan, sample, frame)
-        if self._noting and felt is not None and not self.hold:
-            stages = self._stages(plan, sample, felt, self.time_s)
-            for topic in self._noting:
-                topic.note(*stages[topic.index], frame)
+        if self._filtered in self._wanted and felt is not None and not self.hold:
+            self._filtered.note(*self._stages(plan, sample, felt, self.time_s).final, frame)
 
     def _felt(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
         """The specific force as far as it is needed, None if it is not known; the window takes the sample."""
