@@ -69,6 +69,7 @@ class Monitor:
         self.limits = limits  # may be replaced at any time
         self._reader, self._link, self._clock = reader, reader.link, reader.link.clock
         self._compensation, self._outputs, self._stamps = compensation, outputs, stamps
+        self._log = node.get_logger()
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
         self._published_s = now_s = self._clock.monotonic()
@@ -86,8 +87,8 @@ class Monitor:
         self._rate_hz: float | None = None  # measured; None while that is not possible yet
         # Where the rate is measured from: samples, time here, and the newest one's stamp.
         self._rate_fresh, self._rate_s, self._rate_ns = 0, now_s, -1
-        # When the number of fresh samples changed, and the link's epoch.
-        self._fresh_s, self._epoch = now_s, -1
+        # When the number of fresh samples changed, whether that is long ago, and the link's epoch.
+        self._fresh_s, self._is_silent, self._epoch = now_s, False, -1
         self._stopping = threading.Event()
         self.thread = Worker("monitor", self._run, on_failure)
 
@@ -227,12 +228,14 @@ class Monitor:
         def about(subject: About) -> Problems:
             return [(finding.level, finding.sentence) for finding in findings if finding.about is subject]
 
-        is_silent = silent_s > self.limits.stale_after
-        has_samples = link.is_connected and link.lost is None and not is_silent
+        was_silent, self._is_silent = self._is_silent, silent_s > self.limits.stale_after
+        if self._is_silent and not was_silent and link.is_connected and link.lost is None:
+            self._log.warning(findings[0].sentence)
+        has_samples = link.is_connected and link.lost is None and not self._is_silent
         return [
             self._judge_link(about(About.LINK), now_s, answer_s),
             self._judge_stream(about(About.STREAM)),
-            self._judge_sensor(about(About.SENSOR), temperature, is_silent=is_silent),
+            self._judge_sensor(about(About.SENSOR), temperature),
             self._judge_clock(about(About.CLOCK), has_samples=has_samples),
             self._judge_compensation(compensation, has_samples=has_samples),
         ]
@@ -304,16 +307,14 @@ class Monitor:
         good = "samples arrive" if self._rate_hz is None else f"{self._rate_hz:.0f} samples a second"
         return self._status("stream", problems, good, values)
 
-    def _judge_sensor(
-        self, problems: Problems, temperature: float | None, *, is_silent: bool
-    ) -> DiagnosticStatus:
+    def _judge_sensor(self, problems: Problems, temperature: float | None) -> DiagnosticStatus:
         link, info, flags = self._link, self._link.info, self._flags
         if not link.is_connected:
             problems = [(Level.NOT_POSSIBLE, "unknown: there is no connection to the server, see link")]
         elif link.lost is not None:  # the server's words, with what to do if they do not say it
             lost = link.lost if "check " in link.lost else f"{link.lost}; check its cable and power"
             problems = [(Level.TROUBLE, lost)]
-        elif is_silent:
+        elif self._is_silent:
             problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
         last = mapping(self._row.get("emergency"))
         code, ago_s = whole(last.get("code")), number(last.get("ago_s"))

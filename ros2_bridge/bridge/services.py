@@ -236,9 +236,10 @@ class IdentifyServices:
             raise CompensationError("no identification was started: call identify/start first")
         return self._poses
 
-    def _sensor_now(self) -> tuple[int, object]:
+    def _sensor_now(self) -> tuple[str, object]:
         """What all poses must share: the sensor and its own offset."""
-        return self._control.sensors, self._control.link.info.offset
+        info = self._control.link.info
+        return info.serial, info.offset
 
     def _write(self, result: Identified, comment: list[str]) -> str:
         try:

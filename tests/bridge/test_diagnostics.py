@@ -119,6 +119,8 @@ def test_what_is_wrong_with_the_stream(node: Node, server: Server) -> None:
     node.until("100 samples a second instead of 200", stream="error")
     server.changes = {"flags": DataFlag.INVALID}
     node.until("the sensor does not answer the bus", stream="error")
+    node.run(3.0)
+    assert node.log.count("No new sample for 0.6 s, the sensor does not answer the bus: check its cable") == 1
 
 
 def test_what_is_skipped_and_what_is_repeated(node: Node, server: Server) -> None:

@@ -97,13 +97,6 @@ def test_after_a_stall_nothing_old_is_published(node: Node, quiet: Server) -> No
     assert node.node.reader.counts.stale == 958
 
 
-def test_silence_and_its_end_are_logged_once(node: Node, quiet: Server) -> None:
-    node.run(5.0)
-    feed(node, quiet, quiet.frame(1), quiet.frame(2))
-    said = ["nothing came from localhost:12001 for 1 s", "localhost:12001 sends again"]
-    assert [line for line in node.log.splitlines() if "localhost:12001 " in line] == said
-
-
 def test_what_is_not_finite_is_counted_and_logged_every_ten_seconds(node: Node, quiet: Server) -> None:
     for value in [math.nan, math.inf, -math.inf, math.nan] * 3:
         assert feed(node, quiet, quiet.frame(0, process_data=encode(61, {"torque.y": value}))) == []

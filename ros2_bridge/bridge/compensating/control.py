@@ -44,7 +44,6 @@ class CompensationControl:
         self.parameters, self.output = parameters, output
         self.reader, self.link, self._live = reader, reader.link, live
         self.origin = FROM_PARAMETER  # where the bias in force comes from
-        self.sensors = 1  # how many have been there: what was measured on one is of no use with another
         self._model = ""  # of the sensor that is or was there
         self._log = node.get_logger()
         self.choice = SourceChoice(node, self.link)
@@ -243,7 +242,7 @@ class CompensationControl:
 
     def _make_plan(self) -> None:
         payload, rest = self.parameters.payload, self.parameters.rest
-        watched = payload, self.bias, self.sensors
+        watched = payload, self.bias, self.keeper.serial
         if watched != self._watched:
             self._watched = watched
             self._payload_watch = PayloadWatch(payload, self._log.warning, rest) if payload.mass else None
@@ -271,7 +270,6 @@ class CompensationControl:
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
             self._model = info.name
             self._open_source()
-            self.sensors += is_another
             self._make_plan()
             if not self.keeper.problem and self.bias != NO_WRENCH:
                 self.keeper.keep(self._ramp, self.parameters, self.own_offset.to_keep)

@@ -185,31 +185,27 @@ class FilteredTopic:
 
     def _is_ready(self) -> bool:
         """Whether there is a filter for the current settings and sampling rate."""
-        wanted = self._settings, self._rate_hz()
+        settings, rate_hz = wanted = self._settings, self._rate_hz()
         if wanted != self._designed:
-            why_not = self._design(*wanted)
-            self.problem = f"wrench_filtered has stopped: {why_not}" if why_not else ""
             self._designed = wanted
-            if self.problem:
+            try:
+                self._design(settings, rate_hz)
+                self.problem = ""
+            except CompensationError as error:
+                self.problem = f"wrench_filtered has stopped: {error}"
                 self._node.get_logger().warning(self.problem)
         return not self.problem
 
-    def _design(self, settings: FilterSettings, rate_hz: float) -> str:
-        """Make it; why not, a sentence."""
-        if not settings.cutoff:
-            return "filter.cutoff is 0"
-        if not rate_hz:
-            return "the server does not report the sampling rate"
-        try:
-            self._filter.design(settings, rate_hz)
-        except CompensationError as error:
-            return str(error)
+    def _design(self, settings: FilterSettings, rate_hz: float) -> None:
+        if not settings.cutoff or not rate_hz:
+            why = "the server does not report the sampling rate" if settings.cutoff else "filter.cutoff is 0"
+            raise CompensationError(why)
+        self._filter.design(settings, rate_hz)
         notch = f", notch {settings.notch:g} Hz" if settings.notch else ""
         self._node.get_logger().info(
             f"wrench_filtered is delayed by {self._filter.delay_s * 1e3:.1f} ms: cut-off "
             f"{settings.cutoff:g} Hz{notch}, sampling rate {rate_hz:g} Hz"
         )
-        return ""
 
     def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Filter a sample that is not published."""

@@ -15,7 +15,6 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.client.channel import Channel
 from bota_ethercat.client.client import Client
-from bota_ethercat.client.reading import Condition
 from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
 from bota_ethercat.control import Event
 from bota_ethercat.errors import ConnectionFailedError
@@ -26,8 +25,7 @@ from bridge.process import Worker
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
 from bridge.stream.link import LONGEST_DELAY_MS, SYSTEM_CLOCK, Clock, Link, sentence
 
-SILENCE_S: Final = 1.0
-_SILENCE_NS: Final = round(0.99e9 * SILENCE_S)  # a wait may end some microseconds early
+_WAIT_S: Final = 1.0
 # Times that a ROS message can carry, less the longest delay of a filter.
 _FIRST_STAMP_NS: Final = LONGEST_DELAY_MS * 10**6
 _LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
@@ -162,8 +160,7 @@ class Reader:
         self.client = Client(
             parameters.server_port, parameters.server_host, sensors=[self._sensor], channel=channel
         )
-        self._state = self.client.session.state(self._sensor)
-        self.accounting = self._state.accounting
+        self.accounting = self.client.session.state(self._sensor).accounting
         self.accounting.counts = self.counts
         self._clock = clock
         self.link = Link(self.client, self._sensor, clock)
@@ -171,7 +168,6 @@ class Reader:
         self._limit_hz = parameters.publishing_frequency
         self._selector = FrameSelector(self.counts, same_clock=True, limit_hz=self._limit_hz)
         self._problem: str | None = None
-        self._is_silent = False
         self._next_warning_s = 0.0
         self.thread = Worker("reader", self.run, on_failure)
 
@@ -200,13 +196,11 @@ class Reader:
         """Connect and read, again and again, until `stop`."""
         with contextlib.suppress(ConnectionFailedError):
             while True:
-                self.read(SILENCE_S)
+                self.read(_WAIT_S)
 
     def read(self, timeout_s: float) -> None:
         """Publish what arrives within `timeout_s`; ConnectionFailedError once `client` has been closed."""
         items = self.client.poll_all(timeout_s)
-        if self._is_silent or not items:
-            self._watch_silence()
         frames = []
         for item in items:
             if isinstance(item, DataMessage):
@@ -217,16 +211,6 @@ class Reader:
             frames = []
             self._take_event(item)
         self._publish(frames)
-
-    def _watch_silence(self) -> None:
-        """Log, once, that nothing came for SILENCE_S, and that something came again."""
-        was, connected = self._is_silent, self.link.is_connected
-        why = self._state.why_old(_SILENCE_NS, self._clock.monotonic_ns(), connected=connected)
-        self._is_silent = why is Condition.SILENT
-        if self._is_silent and not was:
-            self._log.warning(f"nothing came from {self.link.address} for {SILENCE_S:g} s")
-        elif was and not self._is_silent and connected:
-            self._log.info(f"{self.link.address} sends again")
 
     def _publish(self, frames: Sequence[DataMessage]) -> None:
         if not frames:
