@@ -159,8 +159,8 @@ class Server(Script):
         self._wire.end()
 
     def reconfigure(self, **changed: Any) -> None:
-        """Somebody has changed settings, and perhaps the rate."""
-        values = {name: changed.pop(name) for name in ("rate_hz",) if name in changed}
+        """Somebody has changed settings, and with them perhaps the rate and the delays."""
+        values = {name: changed.pop(name) for name in ("rate_hz", "delay_ms") if name in changed}
         self.send_json(event(Event.RECONFIGURED, sensor=0, settings={**SETTINGS, **changed}, **values))
 
     def hold(self, up: Sequence[float], **changes: Any) -> None:

@@ -19,6 +19,7 @@ from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
 from bridge.compensating.sources import ImuSource, Oriented, RobotSource, multiply
 from bridge.node import StartError
+from bridge.parameters.table import PARAMETERS, gather
 from bridge.stream.link import SensorInfo
 from ft_compensation.quantities import length, unit_quaternion
 from tests.bridge.fake_tf import FakeTf
@@ -65,6 +66,8 @@ class Robot(Server):
 
     def restore(self) -> None:
         self.quaternion, self.offset_s, self.stamped, self.sending = UPRIGHT, 0.0, True, True
+        # What the arm's IMU feels, m/s²; the covariance that says that it feels nothing.
+        self.felt, self.unfelt = (0.0, 0.0, 0.0), -1.0
         self.hold(UP, acceleration_x=3.0)  # the sensor's own accelerometer says something else
 
     def listening(self) -> list[Any]:
@@ -81,6 +84,10 @@ class Robot(Server):
             holder = message.pose if isinstance(message, PoseStamped) else message
             q = holder.quaternion if isinstance(message, QuaternionStamped) else holder.orientation
             q.x, q.y, q.z, q.w = self.quaternion
+            if isinstance(message, Imu):
+                a = message.linear_acceleration
+                a.x, a.y, a.z = self.felt
+                message.linear_acceleration_covariance[0] = 0.0 if any(self.felt) else self.unfelt
             subscription.callback(message)
 
 
@@ -165,7 +172,7 @@ def test_what_is_refused(robot: Robot, stages: Stages, node: Node, spoil: dict[s
     node.until(compensation="ok")
 
 
-def test_an_imu_without_orientation(robot: Robot, stages: Stages, node: Node) -> None:
+def test_an_imu_without_orientation_and_acceleration(robot: Robot, stages: Stages, node: Node) -> None:
     robot.sending = False
     node.set("orientation.topic", "arm/imu")
     node.set("gravity_source", "topic_imu")
@@ -178,6 +185,37 @@ def test_an_imu_without_orientation(robot: Robot, stages: Stages, node: Node) ->
     )
     robot.sending = True
     stages.settle(ZERO6)
+
+
+def test_accelerations_of_the_robots_imu_are_weight_and_inertia(
+    robot: Robot, stages: Stages, node: Node
+) -> None:
+    """The arm accelerates by 1 m/s² along its x axis, the sensor's -y: the tool's mass pulls back."""
+    quarter = math.sqrt(0.5)
+    node.set("orientation.mounting", [0.0, 0.0, quarter, quarter])
+    node.set("gravity_source", "topic_imu")
+    node.until("subtracted: weight of the tool", compensation="ok")
+    robot.quaternion = (math.nan,) * 4  # it is not asked
+    robot.felt = 1.0, 0.0, STANDARD_GRAVITY
+    pulled: dict[str, Any] = {"force_y": TOOL.mass, "torque_x": -TOOL.mass * TOOL.center[2]}
+    stages.at(UP, acceleration_x=3.0, torque_z=TOOL.mass * TOOL.center[0], **pulled)
+    node.until("subtracted: weight and inertia of the tool", compensation="ok")
+    robot.restore()
+    robot.unfelt = 0.0  # nothing filled in is no free fall
+    stages.at(OVER, wanted=[a - b for a, b in zip(weight(OVER), weight(UP), strict=True)])
+    node.until("subtracted: weight of the tool", compensation="ok")
+
+
+def test_an_imu_beside_the_tool_is_moved_to_its_center_of_gravity() -> None:
+    """While the sensor turns by 2 rad/s about z: 0.4 m/s² towards the axis, 0.1 m from it."""
+    values = {row.name: row.default for row in PARAMETERS}
+    given = gather(values | {"tool_center_of_gravity": (0.0, 0.0, 0.05), "imu_position": (-0.1, 0.0, 0.05)})
+    source = RobotSource(given, "topic /imu")
+    for step in range(20):
+        t = step * 0.01
+        source.latest = Oriented(UPRIGHT, round(t * 1e9) + 10**9, (0.0, 0.0, -STANDARD_GRAVITY))
+        found = source.specific_force(sample(angular_rate=(0.0, 0.0, 2.0)), 5.0 + t, 1.0 + t)
+    assert found == pytest.approx((-0.4, 0.0, STANDARD_GRAVITY))
 
 
 def test_what_is_mounted_askew(robot: Robot, stages: Stages, node: Node) -> None:

@@ -123,6 +123,11 @@ def supervised(server: Server, exit_code: int = 0) -> Node:
     return node
 
 
+def test_no_supervisor_is_heard_without_a_topic() -> None:
+    with Node(Server(), supervisor_topic="''") as node:
+        assert not [s for s in node.node.subscriptions if s.msg_type is KeyValue]
+
+
 @pytest.mark.parametrize(
     ("reply", "exit_code", "said"),
     [

@@ -27,7 +27,7 @@ from ft_compensation.outputs import FilterSettings, WrenchFilter
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.real_node import retire
 from tests.bridge.scripted_server import process_data
-from tests.bridge.simulated_node import RATE_HZ, STEP_S, Node, Server, six, stamp_ns
+from tests.bridge.simulated_node import RATE_HZ, STEP_S, Node, Server, six, stamp_ns, values
 from tests.server.running import wait_until
 
 QUATERNION = {"orientation.x": 0.5, "orientation.y": -0.5, "orientation.z": 0.5, "orientation.w": 0.5}
@@ -123,6 +123,45 @@ def test_temperature(published: Published) -> None:
     heard = published.of({"process_data": encode(61, {"temperature": 36.5})})
     (message,) = heard["temperature"]
     assert (message.temperature, message.variance) == (36.5, 0.25)
+
+
+def test_stamps_of_the_measurement_are_earlier_by_the_delay_of_the_channels_filter() -> None:
+    server = Server()
+    row = server.description["sensors"][0]
+    row["delay_ms"] = {"force_torque": 150.0, "acceleration": 20.0, "angular_rate": 30.0}
+    with Node(server, stamp="measurement", **{"filter.cutoff": 10.0}) as node:
+        names = "wrench", "wrench_compensated", "compensation/tool", "wrench_filtered", "imu/data_raw"
+        topics = [node.hear(name) for name in (*names, "temperature")]
+        node.run(0.2)
+
+        def earlier_ms() -> list[float]:
+            """Of the next sample, by topic."""
+            for messages in topics:
+                messages.clear()
+            server.once(stamp_ns=10**18)
+            node.step()
+            return [(10**18 - stamp_ns(message)) / 1e6 for (message,) in topics]
+
+        def clock(expected: str) -> dict[str, str]:
+            return values(node.until(clock=expected)["clock"])
+
+        assert earlier_ms() == [150.0] * 4 + [20.0, 0.0]
+        told = clock("ok")
+        assert (told["stamp"], told["delay_force_torque_ms"]) == ("measurement", "150.0")
+        # From the first sample after a change on.
+        server.reconfigure(fir=True, delay_ms={"force_torque": 1200.0 / 7, "acceleration": 35.7})
+        assert earlier_ms() == [pytest.approx(1200.0 / 7)] * 4 + [35.7, 0.0]
+        for _ in range(2):
+            server.reconfigure(chop=True, delay_ms={"force_torque": None, "acceleration": "x"})
+            assert earlier_ms() == [0.0] * 6
+        words = "the delay of the filters is not known, so wrench and imu topics have the time of the sample"
+        assert node.log.count(words) == 1
+        node.until(words, clock="warn")
+        server.reconfigure(delay_ms={"force_torque": 150.0, "acceleration": 20.0})
+        assert earlier_ms() == [150.0] * 4 + [20.0, 0.0]
+        node.set("stamp", "sample")
+        assert earlier_ms() == [0.0] * 6
+        assert clock("ok")["delay_acceleration_ms"] == "20.0"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
