@@ -28,12 +28,10 @@ from std_srvs.srv import Trigger
 
 from bridge.node import BridgeNode, spin
 from bridge.spinning import Spinner
-from tests.bridge.scripted_server import ScriptedServer
 from tests.server.running import wait_until
 
 PATIENCE_S = 45.0
 ASK_AGAIN_S = 5.0
-AHEAD_NS = 60 * 10**9  # longer than any test waits
 # Nodes that are done: `destroy_node` crashes the process now and then, so they end with it.
 _ENDED: list[Any] = []
 
@@ -259,18 +257,3 @@ def starter(listener: Listener, kind: Callable[..., Any]) -> Iterator[Callable[.
     finally:
         for node in started:
             node.close()
-
-
-def establish(server: ScriptedServer, listener: Listener) -> None:
-    """Send samples until one arrives at the listener, then until none is on the way.
-
-    From then on samples are dated ahead: the node skips those that it comes to read 50 ms after their time.
-    """
-    server.ahead_ns = AHEAD_NS
-    assert server.subscribed.wait(PATIENCE_S)
-    while listener.messages.empty():
-        server.send_sample(-1.0)
-        time.sleep(0.02)
-    server.send_sample(-2.0)
-    while listener.next_number() != -2.0:
-        pass

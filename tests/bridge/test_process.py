@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import types
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator
@@ -28,7 +27,6 @@ from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import DEFAULTS
 from tests.rights import needs_root, skip_if_forbidden
-from tests.server.running import wait_until
 
 PROGRAM = """
 import sys, types
@@ -153,86 +151,46 @@ def test_a_thread_that_fails_says_so() -> None:
     assert heard == ["the reader failed: LookupError: a defect"]
 
 
-# Executors run until they are told to stop, and keep nothing of what they have handled.
-
-
-class Bench:
-    """A node with a spinner in a thread."""
-
-    def __init__(self) -> None:
-        self.node = rclpy.create_node("spinning")
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.spinner = Spinner(self.executor)
-        self.ticks = 0
-        self.thread = threading.Thread(target=self.spinner.run, daemon=True)
-
-    def count(self, ticks: int) -> None:
-        """Let so many timer callbacks pass."""
-        wanted = self.ticks + ticks
-        wait_until(lambda: self.ticks >= wanted, f"{ticks} callbacks")
-
-    def tick(self) -> None:
-        self.ticks += 1
-
-    def ends(self) -> bool:
-        self.spinner.stop()
-        self.thread.join(PATIENCE_S)
-        return not self.thread.is_alive()
+# Executors run until they are told to stop.
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    made = Bench()
+def node() -> Iterator[Any]:
+    made = rclpy.create_node("spinning")
     yield made
-    assert made.thread.ident is None or made.ends()
-    made.executor.shutdown()
-    made.node.destroy_node()
+    made.destroy_node()
 
 
-def functions() -> int:
-    gc.collect()
-    return sum(isinstance(thing, types.FunctionType) for thing in gc.get_objects())
+@pytest.fixture
+def executor(node: Any) -> Iterator[SingleThreadedExecutor]:
+    made = SingleThreadedExecutor()
+    made.add_node(node)
+    yield made
+    made.shutdown()
 
 
-def test_nothing_is_kept_of_what_was_handled(bench: Bench) -> None:
-    bench.node.create_timer(0.0002, bench.tick)
-    bench.thread.start()
-    bench.count(100)
-    before = functions()
-    bench.count(500)
-    assert functions() - before < 100
-    assert bench.ends()
+def test_told_before_and_once_more_after_the_end(executor: SingleThreadedExecutor) -> None:
+    spinner = Spinner(executor)
+    spinner.stop()
+    spinner.run()
+    executor.shutdown()
+    spinner.stop()
 
 
-def test_an_executor_ends_whenever_it_is_told(bench: Bench) -> None:
-    bench.thread.start()
-    bench.thread.join(0.2)
-    assert bench.thread.is_alive()
-    assert bench.ends()
-
-
-def test_told_before_and_once_more_after_the_end(bench: Bench) -> None:
-    bench.spinner.stop()
-    bench.spinner.run()
-    bench.executor.shutdown()
-    bench.spinner.stop()
-
-
-def test_a_callback_that_raises_ends_it_and_is_told(bench: Bench) -> None:
+def test_a_callback_that_raises_ends_it_and_is_told(executor: SingleThreadedExecutor, node: Any) -> None:
     def fail() -> Any:
         raise LookupError("of the callback")
 
-    bench.node.create_timer(0.001, fail)
+    node.create_timer(0.001, fail)
+    spinner = Spinner(executor)
     with pytest.raises(LookupError, match="of the callback"):
-        bench.spinner.run()
-    bench.spinner.stop()
+        spinner.run()
+    spinner.stop()
 
 
-def test_what_waits_for_no_others_has_an_executor_of_its_own(bench: Bench) -> None:
-    node, group = bench.node, MutuallyExclusiveCallbackGroup()
-    own = node.create_timer(60.0, bench.tick, group)
-    common = node.create_timer(60.0, bench.tick)
+def test_what_waits_for_no_others_has_an_executor_of_its_own(node: Any) -> None:
+    own = node.create_timer(60.0, lambda: None, MutuallyExclusiveCallbackGroup())
+    common = node.create_timer(60.0, lambda: None)
     prompt = PartExecutor(node)
     ordinary = PartExecutor(node, prompt)
     (mine,), (others,) = prompt.get_nodes(), ordinary.get_nodes()
