@@ -32,7 +32,6 @@ from tests.bridge.simulated_node import (
     sensed,
     six,
     stamp_ns,
-    streaming_description,
     values,
     weight,
 )
@@ -93,9 +92,8 @@ def test_what_is_subtracted_stands_beside_it(stages: Stages, node: Node) -> None
 def test_the_weight_goes_along_with_the_pose(stages: Stages, server: Server) -> None:
     for up in (SIDE, OVER, (1, 1, 1)):
         stages.at(up)
-    stages.at(
-        OVER, force_x=3.0, torque_y=0.25, wanted=[3.0, 0.0, 0.0, 0.0, 0.25, 0.0]
-    )  # what the environment does is left as it is
+    # What the environment does is left as it is.
+    stages.at(OVER, force_x=3.0, torque_y=0.25, wanted=[3.0, 0.0, 0.0, 0.0, 0.25, 0.0])
 
 
 def test_a_tare_takes_the_offset_and_leaves_the_tool(stages: Stages, server: Server, node: Node) -> None:
@@ -108,10 +106,8 @@ def test_a_tare_takes_the_offset_and_leaves_the_tool(stages: Stages, server: Ser
 
 
 def test_a_tare_waits_for_settled_data(stages: Stages, server: Server, node: Node) -> None:
-    description = streaming_description()
-    (row,) = description["sensors"]
+    (row,) = server.description["sensors"]
     row["settling"] = True
-    server.answers["describe"] = lambda _: {"ok": True, **description}
     server.hold(UP, force_x=5.0)  # it has not settled
 
     def settle() -> None:
@@ -119,13 +115,11 @@ def test_a_tare_waits_for_settled_data(stages: Stages, server: Server, node: Nod
         row["settling"] = False
 
     node.at(1.0, settle)
-    try:
-        node.do("tare")
-        assert list(node.parameters("bias")[0]) == pytest.approx(ZERO6, abs=1e-4)
-        row["settling"] = True
-        assert node.trigger("tare") == (False, "sensor 0 does not settle: see the server's log")
-    finally:
-        del server.answers["describe"]
+    node.do("tare")
+    assert list(node.parameters("bias")[0]) == pytest.approx(ZERO6, abs=1e-4)
+    row["settling"] = True
+    assert node.trigger("tare") == (False, "sensor 0 does not settle: see the server's log")
+    row["settling"] = False
 
 
 def test_a_tare_without_a_payload_takes_all(stages: Stages, server: Server, node: Node) -> None:
@@ -173,32 +167,11 @@ def test_a_tare_that_is_restored_is_for_the_tool_of_now(stages: Stages, server: 
         stages.at(OVER, bias=BIAS)
 
 
-def test_a_tare_with_the_same_result_is_of_its_own_pose(stages: Stages, server: Server, node: Node) -> None:
-    node.set("tool_mass", 0.0)
-    for up in (UP, SIDE):
-        server.hold(up, payload=Payload(), bias=BIAS)
-        node.run(1.0)
-        node.do("tare")
-    node.set("tool_mass", TOOL.mass)
-    stages.settle(ZERO6)
-
-
 def put(node: Node, **named: Any) -> Any:
     """Set parameters at once; the result."""
     messages = [Parameter(name, value=value).to_parameter_msg() for name, value in named.items()]
     request = SetParametersAtomically.Request(parameters=messages)
     return node.call("set_parameters_atomically", request).result
-
-
-def test_a_tare_before_an_identification_is_restored(stages: Stages, server: Server, node: Node) -> None:
-    node.set("tool_mass", 0.0)
-    server.hold(SIDE, bias=BIAS)
-    node.run(1.0)
-    node.do("tare")
-    assert put(node, tool_mass=TOOL.mass, bias=[9.0, *ZERO6[1:]]).successful
-    assert list(node.parameters("bias")[0]) == [9.0, *ZERO6[1:]]
-    node.do("undo_tare")
-    stages.at(OVER, bias=BIAS)
 
 
 def test_several_are_set_at_once_a_given_bias_is_of_no_tool(
@@ -342,15 +315,11 @@ def test_a_tool_that_is_accelerated_is_no_contact(stages: Stages, server: Server
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("tool_mass", -1.0, "tool_mass"),
         ("tool_mass", "heavy", "Wrong parameter type"),
         ("tool_mass", 1001.0, "tool_mass"),
         ("tool_center_of_gravity", [0.0, 0.0], "it must be 3 numbers from -10 to 10"),
-        ("tool_center_of_gravity", [0.0, 0.0, float("nan")], "it must be 3 numbers"),
         ("gravity", [0, 0, 0], "must be at least 0.1 m/s² long"),
-        ("bias", [1.0] * 7, "it must be 6 numbers"),
         ("gravity_source", "accelerometer", "it must be none or imu or topic_pose"),
-        ("orientation.mounting", [1.0, 0.0, 0.0, 1.0], "a rotation is a quaternion of length 1"),
         ("bias_directory", "", "it must be text that is not empty"),
         ("frame_id", "other", "read-only"),
     ],
@@ -358,8 +327,7 @@ def test_a_tool_that_is_accelerated_is_no_contact(stages: Stages, server: Server
 def test_a_wrong_value_is_refused(stages: Stages, node: Node, name: str, value: Any, words: str) -> None:
     before = node.parameters(name)
     node.refuse_value(name, value, words)
-    after = node.parameters(name)
-    assert list(after[0]) == list(before[0]) if hasattr(before[0], "__iter__") else after == before
+    assert node.parameters(name) == before
 
 
 def test_settings_of_the_sensor_that_do_not_go_with_it(stages: Stages, server: Server, node: Node) -> None:
