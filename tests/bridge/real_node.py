@@ -97,10 +97,6 @@ class Listener(Asking):
         self._node.create_subscription(message_type, f"/{self.tag}/{topic}", messages.put, depth)
         return messages
 
-    def publish(self, message_type: Any, topic: str) -> Any:
-        """A publisher."""
-        return self._node.create_publisher(message_type, topic, 10)
-
     def ask(
         self, service_type: Any, name: str, request: Any, until: Callable[[], object] = lambda: False
     ) -> Any:

@@ -102,9 +102,11 @@ def test_the_accelerometers_offset_is_found_and_subtracted(
 
 
 def test_the_file_is_one_that_the_node_starts_with(started: Node, take: Take, tmp_path: Path) -> None:
+    take(*AXES)
+    started.set("identify.file", "/proc/no/such.yaml")
+    started.do("identify/solve", "Not written: ", "/proc/no")  # the answer stands
     path = tmp_path / "mine.yaml"
     started.set("identify.file", str(path))
-    take(*AXES)
     started.do("identify/solve")
     with Node(Server(), "--params-file", str(path)) as other:
         mass, bias = other.parameters("tool_mass", "bias")
@@ -162,12 +164,6 @@ def test_cancel_changes_nothing(started: Node, take: Take) -> None:
 def test_it_does_not_start_without_an_orientation(node: Node) -> None:
     node.set("gravity_source", "none")
     node.refuse("identify/start", "gravity_source is none")
-
-
-def test_a_file_that_cannot_be_written(started: Node, take: Take) -> None:
-    started.set("identify.file", "/proc/no/such.yaml")
-    take(*AXES)
-    started.do("identify/solve", "Not written: ", "/proc/no")  # the answer stands
 
 
 def test_a_tool_that_was_lost_is_a_warning_and_nothing_is_changed(node: Node, server: Server) -> None:

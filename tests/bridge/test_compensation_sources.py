@@ -23,8 +23,6 @@ from bridge.parameters.table import PARAMETERS, gather
 from bridge.stream.link import SensorInfo
 from ft_compensation.quantities import length, unit_quaternion
 from tests.bridge.fake_tf import FakeTf
-from tests.bridge.real_node import Listener, Start
-from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import (
     DEFAULTS,
     OVER,
@@ -40,7 +38,6 @@ from tests.bridge.simulated_node import (
     weight,
 )
 from tests.compensation.making import BIAS, TOOL, sample
-from tests.server.running import wait_until
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 ROLLED = (1.0, 0.0, 0.0, 0.0)  # half a turn about x: what was up is down
@@ -285,33 +282,6 @@ def test_nothing_listens_where_no_source_is_chosen(robot: Robot, stages: Stages,
     assert not robot.listening()
     stages.at(UP)
     assert values(node.until(compensation="ok")["compensation"])["gravity_source"] == "imu"
-
-
-def test_topics_are_remapped_as_those_of_the_node_are(robot: Robot) -> None:
-    with Node(robot, "-r", "arm/pose:=/left/arm/pose", **POSE) as node:
-        robot.node = node.node
-        (subscription,) = robot.listening()
-        assert subscription.topic_name == "/left/arm/pose"
-        Stages(node).settle(ZERO6)
-
-
-def test_an_orientation_through_dds(listener: Listener, server: ScriptedServer, start: Start) -> None:
-    """In real time: the one message that an executor takes from the middleware."""
-    topic = f"/{listener.tag}/pose"
-    node = start(
-        server.port, **POSE | {"orientation.topic": topic, "tool_center_of_gravity": "[0.0, 0.0, 0.0]"}
-    )
-    publisher = listener.publish(PoseStamped, topic)
-    message = PoseStamped()
-    message.header.stamp.sec, message.pose.orientation.w = 5, 1.0
-
-    def is_taken() -> bool:
-        publisher.publish(message)
-        source: Any = node.node.compensation.choice.source
-        latest = source.latest
-        return latest is not None and latest.stamp_ns == 5 * 10**9
-
-    wait_until(is_taken, "the orientation to be taken")
 
 
 # TF.
