@@ -338,19 +338,16 @@ class Node(Asking):
     def ask(self, service_type: Any, name: str, request: Any) -> Any:
         return self.call(name, request)
 
-    def do(self, name: str, *words: str) -> str:
-        """What a Trigger service says that does it, these words among it."""
-        done, text = self.trigger(name)
-        assert done, text
+    def do(self, name: str, *words: str, done: bool = True) -> str:
+        """What a Trigger service says that does it, or does not; these words among it."""
+        did, text = self.trigger(name)
+        assert did is done, text
         assert [word for word in words if word not in text] == [], text
         return text
 
     def refuse(self, name: str, *words: str) -> str:
         """What a Trigger service says that does not do it, these words among it."""
-        done, text = self.trigger(name)
-        assert not done, text
-        assert [word for word in words if word not in text] == [], text
-        return text
+        return self.do(name, *words, done=False)
 
     def set(self, name: str, value: Any) -> None:
         """Set a parameter, which the node takes."""

@@ -244,19 +244,13 @@ def test_what_is_given_wins_over_the_file_and_the_rest_stays(launch: Launch, tmp
 
 
 @pytest.mark.ros
-def test_namespace_log_level_and_text_that_looks_like_a_number(launch: Launch) -> None:
+def test_namespace_log_level_respawn_and_text_that_looks_like_a_number(launch: Launch) -> None:
     launched = launch(
         "bridge.launch.py", "namespace:=left", "server_host:=127", f"server_port:={free_port()}"
     )
     launched.says(r"\[left.bridge\]: no server at 127:")
-    quiet = launch("bridge.launch.py", "log_level:=error", "server_port:=70000")
-    quiet.says("parameter server_port is 70000", "--log-level error")
-
-
-@pytest.mark.ros
-def test_respawn_starts_the_node_again(launch: Launch) -> None:
-    launched = launch("bridge.launch.py", "sensor:=300", "respawn:=true")
-    launched.says("parameter sensor is 300", times=2)
+    quiet = launch("bridge.launch.py", "log_level:=error", "server_port:=70000", "respawn:=true")
+    quiet.says("parameter server_port is 70000", "--log-level error", times=2)
 
 
 @pytest.mark.ros
@@ -269,21 +263,10 @@ def test_a_server_that_is_not_there_ends_the_demo_with_a_sentence(launch: Launch
 @pytest.mark.ros
 @pytest.mark.bus
 @needs_bus
-def test_the_demo_runs_and_ends_cleanly(launch: Launch) -> None:
+def test_the_demo_runs_with_the_commands_of_the_page_and_ends_cleanly(launch: Launch) -> None:
     port = free_port()
     launched = launch("demo.launch.py", f"server_port:={port}", SERVER_COMMAND)
     launched.says(f"connected to localhost:{port}: sensor 0 .BFT-SENS-ECAT-M8", "streaming")
-    assert launched.stop() == 0
-    assert launched.log.count("process has finished cleanly") == 2, launched.log
-    assert "has died" not in launched.log
-
-
-@pytest.mark.ros
-@pytest.mark.bus
-@needs_bus
-def test_the_commands_on_the_page_about_the_node(launch: Launch) -> None:
-    launched = launch("demo.launch.py", f"server_port:={free_port()}", SERVER_COMMAND)
-    launched.says("connected to localhost")
     try:
         for command in commands("ros2.md"):
             if command.strip() != "ros2 run bridge client":  # it runs already
@@ -294,6 +277,9 @@ def test_the_commands_on_the_page_about_the_node(launch: Launch) -> None:
                 assert done.returncode == 0, done.stderr
     finally:
         subprocess.run(["ros2", "daemon", "stop"], env=launched.environment, check=False, capture_output=True)
+    assert launched.stop() == 0
+    assert launched.log.count("process has finished cleanly") == 2, launched.log
+    assert "has died" not in launched.log
 
 
 @pytest.mark.ros
