@@ -164,22 +164,11 @@ class RobotSource(Source):
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """Nothing has come, it stopped, it is of no use, or its stamps are of another time."""
-        latest, problem, name = self.latest, self.problem, self.describe
-        if latest is None:
-            return f"no orientation from {name}: {problem}"
-        behind_s = stamp_s - latest.stamp_ns * 1e-9
-        if abs(behind_s) <= self._limit_s:
-            return ""
-        limit = f"(limit {self._limit_s:g} s)"
-        if behind_s < 0:
-            return (
-                f"the orientation from {name} is stamped {_seconds(-behind_s)} after the sample {limit}: the "
-                "clocks of the two computers differ"
-            )
-        why = problem or "it has stopped, is slow, or has another clock"
-        return (
-            f"the latest orientation from {name} is {_seconds(behind_s)} older than the sample {limit}: {why}"
-        )
+        if self.latest is None:
+            return f"no orientation from {self.describe}: {self.problem}"
+        off = why_off(stamp_s - self.latest.stamp_ns * 1e-9, self._limit_s)
+        why = self.problem or "it has stopped, is slow, or has another clock"
+        return off and f"the latest orientation from {self.describe} {off}: {why}"
 
     def age_s(self, time_s: float) -> float:
         """Between the stamps of sample and orientation."""
@@ -192,8 +181,12 @@ def _lever(parameters: Parameters, imu_position: Vector3) -> Vector3:
     return cx - x, cy - y, cz - z
 
 
-def _seconds(value: float) -> str:
-    return f"{value:.3f} s" if value < 100 else f"{value:.3g} s"
+def why_off(behind_s: float, limit_s: float) -> str:
+    """That something is too far from the sample in time, the end of a clause; empty if it is not."""
+    if abs(behind_s) <= limit_s:
+        return ""
+    order = "older" if behind_s > 0 else "newer"
+    return f"is {abs(behind_s):.3g} s {order} than the sample (limit {limit_s:g} s, orientation.stale_after)"
 
 
 # What is listened to.
