@@ -350,8 +350,8 @@ class SourceChoice:
                 f"parameter orientation.topic is {wanted.orientation_topic!r}: {reason}"
             ) from None
 
-    def open(self, wanted: Parameters, model: str) -> None:
-        """Open the source that is wanted, for a sensor of this model, unless it is open.
+    def open(self, wanted: Parameters) -> None:
+        """Open the source that is wanted, for the sensor that is or was there, unless it is open.
 
         ParameterError if that cannot be; then there is none.
         """
@@ -359,7 +359,9 @@ class SourceChoice:
         lever = (position, wanted.payload.center) if name in ("imu", "topic_imu") else None
         if name == "imu":
             # As given, else as the drawings of the model have it.
-            position = position if any(position) else (0.0, 0.0, IMU_HEIGHTS.get(model[4:8], 0.0))
+            position = (
+                position if any(position) else (0.0, 0.0, IMU_HEIGHTS.get(self._link.info.name[4:8], 0.0))
+            )
             opened: tuple[object, ...] = name, lever, position, wanted.accelerometer
         else:
             opened = (
