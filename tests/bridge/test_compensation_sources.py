@@ -322,7 +322,7 @@ def test_the_source_tf(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque() -> None:
     link: Any = SimpleNamespace(info=SensorInfo())
-    source, number = ImuSource(DEFAULTS, (0.0, 0.0, 0.0), link), itertools.count(1)
+    source, number = ImuSource(DEFAULTS, link), itertools.count(1)
 
     def felt(count: int = 1) -> float:
         found = None

@@ -40,6 +40,13 @@ TOPIC_KINDS: Final[dict[str, tuple[Any, Callable[[Any], Any]]]] = {
 }
 
 
+# What a source depends on, besides the sensor's model.
+_DEPENDS_ON: Final = (
+    "gravity_source", "gravity", "payload", "accelerometer", "imu_position", "orientation_topic",
+    "orientation_base_frame", "orientation_mounting", "orientation_stale_after",
+)  # fmt: skip
+
+
 class Source:
     """The specific force at the tool's center of gravity, m/s² in the sensor's frame. Of this class: none.
 
@@ -80,10 +87,13 @@ class ImuSource(Source):
     describe = "imu"
     is_imu = has_inertia = True
 
-    def __init__(self, parameters: Parameters, imu_position: Vector3, link: Link) -> None:
-        """`imu_position` is the IMU's, m from the wrench origin; `link` knows the sensor's filters."""
+    def __init__(self, parameters: Parameters, link: Link) -> None:
+        """`link` knows the sensor's model and filters."""
         super().__init__()
-        self._imu = ImuSpecificForce(_lever(parameters, imu_position), parameters.accelerometer)
+        position = parameters.imu_position
+        if not any(position):  # as the drawings of the model have it
+            position = 0.0, 0.0, IMU_HEIGHTS.get(link.info.name[4:8], 0.0)
+        self._imu = ImuSpecificForce(_lever(parameters, position), parameters.accelerometer)
         self._link, self._alignment = link, Alignment()
         self._settings: Mapping[str, SettingValue] | None = None  # those of the alignment
 
@@ -355,29 +365,17 @@ class SourceChoice:
 
         ParameterError if that cannot be; then there is none.
         """
-        name, position = wanted.gravity_source, wanted.imu_position
-        lever = (position, wanted.payload.center) if name in ("imu", "topic_imu") else None
-        if name == "imu":
-            # As given, else as the drawings of the model have it.
-            position = (
-                position if any(position) else (0.0, 0.0, IMU_HEIGHTS.get(self._link.info.name[4:8], 0.0))
-            )
-            opened: tuple[object, ...] = name, lever, position, wanted.accelerometer
-        else:
-            opened = (
-                name, lever, wanted.gravity, wanted.orientation_topic, wanted.orientation_base_frame,
-                wanted.orientation_mounting, wanted.orientation_stale_after,
-            )  # fmt: skip
+        opened = [getattr(wanted, name) for name in _DEPENDS_ON] + [self._link.info.name]
         if opened == self._opened:
             return
         self.close()
         try:
-            if name == "imu":
-                self.source = ImuSource(wanted, position, self._link)
-            elif name == "none":
-                self.source = Source()
-            else:
-                self.source = (open_tf if name == "tf" else open_topic)(self._node, wanted, self._group)
+            if wanted.gravity_source == "imu":
+                self.source = ImuSource(wanted, self._link)
+            elif wanted.gravity_source == "tf":
+                self.source = open_tf(self._node, wanted, self._group)
+            elif wanted.gravity_source in TOPIC_SOURCES:
+                self.source = open_topic(self._node, wanted, self._group)
         except ParameterError as error:
             self.source = Source(str(error))
             raise
