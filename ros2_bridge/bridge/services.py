@@ -95,15 +95,8 @@ class SensorServices:
 
     def _save_settings(self) -> str:
         # `configure` wants at least one setting: one as it is.
-        setting = next(iter(self._link.info.settings.items()), None)
-        sensor = self._link.sensor
-        if setting is None:
-            raise RequestFailedError(
-                f"the settings of sensor {sensor} are not known: there is no server at {self._link.address}, "
-                "or the sensor has none"
-            )
-        name, value = setting
-        self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=sensor, settings={name: value}, save=True)
+        sensor, settings = self._link.sensor, dict(list(self._link.info.settings.items())[:1])
+        self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=sensor, settings=settings, save=True)
         return f"sensor {sensor} keeps its settings and offset in its flash now"
 
 

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
+import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -26,7 +27,7 @@ from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.outputs import FilterSettings, WrenchFilter, WrenchTransform
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
-from ft_compensation.stationary import StationaryWindow
+from ft_compensation.stationary import StationaryWindow, triple
 from ft_compensation.stationary_limits import StationaryLimits
 
 # Failed lookups after the first subscription before it is a problem: TF has to arrive first.
@@ -231,17 +232,14 @@ class RestWindow(StationaryWindow):
         super().__init__(seconds, limits)
         self.source = source
         self.done = threading.Event()
-        self._sum, self._felt = ZERO, 0
-        self._blind = ""
+        self._felt, self._blind = list[Vector3](), ""
 
     def take(self, sample: Sample, time_s: float, stamp_s: float, felt: Vector3 | None) -> bool:
         """Take a sample and its specific force, for the reader. True: the window is complete."""
         if felt is None:
             self._blind = self._blind or self.source.why_none(sample, stamp_s) or "not in every sample"
         else:
-            (x, y, z), (fx, fy, fz) = self._sum, felt
-            self._sum = (x + fx, y + fy, z + fz)
-            self._felt += 1
+            self._felt.append(felt)
         if self.add(sample, time_s):
             self.done.set()
         return self.done.is_set()
@@ -250,8 +248,7 @@ class RestWindow(StationaryWindow):
         """Its mean in the sensor's frame, m/s²; CompensationError if it was not known all the time."""
         if self._blind or not self._felt:
             raise CompensationError(f"the weight of the tool is not known: {self._blind or 'no sample came'}")
-        x, y, z = self._sum
-        return x / self._felt, y / self._felt, z / self._felt
+        return triple(np.mean(self._felt, axis=0))
 
 
 class CompensatedOutput:
