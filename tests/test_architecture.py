@@ -98,8 +98,6 @@ PACKAGES: Final[dict[str, set[str]]] = {
 
 WITHOUT_ROS: Final = (
     "bridge.stream", "bridge.client", "bridge.process", "bridge.parameters.table",
-    "bridge.compensating.tool_sources",
-    "bridge.diagnostics.health",
 )  # fmt: skip
 """What can run, and be tested, where there is no ROS; `bridge.client` loads it later."""
 SOCKETS: Final = {"socket", "socketserver", "select", "selectors", "asyncio", "ssl"}
