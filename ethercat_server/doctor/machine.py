@@ -16,6 +16,7 @@ import re
 import shlex
 import socket
 import struct
+import time
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -88,9 +89,11 @@ class Machine:
     asked: str = ""  # the name on the command line if it differs: virtual
     facts: dict[str, Any] = field(default_factory=dict)  # those that are known, or why they are not
     root: Path = Path("/")
-    timer_resolution_s: float = 1e-9  # of CLOCK_MONOTONIC's timers
+    # Of CLOCK_MONOTONIC's timers.
+    timer_resolution_s: float = field(default_factory=lambda: time.clock_getres(time.CLOCK_MONOTONIC))
     release: str = field(default_factory=lambda: os.uname().release)
     rt_priority: int = 80  # the server's
+    cpu: int | None = None  # likewise
     allow_ip: bool = False  # whether an interface of the machine's network may be used
 
     @property
@@ -170,12 +173,6 @@ class Machine:
         except (OSError, zlib.error):
             text = self.text(f"/boot/config-{self.release}", "")
         return dict(re.findall(r"^CONFIG_(\w+)=(.*)$", text, re.MULTILINE))
-
-    @cached_property
-    def command_line(self) -> dict[str, str]:
-        """The kernel's command line; options without a value have an empty one."""
-        words = (word.partition("=") for word in self.text("/proc/cmdline", "").split())
-        return {name: value for name, _, value in words}
 
     @cached_property
     def processors(self) -> list[int]:

@@ -61,9 +61,8 @@ def test_the_whole_doctor(bench: Bench) -> None:
     interface, others = ended.findings("interface"), ended.findings("other software")
     assert interface["link"]["values"]["kind"] == "veth"
     assert interface["driver"]["values"]["driver"] == "veth"
-    assert interface["coalescing"]["level"] == "ok"
+    assert interface["coalescing"]["level"] == "skipped", "the driver has none"
     assert others["addresses"]["level"] in {"ok", "note"}, "nothing but a link-local address"
-    assert others["listeners"]["level"] in {"ok", "warning"}
     for position in range(2):
         now = sensor.stats(position)
         assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
@@ -177,9 +176,7 @@ def test_without_rights_it_says_what_it_skipped(bench: Bench) -> None:
     before = sensor.command("stats")
     ended = doctor_of_nobody(veth.near, "--json", "--seconds", "0.02")
     assert not ended.json["root"]
-    assert ended.findings("bus")["slaves"]["found"] == (
-        "not checked: CAP_NET_RAW and CAP_NET_ADMIN missing; run with sudo"
-    )
+    assert "CAP_NET_ADMIN and CAP_NET_RAW missing; run with sudo" in ended.findings("bus")["slaves"]["found"]
     assert ended.findings("rights")["capabilities"]["level"] == "note"
     assert ended.findings("measurement")["all"]["level"] == "skipped"
     assert ended.findings("interface")["driver"]["values"]["driver"] == "veth", "this needs no rights"
