@@ -185,16 +185,6 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     benchmark.check(ROOT / "docs" / "benchmark.md")
 
 
-@pytest.mark.parametrize(
-    "wrong", ["--rates 801", "--sensors 0", "--seconds x", "--rt-priority 99", "--load 65", "--load 1 --path"]
-)
-def test_wrong_arguments_are_refused(wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as refused:
-        benchmark.parse(wrong.split())
-    assert refused.value.code == 2
-    assert wrong.split()[-2 if " --path" not in wrong else -1] in capsys.readouterr().err
-
-
 def test_an_option_measures_only_what_it_names() -> None:
     for given, expected in {
         "": ("comparison", False),
@@ -314,12 +304,6 @@ def test_the_c_master_looks_once_at_each_sample_and_not_before_it_is_there(
     assert len(statistics.read_numbers(tmp_path / "own", 2)) >= 46
 
 
-def test_without_a_compiler_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(ScriptError, match="apt install gcc"):
-        masters.build(tmp_path)
-
-
 # -- runs
 
 
@@ -348,7 +332,7 @@ def test_what_is_measured_is_shown_and_written(
         *["Bota's driver"] * (not installed),
     ]  # fmt: skip
     assert {(row["rate_hz"], row["sensors"]) for row in content["comparison"]} == {(800, 1)}
-    assert content["comparison"][-1 - (not installed)]["made"] == 100
+    assert content["comparison"][0]["made"] == 300
     assert ("could not be installed" in content["comparison"][-1].get("missing", "")) == (not installed)
     assert content["idle_states"]
     assert "0 (0) of 300" in shown.getvalue()

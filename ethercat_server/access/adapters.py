@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -140,13 +140,9 @@ def find_holder(ifname: str) -> Holder | None:
     """The process with the EtherCAT socket on `ifname`; None if there is none, or no such interface."""
     if not (inodes := master_sockets(ifname)):
         return None
-    return next(owners(inodes), None) or Holder(None, "ethercat-server", _default_server(ifname))
-
-
-def owners(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Holder]:
-    """The visible processes that have one of these sockets."""
-    for process in users_of(inodes, processes):
-        yield Holder(process.pid, process.name, _listening(processes / str(process.pid), process.sockets))
+    for pid, name, sockets in users_of(inodes):
+        return Holder(pid, name, _listening(Path(f"/proc/{pid}"), sockets))
+    return Holder(None, "ethercat-server", _default_server(ifname))
 
 
 def _default_server(ifname: str) -> Address | None:

@@ -106,13 +106,13 @@ class Machine:
         if name not in self.facts:
             try:
                 self.facts[name] = FACTS[name](self.ifname)
-            except OSError as error:
-                text = NOT_SUPPORTED if error.errno == errno.EOPNOTSUPP else error.strerror or str(error)
-                self.facts[name] = CannotLookError(text)
             except Exception as error:  # noqa: BLE001 - pyroute2's errors share no base
-                kind = type(error).__name__
-                text = f"{kind}: {error}".replace("\0", "").strip()
-                self.facts[name] = CannotLookError(NOT_SUPPORTED if kind == "NotSupportedError" else text)
+                lacks = (
+                    "NotSupported" in type(error).__name__ or getattr(error, "errno", 0) == errno.EOPNOTSUPP
+                )
+                text = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+                text = NOT_SUPPORTED if lacks else text.replace("\0", "").strip()
+                self.facts[name] = CannotLookError(text)
         found = self.facts[name]
         if isinstance(found, CannotLookError):
             raise found

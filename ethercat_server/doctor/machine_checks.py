@@ -52,7 +52,7 @@ def examine_machine(machine: Machine) -> Iterator[Finding]:
             # A virtual bus is gone when the doctor ends: nothing to fix.
             gone = about_the_interface and machine.asked == VIRTUAL_INTERFACE
             yield replace(finding, commands=()) if gone else finding
-        if look is link_state:
+        if look is _link_state:
             link = machine.facts["link"]
             there = isinstance(link, Adapter) and not link.loopback
     if not there:
@@ -71,8 +71,7 @@ _USUAL_RUNTIME_PERCENT: Final = 95
 _FINE_S: Final = 1e-6
 
 
-def preemption(machine: Machine) -> Finding:
-    """Whether a high-priority program can preempt the kernel."""
+def _preemption(machine: Machine) -> Finding:
     version = machine.text("/proc/version", "")
     if machine.text("/sys/kernel/realtime", "") == "1" or "PREEMPT_RT" in version:
         return ok("fully preemptible (PREEMPT_RT)", model="rt")
@@ -104,8 +103,7 @@ def preemption(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def tick(machine: Machine) -> Finding:
-    """Whether sleeping programs wake on time, or at the kernel's next tick."""
+def _tick(machine: Machine) -> Finding:
     rate, resolution_s = machine.config.get("HZ"), machine.timer_resolution_s
     coarse = resolution_s > _FINE_S
     timers = f"timers resolve {resolution_s * 1e3:.3g} ms" if coarse else "high-resolution timers"
@@ -119,8 +117,7 @@ def tick(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def clock_source(machine: Machine) -> Finding:
-    """The hardware that the kernel reads the time from."""
+def _clock_source(machine: Machine) -> Finding:
     folder = "/sys/devices/system/clocksource/clocksource0"
     source = machine.text(f"{folder}/current_clocksource")
     others = machine.text(f"{folder}/available_clocksource", "").split()
@@ -136,8 +133,7 @@ def clock_source(machine: Machine) -> Finding:
     )
 
 
-def throttling(machine: Machine) -> Finding:
-    """Share of CPU time that real-time programs may use."""
+def _throttling(machine: Machine) -> Finding:
     runtime = machine.number("/proc/sys/kernel/sched_rt_runtime_us")
     period = machine.number("/proc/sys/kernel/sched_rt_period_us")
     if period <= 0:
@@ -156,8 +152,7 @@ _NEEDED: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
 _CAPABILITIES: Final = _NEEDED | {14: "CAP_IPC_LOCK", 23: "CAP_SYS_NICE"}
 
 
-def capabilities(machine: Machine) -> Finding:
-    """The capabilities that the server's raw socket and its scheduling need."""
+def _capabilities(machine: Machine) -> Finding:
     missing = [name for bit, name in _CAPABILITIES.items() if not machine.has_capability(bit)]
     held = [name for name in _CAPABILITIES.values() if name not in missing]
     without = (
@@ -189,8 +184,7 @@ _LIGHT_US: Final = 10
 _PERMANENT: Final = "to make it permanent: 'tuned-adm profile latency-performance'"
 
 
-def governor(machine: Machine) -> Finding:
-    """The frequency governor of the processors."""
+def _governor(machine: Machine) -> Finding:
     files = (f"{_CPUS}/cpu{number}/cpufreq/scaling_governor" for number in machine.processors)
     found = Counter(name for file in files if (name := machine.text(file, "")))
     slow = "an idle processor runs slowly at first, just when the server wakes"
@@ -203,8 +197,7 @@ def governor(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def idle_states(machine: Machine) -> Finding:
-    """Exit latency of the deepest idle state."""
+def _idle_states(machine: Machine) -> Finding:
     states: dict[tuple[str, str], int] = {}
     for number in machine.processors:
         folder = f"{_CPUS}/cpu{number}/cpuidle"
@@ -242,8 +235,7 @@ def _latency_limit_us(machine: Machine) -> int | None:
     return int(limit) if 0 <= limit < _NO_CONSTRAINT_US else None
 
 
-def isolation(machine: Machine) -> Finding:
-    """Whether a processor is isolated for the server."""
+def _isolation(machine: Machine) -> Finding:
     online, apart = machine.processors, machine.isolated
     tickless = machine.text(f"{_CPUS}/nohz_full", "").replace("(null)", "")
     files = (f"{_CPUS}/cpu{number}/topology/thread_siblings_list" for number in apart)
@@ -264,8 +256,7 @@ def isolation(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def virtualization(machine: Machine) -> Iterator[Finding]:
-    """Virtual machine or container."""
+def _virtualization(machine: Machine) -> Iterator[Finding]:
     container, virtual = _container(machine), _virtual_machine(machine)
     if container:
         yield note(
@@ -327,8 +318,7 @@ _LIST: Final = "ethercat-sensor adapters"
 _CORRUPTED: Final = "corrupted: check cable, connectors, shield and sources of interference"
 
 
-def link_state(machine: Machine) -> Finding:
-    """Whether the interface is there, up, and has a carrier."""
+def _link_state(machine: Machine) -> Finding:
     if machine.fact("link") is None:
         return bad(
             f"no network interface {machine.ifname!r}",
@@ -349,8 +339,7 @@ def link_state(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def speed(machine: Machine) -> Finding:
-    """EtherCAT is 100 Mbit/s, full duplex."""
+def _speed(machine: Machine) -> Finding:
     if not machine.link.carrier:
         raise CannotLookError("no carrier")
     mbits, duplex = machine.fact("settings")
@@ -368,8 +357,7 @@ def speed(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def driver(machine: Machine) -> Finding:
-    """The network card, and how it is connected."""
+def _driver(machine: Machine) -> Finding:
     kind, folder = machine.link.kind, f"/sys/class/net/{machine.ifname}"
     found, bus = machine.fact("driver")
     wireless = any(machine.path(f"{folder}/{mark}").exists() for mark in ("wireless", "phy80211"))
@@ -384,8 +372,7 @@ def driver(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def coalescing(machine: Machine) -> Finding:
-    """Whether the card delays its interrupts."""
+def _coalescing(machine: Machine) -> Finding:
     found = machine.fact("coalescing")
     adaptive = [name.split("_")[2] for name in _ADAPTIVE if found.get(name)]
     on = [f"{name[:2]} {found[name]} µs" for name in _DELAYS if found.get(name)]
@@ -399,8 +386,7 @@ def coalescing(machine: Machine) -> Finding:
     )
 
 
-def offloads(machine: Machine) -> Finding:
-    """Segmentation and receive offloads, which are for TCP."""
+def _offloads(machine: Machine) -> Finding:
     virtual, found = machine.link.kind, machine.fact("offloads")
     on = [short for name, short in _UNWANTED.items() if found.get(name)]
     text = f"{', '.join(on)} on{', without effect on a virtual interface' if virtual else ''}"
@@ -409,8 +395,7 @@ def offloads(machine: Machine) -> Finding:
     return graded(text if on else "off", (on and not virtual, note, why, command), on=on)
 
 
-def energy_efficient_ethernet(machine: Machine) -> Finding:
-    """Energy-efficient Ethernet."""
+def _energy_efficient_ethernet(machine: Machine) -> Finding:
     enabled, active = machine.fact("EEE")
     mend = f"sudo ethtool --set-eee {machine.shown} eee off"
     return graded(
@@ -421,8 +406,7 @@ def energy_efficient_ethernet(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def card_counters(machine: Machine) -> Finding:
-    """Error counters of the card since it came up."""
+def _card_counters(machine: Machine) -> Finding:
     found, changes = machine.link.counters, machine.link.carrier_changes
     if not found:
         raise CannotLookError("the kernel provides no counters")
@@ -461,8 +445,7 @@ def _counted(found: Mapping[str, int]) -> str:
 _PRIORITY_FIELD: Final = 39  # of /proc/PID/stat, counted from 0: the real-time priority
 
 
-def affinity(machine: Machine) -> Finding:
-    """The processors that handle the card's interrupts."""
+def _affinity(machine: Machine) -> Finding:
     numbers, apart = _interrupts(machine), machine.isolated
     if not numbers and machine.link.kind:
         return ok("none: a virtual interface", irqs=[])
@@ -487,8 +470,7 @@ def affinity(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def threads(machine: Machine) -> Finding:
-    """Priority of interrupt threads relative to the server."""
+def _threads(machine: Machine) -> Finding:
     numbers = _interrupts(machine)
     if not numbers:
         return ok("not applicable: no interrupts", threads={})
@@ -537,8 +519,7 @@ _DHCP_CLIENTS: Final = frozenset({"dhclient", "dhcpcd", "udhcpc", "connmand", "w
 _LEFT_ALONE: Final = frozenset({"unmanaged", "initialized", "pending", "linger"})  # by systemd-networkd
 
 
-def managers(machine: Machine) -> Finding:
-    """Network managers that configure the interface."""
+def _managers(machine: Machine) -> Finding:
     index, name, found = machine.link.ifindex, machine.shown, {}
     state = machine.text(f"/run/NetworkManager/devices/{index}", "")
     if re.search(r"^managed=(true|1)$", state, re.MULTILINE):
@@ -565,8 +546,7 @@ def managers(machine: Machine) -> Finding:
     )
 
 
-def addresses(machine: Machine) -> Finding:
-    """IP on the interface."""
+def _addresses(machine: Machine) -> Finding:
     found: Routes = machine.fact("routes")
     name, delays = machine.shown, "IP traffic delays the sensor's frames"
     text = ", ".join([*found.addresses, *(f"route to {route}" for route in found.others)])
@@ -587,8 +567,7 @@ def addresses(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def membership(machine: Machine) -> Finding:
-    """Bridges, bonds, VLANs."""
+def _membership(machine: Machine) -> Finding:
     link, name = machine.link, machine.shown
     above, below = f"part of {link.master}", f"below {', '.join(link.upper)}"
     return graded(
@@ -602,15 +581,15 @@ def membership(machine: Machine) -> Finding:
 
 
 _BY_SUBJECT: Final[Mapping[str, Mapping[str, Look]]] = {
-    "kernel": {"preemption": preemption, "tick": tick, "clock source": clock_source,
-               "real-time throttling": throttling},
-    "rights": {"capabilities": capabilities},
-    "processors": {"governor": governor, "idle states": idle_states, "isolation": isolation,
-                   "virtualization": virtualization},
-    "interface": {"link": link_state, "speed": speed, "driver": driver, "coalescing": coalescing,
-                  "offloads": offloads, "EEE": energy_efficient_ethernet, "counters": card_counters,
-                  "interrupts": affinity, "interrupt threads": threads},
-    "other software": {"managers": managers, "addresses": addresses, "membership": membership},
+    "kernel": {"preemption": _preemption, "tick": _tick, "clock source": _clock_source,
+               "real-time throttling": _throttling},
+    "rights": {"capabilities": _capabilities},
+    "processors": {"governor": _governor, "idle states": _idle_states, "isolation": _isolation,
+                   "virtualization": _virtualization},
+    "interface": {"link": _link_state, "speed": _speed, "driver": _driver, "coalescing": _coalescing,
+                  "offloads": _offloads, "EEE": _energy_efficient_ethernet, "counters": _card_counters,
+                  "interrupts": _affinity, "interrupt threads": _threads},
+    "other software": {"managers": _managers, "addresses": _addresses, "membership": _membership},
 }  # fmt: skip
 CHECKS: Final = tuple(
     Check(subject, name, look) for subject, checks in _BY_SUBJECT.items() for name, look in checks.items()

@@ -24,7 +24,7 @@ from bota_ethercat.text.json_text import finite
 from ethercat_server.access.sensors import Sensors, note
 from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignments, read_config
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
-from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
+from ethercat_server.ethercat.slave.coe import Sdo, finish
 from ethercat_server.process.signals import signals_held_back
 from ethercat_server.sensor.configuration import Change, save
 from ethercat_server.sensor.objects import dictionary
@@ -50,21 +50,14 @@ _SAVED: Final = (
     "saved to the sensor's flash; a server writes its own settings at start: set the same there, or "
     "--unset-settings keep"
 )
-# How long a change lasts; of a tare, and through a server.
-_UNSAVED: Final = {
-    (False, False): "in force until the sensor is powered off: use --save, or the command save, to keep it",
-    (True, False): "in force until the sensor is powered off: use the command save to keep it",
-    (
-        False,
-        True,
-    ): "in force until the server is started again, also after the sensor was powered off: set the "
-    "same in the server's configuration to keep it",
-    (
-        True,
-        True,
-    ): "in force while the server runs, then until the sensor is powered off: use the command save "
-    "to keep it",
-}
+_UNSAVED: Final = "in force until the sensor is powered off: use the command save to keep it"
+_UNSAVED_IN_SERVER: Final = (
+    "in force until the server is started again, also after the sensor was powered off: set the same in the "
+    "server's configuration to keep it"
+)
+_TARE_IN_SERVER: Final = (
+    "in force while the server runs, then until the sensor is powered off: use the command save to keep it"
+)
 
 
 # -- plan, apply, save
@@ -104,18 +97,9 @@ def _change_lines(found: list[dict[str, Any]]) -> str:
     return columns(rows, indent=2)
 
 
-def _lasts(opened: Sensors, *, tare: bool = False) -> str:
-    return _UNSAVED[tare, opened.private is None]
-
-
-def _verify(sensor: Sensor, settings: Mapping[str, SettingValue]) -> None:
-    """BusError unless `settings` are in force."""
-    for name, value in settings.items():
-        if (held := sensor.settings.get(name)) != value:
-            raise BusError(
-                f"sensor {sensor.number} reads back {name} = {value_text(held)} although it accepted "
-                f"{value_text(value)}: power it off and on, then try again"
-            )
+def _lasts(opened: Sensors, in_server: str = _UNSAVED_IN_SERVER) -> str:
+    """How long a change lasts that is not saved."""
+    return in_server if opened.private is None else _UNSAVED
 
 
 def _asked(args: argparse.Namespace) -> ServerOptions:
@@ -163,7 +147,6 @@ def _apply(args: argparse.Namespace) -> int:
             opened.configure(found.number, settings, args.save)
         if changed:
             after = opened.in_force(found, settings)
-    _verify(after, settings)
     in_force = meaning(after.settings, after.rate_hz)
     values = {
         "changes": changed, "saved": args.save, "settings": after.settings, "rate_hz": after.rate_hz,
@@ -217,7 +200,7 @@ def _tare(args: argparse.Namespace) -> int:
     rows: list[tuple[str, ...]] = [("", *(key.replace("_", " ") for key in keys), "")]
     for n, axis in enumerate(_AXES):
         rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
-    lines = columns(rows, indent=2), _lasts(opened, tare=True)
+    lines = columns(rows, indent=2), _lasts(opened, _TARE_IN_SERVER)
     report(args.json, opened, found, {key: tared[key] for key in keys}, *lines)
     return DONE
 
@@ -327,17 +310,21 @@ def _restore(args: argparse.Namespace) -> int:
     snapshot = read_snapshot(args.file)
     with sensor_of(args) as (opened, found):
         _check_whose(found.identity, snapshot.identity, args)
-        sensor = opened.in_force(found, snapshot.settings)
-        lacking = sorted(snapshot.settings.keys() - sensor.settings.keys())
-        settings = {name: value for name, value in snapshot.settings.items() if name not in lacking}
-        changed = _changes(sensor, settings)
-        differing, unreadable = finish(_differing(opened.sdo(found.number), snapshot))
+        sensor, sdo = opened.in_force(found, snapshot.settings), opened.sdo(found.number)
+        settings = {name: value for name, value in snapshot.settings.items() if name in sensor.settings}
+        missing = sorted(snapshot.settings.keys() - settings.keys())
+        changed, differing = _changes(sensor, settings), dict[Address, tuple[bytes, bytes]]()
+        for address, wanted in snapshot.objects.items():
+            try:
+                if (held := finish(sdo.read(*address))) != wanted:
+                    differing[address] = held, wanted
+            except SdoAbortError:
+                missing.append(f"0x{address[0]:04X}:{address[1]}")
         if changed or differing:
             with signals_held_back():
                 _put_back(opened, found, sensor, settings, differing)
         if args.save:
             _save_now(opened, found)
-    missing = [*lacking, *(f"0x{index:04X}:{sub}" for index, sub in unreadable)]
     lines = [_change_lines(changed)] if changed else []
     if differing:
         lines.append(columns([_object_line(address, *pair) for address, pair in differing.items()], indent=2))
@@ -345,11 +332,11 @@ def _restore(args: argparse.Namespace) -> int:
         lines.append(f"  skipped, this sensor does not have them: {', '.join(missing)}")
     if not changed and not differing:
         lines.append("  nothing to restore: the sensor already matches the file")
+    if changed or differing or args.save:
+        lines.append(_SAVED if args.save else _lasts(opened))
     written = [
         _as_json(address, {"now": old.hex(), "then": new.hex()}) for address, (old, new) in differing.items()
     ]
-    if changed or differing or args.save:
-        lines.append(_SAVED if args.save else _lasts(opened))
     values = {"changes": changed, "objects": written, "left_alone": missing, "saved": args.save}
     report(args.json, opened, found, values, *lines)
     return DONE
@@ -362,22 +349,6 @@ def _check_whose(sensor: Identity, file: Identity, args: argparse.Namespace) -> 
         )
     if sensor.firmware != file.firmware:
         note(f"{args.file} was taken with firmware {file.firmware}, the sensor now has {sensor.firmware}")
-
-
-def _differing(
-    sdo: Sdo, snapshot: Snapshot
-) -> Steps[tuple[dict[Address, tuple[bytes, bytes]], list[Address]]]:
-    """Present and saved value of the objects that differ; the objects that the sensor does not have."""
-    differing, unreadable = {}, []
-    for address, wanted in snapshot.objects.items():
-        try:
-            held = yield from sdo.read(*address)
-        except SdoAbortError:
-            unreadable.append(address)
-            continue
-        if held != wanted:
-            differing[address] = held, wanted
-    return differing, unreadable
 
 
 def _put_back(
@@ -393,14 +364,13 @@ def _put_back(
         opened.configure(found.number, settings, save=False)
     written = []
     try:
-        _verify(opened.in_force(found, settings), settings)
         for address, (_, wanted) in objects.items():
             written.append(address)
-            finish(_write(sdo, address, wanted))
+            _write(sdo, address, wanted)
     except BusError as error:
         try:
             for address in written:
-                finish(_write(sdo, address, objects[address][0]))
+                _write(sdo, address, objects[address][0])
             opened.configure(found.number, before, save=False)
         except BusError as again:
             raise BusError(
@@ -409,10 +379,9 @@ def _put_back(
         raise BusError(f"{error}; the former settings are in force") from None
 
 
-def _write(sdo: Sdo, address: Address, data: bytes) -> Steps[None]:
-    yield from sdo.write(*address, data)
-    held = yield from sdo.read(*address)
-    if held != data:
+def _write(sdo: Sdo, address: Address, data: bytes) -> None:
+    finish(sdo.write(*address, data))
+    if (held := finish(sdo.read(*address))) != data:
         raise BusError(
             f"object 0x{address[0]:04X}:{address[1]} reads back {held.hex()} after writing {data.hex()}"
         )

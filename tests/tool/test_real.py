@@ -83,12 +83,6 @@ def test_a_whole_command_on_the_interface(bench: Bench) -> None:
     assert sensor.stats()["al_state"] == "INIT"
 
 
-def test_the_eeproms_of_a_chain(bench: Bench) -> None:
-    """Each slave's own name, though pysoem gives the second one the first one's."""
-    found = tool("eeprom", bench[0].near, "--json").json["slaves"]
-    assert [row["name"] for row in found] == ["BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8"]
-
-
 def test_watch_ends_with_ctrl_c_and_leaves_the_bus(bench: Bench) -> None:
     """A signal from outside while pysoem's frames are under way."""
     veth, sensor = bench
