@@ -459,7 +459,7 @@ def _watched(
     subject: str, check: str, open_sensors: Callable[[], Sensors], seconds: float,
     describe: Callable[[ServerView], Finding],
 ) -> Iterator[Finding]:  # fmt: skip
-    """What a server says; `describe` finds what the first check does."""
+    """The checks of a server's figures; `describe` is the first one."""
     views: list[ServerView] = []
 
     def watch() -> Finding:
@@ -502,7 +502,7 @@ def _on_bus(machine: Machine, seconds: float, announce: Callable[[str], None]) -
     try:
         with open_interface(machine.ifname, allow_ip=machine.allow_ip) as bus:
             count = yield from _slaves(machine, bus, found)
-    except InterfaceError as error:  # it may not be used, by nobody
+    except InterfaceError as error:  # the server would refuse it as well
         yield from _left_alone(skipped(str(error)))
         return
     except ServerError as error:

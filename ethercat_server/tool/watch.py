@@ -156,7 +156,7 @@ class _Watch:
             if end.passed or all(block.samples >= most for block in self._blocks.values()):
                 return
             opened.wait_settled(settling)
-            awaited = settling  # whose samples that came meanwhile are the next ones here
+            awaited = settling  # their samples that came meanwhile are in the next batch
             if show.passed:
                 show = Deadline(opened.clock, self._interval_s)
                 self.show()

@@ -64,13 +64,6 @@ def test_find_looks_where_it_may(bench: Bench, monkeypatch: pytest.MonkeyPatch) 
     assert "PROMISC" not in veth.ip("link", "show", veth.near)
 
 
-def test_a_master_that_is_no_server_is_named(bench: Bench) -> None:
-    """Which process has a socket is known to the kernel alone."""
-    veth, sensor = bench
-    said = refused("objects", veth.far)
-    assert f"{veth.far} is in use by process {sensor.process.pid}" in said
-
-
 def test_a_whole_command_on_the_interface(bench: Bench) -> None:
     """pysoem's SDO transfers and its way to PREOP, standard output that is a pipe, settings that stay."""
     veth, sensor = bench
