@@ -390,6 +390,16 @@ class ServerView:
             else:
                 yield ok(f"{text}: {verdict.sentence[0].lower()}{verdict.sentence[1:]}", **values)
 
+    def wake_ups(self) -> Finding:
+        """Its lateness."""
+        late, count = self._grown("missed_deadlines"), max(1, self._grown("cycles"))
+        return wake_finding(self._summaries["wake_us"], late, count)
+
+    def exchanges(self) -> Finding:
+        """How long its exchanges take, and how many are lost."""
+        lost, count = self._grown("lost_frames"), max(1, self._grown("cycles"))
+        return exchange_finding(self._when, self._summaries["exchange_us"], lost, count)
+
     def ages(self) -> Iterator[Finding]:
         """The age of samples when the server sends them."""
         recent = [row["age_us"] for row in self.after["sensors"]] if self._own else self._summaries["age_us"]
@@ -413,11 +423,9 @@ class ServerView:
 
     def examine(self, subject: str) -> Iterator[Finding]:
         """All checks."""
-        wake, exchange = self._summaries["wake_us"], self._summaries["exchange_us"]
-        missed, lost, count = map(self._grown, ("missed_deadlines", "lost_frames", "cycles"))
         yield from examine(subject, "sensors", self.sensors)
-        yield from examine(subject, "wake-ups", wake_finding, wake, missed, max(1, count))
-        yield from examine(subject, "exchanges", exchange_finding, self._when, exchange, lost, max(1, count))
+        yield from examine(subject, "wake-ups", self.wake_ups)
+        yield from examine(subject, "exchanges", self.exchanges)
         yield from examine(subject, "age of data", self.ages)
         if not self._own:
             yield from examine(subject, "clients", self.clients)
