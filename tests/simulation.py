@@ -40,7 +40,6 @@ from ethercat_server.access import private_server, sensors
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.acquisition.start_up import AsFound, Wanted
 from ethercat_server.acquisition.stream import OutgoingFrame
-from ethercat_server.doctor import bus_checks
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import ByPosition
@@ -479,8 +478,7 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     bus = SimulatedBus(MemoryBackend(*slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scan, "read_image", _read_image)
-        for module in (private_server, bus_checks):
-            patch.setattr(module, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
+        patch.setattr(private_server, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
 
         def private(_ifname: str, *, force: bool = False, **_: object) -> PrivateServer:
             server = PrivateServer(bus, AsFound(force=force))

@@ -21,9 +21,8 @@ from tests.tool.running import told, tool_here
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
+def bench() -> Iterator[SimulatedBus]:
     """Two sensors behind whatever is opened."""
-    monkeypatch.setattr(find, "promiscuity_kept", lambda _: contextlib.nullcontext())
     with simulated_bus("--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--serial", "10,20") as bus:
         yield bus
 

@@ -15,8 +15,6 @@ from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import DATAGRAM_HEADER, FRAME_HEADER, Command
 from ethercat_server.sensor.objects.dictionary import KNOWN_OBJECTS, NOTE_NAMES
 from ethercat_server.simulation.backend import MemoryBackend
-from ethercat_server.tool.cli import COMMANDS
-from tests.server.test_objects import IN_THE_NOTE
 from tests.simulation import SimulatedBus, SimulatedServer, registers, simulated_bus, simulated_server
 from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign, no_mailbox
 from tests.tool.running import complaints, one_sentence, refused, told, tool_here
@@ -96,14 +94,6 @@ def test_objects_that_cannot_be_read_have_a_line_with_the_reason(
     assert "this firmware does not have it" in alone.out + alone.err
 
 
-@pytest.mark.parametrize(("size", "missing"), [("61", 5), ("77", 1)])
-def test_the_full_dump_has_a_line_for_every_object(size: str, missing: int) -> None:
-    with simulated_bus("--pdo", size) as bus:
-        lines = tool_here("objects", bus.near).out.splitlines()
-    assert len(lines) == 2 + len(KNOWN_OBJECTS)
-    assert sum("this firmware does not have it" in line for line in lines) == missing
-
-
 def test_a_foreign_slave_is_no_sensor_to_anybody(monkeypatch: pytest.MonkeyPatch) -> None:
     foreign(monkeypatch)
     with simulated_bus() as bus:
@@ -131,12 +121,11 @@ def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
 
 
 def test_every_row_of_table_iii_1_is_read_by_name(bench: SimulatedBus) -> None:
-    rows = (*NOTE_NAMES, *IN_THE_NOTE)
-    names = [name for _, _, name in rows]
+    names = [name for _, _, name in NOTE_NAMES]
     ended = tool_here("read", bench.near, *names, "--json", code=1)
     found = ended.json["sensors"][0]["objects"]
     read = {(int(row["index"], 16), row["subindex"]) for row in found}
-    assert {(index, subindex) for index, subindex, _ in rows} <= read
+    assert {(index, subindex) for index, subindex, _ in NOTE_NAMES} <= read
     unreadable = {row["index"] for row in found if "error" in row}
     assert unreadable == {"0x8003", "0x6000"}, "no range, and no quaternion in 61 bytes"
     assert re.search(
@@ -176,7 +165,7 @@ def test_watch_shows_each_block_and_writes_nothing(bench: SimulatedBus) -> None:
 
 
 def test_watch_gives_si_units_rate_and_warnings() -> None:
-    with simulated_bus("--signal", "ramp", "--pdo", "77", "--sinc", "128") as bus:
+    with simulated_bus("--signal", "sine", "--pdo", "77", "--sinc", "128") as bus:
         bus.command("warn 0x20")
         ended = tool_here("watch", bus.near, "--samples", 200, "--interval", 10, "--json")
     (row,) = map(json.loads, ended.out.splitlines())
@@ -208,42 +197,34 @@ def test_a_bus_that_is_silent_is_one_sentence(bench: SimulatedBus) -> None:
         assert "no EtherCAT slave answers on " in refused(command, bench.near)
 
 
-FURTHER: dict[str, list[object]] = {
-    "read": ["sampling rate"], "snapshot": ["new"], "restore": ["old"],
-    "plan": ["--set", "chop=on"], "apply": ["--set", "chop=on"],
-}  # fmt: skip
-"""Arguments of commands on a bus of others."""
-NO_BUS = ("adapters", "find", "filters")
 SII_ACCESS = set(range(reg.SII_OWNER, reg.SII_OWNER + 8))
 """Registers that are written to read an SII; its owner gets it back."""
 
 
-@pytest.fixture
-def old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A snapshot in the current directory."""
+@pytest.mark.parametrize("command", [("watch",), ("snapshot", "new"), ("apply", "--set", "chop=on")])
+def test_a_bus_without_a_sensor_is_not_touched(
+    command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    with simulated_bus() as bus:
-        tool_here("snapshot", bus.near, "old")
-
-
-@pytest.mark.usefixtures("old")
-@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in (*NO_BUS, "eeprom")])
-def test_a_bus_without_a_sensor_is_not_touched_by(command: str) -> None:
     with simulated_bus("--chain", "EK1100,DRIVE:PREOP") as bus:
         before, sent = [state(each) for each in registers(bus.backend)], writes(bus.backend)
-        assert "no Bota Gen-0 sensor" in refused(command, bus.near, *FURTHER.get(command, []))
+        assert "no Bota Gen-0 sensor" in refused(command[0], bus.near, *command[1:])
         assert [state(each) for each in registers(bus.backend)] == before
         assert {address for _, address in sent} <= SII_ACCESS
 
 
-@pytest.mark.usefixtures("old")
-@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in NO_BUS])
-def test_a_drive_at_work_is_not_touched_by(command: str) -> None:
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [(("eeprom",), "--force"), (("tare",), "--force"), (("snapshot", "new"), "--take-over")],
+)
+def test_a_drive_at_work_is_not_touched(
+    command: tuple[str, ...], option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with simulated_bus("--chain", "BOTA:OP,DRIVE:OP") as bus:
         before = registers(bus.backend)
-        said = refused(command, bus.near, *FURTHER.get(command, []))
+        said = refused(command[0], bus.near, *command[1:])
         assert "has slaves at work that are not Bota sensors (position 1 in OP)" in said
-        option = "--take-over" if command in {"snapshot", "restore"} else "--force"
         assert f"; {option} takes them to PREOP" in said
         assert registers(bus.backend) == before
         assert bus.stats_of_foreign(1)["write_count"] == 0
