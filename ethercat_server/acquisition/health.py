@@ -10,10 +10,13 @@ time makes two lines.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import Final
 
 from bota_ethercat.control import Event, event
+from bota_ethercat.pdo import is_finite, layout_for
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.clock import PLAUSIBLE_PULL, SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
@@ -154,6 +157,7 @@ class SampleHealth:
     def __init__(self, number: int) -> None:
         self._number = number
         self.not_finite = 0  # new samples with a number that is NaN or infinite
+        self.newest: list[bytes] = []  # process data that was handed out since `count`
         self._checked = (0, 0, 0)  # the counts of the last check: fresh, repeated, not finite
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
@@ -162,8 +166,18 @@ class SampleHealth:
         self._trusted = self._distrusted = False
         self._deviating_s = 0
 
+    def count(self) -> None:
+        """Find those of the newest samples that are not finite; to be called now and then."""
+        newest, self.newest = self.newest, []
+        # An infinity or a NaN survives the sum, so that one look is enough for all of them.
+        if newest and not math.isfinite(
+            sum(chain.from_iterable(layout_for(len(newest[0])).reals.iter_unpack(b"".join(newest))))
+        ):
+            self.not_finite += sum(not is_finite(each) for each in newest)
+
     def check(self, fresh: int, repeated: int, clock: SampleClock) -> None:
         """What the last second showed; `fresh` and `repeated` count frames since the start."""
+        self.count()
         now = fresh, repeated, self.not_finite
         new, repeats, not_finite = (count - before for count, before in zip(now, self._checked, strict=True))
         self._checked = now

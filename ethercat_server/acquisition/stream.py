@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from bota_ethercat.framing import DataFlag, encode_data
-from bota_ethercat.pdo import is_finite
 from ethercat_server.acquisition.clock import SILENT_PERIODS, SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.health import SampleHealth
@@ -76,7 +75,7 @@ class SensorStream:
         # The working counter of an exchange since then that was not valid; 0 for none.
         self._short_wkc = 0
         self._moment_ns = 0  # of the newest sample
-        self.idle_at_ns = 0.0  # `idle` is to be called from then on
+        self.idle_at_ns = 0.0  # it is silent from then on
 
     def _new_clock(self, period_ns: float, latching: DistributedClock | None) -> SampleClock:
         events = latching and EventTimes(latching, self._timing, self._passing_ns)
@@ -99,7 +98,7 @@ class SensorStream:
         self._fresh = fresh = data != self.process_data
         clock.take(sent_ns, back_ns, latched, fresh=fresh)
         if not fresh:
-            return None
+            return self.idle(back_ns)
         self.process_data = data
         self.idle_at_ns = back_ns + SILENT_PERIODS * clock.estimate.period_ns
         if self._discard:
@@ -120,8 +119,8 @@ class SensorStream:
         if self._fresh:
             if self.clock.locked:
                 self.age.record(exchange.back_ns - self.clock.instant_ns)
-            if self._handed_out is self.process_data and not is_finite(self.process_data):
-                self.health.not_finite += 1
+            if self._handed_out is self.process_data:
+                self.health.newest.append(self.process_data)
         return not self.clock.goes_on()
 
     def learn_short(self, exchange: Exchange, arrived_ns: int) -> None:
@@ -129,13 +128,14 @@ class SensorStream:
         if exchange is self._exchange and self.clock.events is not None:
             self.clock.events.learn(exchange.sent_ns, arrived_ns, 0)
 
-    def invalid(self, wkc: int) -> None:
-        """An exchange brought nothing of this sensor."""
+    def invalid(self, wkc: int, back_ns: int) -> OutgoingFrame | None:
+        """The frame for an exchange that brought nothing of this sensor, as `idle`."""
         self._short_wkc = wkc
+        return self.idle(back_ns)
 
     def idle(self, now_ns: int) -> OutgoingFrame | None:
-        """The frame that shows the sensor's silence; None before its first sample."""
-        if not self.process_data:
+        """The frame that shows the sensor's silence, one a period; None if it is not silent, or never spoke."""
+        if now_ns < self.idle_at_ns or not self.process_data:
             return None
         self._silent = True
         self._handed_out = self._handed_out or self.process_data
@@ -191,8 +191,9 @@ class SensorStream:
             self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
 
     def status(self) -> dict[str, Any]:
-        """The sensor's part of the `status` reply, but for the age."""
+        """The sensor's part of the `status` reply, except for the age."""
         clock = self.clock
+        self.health.count()
         return {
             "sensor": self.number,
             "fresh": self.fresh,

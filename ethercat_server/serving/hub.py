@@ -91,17 +91,15 @@ class Hub:
         """Serve the clients until the clock is at `until_ns`; once, without waiting, if that has passed."""
         watched, now_ns = self._watched, self._monotonic_ns()
         last_start_ns = until_ns - _REQUEST_NS
-        # Where there is never time for a request, one pass is made nevertheless.
+        # Where there is never time for a request, one is begun all the same.
         hurried = last_start_ns <= now_ns
         while hurried or now_ns < until_ns:
-            reads = self._pause_ends_ns <= now_ns and (hurried or now_ns < last_start_ns)
-            wake_ns = until_ns
-            if hurried or self._ready or now_ns < self._pause_ends_ns:
-                if reads:
-                    wake_ns = now_ns
-                elif now_ns < self._pause_ends_ns < until_ns:
-                    wake_ns = self._pause_ends_ns
-            wait_s = (wake_ns - now_ns) * 1e-9 if wake_ns > now_ns else 0.0
+            reads, wake_ns = hurried or now_ns < last_start_ns, until_ns
+            if now_ns < self._pause_ends_ns:
+                reads, wake_ns = False, min(self._pause_ends_ns, until_ns)
+            elif hurried or (reads and self._ready):
+                wake_ns = now_ns
+            wait_s = max(wake_ns - now_ns, 0) * 1e-9
             ready = self._transport.wait(watched.readers if reads else (), watched.writers, wait_s)
             if ready[0] or ready[1] or (reads and self._ready):
                 self._attend(*ready, last_start_ns, reads=reads, hurried=hurried)
