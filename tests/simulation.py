@@ -52,10 +52,10 @@ from ethercat_server.sensor import scan
 from ethercat_server.sensor.sensor import Identity
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.in_memory import InMemoryStream, InMemoryTransport
 from ethercat_server.serving.transport import Transport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
+from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import SensorOptions

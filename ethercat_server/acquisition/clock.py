@@ -99,11 +99,6 @@ _ONE_ONLY, _MISSABLE = 0.8, 1.25
 class Estimate:
     """Of one clock. Times in ns, variances in ns²."""
 
-    __slots__ = (
-        "_contradictions", "_covariance", "_jitter", "_nominal_ns", "_period_variance", "_pull", "_run",
-        "_wander", "period_ns", "phase_ns", "restless", "variance",
-    )  # fmt: skip
-
     def __init__(self, period_ns: float) -> None:
         """`period_ns` is the nominal period."""
         self._nominal_ns = period_ns

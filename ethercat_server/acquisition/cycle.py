@@ -13,9 +13,8 @@ from itertools import cycle
 from typing import Any, Final, Protocol
 
 from ethercat_server.acquisition.clock import SampleClock
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.exchange_timing import SLOT_NS, ExchangeTiming, RecentDistribution
 from ethercat_server.acquisition.health import RoundTripHealth
-from ethercat_server.acquisition.histogram import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import OutgoingFrame, SensorStream

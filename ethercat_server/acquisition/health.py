@@ -11,21 +11,15 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import Final
 
-from bota_ethercat.control import Event, event
 from bota_ethercat.pdo import is_finite, layout_for
-from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.clock import PLAUSIBLE_PULL, SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.slave_clock import Verdict
-from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import FIRST_INDEX
-from ethercat_server.ethercat.slave.emergencies import Emergency
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
-from ethercat_server.sensor.sensor import Sensor
 
 # A usual round trip above this is a slow network card's, or a slow driver's.
 SLOW_US: Final = 300.0
@@ -123,28 +117,6 @@ class Causes:
                 log.info("the other EtherCAT master on %s has stopped sending", self._ifname)
 
 
-class Mailboxes:
-    """Of all sensors of the bus. `announce` sends an event to the clients."""
-
-    def __init__(self, bus: Bus, sensors: Sequence[Sensor], announce: Callable[[JsonObject], None]) -> None:
-        self._bus = bus
-        self._sensors = sensors
-        self._announce = announce
-        self._turn = -1
-        bus.emergencies.tell = self._tell
-
-    def look_at_next(self) -> None:
-        """Look at the next sensor's: one datagram, a second one to read one message that is there."""
-        self._turn = (self._turn + 1) % len(self._sensors)
-        if self._sensors[self._turn].streams:
-            self._bus.slaves[self._turn].sdo.look()
-
-    def _tell(self, number: int, emergency: Emergency, count: int) -> None:
-        message = f"sensor {number} reports {emergency}"
-        keys = {**emergency.as_json(), "count": count, "message": message}
-        self._announce(event(Event.EMERGENCY, sensor=number, **keys))
-
-
 # Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment.
 _DEVIATING_SECONDS: Final = 10
 # Seconds with finite samples only after which it is over.
@@ -162,8 +134,7 @@ class SampleHealth:
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
         self._rate_reported = False
-        # Whether it was reported last that event times date the samples; that they do not.
-        self._trusted = self._distrusted = False
+        self._reported: Verdict | None = None  # of event times, what was reported last
         self._deviating_s = 0
 
     def count(self) -> None:
@@ -232,20 +203,19 @@ class SampleHealth:
         """Say when the slave controller time-stamps the samples, and when it no longer does."""
         if clock.events is None:
             return
-        trust = clock.events.trust
-        if trust.verdict is Verdict.TRUSTED:
-            if not self._trusted:
-                log.info(
-                    "sensor %d: its samples are time-stamped by the distributed clock of its slave "
-                    "controller%s",
-                    self._number, " again" if self._distrusted else "",
-                )  # fmt: skip
-            self._trusted, self._distrusted = True, False
-        elif trust.verdict is Verdict.REFUSED and not self._distrusted:
+        verdict, before = clock.events.trust.verdict, self._reported
+        if verdict in (Verdict.TRIAL, before):
+            return
+        self._reported = verdict
+        if verdict is Verdict.TRUSTED:
+            log.info(
+                "sensor %d: its samples are time-stamped by the distributed clock of its slave controller%s",
+                self._number, "" if before is None else " again",
+            )  # fmt: skip
+        else:
             log.log(
-                logging.WARNING if self._trusted else logging.INFO,
+                logging.INFO if before is None else logging.WARNING,
                 "sensor %d: its samples are time-stamped by polling, for its slave controller's event times "
                 "are unusable: %s",
-                self._number, trust.why,
+                self._number, clock.events.trust.why,
             )  # fmt: skip
-            self._trusted, self._distrusted = False, True

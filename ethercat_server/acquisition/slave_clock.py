@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from enum import Enum
-from typing import Final, NamedTuple
+from typing import Final
 
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.exchange import DistributedClock, Latched
@@ -92,12 +92,6 @@ class LocalClock:
         excess_ns: what the exchanges that count usually take beyond the shortest.
         restarts: how often it turned out to have jumped, or not to run like a clock.
     """
-
-    __slots__ = (
-        "_best_local", "_best_ns", "_best_took_ns", "_block", "_blocks", "_contradictions", "_covariance",
-        "_left", "_pull", "_rate_variance", "_timing", "back_ns", "doubt_ns", "excess_ns", "is_known",
-        "local", "local_at", "rate", "restarts", "time_at", "variance",
-    )  # fmt: skip
 
     def __init__(self, timing: ExchangeTiming) -> None:
         """`timing` is that of the bus: it knows the shortest round trip."""
@@ -185,22 +179,12 @@ class Verdict(Enum):
     REFUSED = "refused"
 
 
-class Evidence(NamedTuple):
-    """What is known of the local clock, and of the events, when a trial begins or ends."""
-
-    restarts: int  # how often the clock was found to be another
-    moved: int  # number of samples with an event of their own
-
-
 class Trust:
     """In the event times of one sensor. Times in ns, variances in ns²."""
 
-    __slots__ = (
-        "_again_ns", "_began", "_compared", "_failures", "_pause_ns", "_since_ns",
-        "_squares", "_sum_ns", "_unfit", "contradictions", "is_final", "verdict", "was_trusted", "why",
-    )  # fmt: skip
-
-    def __init__(self) -> None:
+    def __init__(self, local_clock: LocalClock) -> None:
+        self.local_clock = local_clock
+        self.moved = 0  # number of samples with an event of their own
         self.verdict = Verdict.TRIAL
         self.why = ""  # what was wrong with them last: part of a sentence
         self.is_final = False  # whether they are refused for good: the controller has never shown any
@@ -209,7 +193,7 @@ class Trust:
         self._pause_ns = _FIRST_PAUSE_NS
         self.contradictions = 0.0
         self._since_ns = 0
-        self._began = Evidence(0, 0)
+        self._began = 0, 0  # restarts of the local clock, and samples with an event, at the beginning
         self._compared = self._unfit = 0
         self._sum_ns = self._squares = 0.0
 
@@ -222,17 +206,17 @@ class Trust:
         """A sample has no event that can be its own, or that agrees with the sensor's clock."""
         self.contradictions += weight
 
-    def reconsider(self, evidence: Evidence, now_ns: int) -> None:
+    def reconsider(self, now_ns: int) -> None:
         """End the trust if there were too many contradictions."""
         if self.contradictions > _MOST_CONTRADICTIONS:
             if now_ns - self._since_ns > _PROVEN_NS:
                 self._failures, self._pause_ns = 0, _FIRST_PAUSE_NS
             self._fail("they contradict the frames or the sensor's own clock", now_ns)
-            self.begin(evidence, now_ns)
+            self.begin(now_ns)
 
-    def begin(self, evidence: Evidence, now_ns: int) -> None:
+    def begin(self, now_ns: int) -> None:
         """Begin a trial."""
-        self._since_ns, self._began = now_ns, evidence
+        self._since_ns, self._began = now_ns, (self.local_clock.restarts, self.moved)
         self._compared = self._unfit = 0
         self._sum_ns = self._squares = 0.0
 
@@ -259,7 +243,7 @@ class Trust:
         """An event that cannot be the sample's."""
         self._unfit += 1
 
-    def end(self, evidence: Evidence, variance: float, now_ns: int) -> float:
+    def end(self, variance: float, now_ns: int) -> float:
         """End the trial if it was long enough; `variance` is that of both estimates.
 
         Returns the variance of the differences between them if they are trusted now, else 0.
@@ -267,24 +251,24 @@ class Trust:
         if self.verdict is Verdict.REFUSED:
             return 0.0
         if not self._since_ns:
-            self.begin(evidence, now_ns)
+            self.begin(now_ns)
         if now_ns - self._since_ns < _TRIAL_NS:
             return 0.0
-        count = self._compared + self._unfit
-        if evidence.restarts - self._began.restarts > _RESTARTS:
+        count, (restarts, moved) = self._compared + self._unfit, self._began
+        if self.local_clock.restarts - restarts > _RESTARTS:
             self._refuse("its local clock does not run", now_ns)
             self.is_final = not self.was_trusted
         elif count < _SAMPLES:
             pass
-        elif evidence.moved == self._began.moved:
+        elif self.moved == moved:
             self._refuse("they stand still", now_ns)
             self.is_final = not self.was_trusted
         elif self._compared < _FITTING * count:
             self._fail("they contradict the frames", now_ns)
-            self.begin(evidence, now_ns)
+            self.begin(now_ns)
         elif abs(self.mean_ns) > _MOST_DEVIATIONS * math.sqrt(variance):
             self._fail(f"they differ from what polling shows by {self.mean_ns / 1000:+.0f} µs", now_ns)
-            self.begin(evidence, now_ns)
+            self.begin(now_ns)
         else:
             self.verdict, self._since_ns = Verdict.TRUSTED, now_ns
             self.was_trusted = True
@@ -307,20 +291,13 @@ class EventTimes:
     """Of one sensor. `take` follows every exchange; then, if it brought a new sample, `date` or `compare`;
     then `learn`."""
 
-    __slots__ = (
-        "_answers", "_compared_event", "_event", "_half_behind_ns", "_is_next", "_moved", "_offset",
-        "_passing_ns", "_reading_ns", "_timing", "_took_ns", "are_trusted", "instant_ns", "is_doubtful",
-        "local_clock",
-        "trust",
-    )  # fmt: skip
-
     def __init__(self, clock: DistributedClock, timing: ExchangeTiming, passing_ns: int) -> None:
         """`clock` is the slave controller's; `timing` that of the bus.
 
         The process data passes so long after the frame has arrived.
         """
         self.local_clock = LocalClock(timing)
-        self.trust = Trust()
+        self.trust = Trust(self.local_clock)
         self.are_trusted = False  # whether samples are dated by them
         # CLOCK_MONOTONIC of the new sample of the newest exchange; 0 if its event does not say.
         self.instant_ns = 0.0
@@ -332,7 +309,6 @@ class EventTimes:
         self._took_ns = 0  # by the newest exchange
         self.is_doubtful = False  # whether samples may have been lost before it that nobody knows of
         self._is_next = False  # whether that event is the next sample's, which came while the frame passed
-        self._moved = 0
         self._answers = False  # whether the controller knows the registers
 
     def _use(self, clock: DistributedClock) -> None:
@@ -343,7 +319,7 @@ class EventTimes:
     def retry(self, clock: DistributedClock) -> None:
         """Try them again: another master may have changed the controller's clock, which now is `clock`."""
         if clock.offset != self._offset:
-            self.local_clock = LocalClock(self._timing)
+            self.local_clock = self.trust.local_clock = LocalClock(self._timing)
         self._use(clock)
         self.trust.retry()
 
@@ -429,7 +405,7 @@ class EventTimes:
         else:
             trust.contradicted(self._is_in_time)
         self.is_doubtful = True
-        trust.reconsider(self._evidence, back_ns)
+        trust.reconsider(back_ns)
         self.are_trusted = trust.verdict is Verdict.TRUSTED
         return None
 
@@ -440,7 +416,7 @@ class EventTimes:
         Returns the variance of the differences once they are trusted from here on, else 0.
         """
         trust = self.trust
-        self._moved += self._event != self._compared_event
+        trust.moved += self._event != self._compared_event
         self._compared_event = self._event
         if self._is_next:
             pass
@@ -451,10 +427,6 @@ class EventTimes:
         # Polling does not tell where on its way a round trip takes its time.
         asymmetry_ns = _ASYMMETRY * self._timing.least_ns
         variance += self.variance + asymmetry_ns * asymmetry_ns
-        found = trust.end(self._evidence, variance, back_ns)
+        found = trust.end(variance, back_ns)
         self.are_trusted = trust.verdict is Verdict.TRUSTED
         return found
-
-    @property
-    def _evidence(self) -> Evidence:
-        return Evidence(self.local_clock.restarts, self._moved)

@@ -13,9 +13,8 @@ from typing import Any, Final
 
 from bota_ethercat.framing import DataFlag, encode_data
 from ethercat_server.acquisition.clock import SILENT_PERIODS, SampleClock
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming, RecentDistribution
 from ethercat_server.acquisition.health import SampleHealth
-from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.slave_clock import EventTimes
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, RealtimeOffset
@@ -134,7 +133,7 @@ class SensorStream:
         return self.idle(back_ns)
 
     def idle(self, now_ns: int) -> OutgoingFrame | None:
-        """The frame that shows the sensor's silence, one a period; None if it is not silent, or never spoke."""
+        """The frame that shows the sensor's silence, one a period; None if there is none to show."""
         if now_ns < self.idle_at_ns or not self.process_data:
             return None
         self._silent = True

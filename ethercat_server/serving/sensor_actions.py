@@ -93,14 +93,14 @@ class SensorActions:
         self._jobs.start(number, steps, done, changes=True)
 
     def _check_unchanging(self, number: int) -> None:
-        if self._jobs.is_changing(number) or self._recovery.is_changing(number):
+        if self._jobs.is_changing(number) or self._recovery.sensors[number].is_changing:
             raise RequestError(
                 ErrorCode.BUSY, f"sensor {number} is being configured or tared: try again when that is done"
             )
 
     def _sdo_read(self, connection: Connection, request: Request) -> None:
         values = request.values
-        sdo = self._recovery.sdo(values["sensor"])
+        sdo = self._recovery.sensors[values["sensor"]].sdo
         if (values["index"] is None) == (values["name"] is None):
             raise RequestError(
                 ErrorCode.BAD_REQUEST, "sdo_read needs either the key 'index' or the key 'name'"
@@ -138,7 +138,7 @@ class SensorActions:
                 ErrorCode.DENIED, "object 0x2000 is the factory calibration, which is never written"
             )
         sensor = self.sensors[values["sensor"]]
-        sdo = self._recovery.sdo(sensor.number)
+        sdo = self._recovery.sensors[sensor.number].sdo
         data = bytes_to_write(values)
 
         def steps() -> Steps[Mapping[str, Any]]:
@@ -155,7 +155,7 @@ class SensorActions:
     def _tare(self, connection: Connection, request: Request) -> None:
         values = request.values
         sensor = self.sensors[values["sensor"]]
-        stream, sdo = self._streams[sensor.number], self._recovery.sdo(sensor.number)
+        stream, sdo = self._streams[sensor.number], self._recovery.sensors[sensor.number].sdo
         samples, target = values["samples"], values["target"]
         steps = tare(sdo, sensor, stream, samples, target, self._announce_offset)
         self._start_change(sensor.number, steps, self._answering(connection, request))
@@ -191,10 +191,10 @@ class SensorActions:
             except RequestError as refused:
                 done({}, refused)
 
-        self._recovery.reconfigure(number, change, changed)
+        self._recovery.sensors[number].reconfigure(change, changed)
 
     def _change_in_op(self, sensor: Sensor, change: Change, save_too: bool) -> Steps[Mapping[str, Any]]:
-        sdo = self._recovery.sdo(sensor.number)
+        sdo = self._recovery.sensors[sensor.number].sdo
         yield from apply_in_op(sdo, sensor, change)
         if change.names:
             self._announce_change(sensor)
@@ -208,7 +208,7 @@ class SensorActions:
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
         if save_too:
-            yield from save(self._recovery.sdo(sensor.number), sensor)
+            yield from save(self._recovery.sensors[sensor.number].sdo, sensor)
         return {"sensor": sensor.number, **sensor.in_force(), "saved": save_too}
 
 

@@ -28,7 +28,7 @@ from bota_clients.monitor.tare import tare
 from bota_clients.recording.reader import RecordingError, open_recording
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
-from ethercat_server.serving.in_memory import ManualClock
+from ethercat_server.simulation.transport import ManualClock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.captures import DOCS

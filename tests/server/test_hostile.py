@@ -32,8 +32,8 @@ from bota_ethercat.text.bare_json import encode_bare_json
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.process import logs
 from ethercat_server.serving.connection import MAX_REQUEST_LENGTH, Connection
-from ethercat_server.serving.in_memory import InMemoryStream
 from ethercat_server.serving.permissions import MAX_CLIENTS_PER_USER
+from ethercat_server.simulation.transport import InMemoryStream
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, mutate
 from tests.rights import NO_OTHER_USER, socket_of
