@@ -26,7 +26,7 @@ from ethercat_server.sensor.sensor import Sensor, SensorState
 _SERVE_EVERY_NS: Final = 10_000_000
 # and, without waiting, while an exchange is on its way.
 _SERVE_IN_FLIGHT_NS: Final = 2_000_000
-# Interval between chores: such as looks at whether CLOCK_REALTIME was set.
+# Interval between chores, such as whether CLOCK_REALTIME was set.
 _CHORES_EVERY_NS: Final = 20_000_000
 # Time between two exchanges while all sensors are lost.
 _RECOVERY_STEP_NS: Final = 500_000
@@ -34,26 +34,26 @@ _RECOVERY_STEP_NS: Final = 500_000
 _SUMMARY_NS: Final = 200_000_000
 _COST_GAIN: Final = 1 / 64
 _FIRST_COST_NS: Final = 50_000.0
-# Part of the time that exchanges may take.
+# Fraction of the time that exchanges may take.
 _BUDGET: Final = 1 / 4
-# What a poll may wait for another, in shortest sample periods.
+# Longest time that a poll waits for another, in shortest sample periods.
 _LARGEST_WAIT: Final = 0.3
-# By how much polls are brought forward at most because this machine wakes late.
+# Longest time by which polls are brought forward because this machine wakes late.
 _LONGEST_LEAD_NS: Final = 200_000.0
 
 
 class Outlet(Protocol):
-    """Where the samples go: the server's `Hub`, or a tool that wants them in its own process."""
+    """Where the samples go: the server's `Hub`."""
 
     def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
         """Take the DATA frames that an exchange made, one for a sensor; `now_ns` is when it was back."""
 
     def serve(self, until_ns: int) -> None:
-        """Do what else there is to do, or wait, until CLOCK_MONOTONIC is `until_ns`."""
+        """Serve the clients, or wait, until CLOCK_MONOTONIC is `until_ns`."""
 
 
 class Watchdog(Protocol):
-    """Has to be fed as long as the loop runs."""
+    """systemd's watchdog: it has to be fed as long as the loop runs."""
 
     @property
     def feed_every_ns(self) -> int:
@@ -245,7 +245,7 @@ class Cycle:
             if back < stream.clock.estimate.phase_ns - stream.clock.quiet_ns:
                 continue  # the poll was for another sensor
             data = frame[start:end]
-            # One that is out may be counted in place of one that is not there any more.
+            # The working counter does not tell sensors apart: one that is out may be counted for another.
             if not complete or sensor.state is not SensorState.STREAMING or data == untouched:
                 made = stream.invalid(wkc, back)
             else:
@@ -290,7 +290,7 @@ class Cycle:
                 row[-1].learn_short(exchange, arrived)
 
     def _do_chores(self, now: int) -> None:
-        """What is done now and then, a little at a time."""
+        """Housekeeping that is not done for every exchange, a little at a time."""
         self._chores_at_ns = now + _CHORES_EVERY_NS
         self._streams[0].realtime_offset.follow()
         next(self._in_turn).count()

@@ -18,7 +18,7 @@ from operator import rshift
 from typing import Any, Final
 
 _GAIN: Final = 1 / 64
-# What follows from the averages is derived anew every so many exchanges.
+# Exchanges after which what follows from the averages is derived anew.
 _TURNS: Final = 7
 # The shortest round trip is that of the last one or two of these.
 _WINDOW_NS: Final = 2_000_000_000
@@ -26,9 +26,9 @@ _FIRST_GUESS_NS: Final = 100_000.0
 _FIRST_EXCESS_NS: Final = 20_000.0
 _FIRST_LATE_NS: Final = 15_000.0
 _LEAST_VARIANCE: Final = 1_000.0**2
-# The shortest round trip has become another if it changes by this; below, it is jitter.
+# Change of the shortest round trip from which it is another; below, it is jitter.
 _MOVED_NS: Final = 20_000.0
-# What lies further out than so many standard deviations counts as that far: a stall is no jitter.
+# Standard deviations at which outliers are clipped: a stall is no jitter.
 _OUTLIER: Final = 4.0
 _ROOM_NS: Final = 10_000.0
 _PATIENCE_NS: Final = 100_000.0
@@ -53,7 +53,7 @@ class ExchangeTiming:
         self.excess_ns = _FIRST_EXCESS_NS  # what an exchange usually takes beyond the shortest
         self._excess_square = 2 * _FIRST_EXCESS_NS**2
         self._late_variance = _FIRST_LATE_NS**2
-        # An exchange that is back sooner is a short one, of which somebody wants to know when it arrived.
+        # An exchange that is back sooner is a short one, whose arrival the slave clocks learn from.
         self.short_ns = 0.0
         # Usual time from the arrival of an answer until the program has it.
         self.taking_over_ns = 0.0
@@ -113,7 +113,7 @@ class ExchangeTiming:
             self.moved_ns += more_ns / 2
 
     def woke(self, late_ns: float) -> None:
-        """The loop woke so long after it had wanted to."""
+        """Learn how late the loop woke."""
         error, most = late_ns - self.late_ns, self._most_late_ns
         if not -most < error < most:
             error = math.copysign(most, error)

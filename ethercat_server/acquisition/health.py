@@ -1,10 +1,8 @@
-"""What is looked at about once a second while the bus runs, and told once: a slow network card, another
-master or a busy computer as causes of losses, emergencies in the sensors' mailboxes, and what a sensor's
-samples show of it.
+"""What is checked once a second while the bus runs: a slow network card, another master or a busy computer as
+causes of losses, and what the samples show of a sensor.
 
-While nobody asks a sensor for an object, nobody else reads what it puts into its mailbox. A wrong rate,
-silence, NaN and infinity are logged when they begin and when they end, so a sensor that does it all the
-time makes two lines.
+A wrong rate, silence, NaN and infinity are logged when they begin and when they end, so that a sensor which
+does it all the time makes two lines.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ def cost(usual_us: float) -> str:
 
 
 class RoundTripHealth:
-    """Of the exchanges on `ifname`. `check` is to be called once a second."""
+    """Logs once that round trips on `ifname` are slow; call `check` once a second."""
 
     def __init__(self, timing: ExchangeTiming, ifname: str) -> None:
         self._timing = timing
@@ -45,7 +43,7 @@ class RoundTripHealth:
         self._slow_s = 0
 
     def check(self) -> None:
-        """What the last second showed."""
+        """Check the last second."""
         usual_us = self._timing.usual_ns / 1000
         if self._slow_s < _SLOW_SECONDS:
             self._slow_s = self._slow_s + 1 if usual_us > SLOW_US else 0
@@ -58,19 +56,19 @@ _MASTER_FRAMES: Final = 3
 # Seconds without any after which it has gone.
 _GONE_S: Final = 10
 _RECENT_NS: Final = 1_000_000_000
-# Standing still for so long in that time explains a missing answer, or the end of a watchdog.
+# Stalls of this length in that time explain a missing answer, or an expired watchdog.
 _STALL_NS: Final = 20_000_000
 
 
 class Causes:
-    """Of the bus on `ifname`. `check` is to be called once a second."""
+    """What may explain the loss of a sensor on `ifname`; call `check` once a second."""
 
     def __init__(self, ifname: str) -> None:
         self._ifname = ifname
         self._frames = self._frames_checked = 0  # of other masters
         # When the last one came, when this computer stood still last.
         self._frame_ns = self._stall_ns = -_RECENT_NS
-        self._stalled_ns = 0  # for how long, all in all, without longer breaks in between
+        self._stalled_ns = 0  # sum of the stalls that followed each other within `_RECENT_NS`
         self._gone_s = _GONE_S
 
     def stray(self, frame: bytes, now_ns: int) -> None:
@@ -85,7 +83,7 @@ class Causes:
             self._frame_ns = now_ns
 
     def stood_still(self, late_ns: float, now_ns: int) -> None:
-        """This computer did something else for so long."""
+        """The loop did not run for `late_ns`."""
         if now_ns - self._stall_ns > _RECENT_NS:
             self._stalled_ns = 0
         self._stalled_ns += int(late_ns)
@@ -101,7 +99,7 @@ class Causes:
         return f"{reason}: {otherwise}" if otherwise else reason
 
     def check(self) -> None:
-        """Say once that there is another master, and once that it has gone."""
+        """Log once that there is another master, and once that it has gone."""
         frames, self._frames_checked = self._frames - self._frames_checked, self._frames
         if frames >= _MASTER_FRAMES:
             if self._gone_s >= _GONE_S:
@@ -124,7 +122,7 @@ _FINITE_SECONDS: Final = 10
 
 
 class SampleHealth:
-    """Of the sensor `number`. `check` is to be called once a second."""
+    """What the samples of the sensor `number` show of it; call `check` once a second."""
 
     def __init__(self, number: int) -> None:
         self._number = number
@@ -147,7 +145,7 @@ class SampleHealth:
             self.not_finite += sum(not is_finite(each) for each in newest)
 
     def check(self, fresh: int, repeated: int, clock: SampleClock) -> None:
-        """What the last second showed; `fresh` and `repeated` count frames since the start."""
+        """Check the last second; `fresh` and `repeated` count frames since the start."""
         self.count()
         now = fresh, repeated, self.not_finite
         new, repeats, not_finite = (count - before for count, before in zip(now, self._checked, strict=True))
@@ -188,7 +186,7 @@ class SampleHealth:
                 )
 
     def _check_rate(self, clock: SampleClock) -> None:
-        """Say once if the sensor samples at another rate than it is set to."""
+        """Log once that the sensor samples at another rate than it is set to."""
         pull = clock.estimate.pull
         deviates = clock.locked and abs(pull) > PLAUSIBLE_PULL
         self._deviating_s = self._deviating_s + 1 if deviates else 0
@@ -200,7 +198,7 @@ class SampleHealth:
             )  # fmt: skip
 
     def _check_events(self, clock: SampleClock) -> None:
-        """Say when the slave controller time-stamps the samples, and when it no longer does."""
+        """Log when the slave controller time-stamps the samples, and when it no longer does."""
         if clock.events is None:
             return
         verdict, before = clock.events.trust.verdict, self._reported

@@ -68,8 +68,7 @@ class _Change(NamedTuple):
     asked: frozenset[str]
     done: Callable[[BusError | None], None]
     failed: BusError | None = None
-    # Once it has failed: when whoever asked gets an answer, even if the sensor is not back.
-    until: Deadline | None = None
+    until: Deadline | None = None  # once it has failed: when it is answered even if the sensor is not back
 
 
 class SensorRecovery:
@@ -142,7 +141,7 @@ class SensorRecovery:
             self._report_lost(reason)
 
     def lose_in_change(self, reason: str) -> None:
-        """It has gone, or does not take its former settings either: who asked for a change is told now."""
+        """The sensor has gone, or refuses its former settings too: the request is answered now."""
         if (change := self._change) is None:
             return
         if change.failed is None:
@@ -182,7 +181,7 @@ class SensorRecovery:
         except DifferentSensorError as error:
             self._refuse(error.found)
 
-    # -- what becomes of it
+    # -- changes of its state
 
     def _take_out(self, state: SensorState, steps: Steps[bool]) -> None:
         self._sensor.enter(state)
@@ -418,7 +417,7 @@ class Recovery:
         return any(each.steps is not None for each in self.sensors)
 
     def _watch(self, each: SensorRecovery) -> None:
-        # One that is out may be counted in place of one that is not there any more.
+        # The working counter does not tell sensors apart: one that is out may be counted for another.
         each.look(counted=not self._is_at_work)
         self._others.look_at_next()
 

@@ -81,13 +81,13 @@ _ASYMMETRY: Final = 1 / 24
 
 
 class LocalClock:
-    """Of one slave. Local times are whole ns that never wrap; other times are CLOCK_MONOTONIC, ns.
+    """Local clock of a slave controller. Local times are whole ns that never wrap, others CLOCK_MONOTONIC.
 
     Attributes:
         local: local time of the newest exchange, which was back at `back_ns`.
         time_at: CLOCK_MONOTONIC at the local time `local_at`, once the clock `is_known`.
-        rate: by what part CLOCK_MONOTONIC is faster.
-        doubt_ns: how far that may be off.
+        rate: relative deviation of CLOCK_MONOTONIC from it.
+        doubt_ns: uncertainty of `time_at`.
         variance: of `time_at`.
         excess_ns: what the exchanges that count usually take beyond the shortest.
         restarts: how often it turned out to have jumped, or not to run like a clock.
@@ -118,7 +118,7 @@ class LocalClock:
     def learn(self, sent_ns: int, arrived_ns: int, count: int) -> None:
         """Learn from the exchange that was followed last: sent, and begun to arrive, then.
 
-        `count`: it stands for so many, of which the others were not learned from.
+        It stands for `count` exchanges, of which the others were not learned from.
         """
         took_ns = arrived_ns - sent_ns
         if took_ns < self._best_took_ns:
@@ -130,7 +130,7 @@ class LocalClock:
             excess_ns = self._best_took_ns - self._timing.least_ns
             self._best_took_ns = math.inf
             self.excess_ns += _EXCESS_GAIN * (excess_ns - self.excess_ns)
-            # Where within the excess the slave was is unknown, and the bias may be the same every time.
+            # The position of the slave within the excess is unknown, and the bias may be the same every time.
             self._correct(excess_ns * excess_ns / 4 + _LEAST_VARIANCE)
         self._timing.short_ns = self._best_took_ns + self._timing.taking_over_ns
 
@@ -180,7 +180,7 @@ class Verdict(Enum):
 
 
 class Trust:
-    """In the event times of one sensor. Times in ns, variances in ns²."""
+    """Whether the event times of one sensor are believed. Times in ns, variances in ns²."""
 
     def __init__(self, local_clock: LocalClock) -> None:
         self.local_clock = local_clock
@@ -203,7 +203,7 @@ class Trust:
             self.contradictions -= _FORGET
 
     def contradicted(self, weight: float) -> None:
-        """A sample has no event that can be its own, or that agrees with the sensor's clock."""
+        """A sample has no event that can be its own, or none that agrees with the sensor's clock."""
         self.contradictions += weight
 
     def reconsider(self, now_ns: int) -> None:
@@ -229,14 +229,14 @@ class Trust:
         self.verdict, self._since_ns = Verdict.TRIAL, 0
 
     def compare(self, difference_ns: float) -> None:
-        """An event is so much later than what polling says."""
+        """An event is later than polling says by `difference_ns`."""
         self._compared += 1
         self._sum_ns += difference_ns
         self._squares += difference_ns * difference_ns
 
     @property
     def mean_ns(self) -> float:
-        """By how much events were later than what polling says, in the latest trial."""
+        """Mean difference between events and polling in the latest trial."""
         return self._sum_ns / max(self._compared, 1)
 
     def unfit(self) -> None:
@@ -288,13 +288,13 @@ class Trust:
 
 
 class EventTimes:
-    """Of one sensor. `take` follows every exchange; then, if it brought a new sample, `date` or `compare`;
+    """Event times of one sensor: `take` every exchange; if it brought a new sample, `date` or `compare` it;
     then `learn`."""
 
     def __init__(self, clock: DistributedClock, timing: ExchangeTiming, passing_ns: int) -> None:
         """`clock` is the slave controller's; `timing` that of the bus.
 
-        The process data passes so long after the frame has arrived.
+        The process data passes the slave `passing_ns` after the frame has arrived there.
         """
         self.local_clock = LocalClock(timing)
         self.trust = Trust(self.local_clock)
@@ -335,17 +335,17 @@ class EventTimes:
 
     @property
     def variance(self) -> float:
-        """Of `instant_ns`, in ns², but for where on its way a round trip takes its time."""
+        """Variance of `instant_ns`, in ns², without the asymmetry of the round trip."""
         return self.local_clock.variance + _EVENT_VARIANCE
 
     @property
     def way_ns(self) -> float:
-        """Of the round trips by which the local clock is known, what is not spent behind the slave."""
+        """Time of the round trips by which the local clock is known that is not spent behind the slave."""
         return self._timing.least_ns + self.local_clock.excess_ns - 2 * self._half_behind_ns
 
     @property
     def has_none(self) -> bool:
-        """Whether the new sample of the newest exchange has none, although one would be known."""
+        """Whether the new sample of the newest exchange has no event although the local clock is known."""
         return self._answers and self.local_clock.is_known and not self.instant_ns
 
     def take(self, latched: Latched, sent_ns: int, back_ns: int, fresh: bool, period_ns: float) -> None:

@@ -3,7 +3,7 @@
 A frame exists for every new sample. While the sensor is silent there is one REPEATED (or INVALID)
 frame for each sample period that passes, so that its silence is visible; the polls in between samples, which
 find the same data again only because the bus is read more often than the sensor samples, make none. An answer
-that was overtaken by a later one is no news.
+that was overtaken by a later one is ignored.
 """
 
 from __future__ import annotations
@@ -65,10 +65,8 @@ class SensorStream:
         self.age = RecentDistribution()
         self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
-        # So many new samples to come have GAP.
-        self._gap = 0
-        # Whether nothing new has come for long.
-        self._silent = False
+        self._gap = 0  # number of new samples to come that have GAP
+        self._silent = False  # whether REPEATED or INVALID frames were sent since the newest sample
         # The last valid exchange, and whether it brought a new sample.
         self._exchange, self._fresh = DUPLICATE, False
         # The working counter of an exchange since then that was not valid; 0 for none.
@@ -105,7 +103,7 @@ class SensorStream:
             return None
         self._handed_out = data
         flags = self._count_lost() if self._silent or self._gap or clock.steps != 1 or clock.uncertain else 0
-        # If it does not rise, the one before was dated too young.
+        # It has to rise: the one before may have been dated too young.
         self._moment_ns = moment_ns = max(int(clock.instant_ns), self._moment_ns + 1)
         stamp_ns, sequence = moment_ns + self.realtime_offset.ns, self.sequence
         self.sequence += 1
@@ -141,9 +139,9 @@ class SensorStream:
         period_ns = self.clock.period_ns
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
         self.idle_at_ns = max(self.idle_at_ns + period_ns, float(now_ns))
-        # A single lost frame is no news: a frame is INVALID once nothing valid has come for two periods.
+        # INVALID means that no valid exchange was back for two periods: a single lost frame does not suffice.
         if now_ns - self._exchange.back_ns < max(2 * period_ns, self._timing.patience_ns):
-            self._discard = 0  # what was to be discarded has passed: a sensor that is stuck is to be seen too
+            self._discard = 0  # a sensor that is stuck from the start has to be visible, too
             self.repeated += 1
             flags, wkc = REPEATED, self._exchange.wkc
         else:
@@ -158,12 +156,12 @@ class SensorStream:
     def _count_lost(self) -> int:
         """The flags of a new sample that may not be the next one after that before it."""
         lost = self.clock.steps - 1 if self.sequence else 0
-        # -1 takes back one that was counted after a stall but came after all.
+        # -1 corrects the count after a stall, if the sample came late.
         self.lost_samples = max(0, self.lost_samples + lost)
         flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
         self._gap = max(0, self._gap - 1)
-        # What ended a silence may have been held back, where it has no event, as may be the next: one may be
-        # missing after either.
+        # Without an event, the slave may have held back the sample that ends a silence, or the one after it:
+        # one may be missing after either.
         if self._silent and (events := self.clock.events) is not None and events.has_none:
             self._gap = 2
         self._silent = False

@@ -91,7 +91,7 @@ class Hub:
         """Serve the clients until the clock is at `until_ns`; once, without waiting, if that has passed."""
         watched, now_ns = self._watched, self._monotonic_ns()
         last_start_ns = until_ns - _REQUEST_NS
-        # Where there is never time for a request, one is begun all the same.
+        # One pass is always made, also where there is never time for a request before a deadline.
         hurried = last_start_ns <= now_ns
         while hurried or now_ns < until_ns:
             reads, wake_ns = hurried or now_ns < last_start_ns, until_ns

@@ -96,7 +96,7 @@ class _Tracer:
 
 
 def count(dc: str, clients: int, seconds: float = SECONDS) -> dict[str, float]:
-    """Figures of a new sample of one sensor, whose controller's clock is `dc` (`--dc`), with so many clients.
+    """Figures of a new sample of one sensor, whose controller's clock is `dc` (`--dc`), by clients.
 
     Most are like the median; the mean is what they cost.
     """
