@@ -239,7 +239,8 @@ class Cycle:
     def _take(self, exchange: Exchange) -> None:
         """Hand out what an exchange brought; then learn from it."""
         sent, back, frame, wkc, which = self._answer = exchange
-        timing, carried, new = self._timing, self._carried[which], list[OutgoingFrame]()
+        timing, carried = self._timing, self._carried[which]
+        new: list[OutgoingFrame] = []
         self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
         for start, end, untouched, at, sensor, stream in carried:
             if back < stream.clock.estimate.phase_ns - stream.clock.quiet_ns:
