@@ -355,24 +355,20 @@ class MemoryChannel:
             self._stream.other.close()
 
     def monotonic_ns(self) -> int:
-        """See `Channel`."""
         now_ns: int = self._clock.monotonic_ns()
         return now_ns
 
     def wait(self, event: threading.Event, seconds: float, /) -> bool:
-        """See `Channel`."""
         self._pass(event.is_set, seconds)
         return event.is_set()
 
     def connect(self, timeout_s: float) -> bool:
-        """See `Channel`."""
         if self.server is None:
             raise UnreachableError("Connection refused")
         self._stream = self.server.transport.connect(0, buffer_size=1 << 20)
         return True
 
     def receive(self, buffer: memoryview, timeout_s: float) -> int:
-        """See `Channel`."""
         stream = self._stream
         if stream is None:
             raise ConnectionFailedError("Bad file descriptor")
@@ -387,22 +383,18 @@ class MemoryChannel:
         return len(data)
 
     def send(self, data: bytes) -> None:
-        """See `Channel`."""
         assert self._stream is not None
         self._stream.send(data)
 
     def shutdown(self) -> None:
-        """See `Channel`."""
         self.close()
 
     def close(self) -> None:
-        """See `Channel`."""
         if self._stream is not None:
             self._stream.close()
             self._stream = None
 
     def fileno(self) -> int:
-        """See `Channel`."""
         return -1
 
     def _pass(self, until: Callable[[], object], seconds: float) -> None:
@@ -522,7 +514,6 @@ class PrivateServer(SimulatedServer):
         self.channel = MemoryChannel(self)
 
     def interrupt(self) -> None:
-        """See `PrivateServer`."""
         self.server.jobs.interrupt(private_server.STOPPED)
 
 
@@ -543,13 +534,10 @@ class _ServersClock:
         self._server = server
 
     def monotonic_ns(self) -> int:
-        """See `Clock`."""
         return self._server.clock.monotonic_ns()
 
     def time_ns(self) -> int:
-        """See `Clock`."""
         return self._server.clock.time_ns()
 
     def sleep(self, seconds: float, /) -> None:
-        """See `Clock`."""
         self._server.go_on(lambda: False, seconds)

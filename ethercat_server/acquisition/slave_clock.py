@@ -194,7 +194,7 @@ class Trust:
         self.contradictions = 0.0
         self._since_ns = 0
         self._began = 0, 0  # restarts of the local clock, and samples with an event, at the beginning
-        self._compared = self._unfit = 0
+        self._compared = self.unfit = 0  # events that could be the sample's, and that could not
         self._sum_ns = self._squares = 0.0
 
     def confirmed(self) -> None:
@@ -202,12 +202,9 @@ class Trust:
         if self.contradictions > 0:
             self.contradictions -= _FORGET
 
-    def contradicted(self, weight: float) -> None:
+    def contradicted(self, now_ns: int) -> None:
         """A sample has no event that can be its own, or none that agrees with the sensor's clock."""
-        self.contradictions += weight
-
-    def reconsider(self, now_ns: int) -> None:
-        """End the trust if there were too many contradictions."""
+        self.contradictions += 1
         if self.contradictions > _MOST_CONTRADICTIONS:
             if now_ns - self._since_ns > _PROVEN_NS:
                 self._failures, self._pause_ns = 0, _FIRST_PAUSE_NS
@@ -217,7 +214,7 @@ class Trust:
     def begin(self, now_ns: int) -> None:
         """Begin a trial."""
         self._since_ns, self._began = now_ns, (self.local_clock.restarts, self.moved)
-        self._compared = self._unfit = 0
+        self._compared = self.unfit = 0
         self._sum_ns = self._squares = 0.0
 
     def is_due(self, now_ns: int) -> bool:
@@ -239,10 +236,6 @@ class Trust:
         """Mean difference between events and polling in the latest trial."""
         return self._sum_ns / max(self._compared, 1)
 
-    def unfit(self) -> None:
-        """An event that cannot be the sample's."""
-        self._unfit += 1
-
     def end(self, variance: float, now_ns: int) -> float:
         """End the trial if it was long enough; `variance` is that of both estimates.
 
@@ -254,7 +247,7 @@ class Trust:
             self.begin(now_ns)
         if now_ns - self._since_ns < _TRIAL_NS:
             return 0.0
-        count, (restarts, moved) = self._compared + self._unfit, self._began
+        count, (restarts, moved) = self._compared + self.unfit, self._began
         if self.local_clock.restarts - restarts > _RESTARTS:
             self._refuse("its local clock does not run", now_ns)
             self.is_final = not self.was_trusted
@@ -401,11 +394,12 @@ class EventTimes:
             if not (is_old or is_late) and not doubt_ns < off_ns < self._took_ns / 2:
                 trust.confirmed()
                 return late
-            trust.contradicted(self._is_in_time and not is_old)
+            counts = self._is_in_time and not is_old
         else:
-            trust.contradicted(self._is_in_time)
+            counts = self._is_in_time
         self.is_doubtful = True
-        trust.reconsider(back_ns)
+        if counts:
+            trust.contradicted(back_ns)
         self.are_trusted = trust.verdict is Verdict.TRUSTED
         return None
 
@@ -423,7 +417,7 @@ class EventTimes:
         elif self.instant_ns:
             trust.compare(difference_ns)
         elif self._is_in_time and not (self._answers and not self.local_clock.is_known):
-            trust.unfit()
+            trust.unfit += 1
         # Polling does not tell where on its way a round trip takes its time.
         asymmetry_ns = _ASYMMETRY * self._timing.least_ns
         variance += self.variance + asymmetry_ns * asymmetry_ns

@@ -66,8 +66,6 @@ class Unreadable(NamedTuple):
 class Subscription:
     """Which DATA a client wants. Lists are by the sensor's number."""
 
-    __slots__ = ("chooses", "every", "fresh_only", "gap", "last_ns", "skipped", "wanted")
-
     def __init__(
         self, sensor_count: int, sensors: tuple[int, ...] | None, every: int, fresh_only: bool
     ) -> None:
@@ -163,7 +161,10 @@ class Outbox:
     def _refused(self, error: OSError) -> int:
         """The socket accepts nothing: not now, or never again."""
         if not isinstance(error, BlockingIOError):
-            self._break()
+            self.broken = True
+            self._writers.discard(self._fd)
+            self._queue.clear()
+            self._queued_data = self._queued_json_bytes = self._head_sent = 0
         return 0
 
     def _wait(self) -> None:
@@ -191,12 +192,6 @@ class Outbox:
             else:
                 self._queued_json_bytes -= len(message)
         self._writers.discard(self._fd)
-
-    def _break(self) -> None:
-        self.broken = True
-        self._writers.discard(self._fd)
-        self._queue.clear()
-        self._queued_data = self._queued_json_bytes = self._head_sent = 0
 
     def _drop_oldest_data(self) -> int:
         first = 1 if self._head_sent else 0  # a frame that is partly sent must go out whole
@@ -227,7 +222,7 @@ class Connection:
     """A client's stream and everything that belongs to it."""
 
     def __init__(
-        self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int], watched: Watched | None = None
+        self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int], watched: Watched
     ) -> None:
         """`uid` is the user who owns the other end, None if that is not known."""
         self.fd = stream.fileno()
@@ -237,7 +232,7 @@ class Connection:
         self.framed: FrameDecoder | None = None
         self.bare: BareJsonDecoder | None = None
         self.subscription: Subscription | None = None
-        self._watched = watched or Watched(set(), set())
+        self._watched = watched
         self._watched.readers.add(self.fd)
         self.outbox = Outbox(stream, monotonic_ns, self._watched.writers)
         self._stream = stream

@@ -9,7 +9,6 @@ from bota_ethercat.control import ErrorCode, Event, Request, error_reply, event,
 from bota_ethercat.errors import RequestError, SettingError
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import SettingValue
-from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.jobs import Done, Jobs, refusal
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import SensorStream
@@ -79,12 +78,14 @@ class SensorActions:
             raise RequestError(ErrorCode.BAD_REQUEST, f"{problem} {choice} (available: {available})")
         return found[0]
 
-    def _start(self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]) -> None:
-        self._jobs.start(request.values["sensor"], steps, self._answering(connection, request))
-
     def _answering(self, connection: Connection, request: Request) -> Done:
         def done(values: Mapping[str, Any], error: RequestError | None) -> None:
-            self._hub.answer(connection, _answer(request, values, error))
+            if error is None:
+                answer = reply(request, **values)
+            else:
+                message = {"action": request.action, **({"id": request.id} if request.has_id else {})}
+                answer = error_reply(message, error.code, str(error), **error.extra)
+            self._hub.answer(connection, answer)
 
         return done
 
@@ -150,7 +151,7 @@ class SensorActions:
                 self._announce_offset(sensor)
             return written
 
-        self._start(connection, request, steps())
+        self._jobs.start(sensor.number, steps(), self._answering(connection, request))
 
     def _tare(self, connection: Connection, request: Request) -> None:
         values = request.values
@@ -210,12 +211,3 @@ class SensorActions:
         if save_too:
             yield from save(self._recovery.sensors[sensor.number].sdo, sensor)
         return {"sensor": sensor.number, **sensor.in_force(), "saved": save_too}
-
-
-def _answer(request: Request, values: Mapping[str, Any], error: RequestError | None) -> JsonObject:
-    if error is None:
-        return reply(request, **values)
-    message: JsonObject = {"action": request.action}
-    if request.has_id:
-        message["id"] = request.id
-    return error_reply(message, error.code, str(error), **error.extra)

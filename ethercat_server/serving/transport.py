@@ -166,7 +166,9 @@ class SocketStream:
         self.peer = "this process"
         if sock.family in (socket.AF_INET, socket.AF_INET6):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self.peer = _peer(sock)
+            self.peer = "unknown"
+            with contextlib.suppress(OSError):
+                self.peer = str(Address(*sock.getpeername()[:2]))
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         self._sock = sock
         self._diagnostics = diagnostics
@@ -225,13 +227,6 @@ class SocketTransport:
         self.stop_listening()
         if self._diagnostics is not None:
             self._diagnostics.close()
-
-
-def _peer(sock: socket.socket) -> str:
-    try:
-        return str(Address(*sock.getpeername()[:2]))
-    except OSError:
-        return "unknown"
 
 
 def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:

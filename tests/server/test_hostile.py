@@ -38,7 +38,7 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, mutate
 from tests.rights import NO_OTHER_USER, socket_of
 from tests.server.running import OLD, has_ipv6, on_a_bus, server, wait_until
-from tests.simulation import Simulation, check_frames, reading
+from tests.simulation import Simulation, check_frames, more_if_long, reading
 
 SEED = int(os.environ.get("FUZZ_SEED", "20261121"))
 REQUEST_NS = 150_000
@@ -406,7 +406,9 @@ def besieged() -> Iterator[Besieged]:
         yield found
 
 
-def besiege(count: int) -> None:
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("count", more_if_long([300], [300, 50_000]))
+def test_hostile_connections_harm_nobody(count: int) -> None:
     with besieged() as found:
         began_ns, blocks = found.simulation.clock.now_ns, []
         for part in range(3):
@@ -418,16 +420,6 @@ def besiege(count: int) -> None:
         tens = (found.simulation.clock.now_ns - began_ns) * 1e-10
         assert len(found.log.getvalue()) < LOG_LIMIT * (1 + tens), "the log can be flooded"
         assert found.asking.ask("describe")["ok"]
-
-
-def test_hostile_connections_harm_nobody() -> None:
-    besiege(300)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(1800)
-def test_fifty_thousand_hostile_connections_harm_nobody() -> None:
-    besiege(50_000)
 
 
 def test_a_crowd_that_asks_without_pause_costs_no_samples() -> None:
@@ -533,7 +525,11 @@ class Socket:
         self.close()
 
 
-def besiege_real(count: int) -> None:
+@pytest.mark.timeout(1800)
+@on_a_bus
+@pytest.mark.parametrize("count", more_if_long([20], [20, 5_000]))
+def test_hostile_connections_to_a_real_server(count: int) -> None:
+    """The kernel's resets, half-closed connections, full buffers and owners of sockets."""
     # Whoever cannot become another user here may shut it down.
     kinds = [nuisance for nuisance in KINDS if NO_OTHER_USER is None or nuisance is not shut_it_down]
     hosts = itertools.cycle(("127.0.0.1", "::1") if has_ipv6() else ("127.0.0.1",))
@@ -560,16 +556,3 @@ def besiege_real(count: int) -> None:
         assert "Traceback" not in running.said()
         running.signal(signal.SIGINT)
         assert running.wait() == 0
-
-
-@on_a_bus
-def test_hostile_connections_to_a_real_server() -> None:
-    """The kernel's resets, half-closed connections, full buffers and owners of sockets."""
-    besiege_real(20)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(1800)
-@on_a_bus
-def test_ten_thousand_hostile_connections_to_a_real_server() -> None:
-    besiege_real(5_000)
