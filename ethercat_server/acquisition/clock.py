@@ -441,8 +441,8 @@ class SampleClock:
 
     # -- what an exchange says
 
-    def take(self, sent_ns: int, back_ns: int, latched: Latched | None, *, fresh: bool) -> None:
-        """Date what an exchange brought, before learning from it.
+    def take(self, sent_ns: int, back_ns: int, latched: Latched | None, *, fresh: bool) -> bool:
+        """Date what an exchange brought, before learning from it; whether it is certainly the next sample.
 
         `latched` is what the slave controller has latched. If it brought a new sample (`fresh`) this sets
         `steps`, `uncertain` and `instant_ns`.
@@ -451,7 +451,7 @@ class SampleClock:
         if latched is not None and events is not None:
             events.take(latched, sent_ns, back_ns, fresh, self.estimate.period_ns)
         if not fresh:
-            return
+            return False
         phase_ns, outward_ns = self.estimate.phase_ns, self._outward_ns
         if self._steady and back_ns < phase_ns + self._sure_ns:
             if events is None or not events.are_trusted:
@@ -462,9 +462,10 @@ class SampleClock:
                 self._by_event = instant_ns - outward_ns
             if -self._doubt_ns < instant_ns - outward_ns - phase_ns < self._doubt_ns:
                 self.instant_ns = instant_ns if instant_ns < back_ns else back_ns
-                return
+                return True
         self._skips = 0
         self._predict(sent_ns, back_ns)
+        return self.steps == 1 and not self.uncertain
 
     def goes_on(self) -> bool:
         """Whether the last exchange needs no `learn`: a steady clock is learned from some samples only.

@@ -38,6 +38,8 @@ _FIRST_COST_NS: Final = 50_000.0
 _BUDGET: Final = 1 / 4
 # Longest time that a poll waits for another, in shortest sample periods.
 _LARGEST_WAIT: Final = 0.3
+# Read for every sample: as an attribute of its Enum it takes ten times as long.
+_STREAMING: Final = SensorState.STREAMING
 # Longest time by which polls are brought forward because this machine wakes late.
 _LONGEST_LEAD_NS: Final = 200_000.0
 
@@ -163,8 +165,11 @@ class Cycle:
             wanted = [stream.clock.next_poll_ns() for stream in streams]
             latest_ns = min(wanted) + self._spacing_ns
             poll_ns = max([each for each in wanted if each <= latest_ns])
-        due_ns = max(poll_ns - min(timing.late_ns, _LONGEST_LEAD_NS), timing.sent_ns + self._spacing_ns)
-        return max(int(due_ns), self._bus.process_data.blocked_until_ns)
+        due_ns, earliest_ns = (
+            poll_ns - min(timing.late_ns, _LONGEST_LEAD_NS),
+            timing.sent_ns + self._spacing_ns,
+        )
+        return max(int(due_ns), int(earliest_ns), self._bus.process_data.blocked_until_ns)
 
     def _plan(self) -> None:
         """Derive from the sensors' rates, which change, how exchanges follow each other; once a second."""
@@ -247,7 +252,7 @@ class Cycle:
                 continue  # the poll was for another sensor
             data = frame[start:end]
             # The working counter does not tell sensors apart: one that is out may be counted for another.
-            if not complete or sensor.state is not SensorState.STREAMING or data == untouched:
+            if not complete or sensor.state is not _STREAMING or data == untouched:
                 made = stream.invalid(wkc, back)
             else:
                 made = stream.take(data, exchange, LATCHED.unpack_from(frame, at) if at else None)

@@ -93,30 +93,36 @@ class SensorStream:
             return None
         clock, self._exchange = self.clock, exchange
         self._fresh = fresh = data != self.process_data
-        clock.take(sent_ns, back_ns, latched, fresh=fresh)
+        is_next = clock.take(sent_ns, back_ns, latched, fresh=fresh)
         if not fresh:
             return self.idle(back_ns)
         self.process_data = data
-        self.idle_at_ns = back_ns + SILENT_PERIODS * clock.estimate.period_ns
         if self._discard:
-            self._discard -= 1
             return None
-        self._handed_out = data
-        flags = self._count_lost() if self._silent or self._gap or clock.steps != 1 or clock.uncertain else 0
-        # It has to rise: the one before may have been dated too young.
-        self._moment_ns = moment_ns = max(int(clock.instant_ns), self._moment_ns + 1)
-        stamp_ns, sequence = moment_ns + self.realtime_offset.ns, self.sequence
-        self.sequence += 1
-        return encode_data(sequence, stamp_ns, moment_ns, self.number, flags, wkc, data), self.number, flags
+        flags = 0 if is_next and not (self._silent or self._gap) else self._count_lost()
+        if (moment_ns := int(clock.instant_ns)) <= self._moment_ns:  # the one before was dated too young
+            moment_ns = self._moment_ns + 1
+        self._moment_ns = moment_ns
+        stamp_ns = moment_ns + self.realtime_offset.ns
+        return (
+            encode_data(self.sequence, stamp_ns, moment_ns, self.number, flags, wkc, data),
+            self.number,
+            flags,
+        )
 
     def finish(self, exchange: Exchange) -> bool:
-        """Count what an exchange brought, once that is handed out; whether `clock.learn` must follow."""
+        """Account for what an exchange brought, once it is handed out; whether `clock.learn` must follow."""
         if exchange is not self._exchange:
             return False
         if self._fresh:
+            self.idle_at_ns = exchange.back_ns + SILENT_PERIODS * self.clock.estimate.period_ns
             if self.clock.locked:
                 self.age.record(exchange.back_ns - self.clock.instant_ns)
-            if self._handed_out is self.process_data:
+            if self._discard:
+                self._discard -= 1
+            else:
+                self.sequence += 1
+                self._handed_out = self.process_data
                 self.health.newest.append(self.process_data)
         return not self.clock.goes_on()
 

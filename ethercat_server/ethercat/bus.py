@@ -64,7 +64,7 @@ class Bus(Datagrams):
         pysoem is the master where there are sensors only; other slaves are not written to. `again`: after a
         failure, with the master that repeats what lost frames spoil.
         """
-        self._soem = self.backend.master if len(positions) == len(sii) and not again else None
+        self._soem = self.backend.master if not again else None
         self.positions, self._sii, self.slaves = list(positions), sii, []
         if self._soem is not None:
             self._soem.scan(positions, check_interrupt)

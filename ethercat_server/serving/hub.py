@@ -99,7 +99,7 @@ class Hub:
                 reads, wake_ns = False, min(self._pause_ends_ns, until_ns)
             elif hurried or (reads and self._ready):
                 wake_ns = now_ns
-            wait_s = max(wake_ns - now_ns, 0) * 1e-9
+            wait_s = (wake_ns - now_ns) * 1e-9 if wake_ns > now_ns else 0.0
             ready = self._transport.wait(watched.readers if reads else (), watched.writers, wait_s)
             if ready[0] or ready[1] or (reads and self._ready):
                 self._attend(*ready, last_start_ns, reads=reads, hurried=hurried)

@@ -379,6 +379,14 @@ def test_a_sensor_does_one_change_at_a_time(bench: Bench) -> None:
     assert other.refused("sdo_read", index=RATE)["code"] == "not_ready"
 
 
+def test_a_long_job_of_one_sensor_does_not_hold_up_those_of_another() -> None:
+    bench = Bench(AT_REST, SensorOptions(signal="rest", serial=2))
+    tare = bench.asking.send("tare", sensor=0, samples=400)
+    assert bench.connect().ask("sdo_read", sensor=1, index=RATE)["ok"]
+    assert bench.asking.replies == []
+    assert bench.asking.reply(tare)["ok"]
+
+
 def test_a_client_that_leaves_leaves_nothing_behind(
     streaming: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
