@@ -16,15 +16,12 @@ from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.slave_clock import EventTimes
 from ethercat_server.ethercat.exchange import Latched
 
-# The estimate
+# -- the estimate
 _ROOT_2_PI: Final = math.sqrt(2 * math.pi)
 _ROOT_HALF: Final = math.sqrt(0.5)
-# Period jitter of a crystal, at most.
-_JITTER_NS: Final = 30.0
-# Relative change of the period from sample to sample: 1 ppm in a minute at 1600 Hz.
-_DRIFT: Final = 3e-9
-# Variance of the instant of a look that no round trip shows.
-_LOOK_VARIANCE: Final = 2_000.0**2
+_JITTER_NS: Final = 30.0  # period jitter of a crystal, at most
+_DRIFT: Final = 3e-9  # relative change of the period from sample to sample: 1 ppm in a minute at 1600 Hz
+_LOOK_VARIANCE: Final = 2_000.0**2  # variance of the instant of a look that no round trip shows
 # Probability that a bit is meaningless: it came from a stall, or belongs to another sample.
 _WRONG: Final = 0.005
 _FARTHEST: Final = 8.0
@@ -35,47 +32,35 @@ _NOISE_RATE: Final = 1.4
 _MOST_NOISE: Final = math.log(1e7)
 # Negative log-likelihood of a run of late looks from which noise is raised: about one run in a thousand.
 _UNLIKELY_RUN: Final = 7.0
-# Standard deviations beyond which a measurement contradicts the model.
-_CONTRADICTS: Final = 3.0
-# Consecutive contradictions after which the sensor's clock has started anew.
-_CONTRADICTIONS: Final = 4
-# Standard deviations beyond which an expected bit carries no information.
-_CERTAIN: Final = 5.0
-# Standard deviation of an unknown phase, in periods: 1/sqrt(12).
-_UNKNOWN: Final = 0.3
+_CONTRADICTS: Final = 3.0  # standard deviations beyond which a measurement contradicts the model
+_CONTRADICTIONS: Final = 4  # consecutive contradictions after which the sensor's clock has started anew
+_CERTAIN: Final = 5.0  # standard deviations beyond which an expected bit carries no information
+_UNKNOWN: Final = 0.3  # standard deviation of an unknown phase, in periods: 1/sqrt(12)
 _FIRST_PULL: Final = 0.001
 # Largest standard deviation of the period, as part of it; it is reached after contradictions.
 _MOST_PULL: Final = 0.03
 # The period may differ from the nominal one by this part. Oscillators are off by 0.0005 at most, but a
 # simulated sensor that sleeps between its samples is slower by much more.
 _LARGEST_PULL: Final = 0.12
-# Relative standard deviation of the period below which it counts as known.
-_STEADY: Final = 2e-6
-# The margin
+_STEADY: Final = 2e-6  # relative standard deviation of the period below which it counts as known
+# -- the margin
 # Cost of an exchange, as age.
 _PRICE_NS: Final = 15_000.0
 # Cost of a lost sample, as age in periods, where there is no time for a second poll.
 _LOSS_PERIODS: Final = 10.0
-# Round trip, in periods, beyond which there is no time for one.
-_NO_TIME: Final = 0.5
+_NO_TIME: Final = 0.5  # round trip, in periods, beyond which there is no time for one
 _LARGEST_MARGIN: Final = 0.4
 # Factor by which an early look costs more where nothing is learned from it: events date the samples.
 _NOTHING_LEARNED: Final = 1.2
-# The clock
+# -- the clock
 # Standard deviation of the phase, in periods, below which the clock is followed.
 _LOCKED: Final = 0.125
-# Exchanges per sample while it is not.
-_POLLS_UNLOCKED: Final = 4
-# Exchanges per period once a sample is overdue.
-_SEARCH_STEPS: Final = 8
-# Standard deviations after which it is.
-_OVERDUE: Final = 2.0
-# A real sensor's period differs from the nominal one by less than this part.
-PLAUSIBLE_PULL: Final = 0.002
-# Periods without a new sample after which a sensor is silent, not just late.
-SILENT_PERIODS: Final = 3
-# Fraction of the samples whose first poll is to be early.
-_EARLY_POLLS: Final = 0.11
+_POLLS_UNLOCKED: Final = 4  # exchanges per sample while it is not
+_SEARCH_STEPS: Final = 8  # exchanges per period once a sample is overdue
+_OVERDUE: Final = 2.0  # standard deviations after which it is
+PLAUSIBLE_PULL: Final = 0.002  # a real sensor's period differs from the nominal one by less than this part
+SILENT_PERIODS: Final = 3  # periods without a new sample after which a sensor is silent, not just late
+_EARLY_POLLS: Final = 0.11  # fraction of the samples whose first poll is to be early
 _CAUTION_GAIN: Final = 0.05
 # Calls of `learn` after which the margin is derived anew, and change of the variance by which it is at once.
 _TURNS: Final = 3
@@ -85,12 +70,10 @@ _LEARN_BY_EVENT_EVERY_NS: Final = 10e6
 _LEARN_BY_POLL_EVERY_NS: Final = 6.25e6
 # Variance of the phase below which no probes are needed, however precise polls are.
 _PROBE_BELOW: Final = 5_000.0**2
-# Samples without an early look after which the phase is probed.
-_UNPROBED: Final = 500
+_UNPROBED: Final = 500  # samples without an early look after which the phase is probed
 # Excess of an exchange, in periods, beyond which it says nothing of when the sensor looked.
 _LONGEST_LOOK: Final = 0.5
-# Lateness in periods below which a sample is the one expected before.
-_EARLY: Final = -0.25
+_EARLY: Final = -0.25  # lateness in periods below which a sample is the one expected before
 _BIAS_GAIN: Final = 1 / 64
 # Time without a look, in periods: below the first only one sample can have come, above the second more may.
 _ONE_ONLY, _MISSABLE = 0.8, 1.25
@@ -290,34 +273,27 @@ class SampleClock:
         self.quiet_ns = math.inf
         # The last exchange: when it was sent, and whether it brought a new sample.
         self._sent_ns, self._fresh = 0, False
-        # Instant of the newest sample by its event, less the outward part; 0: unknown.
-        self._by_event = 0.0
+        self._by_event = 0.0  # instant of the newest sample by its event, less the outward part; 0: unknown
         # When the last valid exchange was sent from which was learned, or that went on.
         self._looked_ns = 0
         self._moved_ns = timing.moved_ns
-        # By how much events are later than polls show, where both are followed.
-        self._bias_ns = 0.0
-        # Number of the newest sample, counted from the one before it by the phase alone.
-        self._newest = 1
+        self._bias_ns = 0.0  # by how much events are later than polls show, where both are followed
+        self._newest = 1  # number of the newest sample, counted from the one before it by the phase alone
         # When the sensor had certainly looked in the exchange that brought the newest sample.
         self._seen_by_ns = 0.0
-        # Consecutive samples that were polled for and did not come.
-        self._absent = 0
+        self._absent = 0  # consecutive samples that were polled for and did not come
         # Whether an instant is known; whether the sample before was `uncertain`; whether the next is overdue.
         self._begun = self._doubtful = self._overdue = False
-        # Whether there is no time for a second poll of a sample.
-        self._single = True
+        self._single = True  # whether there is no time for a second poll of a sample
         # Whether the next poll is to be early: polls can tell the phase better, or did not for long.
         self._probing = False
-        # Samples since a look was early.
-        self._hits = 0
+        self._hits = 0  # samples since a look was early
         # κ, the fraction of the margin that is needed: looks are distributed less evenly than it assumes.
         self._caution = 1.0
         # Between these variances the margin is as it was derived last.
         self._turn, self._least_variance, self._most_variance = 0, 0.0, 0.0
         self._usual_margin_ns = self._margin_ns = self._probed_above = 0.0
-        # How long after the phase the next poll should be sent.
-        self._aim_after_ns = 0.0
+        self._aim_after_ns = 0.0  # how long after the phase the next poll should be sent
         # Whether the next sample is certainly the expected one if its exchange is back less than `_sure_ns`
         # after its phase; its event is then within `_doubt_ns` of it, and it is overdue after `_late_ns`.
         self._steady = False

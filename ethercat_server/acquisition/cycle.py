@@ -24,20 +24,15 @@ from ethercat_server.sensor.sensor import Sensor, SensorState
 
 # Sockets are served this often even if every deadline has passed,
 _SERVE_EVERY_NS: Final = 10_000_000
-# and, without waiting, while an exchange is on its way.
-_SERVE_IN_FLIGHT_NS: Final = 2_000_000
-# Interval between chores, such as whether CLOCK_REALTIME was set.
-_CHORES_EVERY_NS: Final = 20_000_000
-# Time between two exchanges while all sensors are lost.
-_RECOVERY_STEP_NS: Final = 500_000
+_SERVE_IN_FLIGHT_NS: Final = 2_000_000  # and, without waiting, while an exchange is on its way
+_CHORES_EVERY_NS: Final = 20_000_000  # interval between chores, such as whether CLOCK_REALTIME was set
+_RECOVERY_STEP_NS: Final = 500_000  # time between two exchanges while all sensors are lost
 # Interval between summaries of the distributions, which take some 100 µs each.
 _SUMMARY_NS: Final = 200_000_000
 _COST_GAIN: Final = 1 / 64
 _FIRST_COST_NS: Final = 50_000.0
-# Fraction of the time that exchanges may take.
-_BUDGET: Final = 1 / 4
-# Longest time that a poll waits for another, in shortest sample periods.
-_LARGEST_WAIT: Final = 0.3
+_BUDGET: Final = 1 / 4  # fraction of the time that exchanges may take
+_LARGEST_WAIT: Final = 0.3  # longest time that a poll waits for another, in shortest sample periods
 # Read for every sample: as an attribute of its Enum it takes ten times as long.
 _STREAMING: Final = SensorState.STREAMING
 # Longest time by which polls are brought forward because this machine wakes late.

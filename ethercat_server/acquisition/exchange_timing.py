@@ -18,18 +18,14 @@ from operator import rshift
 from typing import Any, Final
 
 _GAIN: Final = 1 / 64
-# Exchanges after which what follows from the averages is derived anew.
-_TURNS: Final = 7
-# The shortest round trip is that of the last one or two of these.
-_WINDOW_NS: Final = 2_000_000_000
+_TURNS: Final = 7  # exchanges after which what follows from the averages is derived anew
+_WINDOW_NS: Final = 2_000_000_000  # the shortest round trip is that of the last one or two of these
 _FIRST_GUESS_NS: Final = 100_000.0
 _FIRST_EXCESS_NS: Final = 20_000.0
 _FIRST_LATE_NS: Final = 15_000.0
 _LEAST_VARIANCE: Final = 1_000.0**2
-# Change of the shortest round trip from which it is another; below, it is jitter.
-_MOVED_NS: Final = 20_000.0
-# Standard deviations at which outliers are clipped: a stall is no jitter.
-_OUTLIER: Final = 4.0
+_MOVED_NS: Final = 20_000.0  # change of the shortest round trip from which it is another; below, it is jitter
+_OUTLIER: Final = 4.0  # standard deviations at which outliers are clipped: a stall is no jitter
 _ROOM_NS: Final = 10_000.0
 _PATIENCE_NS: Final = 100_000.0
 
@@ -140,8 +136,7 @@ class ExchangeTiming:
 
 
 _POINTS: Final = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
-# A recent distribution covers the last ten slots of this length.
-SLOT_NS: Final = 1_000_000_000
+SLOT_NS: Final = 1_000_000_000  # a recent distribution covers the last ten slots of this length
 _WINDOW_SLOTS: Final = 10
 # The upper bits of a float32 are its sign, its exponent and the first bits of its mantissa: of those, 5 tell
 # 32 buckets an octave apart.

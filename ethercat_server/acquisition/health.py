@@ -19,10 +19,8 @@ from ethercat_server.acquisition.slave_clock import Verdict
 from ethercat_server.ethercat.datagrams import FIRST_INDEX
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
 
-# A usual round trip above this is a slow network card's, or a slow driver's.
-SLOW_US: Final = 300.0
-# A usual round trip through a PCIe card, system calls included.
-_PCIE_US: Final = 100.0
+SLOW_US: Final = 300.0  # a usual round trip above this is a slow network card's, or a slow driver's
+_PCIE_US: Final = 100.0  # a usual round trip through a PCIe card, system calls included
 _SLOW_SECONDS: Final = 5
 
 log = logging.getLogger(__name__)
@@ -53,8 +51,7 @@ class RoundTripHealth:
 
 # Frames of others in a second that are a master's; fewer may be late answers from before the loop.
 _MASTER_FRAMES: Final = 3
-# Seconds without any after which it has gone.
-_GONE_S: Final = 10
+_GONE_S: Final = 10  # seconds without any after which it has gone
 _RECENT_NS: Final = 1_000_000_000
 # Stalls of this length in that time explain a missing answer, or an expired watchdog.
 _STALL_NS: Final = 20_000_000
@@ -117,8 +114,7 @@ class Causes:
 
 # Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment.
 _DEVIATING_SECONDS: Final = 10
-# Seconds with finite samples only after which it is over.
-_FINITE_SECONDS: Final = 10
+_FINITE_SECONDS: Final = 10  # seconds with finite samples only after which it is over
 
 
 class SampleHealth:

@@ -16,68 +16,48 @@ from typing import Final
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.exchange import DistributedClock, Latched
 
-# The local clock
-# Local times are given modulo this, in ns: 4.3 s.
-_WRAP: Final = 1 << 32
+# -- the local clock
+_WRAP: Final = 1 << 32  # local times are given modulo this, in ns: 4.3 s
 _HALF: Final = 1 << 31
-# Exchanges; the first blocks are shorter.
-_BLOCK: Final = 32
+_BLOCK: Final = 32  # exchanges of a block; the first ones are shorter
 _FIRST_BLOCK: Final = 4
-# Of the middle of the shortest round trip.
-_LEAST_VARIANCE: Final = 4_000.0**2
-# Standard deviation of the rate's error at first; crystals are off by 100e-6 at most.
-_FIRST_RATE: Final = 200e-6
-# A clock that is further off is none.
-_MOST_RATE: Final = 0.001
-# Variance that the phase gains, ns² in each ns: 10 ns in a ms.
-_JITTER: Final = 1e-4
-# Variance that the rate gains in each ns: 1 ppm in a minute.
-_DRIFT: Final = 1.7e-23
+_LEAST_VARIANCE: Final = 4_000.0**2  # of the middle of the shortest round trip
+_FIRST_RATE: Final = 200e-6  # standard deviation of the rate's error at first; crystals: 100e-6 at most
+_MOST_RATE: Final = 0.001  # a clock that is further off is none
+_JITTER: Final = 1e-4  # variance that the phase gains, ns² in each ns: 10 ns in a ms
+_DRIFT: Final = 1.7e-23  # variance that the rate gains in each ns: 1 ppm in a minute
 _EXCESS_GAIN: Final = 1 / 8
-_CONTRADICTS: Final = 5.0
-# Consecutive blocks beyond `_CONTRADICTS` standard deviations after which the clock has jumped.
-_JUMPED: Final = 3
+_CONTRADICTS: Final = 5.0  # standard deviations beyond which a block contradicts the clock
+_JUMPED: Final = 3  # consecutive contradictions after which the clock has jumped
 _PULL_GAIN: Final = 0.15
-_PULLED: Final = 1.0
-# The rate has changed by about this once the mean error exceeds `_PULLED` standard deviations.
-_RATE_STEP: Final = 50e-6
-_KNOWN_NS: Final = 10_000.0
-_KNOWN: Final = 1 / 32
-_KNOWN_BLOCKS: Final = 12
+_PULLED: Final = 1.0  # mean error, in standard deviations, beyond which the rate has changed
+_RATE_STEP: Final = 50e-6  # by about this
 # The clock is known after `_KNOWN_BLOCKS` blocks, once its standard deviation is below `_KNOWN_NS` or the
 # part `_KNOWN` of the shortest round trip, and until it exceeds that `_STILL` times.
+_KNOWN_BLOCKS: Final = 12
+_KNOWN_NS: Final = 10_000.0
+_KNOWN: Final = 1 / 32
 _STILL: Final = 5
-# Trust
-_SAMPLES: Final = 100
-# Minimum samples and duration of a trial.
-_TRIAL_NS: Final = 500_000_000
-# Part of them whose events must lie between the frames around the sample. All are in the same clock, so
+# -- trust
+_SAMPLES: Final = 100  # samples of a trial at least
+_TRIAL_NS: Final = 500_000_000  # duration of a trial at least
+# Fraction of them whose events must lie between the frames around the sample. All are in the same clock, so
 # right ones always do. One that is off at random does not only where a poll came close, as one in ten does.
 _FITTING: Final = 0.99
-# Standard deviations by which the mean difference from polling may deviate.
-_MOST_DEVIATIONS: Final = 3.0
-# Failed trials after which event times are not used, for a while.
-_MOST_FAILURES: Final = 5
-_FIRST_PAUSE_NS: Final = 10_000_000_000
-# That while at first, and at most: it doubles with each trial that fails after it.
+_MOST_DEVIATIONS: Final = 3.0  # standard deviations by which the mean difference from polling may deviate
+_RESTARTS: Final = 3  # restarts of the local clock in one trial beyond which it counts as not running
+_MOST_FAILURES: Final = 5  # failed trials after which event times are not used, for a while
+_FIRST_PAUSE_NS: Final = 10_000_000_000  # that while at first; it doubles with each trial that fails after it
 _LONGEST_PAUSE_NS: Final = 320_000_000_000
-# Time trusted after which earlier failures are forgotten.
-_PROVEN_NS: Final = 60_000_000_000
-# Restarts of the local clock in one trial beyond which it counts as not running.
-_RESTARTS: Final = 3
-_MOST_CONTRADICTIONS: Final = 4.0
-# Contradictions at which the trust ends; each sample that fits takes `_FORGET` back.
-_FORGET: Final = 1 / 100
-# Events
-# Tolerance between the latched times of an event and of a frame's arrival.
-_SLACK_NS: Final = 5_000
-# Standard deviations from the estimate beyond which an instant is not used.
-_SURE: Final = 5.0
-# Age of the newest event, in periods, beyond which samples have come without events.
-_OLDEST: Final = 1.5
+_PROVEN_NS: Final = 60_000_000_000  # time trusted after which earlier failures are forgotten
+_MOST_CONTRADICTIONS: Final = 4.0  # at which the trust ends
+_FORGET: Final = 1 / 100  # part of a contradiction that each sample which fits takes back
+# -- events
+_SLACK_NS: Final = 5_000  # tolerance between the latched times of an event and of a frame's arrival
+_SURE: Final = 5.0  # standard deviations from the estimate beyond which an instant is not used
+_OLDEST: Final = 1.5  # age of the newest event, in periods, beyond which samples have come without events
 _EVENT_VARIANCE: Final = 3_000.0**2
-# Standard deviation of the outward part of a round trip, as part of the shortest one.
-_ASYMMETRY: Final = 1 / 24
+_ASYMMETRY: Final = 1 / 24  # standard deviation of the outward part of a round trip, as part of the shortest
 
 
 class LocalClock:

@@ -22,8 +22,7 @@ from ethercat_server.ethercat.exchange import DUPLICATE, DistributedClock, Excha
 from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.sensor.sensor import Sensor
 
-# Bota's own driver discards the first three frames after entering OP.
-DISCARDED_AT_START: Final = 3
+DISCARDED_AT_START: Final = 3  # Bota's own driver discards the first three frames after entering OP
 
 # A DATA frame, the number of its sensor, its flags.
 OutgoingFrame = tuple[bytes, int, int]

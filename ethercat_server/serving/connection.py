@@ -25,10 +25,8 @@ NO_SENSOR: Final = -1
 _IDLE_FRAME_NS: Final = 10_000_000
 _REPEATED: Final = int(DataFlag.REPEATED)
 _GAP: Final = int(DataFlag.GAP)
-# Timeout for the rest of a message whose first part has arrived.
-_UNFINISHED_NS: Final = 10_000_000_000
-# Timeout for a connection that is being closed.
-_LAST_REPLY_NS: Final = 1_000_000_000
+_UNFINISHED_NS: Final = 10_000_000_000  # timeout for the rest of a message whose first part has arrived
+_LAST_REPLY_NS: Final = 1_000_000_000  # timeout for a connection that is being closed
 
 
 class State(Enum):

@@ -23,16 +23,12 @@ from ethercat_server.serving.connection import Connection, Limits, State, Unread
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import Transport
 
-# Clients get at most a tenth of this thread's time, however much they ask.
-_PAUSE_RATIO: Final = 9
+_PAUSE_RATIO: Final = 9  # clients get at most a tenth of this thread's time, however much they ask
 # A pass that took long because this thread was not running must not silence all clients.
 _LONGEST_PAUSE_NS: Final = 20_000_000
-# No request is begun this shortly before a deadline; a usual one takes less.
-_REQUEST_NS: Final = 280_000
-# Clients accepted in one pass.
-_MAX_ACCEPTS: Final = 2
-# How often connections are checked for timeouts and closed.
-_SWEEP_NS: Final = 50_000_000
+_REQUEST_NS: Final = 280_000  # no request is begun this shortly before a deadline; a usual one takes less
+_MAX_ACCEPTS: Final = 2  # clients accepted in one pass
+_SWEEP_NS: Final = 50_000_000  # how often connections are checked for timeouts and closed
 _CLOSE_NS: Final = 1_000_000_000
 _CLOSE_TURN_NS: Final = 20_000_000
 

@@ -27,8 +27,7 @@ from ethercat_server.serving.hub import Hub
 # Reads that may wait for one sensor: everyone may read, and changes must still get their turn.
 _MOST_READS: Final = 8
 
-# A sensor does one of these at a time.
-_CHANGES: Final = frozenset({"configure", "tare"})
+_CHANGES: Final = frozenset({"configure", "tare"})  # a sensor does one of these at a time
 
 
 class SensorActions:
