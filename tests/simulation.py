@@ -63,8 +63,7 @@ from ethercat_server.virtual_sensor.sensor import Firmware
 from ethercat_server.virtual_sensor.signals import ClockReading, decode_clock
 from tests.server.running import OLD, Commanded, FramedClient
 
-PATIENCE_S = 60.0
-"""Simulated time that anything may take."""
+PATIENCE_S = 60.0  # simulated time that anything may take
 AT_REST = SensorOptions(signal="rest")
 _EXCUSE = int(DataFlag.GAP | DataFlag.REPEATED)
 
@@ -130,8 +129,8 @@ def registers(backend: MemoryBackend) -> list[bytes]:
 class SimulatedBus(Commanded):
     """Virtual sensors in memory."""
 
+    # The doctor asks the kernel about it, so there must be such an interface; nothing is sent there.
     near = "lo"
-    """The doctor asks the kernel about it, so there must be such an interface; nothing is sent there."""
 
     def __init__(self, backend: MemoryBackend) -> None:
         self.backend, self.clock = backend, backend.clock
@@ -157,8 +156,7 @@ class Exchange:
 
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
-        self.inputs: dict[int, bytes] = {}
-        """Of each sensor, as of the last exchange that came back."""
+        self.inputs: dict[int, bytes] = {}  # of each sensor, as of the last exchange that came back
 
     def __call__(self, timeout_s: float = 0.01) -> int:
         """The working counter of all frames; -1 if one did not come back in time."""
@@ -196,11 +194,9 @@ class Simulation(SimulatedBus):
         self.started_ns = self.clock.now_ns
         self.transport = InMemoryTransport(self.clock)
         self.frames: list[DataMessage] = []
-        self.published_ns: list[int] = []
-        """When each was handed out."""
+        self.published_ns: list[int] = []  # when each was handed out
         self.events: list[JsonObject] = []
-        self.announced_ns: list[int] = []
-        """When each was announced."""
+        self.announced_ns: list[int] = []  # when each was announced
         self._decoder = FrameDecoder()
         self._awaited: Callable[[], object] = lambda: False
         self.on_serve: Callable[[int], None] = lambda _: None
@@ -210,8 +206,7 @@ class Simulation(SimulatedBus):
         self.sensors, self.streams, self.others = self.server.sensors, self.server.streams, self.server.others
         self.recovery, self.jobs, self.cycle = self.server.recovery, self.server.jobs, self.server.cycle
         self.clients: list[Client] = []
-        self.hangs = False
-        """Whether somebody has stopped it; time passes all the same."""
+        self.hangs = False  # whether somebody has stopped it; time passes all the same
 
     def listen(self) -> Transport:
         """Where its clients come from."""
@@ -296,8 +291,7 @@ class Client(FramedClient):
         self.simulation = simulation
         self.stream = simulation.transport.connect(uid, buffer_size=buffer_size)
         super().__init__(self.stream.send, simulation.run_until)
-        self.reads = True
-        """Whether it takes what arrives."""
+        self.reads = True  # whether it takes what arrives
         simulation.clients.append(self)
 
     def receive(self) -> None:
@@ -451,8 +445,8 @@ def check_frames(frames: Iterable[DataMessage], *, complete: bool = True) -> Non
 
 # -- the buses of the tool and the doctor
 
+# What a server sets the sensors to: the fewer samples, the faster it is simulated.
 SINC_LENGTH, RATE_HZ = 512, 100
-"""What a server sets the sensors to: the fewer samples, the faster it is simulated."""
 _READ_IMAGE = scan.read_image
 
 

@@ -30,8 +30,7 @@ from ethercat_server.serving.transport import open_diagnostics, peer_uid
 from tests.rights import NOBODY, needs_another_user, socket_of
 from tests.server.running import Server, Veth, free_port, on_a_bus, server, wait_until
 
-RESET = struct.pack("ii", 1, 0)
-"""SO_LINGER with which a close resets the connection."""
+RESET = struct.pack("ii", 1, 0)  # SO_LINGER with which a close resets the connection
 
 
 @pytest.fixture
@@ -134,13 +133,13 @@ def test_named_users_and_groups_may_control() -> None:
 
 # -- at one server for all of these, which none may change but the last
 
+# What changes something, with everything it needs.
 CONTROL: dict[str, dict[str, Any]] = {
     "shutdown": {},
     "configure": {"sensor": 0, "settings": {"fir": True}},
     "tare": {"sensor": 0, "samples": 10},
     "sdo_write": {"sensor": 0, "index": 0x8010, "subindex": 1, "hex": "00"},
 }
-"""What changes something, with everything it needs."""
 HERE, THERE = "10.77.12.1", "10.77.12.2"
 
 

@@ -271,11 +271,11 @@ def of_each(running: Simulation) -> dict[int, list[DataMessage]]:
     return by_sensor
 
 
+# SINC length (64: 800 Hz), round trip in ms, jitter in µs.
 CARDS = [
     (64, 0.86, 0), (64, 2.0, 0), (64, 3.0, 0), (64, 2.8, 400),
     (32, 0.44, 0), (32, 0.86, 0), (32, 2.0, 0), (32, 1.8, 400),
 ]  # fmt: skip
-"""SINC length (64: 800 Hz), round trip in ms, jitter in µs."""
 
 
 @pytest.mark.parametrize(("sinc_length", "milliseconds", "jitter_us"), CARDS)

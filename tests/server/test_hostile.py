@@ -41,22 +41,18 @@ from tests.server.running import OLD, has_ipv6, on_a_bus, server, wait_until
 from tests.simulation import Simulation, check_frames, more_if_long, reading
 
 SEED = int(os.environ.get("FUZZ_SEED", "20261121"))
-REQUEST_NS = 150_000
-"""What a request costs the server's thread in simulated time."""
-LINGER_S = 1.2
-"""After which the server has closed whatever it does not need."""
+REQUEST_NS = 150_000  # what a request costs the server's thread in simulated time
+LINGER_S = 1.2  # after which the server has closed whatever it does not need
 CROWD_S = 2.0
-GROWTH_MB = 8
-"""What as many connections again may add to a real server: others may hang at that time."""
-LOG_LIMIT = 20_000
-"""Characters that hostile clients may make the server log in ten seconds."""
+GROWTH_MB = 8  # what as many connections again may add to a real server: others may hang at that time
+LOG_LIMIT = 20_000  # characters that hostile clients may make the server log in ten seconds
 
 # -- the hostile
 
+# Connections that act, and that are left hanging: together somewhat more than one user may have.
 AT_ONCE, MOST_HELD = 10, 8
-"""Connections that act, and that are left hanging: together somewhat more than one user may have."""
+# The connections come from many users, because one may not have many.
 FIRST_UID, USERS, OF_ONE_USER = 60_000, 1_000, 20
-"""The connections come from many users, because one may not have many."""
 PATIENCE_TURNS = 50_000
 _SHUTDOWN = request("shutdown")
 
@@ -68,8 +64,7 @@ class Hostile:
 
     def __init__(self, stream: Any, chance: random.Random, answers: collections.Counter[str]) -> None:
         self.stream, self.chance, self.answers = stream, chance, answers
-        self.is_held = False
-        """It stays open and says no more."""
+        self.is_held = False  # it stays open and says no more
 
     def hold(self) -> None:
         self.is_held = True
@@ -320,8 +315,8 @@ class Besieged:
     def __init__(self) -> None:
         self.simulation = Simulation(SensorOptions(signal="clock", ppm=150.0))
         self.log = io.StringIO()
+        # What others were granted although it needs a right that they do not have.
         self.granted: list[JsonObject] = []
-        """What others were granted although it needs a right that they do not have."""
         self._streams: list[InMemoryStream] = []
         assert self.simulation.hub._handler is not None
         self._handle = self.simulation.hub._handler

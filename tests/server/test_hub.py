@@ -35,8 +35,7 @@ from tests.simulation import Client, Simulation, check_frames, life_of, reading
 
 DESCRIBE = encode_json({"action": "describe"})
 ANSWER = {"reply": "describe", "ok": True}
-TURN_NS = 1_250_000
-"""Time between two deadlines: the acquisition loop's at 800 Hz."""
+TURN_NS = 1_250_000  # time between two deadlines: the acquisition loop's at 800 Hz
 
 
 def decoded(data: bytes | bytearray) -> list[Any]:
@@ -689,8 +688,7 @@ def test_shutdown_ends_the_loop_and_takes_the_sensor_to_init() -> None:
 # -- eight clients at 800 Hz, half of them troublesome
 
 ALL_FOR_S = 2.0
-SMALL_BUFFER = 4096
-"""Bytes on their way to a client that reads slowly; a kernel holds more."""
+SMALL_BUFFER = 4096  # bytes on their way to a client that reads slowly; a kernel holds more
 
 
 class Troublesome:

@@ -532,8 +532,8 @@ def test_given_up_in_the_second_attempt(at: int, monkeypatch: pytest.MonkeyPatch
 
 # -- among the devices of other vendors sensors stream as if alone, and nothing is done to the others
 
+# All that may be written to a slave that is no sensor.
 READING_THE_SII: Final = range(reg.SII_OWNER, reg.SII_DATA)
-"""All that may be written to a slave that is no sensor."""
 KINDS: Final = ("EK1100", "EL3102", "DRIVE", "DRIVE:PREOP")
 
 
