@@ -160,11 +160,8 @@ class Cycle:
             wanted = [stream.clock.next_poll_ns() for stream in streams]
             latest_ns = min(wanted) + self._spacing_ns
             poll_ns = max([each for each in wanted if each <= latest_ns])
-        due_ns, earliest_ns = (
-            poll_ns - min(timing.late_ns, _LONGEST_LEAD_NS),
-            timing.sent_ns + self._spacing_ns,
-        )
-        return max(int(due_ns), int(earliest_ns), self._bus.process_data.blocked_until_ns)
+        due_ns = poll_ns - min(timing.late_ns, _LONGEST_LEAD_NS)
+        return int(max(due_ns, timing.sent_ns + self._spacing_ns, self._bus.process_data.blocked_until_ns))
 
     def _plan(self) -> None:
         """Derive from the sensors' rates, which change, how exchanges follow each other; once a second."""
@@ -257,10 +254,7 @@ class Cycle:
             self._hub.publish(new, back)
         timing.in_flight, timing.unanswered = sent < timing.sent_ns, 0
         self._exchange.record(back - sent)
-        learners = []
-        for row in carried:
-            if row[-1].finish(exchange):
-                learners.append(row[-1].clock)
+        learners = [row[-1].clock for row in carried if row[-1].finish(exchange)]
         if learners or not timing.short_ns < back - sent < timing.usual_ns + self._shortest_ns:
             self._learn(exchange, learners)
 

@@ -62,7 +62,7 @@ class DifferentSensorError(Exception):
 
 
 class _Change(NamedTuple):
-    """A change of settings under way: what to go back to, whom to tell, why it failed if it did."""
+    """A change of settings under way: the former settings, whom to answer, why it failed if it did."""
 
     wanted: dict[str, SettingValue]
     asked: frozenset[str]
@@ -72,7 +72,7 @@ class _Change(NamedTuple):
 
 
 class SensorRecovery:
-    """Of one sensor; to be made while it is in OP.
+    """Notices that one sensor is lost, brings it back, changes its settings; to be made while it is in OP.
 
     It goes by the sensor's AL status: SAFEOP with error is acknowledged; SAFEOP goes to OP; any other state
     means that the sensor started anew, so it is set up from INIT. One that does not answer may have lost its
@@ -195,7 +195,7 @@ class SensorRecovery:
         self._announce(event(Event.SENSOR_LOST, sensor=self._number, reason=reason, message=message))
 
     def _revert(self, error: BusError) -> None:
-        """The change failed: the former settings are what is wanted again."""
+        """The change failed: the former settings are wanted again."""
         sensor, change = self._sensor, self._change
         assert change is not None
         log.warning("sensor %d keeps its former settings: %s", self._number, error)
