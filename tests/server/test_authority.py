@@ -216,9 +216,10 @@ GOING: Sequence[Callable[[socket.socket], None]] = (
 @with_server
 def test_asking_and_being_gone_at_once_changes_nothing(shared: Server) -> None:
     """The kernel shows a socket that nobody holds any more as root's."""
-    before = what_can_be_changed(shared)
+    before, descriptors = what_can_be_changed(shared), Path(f"/proc/{shared.process.pid}/fd")
     with shared.connect() as watcher:
         watcher.ask("subscribe")
+        opened = len(list(descriptors.iterdir()))
         for number, (action, go, _) in enumerate(itertools.product(CONTROL, GOING, range(6))):
             encode = encode_bare_json if number % 3 == 0 else encode_json
             # The server may be rid of it already.
@@ -227,7 +228,7 @@ def test_asking_and_being_gone_at_once_changes_nothing(shared: Server) -> None:
                 sock.sendall(encode(request(action, **CONTROL[action])))
                 go(sock)
         assert what_can_be_changed(shared) == before, "after all that it sent was read"
-        assert shared.process.poll() is None
+        wait_until(lambda: len(list(descriptors.iterdir())) <= opened, "all connections to be closed")
         told = {event["event"] for event in watcher.events}
         assert told <= {"sensor_lost", "sensor_back"}, "a busy machine starves the sensor, nothing else"
         watcher.fresh(10)
