@@ -68,6 +68,22 @@ AT_REST = SensorOptions(signal="rest")
 _EXCUSE = int(DataFlag.GAP | DataFlag.REPEATED)
 
 
+class ManualClock:
+    """A clock that stands still until it is advanced."""
+
+    def __init__(self, now_ns: int = 1_000_000_000) -> None:
+        self.now_ns = now_ns
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    def time_ns(self) -> int:
+        return self.now_ns
+
+    def sleep(self, seconds: float, /) -> None:
+        self.now_ns += round(seconds * 1e9)
+
+
 class Asked:
     """What command line and configuration ask of the sensors; see `start_up.Wanted`."""
 

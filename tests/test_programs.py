@@ -11,12 +11,10 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Final
 
 import pytest
 
-from bota_clients import program
 from bota_ethercat.program.output import never_fail
 from ethercat_server import programs
 from ethercat_server.virtual_sensor.cli import main as virtual_sensor
@@ -26,7 +24,6 @@ ROOT: Final = Path(__file__).parent.parent
 SCRIPTS: Final[dict[str, str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 PROGRAMS: Final = {name: entry for name, entry in SCRIPTS.items() if name != "bridge-client"}
 CLIENTS: Final = [name for name, entry in PROGRAMS.items() if entry.startswith("bota_clients.")]
-UNKNOWN: Final = "numpy is not installed: in this project's folder run PIP '.[client]'"
 EXTRA: Final = ("jinja2", "matplotlib", "mcap", "numpy", "rich", "textual", "zstandard")
 
 INTERRUPTED: Final = """
@@ -145,27 +142,6 @@ for name, entry in {[(name, PROGRAMS[name]) for name in CLIENTS]!r}:
     assert (done.returncode, done.stderr) == (0, "")
     for name in CLIENTS:
         assert f"usage: {name}" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("url", "what"),
-    [
-        ({"url": ROOT.as_uri(), "dir_info": {}}, f"numpy is not installed: PIP '{ROOT}[client]'"),
-        (
-            {"url": "https://example.org/a.git", "vcs_info": {"vcs": "git"}},
-            "numpy is not installed: PIP 'bota-ethercat-bridge[client] @ git+https://example.org/a.git'",
-        ),
-        ({"url": "file:///no/such/folder"}, UNKNOWN),
-        (None, UNKNOWN),
-    ],
-)
-def test_what_is_missing_comes_from_where_this_came_from(
-    url: object, what: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = None if url is None else json.dumps(url)
-    monkeypatch.setattr(program, "_CHECKOUT", Path("/no/checkout"))
-    monkeypatch.setattr(program, "distribution", lambda _: SimpleNamespace(read_text=lambda _: text))
-    assert program.missing("numpy.linalg") == what.replace("PIP", f"{sys.executable} -m pip install")
 
 
 @pytest.mark.parametrize(

@@ -24,16 +24,14 @@ from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import STATE_S, AlState, AlStatus
-from ethercat_server.ethercat.slave.coe import Steps
+from ethercat_server.ethercat.slave.coe import Emergency, Steps
 from ethercat_server.ethercat.slave.controller import GoneError
-from ethercat_server.ethercat.slave.emergencies import Emergency
 from ethercat_server.ethercat.slave.sii import read_sii
-from ethercat_server.sensor.configuration import IN_FORCE, LATER, Change
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import is_sensor
 from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
-from ethercat_server.sensor.set_up import identify, set_up, set_up_in_op
+from ethercat_server.sensor.set_up import IN_FORCE, LATER, Change, identify, set_up, set_up_in_op
 
 _SHORT_EXCHANGES: Final = 2  # short working counters, almost in a row, before the sensors' states are read
 # Time without a frame coming back after which all sensors are lost; a single lost frame never suffices.

@@ -129,9 +129,9 @@ def _check(args: argparse.Namespace) -> None:
     for name in ("rt_priority", "cpu"):
         value, setting = getattr(args, name), SERVER_SETTINGS[name]
         try:
-            setting.parse(str(value)) if value is not None else None
-        except ValueError as error:
-            raise UsageError(f"{setting.flag} {value}: it must be {error}") from None
+            setting.parse_argument(str(value)) if value is not None else None
+        except argparse.ArgumentTypeError as error:
+            raise UsageError(f"{setting.flag} {value}: it {error}") from None
     last = (os.cpu_count() or 1) - 1
     if args.cpu is not None and args.cpu > last:
         raise UsageError(f"--cpu {args.cpu}: this machine has the processors 0 to {last}")

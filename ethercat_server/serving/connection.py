@@ -9,9 +9,9 @@ from typing import Final, NamedTuple
 
 from bota_ethercat.errors import BadMessageError, RemoteProtocolError
 from bota_ethercat.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, encode_json
-from bota_ethercat.text.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import OutgoingFrame
+from ethercat_server.serving.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from ethercat_server.serving.transport import Stream
 
 MAX_REQUEST_LENGTH: Final = 4096

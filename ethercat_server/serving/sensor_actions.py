@@ -16,10 +16,10 @@ from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.sii import read_sii
-from ethercat_server.sensor.configuration import Change, apply_in_op, save
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.access import bytes_to_write, entry_named, read, read_named, write
 from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.sensor.set_up import Change, apply_in_op, save
 from ethercat_server.sensor.tare import tare
 from ethercat_server.serving.connection import Connection
 from ethercat_server.serving.hub import Hub

@@ -19,8 +19,13 @@ from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Sdo, Steps, finish
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION, ObjectEntry
-from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, find_objects, similar_names
+from ethercat_server.sensor.objects.dictionary import (
+    FACTORY_CALIBRATION,
+    KNOWN_OBJECTS,
+    ObjectEntry,
+    find_objects,
+    similar_names,
+)
 from ethercat_server.sensor.scan import look_safely
 from ethercat_server.sensor.sensor import Found, Identity
 from ethercat_server.sensor.set_up import read_sinc

@@ -27,12 +27,10 @@ from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignmen
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
 from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
 from ethercat_server.process.signals import signals_held_back
-from ethercat_server.sensor.configuration import Change, save
 from ethercat_server.sensor.objects import dictionary
-from ethercat_server.sensor.objects.dictionary import OBJECTS, Access, ObjectEntry
-from ethercat_server.sensor.objects.search import BY_ADDRESS, KNOWN_OBJECTS
+from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, KNOWN_OBJECTS, OBJECTS, Access, ObjectEntry
 from ethercat_server.sensor.sensor import Found, Identity, Sensor
-from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
+from ethercat_server.sensor.set_up import Change, pack_offset, read_offset, save, write_offset
 from ethercat_server.tool.command import (
     CHANGES,
     DONE,

@@ -19,8 +19,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final, Self, TextIO
 
-from ethercat_server.ethercat.nic import look_up
-from ethercat_server.ethercat.raw_socket import arrived_ns
+from ethercat_server.ethercat.nic import arrived_ns, look_up
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, QuitCommand, obey

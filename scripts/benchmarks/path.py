@@ -36,7 +36,7 @@ _NOT_COUNTED: Final = ("/simulation/", "/virtual_sensor/")
 # What each of these is in a server that has a network interface, and TCP.
 _SYSTEM_CALLS: Final = {
     (MemoryBackend, "send"): 1,
-    (MemoryBackend, "receive"): 2,  # poll and recv, of which a look in vain needs the first only
+    (MemoryBackend, "receive"): 2,  # select and recv, of which a look needs the second only
     (MemoryBackend, "arrived_ns"): 1,
     (InMemoryTransport, "wait"): 1,
     (InMemoryStream, "send"): 1,

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rich.console import Console
+from rich.text import Text
 
 from bota_clients.monitor.model import State
 from bota_clients.monitor.screen import Look, render
@@ -20,7 +21,9 @@ def svg(state: State, look: Look, width: int, height: int) -> str:
         width=width, height=height, record=True, file=io.StringIO(), force_terminal=True,
         color_system="truecolor", legacy_windows=False, _environ={},
     )  # fmt: skip
-    for row in render(state, look, width, height):
+    head, body, foot = render(state, look, width)
+    room = height - len(head) - len(foot)
+    for row in [*head, *body[:room], *[Text()] * (room - len(body)), *foot]:
         console.print(row, soft_wrap=True)
     return console.export_svg(title="ethercat-monitor", unique_id="monitor")
 

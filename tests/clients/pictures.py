@@ -20,7 +20,6 @@ from PIL import Image, PngImagePlugin
 from bota_clients.monitor.web.server import read_page
 from bota_clients.report.checks import Examination
 from bota_clients.report.page import render
-from tests.clients import chromium
 from tests.clients import monitor_states as made
 from tests.clients.devtools import browser
 from tests.clients.monitor_states import RATE_HZ, frame, now
@@ -66,11 +65,13 @@ def report_digest(page: str) -> str:
 
 
 def draw_report(name: str, scratch: Path) -> None:
-    page = report_page()
-    source, drawn = scratch / "report.html", scratch / "drawn.png"
-    source.write_text(page, encoding="utf-8")
-    said = chromium.screenshot(source, drawn, 960, 3480)
-    _keep(drawn, name, report_digest(page), 160, said)
+    text, source = report_page(), scratch / "report.html"
+    source.write_text(text, encoding="utf-8")
+    with browser(scratch) as page:
+        page.size(960, 3480)
+        page.open(source.as_uri())
+        page.screenshot(scratch / "drawn.png")
+        _keep(scratch / "drawn.png", name, report_digest(text), 160, page.complaints)
 
 
 def web_digest() -> str:

@@ -225,8 +225,14 @@ class Server(Program):
 
 
 @contextlib.contextmanager
-def server(ifname: str, *arguments: str, port: int = 0, under: Sequence[str] = ()) -> Iterator[Server]:
-    running = _streaming(ifname, *arguments, port=port, under=under)
+def server(
+    ifname: str,
+    *arguments: str,
+    port: int = 0,
+    under: Sequence[str] = (),
+    python: str | Path = sys.executable,
+) -> Iterator[Server]:
+    running = _streaming(ifname, *arguments, port=port, under=under, python=python)
     try:
         yield running
     finally:
@@ -255,10 +261,10 @@ def starved(said: str) -> bool:
     return any(words in said for words in _STARVED)
 
 
-def _streaming(ifname: str, *arguments: str, port: int, under: Sequence[str]) -> Server:
+def _streaming(ifname: str, *arguments: str, port: int, under: Sequence[str], python: str | Path) -> Server:
     """A server that streams; started again where the sensor was starved."""
     for attempt in range(ATTEMPTS):
-        running = Server(ifname, *arguments, port=port, under=under)
+        running = Server(ifname, *arguments, port=port, under=under, python=python)
         try:
             return running.wait_streaming()
         except BaseException:

@@ -23,8 +23,8 @@ import pytest
 
 from bota_ethercat.control import request
 from bota_ethercat.framing import encode_json
-from bota_ethercat.text.bare_json import encode_bare_json
 from ethercat_server.errors import UsageError
+from ethercat_server.serving.bare_json import encode_bare_json
 from ethercat_server.serving.permissions import controlling_uids
 from ethercat_server.serving.transport import open_diagnostics, peer_uid
 from tests.rights import NOBODY, needs_another_user, socket_of

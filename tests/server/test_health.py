@@ -11,7 +11,7 @@ import pytest
 
 from bota_ethercat.pdo import LAYOUTS, encode
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.ethercat.slave.emergencies import Emergency
+from ethercat_server.ethercat.slave.coe import Emergency
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions

@@ -28,10 +28,10 @@ from ethercat_server.serving.connection import (
     Subscription,
 )
 from ethercat_server.serving.hub import Hub
-from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport, ManualClock
+from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.server.running import OLD
-from tests.simulation import Client, Simulation, check_frames, life_of, reading
+from tests.simulation import Client, ManualClock, Simulation, check_frames, life_of, reading
 
 DESCRIBE = encode_json({"action": "describe"})
 ANSWER = {"reply": "describe", "ok": True}

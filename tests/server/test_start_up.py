@@ -24,7 +24,7 @@ from ethercat_server.acquisition.start_up import Started, Wanted, bring_up
 from ethercat_server.daemon.cli import main
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.errors import BusError, ServerError, SetUpError, StopRequestedError
-from ethercat_server.ethercat import mapping, nic
+from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import registers as reg
@@ -229,15 +229,16 @@ def test_mailboxes_that_no_frame_can_carry(monkeypatch: pytest.MonkeyPatch, size
 @pytest.mark.parametrize("times", [1, 2, 9])
 def test_an_fmmu_that_was_not_written(monkeypatch: pytest.MonkeyPatch, unit: int, times: int) -> None:
     """SOEM does not notice; without outputs the sensor's watchdog would take it out of OP again and again."""
-    map_process_data, left = mapping.map_process_data, [times]
+    map_process_data, left = Bus.map, [times]
 
-    def odd(sensors: Sequence[SlaveController], *arguments: Any) -> None:
-        map_process_data(sensors, *arguments)
+    def odd(bus: Bus, slave: SlaveController, *arguments: Any) -> int:
+        end = map_process_data(bus, slave, *arguments)
         left[0] -= 1
         if left[0] >= 0:
-            sensors[0].write(FMMU + unit * FMMU_SIZE, bytes(FMMU_SIZE))
+            slave.write(FMMU + unit * FMMU_SIZE, bytes(FMMU_SIZE))
+        return end
 
-    monkeypatch.setattr(mapping, "map_process_data", odd)
+    monkeypatch.setattr(Bus, "map", odd)
     if times < 3:
         assert start(MemoryBackend()).sensors[0].streams
     else:
@@ -258,7 +259,7 @@ class Misled:
 
     def scan(self, positions: Sequence[int], _: CheckInterrupt) -> None:
         self._do("scan")
-        mapping.assign_stations(self.bus, positions, ())
+        self.bus.assign_stations(positions)
         if self.step != "mailboxes":
             for position in positions:
                 managers = pack_sync_manager(0x1000, 128, 0x26) + pack_sync_manager(0x1080, 128, 0x22)
@@ -401,7 +402,7 @@ def test_a_drive_at_work_is_not_touched(drive: int, state: AlState) -> None:
     assert found.life is not None
     found.life.esc.memory[reg.AL_STATUS] = state
     before = registers(backend)
-    with pytest.raises(BusError, match=rf"no Bota sensors \(position {drive} in {state.name}\).*--force"):
+    with pytest.raises(BusError, match=rf"not Bota sensors \(position {drive} in {state.name}\).*--force"):
         bring_up(bus := Bus(backend), Asked(), lambda: None)
     bus.close()
     assert registers(backend) == before
@@ -602,6 +603,15 @@ def test_sensors_stream_as_if_alone(text: str) -> None:
     assert_left_alone(simulation, text)
     simulation.close()
     assert_left_alone(simulation, text)
+
+
+def test_pysoem_is_not_asked_to_scan_what_others_share() -> None:
+    """It would write to every slave before it counted them."""
+    backend = chain("BOTA,DRIVE:PREOP")
+    bus = Bus(backend)
+    backend.master = misled = Misled(bus, "scan")  # type: ignore[assignment]
+    assert bring_up(bus, Asked(), lambda: None).sensors[0].streams
+    assert not misled.failed
 
 
 def test_one_that_goes_away_is_told_and_costs_the_others_nothing(caplog: pytest.LogCaptureFixture) -> None:

@@ -18,8 +18,9 @@ import pytest
 
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.serving.transport import SocketTransport, Stream, Transport
-from ethercat_server.simulation.transport import InMemoryTransport, ManualClock
+from ethercat_server.simulation.transport import InMemoryTransport
 from tests.server.running import free_port
+from tests.simulation import ManualClock
 
 PATIENCE_S = 20.0
 

@@ -98,7 +98,7 @@ def test_other_interfaces_without_a_sensor_are_told_apart(
         rows = found(monkeypatch, *(Adapter(name) for name in (*buses, "denied")))
     assert rows["empty"]["found"] == "no EtherCAT slave answers"
     assert rows["foreign"]["found"] == "another EtherCAT slave"
-    assert "has slaves at work that are no Bota sensors (position 1 in OP)" in str(rows["at_work"]["found"])
+    assert "has slaves at work that are not Bota sensors (position 1 in OP)" in str(rows["at_work"]["found"])
     assert registers(at_work) == before
     assert "run with sudo" in str(rows["denied"]["found"])
     assert [name for name, row in rows.items() if row["sensors"]] == ["ens5"]

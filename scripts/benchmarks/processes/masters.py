@@ -19,7 +19,7 @@ from array import array
 from pathlib import Path
 from typing import Any, Final
 
-from ethercat_server.ethercat.raw_socket import packet_sockets
+from ethercat_server.ethercat.soem import packet_sockets
 from scripts.benchmarks.chain import ScriptError
 from scripts.benchmarks.records import PORT, write
 
