@@ -25,8 +25,7 @@ from bota_ethercat.text.json_text import JsonObject
 from tests.rights import socket_of
 
 Test = TypeVar("Test", bound=Callable[..., None])
-OLD = int(DataFlag.REPEATED | DataFlag.INVALID)
-"""Flags of frames that carry no new sample."""
+OLD = int(DataFlag.REPEATED | DataFlag.INVALID)  # flags of frames that carry no new sample
 START_TIMEOUT_S = 40.0
 PATIENCE_S = 30.0
 
@@ -240,6 +239,7 @@ def server(
         running.close()
 
 
+# What it says at start where a busy machine lets the virtual sensor's process wait for too long.
 _STARVED = (
     "no EtherCAT slave answers",
     "stopped answering",
@@ -253,7 +253,6 @@ _STARVED = (
     "does not go to",  # after a lost frame of SOEM's set-up
     "maps process data of",  # as much of it as SOEM could read in its time
 )
-"""What it says at start where a busy machine lets the virtual sensor's process wait for too long."""
 ATTEMPTS = 5
 
 
@@ -368,8 +367,7 @@ class FramedClient:
     ) -> None:
         self.send_all, self.wait = send_all, wait
         self.frames: list[DataMessage] = []
-        self.events: list[JsonObject] = []
-        """Those that `wait_event` has not returned."""
+        self.events: list[JsonObject] = []  # those that `wait_event` has not returned
         self.replies: list[JsonObject] = []
         self._decoder = FrameDecoder()
         self._id = 0

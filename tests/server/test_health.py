@@ -17,8 +17,7 @@ from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import Simulation, check_frames, life_of
 
-SLOW = {"sinc_length": 512}
-"""The fewer samples, the faster it is simulated."""
+SLOW = {"sinc_length": 512}  # the fewer samples, the faster it is simulated
 
 
 @pytest.fixture

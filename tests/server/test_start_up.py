@@ -110,13 +110,6 @@ def test_wrong_arguments(caplog: pytest.LogCaptureFixture, arguments: str, code:
     assert re.search(complaint, fails(caplog, *arguments.split(), code=code))
 
 
-def test_port_taken(caplog: pytest.LogCaptureFixture) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = other.getsockname()[1]
-        said = fails(caplog, "virtual", str(port))
-    assert f"port {port} on 127.0.0.1 is in use by another program" in said
-
-
 def test_too_few_open_files() -> None:
     """A process, whose listening sockets are too many."""
     command = f"ulimit -n 6; exec {sys.executable} -m ethercat_server.daemon.cli lo {free_port()}"
@@ -139,6 +132,13 @@ def test_interfaces_without_sensor(caplog: pytest.LogCaptureFixture, monkeypatch
         veth.ip("link", "set", veth.far, "down")
         veth.ip("link", "set", veth.near, "up")
         assert f"{veth.near} has no carrier: check the cable" in fails(caplog, veth.near, "PORT")
+
+
+def test_a_port_that_is_taken(caplog: pytest.LogCaptureFixture) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        said = fails(caplog, "virtual", str(port))
+    assert f"port {port} on 127.0.0.1 is in use by another program" in said
 
 
 # -- sensors that are not what they must be, in memory
@@ -417,17 +417,6 @@ def test_a_sensor_left_in_op_is_no_obstacle(pdo_size: int) -> None:
     assert [sensor.streams for sensor in sensors] == [True, True]
 
 
-def test_a_drive_that_is_not_at_work_may_be_scanned() -> None:
-    slaves = look_safely(Bus(chain("BOTA:OP,DRIVE:PREOP")), lambda: None)
-    assert [slave.name for slave in slaves] == ["BFT-SENS-ECAT-M8", "DRIVE"]
-
-
-def test_an_eeprom_is_not_asked_without_pause_whether_it_has_read_a_word() -> None:
-    backend = MemoryBackend()
-    start(backend)
-    assert backend.sensors.frames < 1500, "half of them are for the EEPROM: 107 reads of 2 ms"
-
-
 class OthersFrames(MemoryBackend):
     """Frames of another master come by, one each `every_s`."""
 
@@ -449,9 +438,7 @@ def test_another_master_is_left_alone() -> None:
     with pytest.raises(BusError, match=r"another EtherCAT master is sending on .*: stop it"):
         look_safely(Bus(backend), lambda: None)
     assert registers(backend) == before
-
-
-def test_the_last_frames_of_a_killed_master_are_no_obstacle() -> None:
+    # The last frames of one that was killed are no obstacle.
     assert len(look_safely(Bus(OthersFrames(0.001, 2)), lambda: None)) == 1
 
 
@@ -546,8 +533,8 @@ def test_given_up_in_the_second_attempt(at: int, monkeypatch: pytest.MonkeyPatch
 
 # -- among the devices of other vendors sensors stream as if alone, and nothing is done to the others
 
+# All that may be written to a slave that is no sensor.
 READING_THE_SII: Final = range(reg.SII_OWNER, reg.SII_DATA)
-"""All that may be written to a slave that is no sensor."""
 KINDS: Final = ("EK1100", "EL3102", "DRIVE", "DRIVE:PREOP")
 
 
