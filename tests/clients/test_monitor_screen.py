@@ -14,7 +14,7 @@ from bota_clients.monitor.screen import KEYS, Look, bar, render, scale_for, tabl
 from bota_clients.monitor.words import json_line
 from bota_ethercat.framing import DataMessage
 from tests.clients import monitor_states as made
-from tests.clients.captures import DOCS, captures
+from tests.clients.pictures import AGAIN, DOCS, captures
 
 STATES = {"healthy": made.healthy, "troubled": made.troubled, "gone": made.gone}
 
@@ -103,8 +103,7 @@ def test_no_fact_is_told_by_color_alone() -> None:
 
 @pytest.mark.parametrize("name", ["monitor.svg", "monitor-warnings.svg", "monitor-gone.svg"])
 def test_captures_are_in_step(name: str) -> None:
-    """If this fails, look at the new ones: `python -m tests.clients.captures`."""
-    assert _texts((DOCS / name).read_text()) == _texts(captures()[name])
+    assert _texts((DOCS / name).read_text()) == _texts(captures()[name]), AGAIN
 
 
 def _texts(svg: str) -> list[str]:

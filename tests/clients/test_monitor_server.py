@@ -30,7 +30,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
-from tests.clients.captures import DOCS
+from tests.clients.pictures import DOCS
 from tests.rights import NO_OTHER_USER
 from tests.served_simulation import ServedSimulation, served
 from tests.server.running import PATIENCE_S, free_port, wait_until
