@@ -40,7 +40,7 @@ PUBLIC: Final = ("bota_ethercat", "bota_ethercat.client")
 
 ROOMS: Final[dict[str, set[str]]] = {
     "bota_ethercat": PROTOCOL - {"bota_ethercat.health", "bota_ethercat.program"},
-    "bota_ethercat.program": {"bota_ethercat", "bota_ethercat.program"},
+    "bota_ethercat.program": {"bota_ethercat", "bota_ethercat.program", "bota_ethercat.sensor"},
     "bota_ethercat.text": {"bota_ethercat.text", "bota_ethercat.errors"},
     "bota_ethercat.sensor": PROTOCOL - {"bota_ethercat.health", "bota_ethercat.program"},
     "bota_ethercat.health": PROTOCOL,
@@ -98,8 +98,6 @@ PACKAGES: Final[dict[str, set[str]]] = {
 
 WITHOUT_ROS: Final = (
     "bridge.stream", "bridge.client", "bridge.process", "bridge.parameters.table",
-    "bridge.compensating.tool_sources",
-    "bridge.diagnostics.health",
 )  # fmt: skip
 """What can run, and be tested, where there is no ROS; `bridge.client` loads it later."""
 SOCKETS: Final = {"socket", "socketserver", "select", "selectors", "asyncio", "ssl"}

@@ -114,17 +114,6 @@ def test_a_terminal_without_the_characters_gets_them_spelled(monkeypatch: pytest
     assert json.loads(as_json) == {"name": "é😀 5 us"}
 
 
-def test_the_doctor_writes_to_an_ascii_terminal() -> None:
-    """A process, because Python makes its output at the start."""
-    package, _, entry = PROGRAMS["ethercat-doctor"].partition(":")
-    done = subprocess.run(
-        [sys.executable, "-c", f"from {package} import {entry}; {entry}()", "no-such-one", "--seconds", "0"],
-        env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, check=False,
-    )  # fmt: skip
-    assert b"Traceback" not in done.stderr
-    assert b"no-such-one" in done.stdout.decode("ascii").encode()
-
-
 def test_help_needs_nothing_of_the_extra() -> None:
     """A process, in which none of it can be imported."""
     script = f"""

@@ -21,18 +21,17 @@ from rclpy.utilities import remove_ros_args
 
 from bota_ethercat.client.channel import Channel
 from bridge.compensating.control import CompensationControl
-from bridge.diagnostics.monitor import Monitor
+from bridge.diagnostics import Monitor
 from bridge.parameters.declare import LiveParameters, SettingsParameters, declare, warn_of_others
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import Worker, call_on_stop_signal, prepare
 from bridge.publishing.compensated_wrench import CompensatedOutput
-from bridge.publishing.messages import make_measured
+from bridge.publishing.messages import Stamps, make_measured
 from bridge.services import BiasServices, IdentifyServices, SensorServices
 from bridge.spinning import PartExecutor, Spinner
 from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
 
-SUPERVISOR_TOPIC = "/supervisor_status_data"
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
 SERVER_GOES_ON: Final = 3  # exit code: the supervisor stopped the node, but the server refused to shut down
 
@@ -56,8 +55,9 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
         self.parameters = parameters = declare(self)
-        compensated = CompensatedOutput(self, parameters, lambda: self.reader.link.rate_hz)
-        self.outputs = Outputs([*make_measured(self, parameters), compensated])
+        self.stamps = stamps = Stamps(self.get_logger())
+        compensated = CompensatedOutput(self, parameters, stamps, lambda: self.reader.link.info.rate_hz)
+        self.outputs = Outputs([*make_measured(self, parameters, stamps), compensated])
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
@@ -68,21 +68,22 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.compensation = CompensationControl(self, parameters, compensated, self.reader, live)
         live.apply = self._apply
         self.monitor = Monitor(
-            self, parameters.limits, self.reader, self.compensation.state, self.outputs, self.fail
+            self, parameters.limits, self.reader, self.compensation.state, self.outputs, stamps, self.fail
         )
-        SensorServices(self, link, self.sensor_settings, self.compensation.own_offset.after_tare)
+        SensorServices(self, link, self.sensor_settings)
         BiasServices(self, self.compensation)
         IdentifyServices(self, self.compensation)
         warn_of_others(self)
         link.on_change = self._on_link_change
-        self.create_subscription(
-            KeyValue,
-            SUPERVISOR_TOPIC,
-            self._on_supervisor,
-            10,
-            callback_group=MutuallyExclusiveCallbackGroup(),  # it is heard while a service waits
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        if parameters.supervisor_topic:
+            self.create_subscription(
+                KeyValue,
+                parameters.supervisor_topic,
+                self._on_supervisor,
+                10,
+                callback_group=MutuallyExclusiveCallbackGroup(),  # received while a service waits
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
 
     @classmethod
     def create(cls, arguments: Sequence[str] | None = None) -> Self:
@@ -100,6 +101,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         return node
 
     def _apply(self, parameters: Parameters) -> None:
+        self.stamps.update(parameters.stamp, self.reader.link)
         self.compensation.apply(parameters)
         self.monitor.limits = parameters.limits
         self.reader.limit_rate(parameters.publishing_frequency)
@@ -107,6 +109,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
             output.configure(parameters)
 
     def _on_link_change(self) -> None:
+        self.stamps.update(self.compensation.parameters.stamp, self.reader.link)
         self.compensation.link_changed()
         self.sensor_settings.changed()
 
@@ -186,7 +189,7 @@ def spin(node: BridgeNode, on_started: Callable[[], object] = lambda: None) -> i
             node.get_logger().error("a thread did not end in time")
         else:
             prompt.shutdown()
-        node.compensation.close()
+        node.compensation.choice.close()
         executor.shutdown()
         node.destroy_node()
 

@@ -1,4 +1,4 @@
-"""The services, all `std_srvs/Trigger`; the message says what came of it.
+"""The services, all `std_srvs/Trigger`; the message is the result.
 
 Each blocks the executor, and never the stream: until the server has answered or a time-out, or for the
 `rest.duration` of a window.
@@ -72,43 +72,31 @@ def _name(act: Callable[[], str]) -> str:
 class SensorServices:
     """What the server does, for every client."""
 
-    def __init__(
-        self, node: Node, link: Link, settings: SettingsParameters, after_tare: Callable[[], str]
-    ) -> None:
-        """`after_tare` says what a new offset in the sensor means for the rest of the node; "" if nothing."""
-        self._link, self._settings, self._after_tare = link, settings, after_tare
+    def __init__(self, node: Node, link: Link, settings: SettingsParameters) -> None:
+        self._link, self._settings = link, settings
         acts = self._sensor_tare, self._get_settings, self._apply_settings, self._save_settings
         _create_triggers(node, "", *acts)
 
     def _sensor_tare(self) -> str:
-        rate_hz = self._link.rate_hz or 800.0
+        rate_hz = self._link.info.rate_hz or 800.0
         samples = min(max(round(_TARE_S * rate_hz), _FEWEST_SAMPLES), _MOST_SAMPLES)
         timeout_s = _TARE_EXTRA_S + _TARE_PATIENCE * samples / rate_hz
         reply = self._link.ask("tare", timeout_s, sensor=self._link.sensor, samples=samples)
         titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
         parts = [f"{title} {offset_text(reply.get(key))}" for key, title in titles]
-        text = f"sensor {self._link.sensor} tared: " + "; ".join(parts)
-        also = self._after_tare()
-        return f"{text}. {also}" if also else text
+        return f"sensor {self._link.sensor} tared: " + "; ".join(parts)
 
     def _get_settings(self) -> str:
         info = find_sensor(self._link.ask("describe", DESCRIBE_TIMEOUT_S), self._link.sensor)
-        return json.dumps({**info.settings, "rate_hz": info.rate})
+        return json.dumps({**info.settings, "rate_hz": info.rate_hz})
 
     def _apply_settings(self) -> str:
         return f"sensor {self._link.sensor} has these settings now: {json.dumps(self._settings.apply())}"
 
     def _save_settings(self) -> str:
         # `configure` wants at least one setting: one as it is.
-        setting = next(iter(self._link.settings.items()), None)
-        sensor = self._link.sensor
-        if setting is None:
-            raise RequestFailedError(
-                f"the settings of sensor {sensor} are not known: there is no server at {self._link.address}, "
-                "or the sensor has none"
-            )
-        name, value = setting
-        self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=sensor, settings={name: value}, save=True)
+        sensor, settings = self._link.sensor, dict(list(self._link.info.settings.items())[:1])
+        self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=sensor, settings=settings, save=True)
         return f"sensor {sensor} keeps its settings and offset in its flash now"
 
 
@@ -124,17 +112,19 @@ class BiasServices:
         payload = control.parameters.payload
         window = take_window(control, needs_tool=payload.mass > 0)
         means = window.means()
-        felt: Vector3 | None = None
+        specific_force: Vector3 | None = None
         try:
             if conflict := control.conflict(needs_tool=True):
                 raise CompensationError(conflict)
-            felt = window.specific_force()
-            check_at_rest(felt, length(control.parameters.gravity))
+            specific_force = window.specific_force()
+            check_at_rest(specific_force, length(control.parameters.gravity))
         except CompensationError:
             if payload.mass:
                 raise
-            felt = None  # until there is a tool_mass nobody needs it
-        control.set_bias(estimate_bias(means, payload, felt or ZERO), "tare", Taken(payload, felt))
+            specific_force = None  # not needed without a tool_mass
+        control.set_bias(
+            estimate_bias(means, payload, specific_force or ZERO), "tare", Taken(payload, specific_force)
+        )
         if payload.mass:
             weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
         else:
@@ -170,7 +160,7 @@ class IdentifyServices:
         _create_triggers(node, "identify/", *acts)
 
     def _start(self) -> str:
-        if self._control.parameters.orientation.source == "none":
+        if self._control.parameters.gravity_source == "none":
             raise CompensationError("gravity_source is none, so a pose says nothing: set it, such as to imu")
         before = "" if self._poses is None else f", the {len(self._poses)} poses before are dropped"
         self._poses, self._result = [], None
@@ -186,8 +176,9 @@ class IdentifyServices:
         window = take_window(self._control, needs_tool=True)
         means = window.means()
         x, y, z = window.specific_force()
-        magnitude = length(self._control.parameters.gravity)
-        poses.append(pose_of(means, None if window.source.is_imu else (-x, -y, -z), magnitude))
+        parameters = self._control.parameters
+        gravity = None if window.source.is_imu else (-x, -y, -z)
+        poses.append(pose_of(means, gravity, length(parameters.gravity)))
         self._result = None
         x, y, z = (round(part, 2) + 0.0 for part in poses[-1].up)
         return (
@@ -240,9 +231,10 @@ class IdentifyServices:
             raise CompensationError("no identification was started: call identify/start first")
         return self._poses
 
-    def _sensor_now(self) -> tuple[int, object]:
+    def _sensor_now(self) -> tuple[str, object]:
         """What all poses must share: the sensor and its own offset."""
-        return self._control.sensors, self._control.link.offset
+        info = self._control.link.info
+        return info.serial, info.offset
 
     def _write(self, result: Identified, comment: list[str]) -> str:
         try:
@@ -258,7 +250,7 @@ class IdentifyServices:
         parameters, info = self._control.parameters, self._control.link.info
         if parameters.identify_file != AUTO:
             return expand(parameters.identify_file, "identify.file")
-        serial = info.serial if info is not None and info.serial.isalnum() else "unknown"
+        serial = info.serial if info.serial.isalnum() else "unknown"
         return directory_of(parameters.bias_directory) / f"sensor-{serial}-payload.yaml"
 
 
@@ -282,7 +274,7 @@ def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow
 
     CompensationError or RequestFailedError if they do not come or mean nothing.
     """
-    if (conflict := control.conflict(needs_tool=needs_tool)) is not None:
+    if conflict := control.conflict(needs_tool=needs_tool):
         raise CompensationError(conflict)
     link, clock = control.link, control.link.clock
     if not link.is_connected:
@@ -292,7 +284,7 @@ def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow
     window = RestWindow(seconds, limits, control.choice.source)
     patience_s = 1.5 * seconds + _PATIENCE_S
     deadline_s = clock.monotonic() + patience_s
-    info, offset, bad = link.info, link.offset, control.reader.not_finite
+    info, offset, bad = link.info, link.info.offset, control.reader.not_finite
     control.output.window = window
     try:
         while not clock.wait(window.done, _LOOK_S):
@@ -305,9 +297,9 @@ def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow
     finally:
         control.output.window = None
     # By what the reader knows: the executor, which would count another sensor, is the one that waits here.
-    if info is not None and link.info is not None and info.serial != link.info.serial:
+    if info.serial != link.info.serial:
         raise CompensationError("the sensor was replaced by another meanwhile: call again")
-    if offset != link.offset:
+    if offset != link.info.offset:
         raise CompensationError("the sensor's own offset was changed meanwhile: call again")
     if bad := control.reader.not_finite - bad:
         raise CompensationError(

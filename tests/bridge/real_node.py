@@ -28,12 +28,10 @@ from std_srvs.srv import Trigger
 
 from bridge.node import BridgeNode, spin
 from bridge.spinning import Spinner
-from tests.bridge.scripted_server import ScriptedServer
 from tests.server.running import wait_until
 
 PATIENCE_S = 45.0
 ASK_AGAIN_S = 5.0
-AHEAD_NS = 60 * 10**9  # longer than any test waits
 # Nodes that are done: `destroy_node` crashes the process now and then, so they end with it.
 _ENDED: list[Any] = []
 
@@ -99,10 +97,6 @@ class Listener(Asking):
         self._node.create_subscription(message_type, f"/{self.tag}/{topic}", messages.put, depth)
         return messages
 
-    def publish(self, message_type: Any, topic: str) -> Any:
-        """A publisher."""
-        return self._node.create_publisher(message_type, topic, 10)
-
     def ask(
         self, service_type: Any, name: str, request: Any, until: Callable[[], object] = lambda: False
     ) -> Any:
@@ -137,12 +131,13 @@ class Listener(Asking):
 
 
 class Log:
-    """The node's logger: passes on to rclpy's and keeps the text."""
+    """The node's logger: passes on to rclpy's and keeps the text, of what is throttled the first."""
 
     def __init__(self, logger: Any) -> None:
         self._logger = logger
         self.lines: list[str] = []
         self.warnings: list[str] = []
+        self._throttled: set[str] = set()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._logger, name)
@@ -150,7 +145,12 @@ class Log:
     def info(self, text: str) -> None:
         self.lines.append(text)
 
-    def warning(self, text: str) -> None:
+    def warning(self, text: str, throttle_duration_sec: float = 0.0) -> None:
+        if throttle_duration_sec:
+            kind = text.partition("(")[0]
+            if kind in self._throttled:
+                return
+            self._throttled.add(kind)
         self.warnings.append(text)
         self.info(text)
 
@@ -171,7 +171,17 @@ class LoggedNode(BridgeNode):
         return "\n".join(self.get_logger().lines)
 
 
-class NodeThread:
+class Started:
+    """A node that runs."""
+
+    log: str  # all that it has said
+
+    def says(self, words: str) -> None:
+        """Wait until it has said `words`."""
+        wait_until(lambda: words in self.log, f"{words!r} in the log")
+
+
+class NodeThread(Started):
     """The node in a thread of this process, as `bridge.node.run` runs it."""
 
     def __init__(self, *arguments: str) -> None:
@@ -182,13 +192,8 @@ class NodeThread:
         self._thread.start()
 
     @property
-    def log(self) -> str:
-        """All that it has said."""
+    def log(self) -> str:  # type: ignore[override]
         return self.node.text
-
-    def says(self, words: str) -> None:
-        """Wait until it has said `words`."""
-        wait_until(lambda: words in self.log, f"{words!r} in the log")
 
     def ends(self) -> int:
         """Wait until it has ended; its exit code."""
@@ -202,7 +207,7 @@ class NodeThread:
         self.ends()
 
 
-class NodeProcess:
+class NodeProcess(Started):
     """`bridge-client` in a process of its own."""
 
     def __init__(self, *arguments: str) -> None:
@@ -212,14 +217,9 @@ class NodeProcess:
         )
 
     @property
-    def log(self) -> str:
-        """All that it has said."""
+    def log(self) -> str:  # type: ignore[override]
         self._log.seek(0)
         return self._log.read()
-
-    def says(self, words: str) -> None:
-        """Wait until it has said `words`."""
-        wait_until(lambda: words in self.log, f"{words!r} in the log")
 
     def ends(self) -> int:
         """Wait until it has ended; its exit code."""
@@ -259,18 +259,3 @@ def starter(listener: Listener, kind: Callable[..., Any]) -> Iterator[Callable[.
     finally:
         for node in started:
             node.close()
-
-
-def establish(server: ScriptedServer, listener: Listener) -> None:
-    """Send samples until one arrives at the listener, then until none is on the way.
-
-    From then on samples are dated ahead: the node skips those that it comes to read 50 ms after their time.
-    """
-    server.ahead_ns = AHEAD_NS
-    assert server.subscribed.wait(PATIENCE_S)
-    while listener.messages.empty():
-        server.send_sample(-1.0)
-        time.sleep(0.02)
-    server.send_sample(-2.0)
-    while listener.next_number() != -2.0:
-        pass

@@ -29,7 +29,8 @@ from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 from bota_ethercat.framing import FrameDecoder
 from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
-from bridge.diagnostics.monitor import TICK_S
+from bridge.diagnostics import TICK_S
+from bridge.parameters.table import PARAMETERS, gather
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from tests.bridge.real_node import PATIENCE_S, Asking, LoggedNode, retire
 from tests.bridge.scripted_server import Script, description
@@ -41,6 +42,7 @@ SETTINGS: JsonObject = {"sinc_length": 512, "fir": False, "acceleration_range_g"
 UP, SIDE, OVER = (0, 0, 1), (1, 0, 0), (0, 0, -1)
 ZERO6 = [0.0] * 6
 QUICK: dict[str, object] = {"rest.duration": 0.3, "bias_ramp_time": 0.0}
+DEFAULTS = gather({row.name: row.default for row in PARAMETERS})
 STEP_S = 0.01  # time passes in steps of this length: a sample each
 
 
@@ -157,8 +159,8 @@ class Server(Script):
         self._wire.end()
 
     def reconfigure(self, **changed: Any) -> None:
-        """Somebody has changed settings, and perhaps the rate."""
-        values = {name: changed.pop(name) for name in ("rate_hz",) if name in changed}
+        """Somebody has changed settings, and with them perhaps the rate and the delays."""
+        values = {name: changed.pop(name) for name in ("rate_hz", "delay_ms") if name in changed}
         self.send_json(event(Event.RECONFIGURED, sensor=0, settings={**SETTINGS, **changed}, **values))
 
     def hold(self, up: Sequence[float], **changes: Any) -> None:
@@ -262,7 +264,7 @@ class Node(Asking):
     def close(self) -> None:
         assert self.node.exit_code != 1, self.log
         self.node.reader.client.close()
-        self.node.compensation.close()
+        self.node.compensation.choice.close()
         retire(self.node)
 
     @property
@@ -336,19 +338,16 @@ class Node(Asking):
     def ask(self, service_type: Any, name: str, request: Any) -> Any:
         return self.call(name, request)
 
-    def do(self, name: str, *words: str) -> str:
-        """What a Trigger service says that does it, these words among it."""
-        done, text = self.trigger(name)
-        assert done, text
+    def do(self, name: str, *words: str, done: bool = True) -> str:
+        """What a Trigger service says that does it, or does not; these words among it."""
+        did, text = self.trigger(name)
+        assert did is done, text
         assert [word for word in words if word not in text] == [], text
         return text
 
     def refuse(self, name: str, *words: str) -> str:
         """What a Trigger service says that does not do it, these words among it."""
-        done, text = self.trigger(name)
-        assert not done, text
-        assert [word for word in words if word not in text] == [], text
-        return text
+        return self.do(name, *words, done=False)
 
     def set(self, name: str, value: Any) -> None:
         """Set a parameter, which the node takes."""

@@ -32,7 +32,6 @@ from tests.bridge.simulated_node import (
     sensed,
     six,
     stamp_ns,
-    streaming_description,
     values,
     weight,
 )
@@ -93,9 +92,8 @@ def test_what_is_subtracted_stands_beside_it(stages: Stages, node: Node) -> None
 def test_the_weight_goes_along_with_the_pose(stages: Stages, server: Server) -> None:
     for up in (SIDE, OVER, (1, 1, 1)):
         stages.at(up)
-    stages.at(
-        OVER, force_x=3.0, torque_y=0.25, wanted=[3.0, 0.0, 0.0, 0.0, 0.25, 0.0]
-    )  # what the environment does is left as it is
+    # What the environment does is left as it is.
+    stages.at(OVER, force_x=3.0, torque_y=0.25, wanted=[3.0, 0.0, 0.0, 0.0, 0.25, 0.0])
 
 
 def test_a_tare_takes_the_offset_and_leaves_the_tool(stages: Stages, server: Server, node: Node) -> None:
@@ -108,10 +106,8 @@ def test_a_tare_takes_the_offset_and_leaves_the_tool(stages: Stages, server: Ser
 
 
 def test_a_tare_waits_for_settled_data(stages: Stages, server: Server, node: Node) -> None:
-    description = streaming_description()
-    (row,) = description["sensors"]
+    (row,) = server.description["sensors"]
     row["settling"] = True
-    server.answers["describe"] = lambda _: {"ok": True, **description}
     server.hold(UP, force_x=5.0)  # it has not settled
 
     def settle() -> None:
@@ -119,13 +115,11 @@ def test_a_tare_waits_for_settled_data(stages: Stages, server: Server, node: Nod
         row["settling"] = False
 
     node.at(1.0, settle)
-    try:
-        node.do("tare")
-        assert list(node.parameters("bias")[0]) == pytest.approx(ZERO6, abs=1e-4)
-        row["settling"] = True
-        assert node.trigger("tare") == (False, "sensor 0 does not settle: see the server's log")
-    finally:
-        del server.answers["describe"]
+    node.do("tare")
+    assert list(node.parameters("bias")[0]) == pytest.approx(ZERO6, abs=1e-4)
+    row["settling"] = True
+    assert node.trigger("tare") == (False, "sensor 0 does not settle: see the server's log")
+    row["settling"] = False
 
 
 def test_a_tare_without_a_payload_takes_all(stages: Stages, server: Server, node: Node) -> None:
@@ -173,32 +167,11 @@ def test_a_tare_that_is_restored_is_for_the_tool_of_now(stages: Stages, server: 
         stages.at(OVER, bias=BIAS)
 
 
-def test_a_tare_with_the_same_result_is_of_its_own_pose(stages: Stages, server: Server, node: Node) -> None:
-    node.set("tool_mass", 0.0)
-    for up in (UP, SIDE):
-        server.hold(up, payload=Payload(), bias=BIAS)
-        node.run(1.0)
-        node.do("tare")
-    node.set("tool_mass", TOOL.mass)
-    stages.settle(ZERO6)
-
-
 def put(node: Node, **named: Any) -> Any:
     """Set parameters at once; the result."""
     messages = [Parameter(name, value=value).to_parameter_msg() for name, value in named.items()]
     request = SetParametersAtomically.Request(parameters=messages)
     return node.call("set_parameters_atomically", request).result
-
-
-def test_a_tare_before_an_identification_is_restored(stages: Stages, server: Server, node: Node) -> None:
-    node.set("tool_mass", 0.0)
-    server.hold(SIDE, bias=BIAS)
-    node.run(1.0)
-    node.do("tare")
-    assert put(node, tool_mass=TOOL.mass, bias=[9.0, *ZERO6[1:]]).successful
-    assert list(node.parameters("bias")[0]) == [9.0, *ZERO6[1:]]
-    node.do("undo_tare")
-    stages.at(OVER, bias=BIAS)
 
 
 def test_several_are_set_at_once_a_given_bias_is_of_no_tool(
@@ -248,6 +221,14 @@ def test_a_tare_is_refused(
     server.hold(UP, bias=BIAS, **changes)
     node.refuse("tare", words)
     assert list(node.parameters("bias")[0]) == ZERO6
+
+
+def with_bits(**fields: int) -> bytes:
+    """Process data of the sensor at rest with these fields."""
+    data = bytearray(sensed(UP))
+    for name, bits in fields.items():
+        data[layout_for(len(data)).offsets[name]] = bits
+    return bytes(data)
 
 
 def every_other(server: Server, **bad: Any) -> None:
@@ -308,11 +289,9 @@ def test_what_is_subtracted_is_told(stages: Stages, server: Server, node: Node) 
     status = node.until(compensation="ok")["compensation"]
     assert status.message == "subtracted: weight and inertia of the tool"
     told = values(status)
-    assert (told["tool_mass"], told["gravity_source"], told["orientation_age_s"]) == ("0.8", "imu", "0.0")
-    server.answers["tare"] = lambda _: {"ok": True}
-    assert "~/tare" not in node.trigger("sensor_tare")[1]
-    node.set("bias", [1, 0, 0, 0, 0, 0])
-    node.do("sensor_tare", "The node's own bias was for the old offset: call ~/tare")
+    assert (told["tool_mass"], told["gravity_source"], told["orientation_age_s"]) == ("0.8", "imu", "")
+    server.changes["process_data"] = with_bits(acceleration_saturated=0b10)
+    node.until("the IMU's range was exceeded", compensation="warn")
 
 
 def test_without_a_source_nothing_with_weight_is_compensated(stages: Stages, node: Node) -> None:
@@ -336,15 +315,11 @@ def test_a_tool_that_is_accelerated_is_no_contact(stages: Stages, server: Server
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("tool_mass", -1.0, "tool_mass"),
         ("tool_mass", "heavy", "Wrong parameter type"),
         ("tool_mass", 1001.0, "tool_mass"),
-        ("tool_center_of_gravity", [0.0, 0.0], "it must be 3 numbers, none beyond 10 either way"),
-        ("tool_center_of_gravity", [0.0, 0.0, float("nan")], "it must be 3 numbers"),
+        ("tool_center_of_gravity", [0.0, 0.0], "it must be 3 numbers from -10 to 10"),
         ("gravity", [0, 0, 0], "must be at least 0.1 m/s² long"),
-        ("bias", [1.0] * 7, "it must be 6 numbers"),
         ("gravity_source", "accelerometer", "it must be none or imu or topic_pose"),
-        ("orientation.mounting", [1.0, 0.0, 0.0, 1.0], "a rotation is a quaternion of length 1"),
         ("bias_directory", "", "it must be text that is not empty"),
         ("frame_id", "other", "read-only"),
     ],
@@ -352,8 +327,7 @@ def test_a_tool_that_is_accelerated_is_no_contact(stages: Stages, server: Server
 def test_a_wrong_value_is_refused(stages: Stages, node: Node, name: str, value: Any, words: str) -> None:
     before = node.parameters(name)
     node.refuse_value(name, value, words)
-    after = node.parameters(name)
-    assert list(after[0]) == list(before[0]) if hasattr(before[0], "__iter__") else after == before
+    assert node.parameters(name) == before
 
 
 def test_settings_of_the_sensor_that_do_not_go_with_it(stages: Stages, server: Server, node: Node) -> None:
@@ -456,12 +430,6 @@ def test_nothing_is_published_with_the_imu_off(weighed: Node, fresh: Server) -> 
     weighed.until("switch the IMU on (settings.imu_active)", compensation="error")
 
 
-def saturated() -> bytes:
-    data = bytearray(sensed(UP))
-    data[layout_for(len(data)).offsets["force_torque_saturated"]] = 0b100
-    return bytes(data)
-
-
 def test_saturated_samples_can_be_left_out(weighed: Node, fresh: Server) -> None:
     stages, raw = Stages(weighed), weighed.hear("wrench")
     stages.settle(ZERO6)
@@ -472,7 +440,7 @@ def test_saturated_samples_can_be_left_out(weighed: Node, fresh: Server) -> None
         stages.forget()
         raw.clear()
         for _ in range(3):
-            fresh.once(process_data=saturated())
+            fresh.once(process_data=with_bits(force_torque_saturated=0b100))
         weighed.run(0.1)
         return len(raw), len(stages.final)
 
@@ -480,12 +448,10 @@ def test_saturated_samples_can_be_left_out(weighed: Node, fresh: Server) -> None
     weighed.set("on_saturation", "stop")
     weighed.statuses()  # the next one comes after what follows
     assert saturate() == (10, 7)
-    weighed.until(
-        "3 samples were not compensated, because force or torque was saturated", compensation="warn"
-    )
-    fresh.changes = {"process_data": saturated()}
+    weighed.until("3 samples were not compensated: force or torque was saturated", compensation="warn")
+    fresh.changes = {"process_data": with_bits(force_torque_saturated=0b100)}
     array = weighed.until(
-        "has stopped: force or torque is saturated, and on_saturation is stop", compensation="error"
+        "has stopped: force or torque was saturated, and on_saturation is stop", compensation="error"
     )
     assert int(values(array["sensor"])["saturated_samples"]) > 6
 

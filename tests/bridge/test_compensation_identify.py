@@ -102,14 +102,26 @@ def test_the_accelerometers_offset_is_found_and_subtracted(
 
 
 def test_the_file_is_one_that_the_node_starts_with(started: Node, take: Take, tmp_path: Path) -> None:
+    take(*AXES)
+    started.set("identify.file", "/proc/no/such.yaml")
+    started.do("identify/solve", "Not written: ", "/proc/no")  # the answer stands
     path = tmp_path / "mine.yaml"
     started.set("identify.file", str(path))
-    take(*AXES)
     started.do("identify/solve")
     with Node(Server(), "--params-file", str(path)) as other:
         mass, bias = other.parameters("tool_mass", "bias")
     assert mass == pytest.approx(TOOL.mass, abs=1e-4)
     assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
+
+
+def test_the_answer_names_a_pose_in_which_the_tool_was_touched(
+    started: Node, take: Take, server: Server
+) -> None:
+    take(*AXES[:3])
+    server.hold((1, 1, 1), bias=BIAS, force_x=2.0)
+    started.do("identify/add_pose")
+    take(*AXES[3:], (1, -1, 1), (-1, 1, -1))
+    started.do("identify/solve", "pose 4 ", "if something touched the tool, take it again")
 
 
 def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(started: Node, take: Take) -> None:
@@ -162,12 +174,6 @@ def test_cancel_changes_nothing(started: Node, take: Take) -> None:
 def test_it_does_not_start_without_an_orientation(node: Node) -> None:
     node.set("gravity_source", "none")
     node.refuse("identify/start", "gravity_source is none")
-
-
-def test_a_file_that_cannot_be_written(started: Node, take: Take) -> None:
-    started.set("identify.file", "/proc/no/such.yaml")
-    take(*AXES)
-    started.do("identify/solve", "Not written: ", "/proc/no")  # the answer stands
 
 
 def test_a_tool_that_was_lost_is_a_warning_and_nothing_is_changed(node: Node, server: Server) -> None:

@@ -100,26 +100,18 @@ def test_another_sensor_has_its_own(bench: Bench) -> None:
         assert list(node.parameters("bias")[0]) == ZERO6
 
 
-def test_another_sensor_does_not_get_a_tare_that_is_not_kept(bench: Bench) -> None:
+def test_nothing_of_one_sensor_is_used_for_another(bench: Bench) -> None:
     with bench.start(bias_keep=False) as (node, stages):
         node.do("tare")
         bench.server.drop()  # the same sensor comes back: its bias stays
         stages.forget()
         assert stages.first() == pytest.approx(ZERO6, abs=1e-3)
         assert bench.server.connections == 2
-        bench.replace_sensor(9)
-        stages.forget()
-        assert stages.first() == pytest.approx(BIAS.values, abs=1e-3)
-
-
-def test_nothing_of_one_sensor_is_used_for_another(bench: Bench) -> None:
-    with bench.start(bias_keep=False) as (node, stages):
-        node.do("tare")
-        node.set("bias", [0.0] * 6)
         node.do("identify/start")
         node.do("identify/add_pose")
         bench.replace_sensor(2)
-        stages.settle(list(BIAS.values))
+        stages.forget()
+        assert stages.first() == pytest.approx(BIAS.values, abs=1e-3)
         assert node.trigger("undo_tare") == (False, "there is no change of the bias to undo")
         node.refuse("identify/add_pose", "another sensor is there now, so the previous poses were dropped")
         node.refuse("identify/add_pose", "no identification was started")
@@ -147,9 +139,8 @@ def test_a_damaged_file_is_said_and_not_used(bench: Bench) -> None:
         assert bench.kept() == pytest.approx(BIAS.values, abs=1e-4)
 
 
-@pytest.mark.parametrize("serial", ["?", "12a"])
-def test_a_sensor_without_a_number(bench: Bench, serial: str) -> None:
-    bench.server.description["sensors"][0]["serial"] = serial
+def test_a_sensor_without_a_number(bench: Bench) -> None:
+    bench.server.description["sensors"][0]["serial"] = "12a"
     with bench.start() as (node, _):
         node.do("tare", "not kept: the sensor's serial number is")
 
@@ -313,23 +304,21 @@ def test_a_kept_bias_is_for_the_tool_of_now(bench: Bench) -> None:
 
 def test_a_kept_bias_of_a_tool_whose_pose_is_not_known(bench: Bench) -> None:
     """As of an older file."""
-    bench.store.save(1, BIAS, Payload(1.5, (0.0, 0.0, 0.1)), Wrench.of(ZERO6))
+    tool = Payload(1.5, (0.0, 0.0, 0.1))
+    bench.store.save(1, BIAS, tool, Wrench.of(ZERO6))
     bench.server.description["sensors"][0]["offset"] = ZERO6
     with bench.start() as (node, stages):
         assert stages.first() == pytest.approx(ZERO6, abs=1e-5)
-        told = (
-            "taken with a tool of 1.5 kg, and in which pose is not known: with no tool_mass it may be wrong"
-        )
-        assert node.log.count(f"{told} by 14.7 N and 1.47 Nm in every pose: tare again") == 1
+        told = "taken with a tool of 1.5 kg, and in which pose is not known: with no tool_mass it may be "
+        told += "wrong by 14.7 N and 1.47 Nm in every pose: tare again"
+        assert node.log.count(told) == 1
         node.until(told, compensation="warn")
         bench.server.send_json({"event": "offset_changed", "sensor": 0, "offset": [1.0] * 6})
         node.run(0.1)
         stored = bench.store.load(1)
         assert stored is not None
         assert stored.bias == BIAS.plus(Wrench.of([1.0] * 6))
-        assert (stored.payload, stored.specific_force) == (Payload(1.5, (0.0, 0.0, 0.1)), None), (
-            "as it was taken"
-        )
+        assert (stored.payload, stored.specific_force) == (tool, None), "as it was taken"
 
 
 def test_the_node_ends_while_a_tare_waits(bench: Bench) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
 
@@ -23,48 +24,23 @@ CONFIG = Path(__file__).parents[2] / "ros2_bridge" / "config" / "client.yaml"
 
 
 def test_defaults_are_the_contracts() -> None:
-    defaults = {name: row.default for name, row in ROWS.items()}
-    assert defaults == {
+    contract = {
         "server_host": "localhost", "server_port": 12001, "SERVER_PORT": 0, "sensor": 0,
-        "rt_priority": 40, "cpu": -1,
         "publishing_frequency": 0.0, "array_topic": "sensone_sensor_data", "frame_id": "ft_sensor",
-        "imu_frame_id": "ft_sensor_imu", "imu_raw_units": "g_dps", "temperature_variance": 0.0,
-        "orientation_covariance": (0.0, 0.0, 0.0), "angular_velocity_covariance": (0.0, 0.0, 0.0),
-        "linear_acceleration_covariance": (0.0, 0.0, 0.0), "wrench_frames": ("",),
-        "diagnostics.stale_after": 0.5,
-        "diagnostics.rate_tolerance": 0.01, "diagnostics.age_warn": 0.01, "diagnostics.age_error": 0.1,
-        "diagnostics.lost_warn": 1, "diagnostics.temperature_warn": 60.0,
-        "diagnostics.temperature_error": 80.0,
-        "tool_mass": 0.0, "tool_center_of_gravity": (0.0, 0.0, 0.0), "gravity": (0.0, 0.0, -9.80665),
-        "bias": (0.0,) * 6, "bias_ramp_time": 0.5, "bias_keep": False, "bias_directory": "auto",
-        "imu_position": (0.0, 0.0, 0.0),
-        "on_saturation": "publish", "gravity_source": "imu",
-        "orientation.topic": "orientation", "orientation.base_frame": "base_link",
-        "orientation.mounting": (0.0, 0.0, 0.0, 1.0), "orientation.stale_after": 0.1,
-        "accelerometer.offset": (0.0, 0.0, 0.0),
-        "accelerometer.scale": (1.0, 1.0, 1.0), "accelerometer.offset_interval": (0.784, 0.784, 0.784),
-        "accelerometer.scale_interval": (0.0098, 0.0098, 0.0098),
-        "rest.duration": 1.0, "rest.force_spread": 0.8,
-        "rest.torque_spread": 0.02, "rest.force_wander": 0.3, "rest.torque_wander": 0.01,
-        "rest.angular_rate": 0.05, "rest.angular_rate_spread": 0.02, "rest.acceleration_spread": 0.3,
-        "rest.acceleration_wander": 0.05, "identify.file": "auto",
-        "filter.cutoff": 0.0, "filter.notch": 0.0, "filter.notch_width": 5.0,
-        "filter.dead_band_force": 0.0, "filter.dead_band_torque": 0.0,
+        "imu_frame_id": "ft_sensor_imu", "imu_raw_units": "g_dps",
+        "supervisor_topic": "/supervisor_status_data", "stamp": "sample",
     }  # fmt: skip
+    assert {name: ROWS[name].default for name in contract} == contract
     assert all(row.check(row.default) == row.default for row in PARAMETERS)
 
 
 def test_the_configuration_file_says_the_same() -> None:
     pairs = (line.split("#")[0].partition(":") for line in CONFIG.read_text().splitlines())
-    given = {name.strip(): value.strip() for name, _, value in pairs if value.strip()}
-    defaults = {name: row.default for name, row in ROWS.items() if name != "SERVER_PORT"}
-    assert given == {name: _yaml(default) for name, default in defaults.items()}
-
-
-def _yaml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return str([*value] if isinstance(value, tuple) else value)
+    given = {name.strip(): yaml.safe_load(value) for name, _, value in pairs if value.strip()}
+    assert {name: row.check(given.pop(name)) for name, row in ROWS.items() if name in given} == {
+        name: row.default for name, row in ROWS.items() if name != "SERVER_PORT"
+    }
+    assert not given
 
 
 @pytest.mark.parametrize(
@@ -84,6 +60,7 @@ def _yaml(value: Any) -> str:
         ("wrench_frames", [1.0, 2.0, 3.0]), ("wrench_frames", 5), ("wrench_frames", ["tool0", 5]),
         ("filter.cutoff", -1.0), ("filter.cutoff", "10"), ("filter.notch_width", 0.0),
         ("gravity_source", "accelerometer"), ("orientation.mounting", [0.0] * 3), ("rest.duration", 0.0),
+        ("accelerometer.scale", [1.0, 0.4, 1.0]),
     ],
 )  # fmt: skip
 def test_wrong_values_are_named(name: str, value: Any) -> None:
@@ -98,7 +75,7 @@ def test_what_is_taken_and_what_else_is_said() -> None:
     for value in values:
         assert ROWS["orientation_covariance"].check(value) == tuple(map(float, value))
     for name, wrong, words in (
-        ("bias", [1.0], "it must be 6 numbers, none beyond 1e\\+06 either way"),
+        ("bias", [1.0], "it must be 6 numbers from -1e\\+06 to 1e\\+06"),
         ("bias_keep", 0.0, "it must be true or false"),
     ):
         with pytest.raises(ParameterError, match=words):
@@ -162,9 +139,13 @@ def test_no_value_of_any_parameter_ends_the_node() -> None:
             length = max(len(getattr(before, f"{kind}_array_value")) for kind in ("double", "string"))
             for value in hostile_values(length or 3):
                 parameters = [Parameter(name=name, value=value)]
-                (result,) = node.call("set_parameters", SetParameters.Request(parameters=parameters)).results
+                results = node.call("set_parameters", SetParameters.Request(parameters=parameters)).results
                 request = SetParametersAtomically.Request(parameters=parameters)
                 again = node.call("set_parameters_atomically", request).result
+                if value.type > ParameterType.PARAMETER_STRING_ARRAY:  # nothing is set of a type that is none
+                    assert (results, again.successful) == ([], False)
+                    continue
+                (result,) = results
                 assert again.successful == result.successful, (name, value)
                 if result.successful:
                     restored = SetParameters.Request(parameters=[Parameter(name=name, value=before)])
@@ -199,7 +180,6 @@ def test_limits_and_covariances_can_be_set_while_it_runs() -> None:
         assert imu[-1].orientation_covariance[0] == -1.0
         assert temperatures[-1].variance == 0.5
         node.until("25.0 °C", sensor="warn")
-        assert "vibration above 5 Hz appear at lower frequencies" in node.log
         node.set("publishing_frequency", 0)
         assert len(node.fresh(wrenches, 0.5)) == 50
         node.refuse_value("diagnostics.lost_warn", 0, "lost_warn out of range")
@@ -209,11 +189,6 @@ def test_limits_and_covariances_can_be_set_while_it_runs() -> None:
 
 
 def test_what_is_warned_of_at_start() -> None:
-    with Node(Server(), publishing_frequency=50.0) as node:
-        node.run(0.1)
-        assert "takes the newest of 100 samples a second, without a low-pass" in node.log
-        node.set("publishing_frequency", 100.0)
-        assert node.log.count("aliasing") == 1
     given = {"publish_frequency": 100.0, "settings.sinc_lenght": 64, "zzz": 1, "use_sim_time": True}
     with Node(Server(), **given) as node:
         assert "unknown parameter publish_frequency" in node.log

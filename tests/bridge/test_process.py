@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import gc
 import os
+import queue
 import signal
-import subprocess
 import sys
 import threading
-import types
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,56 +23,34 @@ from rclpy.executors import SingleThreadedExecutor
 from bota_ethercat.client import Scheduling
 from bridge import process
 from bridge.client import PROFILES, use_own_profiles
-from bridge.parameters.table import DEFAULTS
 from bridge.spinning import PartExecutor, Spinner
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
+from tests.bridge.simulated_node import DEFAULTS
 from tests.rights import needs_root, skip_if_forbidden
-from tests.server.running import wait_until
-
-PROGRAM = """
-import sys, types
-from bridge import process
-
-def monotonic():
-    seen = now  # the test sets it on as soon as it reads the line
-    print("looked at the time", flush=True)
-    return seen
-
-now = 100.0
-process.time = types.SimpleNamespace(monotonic=monotonic)
-process.block_stop_signals()
-process.call_on_stop_signal(lambda number: print("called", int(number), flush=True))
-print("ready", flush=True)
-for line in sys.stdin:
-    now = float(line)
-    print("time passes", flush=True)
-"""
 
 
-def test_a_second_signal_counts_only_when_it_is_meant() -> None:
-    """With a clock of its own, so that the machine may be busy."""
-    command = [sys.executable, "-c", PROGRAM]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, bufsize=1) as program:
-        assert program.stdin is not None
-        assert program.stdout is not None
+def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with the time at which it comes: a terminal and a launcher may send theirs within a second."""
+    signals = iter([(100.0, signal.SIGINT), (100.9, signal.SIGINT), (101.0, signal.SIGTERM)])
+    now_s, called, ended = 0.0, list[int](), queue.Queue[int]()
 
-        def says(words: str) -> None:
-            assert program.stdout is not None
-            assert program.stdout.readline() == f"{words}\n"
+    def wait(_: object) -> int:
+        nonlocal now_s
+        now_s, number = next(signals)
+        return number
 
-        says("ready")
-        program.send_signal(2)
-        says("called 2")
-        says("looked at the time")
-        for number, now in ((2, 100.9), (15, 101.0)):  # a terminal and a launcher may each send theirs
-            program.send_signal(number)
-            says("looked at the time")
-            program.stdin.write(f"{now}\n")
-            says("time passes")
-        program.send_signal(15)
-        assert program.wait(timeout=30) == 128 + 15
+    def end(code: int) -> None:
+        ended.put(code)
+        threading.Event().wait()  # as a process that ends
+
+    monkeypatch.setattr(signal, "sigwait", wait)
+    monkeypatch.setattr(os, "_exit", end)
+    monkeypatch.setattr(process, "time", SimpleNamespace(monotonic=lambda: now_s))
+    process.call_on_stop_signal(called.append)
+    assert ended.get(timeout=PATIENCE_S) == 128 + signal.SIGTERM
+    assert called == [signal.SIGINT]
+    assert next(signals, None) is None
 
 
 DEFAULT = DEFAULTS.rt_priority
@@ -153,86 +131,46 @@ def test_a_thread_that_fails_says_so() -> None:
     assert heard == ["the reader failed: LookupError: a defect"]
 
 
-# Executors run until they are told to stop, and keep nothing of what they have handled.
-
-
-class Bench:
-    """A node with a spinner in a thread."""
-
-    def __init__(self) -> None:
-        self.node = rclpy.create_node("spinning")
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.spinner = Spinner(self.executor)
-        self.ticks = 0
-        self.thread = threading.Thread(target=self.spinner.run, daemon=True)
-
-    def count(self, ticks: int) -> None:
-        """Let so many timer callbacks pass."""
-        wanted = self.ticks + ticks
-        wait_until(lambda: self.ticks >= wanted, f"{ticks} callbacks")
-
-    def tick(self) -> None:
-        self.ticks += 1
-
-    def ends(self) -> bool:
-        self.spinner.stop()
-        self.thread.join(PATIENCE_S)
-        return not self.thread.is_alive()
+# Executors run until they are told to stop.
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    made = Bench()
+def node() -> Iterator[Any]:
+    made = rclpy.create_node("spinning")
     yield made
-    assert made.thread.ident is None or made.ends()
-    made.executor.shutdown()
-    made.node.destroy_node()
+    made.destroy_node()
 
 
-def functions() -> int:
-    gc.collect()
-    return sum(isinstance(thing, types.FunctionType) for thing in gc.get_objects())
+@pytest.fixture
+def executor(node: Any) -> Iterator[SingleThreadedExecutor]:
+    made = SingleThreadedExecutor()
+    made.add_node(node)
+    yield made
+    made.shutdown()
 
 
-def test_nothing_is_kept_of_what_was_handled(bench: Bench) -> None:
-    bench.node.create_timer(0.0002, bench.tick)
-    bench.thread.start()
-    bench.count(100)
-    before = functions()
-    bench.count(500)
-    assert functions() - before < 100
-    assert bench.ends()
+def test_told_before_and_once_more_after_the_end(executor: SingleThreadedExecutor) -> None:
+    spinner = Spinner(executor)
+    spinner.stop()
+    spinner.run()
+    executor.shutdown()
+    spinner.stop()
 
 
-def test_an_executor_ends_whenever_it_is_told(bench: Bench) -> None:
-    bench.thread.start()
-    bench.thread.join(0.2)
-    assert bench.thread.is_alive()
-    assert bench.ends()
-
-
-def test_told_before_and_once_more_after_the_end(bench: Bench) -> None:
-    bench.spinner.stop()
-    bench.spinner.run()
-    bench.executor.shutdown()
-    bench.spinner.stop()
-
-
-def test_a_callback_that_raises_ends_it_and_is_told(bench: Bench) -> None:
+def test_a_callback_that_raises_ends_it_and_is_told(executor: SingleThreadedExecutor, node: Any) -> None:
     def fail() -> Any:
         raise LookupError("of the callback")
 
-    bench.node.create_timer(0.001, fail)
+    node.create_timer(0.001, fail)
+    spinner = Spinner(executor)
     with pytest.raises(LookupError, match="of the callback"):
-        bench.spinner.run()
-    bench.spinner.stop()
+        spinner.run()
+    spinner.stop()
 
 
-def test_what_waits_for_no_others_has_an_executor_of_its_own(bench: Bench) -> None:
-    node, group = bench.node, MutuallyExclusiveCallbackGroup()
-    own = node.create_timer(60.0, bench.tick, group)
-    common = node.create_timer(60.0, bench.tick)
+def test_what_waits_for_no_others_has_an_executor_of_its_own(node: Any) -> None:
+    own = node.create_timer(60.0, lambda: None, MutuallyExclusiveCallbackGroup())
+    common = node.create_timer(60.0, lambda: None)
     prompt = PartExecutor(node)
     ordinary = PartExecutor(node, prompt)
     (mine,), (others,) = prompt.get_nodes(), ordinary.get_nodes()

@@ -83,9 +83,12 @@ def test_garbage_ends_only_its_connection(node: Node, quiet: Server, garbage: by
     assert feed(node, quiet, quiet.frame(3)) == [1.0, 3.0]
 
 
-def test_a_sample_with_an_impossible_time_is_not_published(node: Node, quiet: Server) -> None:
-    assert feed(node, quiet, quiet.frame(1, stamp_ns=2**64 - 1), quiet.frame(2)) == [2.0]
-    assert "a sample with the impossible time 18446744073709551615 ns was not published" in node.log
+@pytest.mark.parametrize("impossible_ns", [0, 2**64 - 1])
+def test_a_sample_with_an_impossible_time_is_not_published(
+    node: Node, quiet: Server, impossible_ns: int
+) -> None:
+    assert feed(node, quiet, quiet.frame(1, stamp_ns=impossible_ns), quiet.frame(2)) == [2.0]
+    assert f"a sample with the impossible time {impossible_ns} ns was not published" in node.log
 
 
 def test_after_a_stall_nothing_old_is_published(node: Node, quiet: Server) -> None:
@@ -97,20 +100,13 @@ def test_after_a_stall_nothing_old_is_published(node: Node, quiet: Server) -> No
     assert node.node.reader.counts.stale == 958
 
 
-def test_silence_and_its_end_are_logged_once(node: Node, quiet: Server) -> None:
-    node.run(5.0)
-    feed(node, quiet, quiet.frame(1), quiet.frame(2))
-    said = ["nothing came from localhost:12001 for 1 s", "localhost:12001 sends again"]
-    assert [line for line in node.log.splitlines() if "localhost:12001 " in line] == said
-
-
-def test_what_is_not_finite_is_counted_and_logged_every_ten_seconds(node: Node, quiet: Server) -> None:
-    for value in [math.nan, math.inf, -math.inf, math.nan] * 3:
+def test_what_is_not_finite_is_counted_and_logged_now_and_then(node: Node, quiet: Server) -> None:
+    for value in (math.nan, math.inf, -math.inf):
         assert feed(node, quiet, quiet.frame(0, process_data=encode(61, {"torque.y": value}))) == []
-        node.run(1.0)
-    assert node.node.reader.not_finite == 12
-    said = [line for line in node.log.splitlines() if "that are not finite" in line]
-    assert [line.split("(")[1] for line in said] == ["1 so far)", "11 so far)"]
+    assert node.node.reader.not_finite == 3
+    assert [line for line in node.log.splitlines() if "not finite" in line] == [
+        "a sample with numbers that are not finite was not published (1 so far)"
+    ]
 
 
 def test_events_reach_the_log_and_the_link(node: Node, quiet: Server) -> None:
@@ -179,103 +175,80 @@ def test_a_server_that_does_not_fit_is_named_once(quiet: Server, changes: dict[s
 # Which frames are news.
 
 
-def frame(number: int) -> DataMessage:
-    """Frame `number` of a stream that began at time 0."""
-    return DataMessage(number, 0, number * PERIOD_NS, 0, 0, 3, b"")
+class Selecting:
+    """A stream of one sample a period, which began at time 0, on its way through a selector."""
+
+    def __init__(self, *, same_clock: bool = True, limit_hz: float = 0.0) -> None:
+        self.counts = FrameCounts()
+        self.select = FrameSelector(self.counts, same_clock=same_clock, limit_hz=limit_hz)
+
+    def of(self, numbers: Iterable[int], now_ns: int) -> list[int]:
+        """Those that are selected of these frames, which are read at once."""
+        frames = [DataMessage(number, 0, number * PERIOD_NS, 0, 0, 3, b"") for number in numbers]
+        return [frame.sequence for frame in self.select.select(frames, now_ns)]
+
+    def one_by_one(self, begin: int, end: int, age_ns: int = 0) -> list[int]:
+        """Likewise of frames that are read one after the other, of this age."""
+        return [n for i in range(begin, end) for n in self.of([i], age_ns + i * PERIOD_NS)]
 
 
-def frames(numbers: Iterable[int]) -> list[DataMessage]:
-    return [frame(number) for number in numbers]
-
-
-def selector(*, same_clock: bool = True, limit_hz: float = 0.0) -> tuple[FrameSelector, FrameCounts]:
-    counts = FrameCounts()
-    return FrameSelector(counts, same_clock=same_clock, limit_hz=limit_hz), counts
-
-
-def numbers(selected: Iterable[DataMessage]) -> list[int]:
-    return [item.sequence for item in selected]
-
-
-def test_a_stall_in_several_reads_gives_nothing_until_it_is_fresh() -> None:
-    select, counts = selector()
-    now_ns = 1600 * PERIOD_NS
+def test_a_stall_gives_nothing_until_the_stream_is_fresh() -> None:
+    selecting = Selecting()
     for start in range(0, 1500, 500):
-        assert select.select(frames(range(start, start + 500)), now_ns) == []
-    assert numbers(select.select(frames(range(1500, 1600)), now_ns)) == [1599]
-    assert counts.stale == 1599
+        assert selecting.of(range(start, start + 500), 1600 * PERIOD_NS) == []
+    assert selecting.of(range(1500, 1600), 1600 * PERIOD_NS) == [1599]
+    assert selecting.counts.stale == 1599
+    alone = Selecting()
+    assert alone.of([1], PERIOD_NS + BACKLOG_NS + 1) == []
+    assert alone.of([100], 100 * PERIOD_NS + FRESH_NS + 1) == []
+    assert alone.of([101], 101 * PERIOD_NS + FRESH_NS) == [101]
 
 
-def test_one_old_frame_alone_does_not_pass_on_the_same_machine() -> None:
-    select, counts = selector()
-    assert select.select([frame(1)], PERIOD_NS + BACKLOG_NS + 1) == []
-    late = 100 * PERIOD_NS
-    assert select.select([frame(100)], late + FRESH_NS + 1) == []
-    assert numbers(select.select([frame(101)], 101 * PERIOD_NS + FRESH_NS)) == [101]
-    assert counts.stale == 2
-
-
-def test_clocks_that_differ_make_ages_relative() -> None:
-    for offset_ns in (-(10**15), 10**15):
-        select, _ = selector(same_clock=False)
-        for i in range(1000):
-            now_ns = offset_ns + i * PERIOD_NS + (i * 7919 % 1000) * 1000
-            assert numbers(select.select([frame(i)], now_ns)) == [i]
-        now_ns = offset_ns + 3000 * PERIOD_NS
-        assert select.select(frames(range(1000, 2000)), now_ns) == []
-        assert numbers(select.select(frames(range(2000, 3000)), now_ns)) == [2999]
+@pytest.mark.parametrize("offset_ns", [-(10**15), 10**15])
+def test_clocks_that_differ_make_ages_relative(offset_ns: int) -> None:
+    selecting = Selecting(same_clock=False)
+    for i in range(1000):
+        assert selecting.of([i], offset_ns + i * PERIOD_NS + (i * 7919 % 1000) * 1000) == [i]
+    now_ns = offset_ns + 3000 * PERIOD_NS
+    assert selecting.of(range(1000, 2000), now_ns) == []
+    assert selecting.of(range(2000, 3000), now_ns) == [2999]
 
 
 @pytest.mark.parametrize("same_clock", [True, False])
 @pytest.mark.parametrize("age_ns", [0, 5_000_000, 30_000_000])
 def test_a_stall_costs_no_more_than_itself(same_clock: bool, age_ns: int) -> None:
     """Whatever is usual on this connection: what is queued after 60 ms gives one sample, the next passes."""
-    select, counts = selector(same_clock=same_clock)
-    offset_ns = age_ns if same_clock else age_ns - 10**15
-    for i in range(8):
-        assert numbers(select.select([frame(i)], offset_ns + i * PERIOD_NS)) == [i]
+    selecting = Selecting(same_clock=same_clock)
+    age_ns -= 0 if same_clock else 10**15
+    assert selecting.one_by_one(0, 8, age_ns) == list(range(8))
     for begin in (8, 1008):  # and again: nothing has changed for the rest of the connection
         now = begin + 48
-        assert numbers(select.select(frames(range(begin, now)), offset_ns + now * PERIOD_NS)) == [now - 1]
-        for i in range(now, begin + 1000):
-            assert numbers(select.select([frame(i)], offset_ns + i * PERIOD_NS)) == [i]
-    assert counts.stale == 2 * 47
+        assert selecting.of(range(begin, now), age_ns + now * PERIOD_NS) == [now - 1]
+        assert selecting.one_by_one(now, begin + 1000, age_ns) == list(range(now, begin + 1000))
+    assert selecting.counts.stale == 2 * 47
 
 
-def test_a_connection_that_has_become_slower_is_no_backlog_for_long() -> None:
-    select, counts = selector()
-    for i in range(800):
-        select.select([frame(i)], i * PERIOD_NS)
-    slower_ns = 80_000_000
-    got = [n for i in range(800, 900) for n in numbers(select.select([frame(i)], slower_ns + i * PERIOD_NS))]
-    assert got == list(range(816, 900))  # 20 ms
-    assert counts.stale == 16
-    stall = select.select(frames(range(900, 1000)), slower_ns + 1000 * PERIOD_NS)
-    assert numbers(stall) == [999]
-
-
-def test_a_clock_wrongly_taken_for_ours_does_not_silence_the_stream() -> None:
-    select, _ = selector()
-    offset_ns = 10**12
-    got = [n for i in range(1000) for n in numbers(select.select([frame(i)], offset_ns + i * PERIOD_NS))]
-    assert got == list(range(16, 1000))
+@pytest.mark.parametrize("slower_ns", [80_000_000, 10**12])
+def test_a_connection_that_has_become_slower_is_no_backlog_for_long(slower_ns: int) -> None:
+    """Nor does a clock that is wrongly taken for ours silence the stream."""
+    selecting = Selecting()
+    selecting.one_by_one(0, 800)
+    assert selecting.one_by_one(800, 900, slower_ns) == list(range(816, 900))  # 20 ms
+    assert selecting.of(range(900, 1000), slower_ns + 1000 * PERIOD_NS) == [999]
 
 
 def test_a_limit_takes_the_newest() -> None:
-    select, counts = selector(limit_hz=100)
-    got = numbers(select.select(frames(range(8)), 8 * PERIOD_NS))
-    passed_over = numbers(select.passed_over)
-    assert numbers(select.select(frames(range(8, 10)), 10 * PERIOD_NS)) == []
-    passed_over += numbers(select.passed_over)
-    got += numbers(select.select(frames(range(10, 16)), 16 * PERIOD_NS))
-    passed_over += numbers(select.passed_over)
-    assert got == [7, 15]
-    assert passed_over == [*range(7), *range(8, 15)]
-    assert counts.limited == 14
+    selecting = Selecting(limit_hz=100)
+    got, passed_over = list[int](), list[int]()
+    for begin, end in ((0, 8), (8, 10), (10, 16)):
+        got += selecting.of(range(begin, end), end * PERIOD_NS)
+        passed_over += [frame.sequence for frame in selecting.select.passed_over]
+    assert (got, passed_over) == ([7, 15], [*range(7), *range(8, 15)])
+    assert selecting.counts.limited == 14
 
 
-@pytest.mark.parametrize("limit_hz", [1.0, 10.0, 99.9, 100.0, 333.0, 799.0])
-@pytest.mark.parametrize("rate_hz", [800, 801, 997, 1000, 1333, 1600, 1700])
+@pytest.mark.parametrize("limit_hz", [1.0, 99.9, 333.0, 799.0])
+@pytest.mark.parametrize("rate_hz", [800, 997, 1333, 1700])
 def test_a_limit_below_the_streams_rate_is_kept_and_reached(limit_hz: float, rate_hz: int) -> None:
     limit = RateLimit(limit_hz)
     passed = sum(limit.allows(i * 1_000_000_000 // rate_hz) for i in range(3 * rate_hz))
@@ -289,15 +262,9 @@ def test_a_limit_equal_to_the_streams_rate_lets_all_pass(seed: int) -> None:
     assert all(limit.allows(i * PERIOD_NS + jitter(-200_000, 200_000)) for i in range(1, 20_000))
 
 
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1), st.integers(0, 255)), max_size=20
-    )
-)
-def test_hostile_numbers_are_survived(rows: list[tuple[int, int, int]]) -> None:
-    for limit_hz in (0.0, 100.0):
-        for same_clock in (True, False):
-            select, _ = selector(same_clock=same_clock, limit_hz=limit_hz)
-            for sequence, monotonic_ns, flags in rows:
-                message = DataMessage(sequence, 0, monotonic_ns, 0, flags, 3, b"")
-                assert len(select.select([message], 10**12)) <= 1
+@given(st.lists(st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1)), max_size=20))
+def test_hostile_numbers_are_survived(rows: list[tuple[int, int]]) -> None:
+    for limit_hz, same_clock in itertools.product((0.0, 100.0), (True, False)):
+        select = FrameSelector(FrameCounts(), same_clock=same_clock, limit_hz=limit_hz)
+        for sequence, monotonic_ns in rows:
+            assert len(select.select([DataMessage(sequence, 0, monotonic_ns, 0, 0, 3, b"")], 10**12)) <= 1

@@ -65,15 +65,11 @@ def configures(scripted: Server) -> list[Any]:
 
 
 def test_tare(node: Node, scripted: Server) -> None:
-    asked: list[JsonObject] = []
-
-    def answer(message: JsonObject) -> JsonObject:
-        asked.append(message)
-        return {"ok": True, "old_offset": [1, 2, 3, 4, 5, 6], "new_offset": [0.5] * 6, "residual": [1e-3] * 6}
-
-    scripted.answers["tare"] = answer
+    offsets = {"old_offset": [1, 2, 3, 4, 5, 6], "new_offset": [0.5] * 6, "residual": [1e-3] * 6}
+    scripted.answers["tare"] = lambda _: {"ok": True, **offsets}
     node.do("sensor_tare", "old offset Fx 1.0000 Fy 2.0000", "new offset Fx 0.5000", "residual Fx 0.0010")
-    assert (asked[0]["sensor"], asked[0]["samples"]) == (0, 50)  # half a second
+    asked = scripted.requests[-1]
+    assert (asked["action"], asked["sensor"], asked["samples"]) == ("tare", 0, 50)  # half a second
 
 
 def test_a_refusal_in_the_servers_own_words(node: Node, scripted: Server) -> None:
@@ -101,16 +97,10 @@ def test_parameters_refused_together_leave_the_sensor_alone(node: Node, scripted
 def test_settings_are_shown_and_saved(node: Node, scripted: Server) -> None:
     text = node.do("get_settings")
     assert json.loads(text) == {**SETTINGS, "rate_hz": 100.0}
-    asked: list[JsonObject] = []
-
-    def answer(message: JsonObject) -> JsonObject:
-        asked.append(message)
-        return {"ok": True, "settings": SETTINGS, "saved": True}
-
-    scripted.answers["configure"] = answer
+    scripted.answers["configure"] = lambda _: {"ok": True, "settings": SETTINGS, "saved": True}
     node.do("save_settings")
-    assert asked[0]["save"] is True
-    assert asked[0]["settings"].items() <= SETTINGS.items()
+    assert scripted.requests[-1]["save"] is True
+    assert scripted.requests[-1]["settings"].items() <= SETTINGS.items()
 
 
 def test_a_setting_is_set_or_is_not(node: Node, scripted: Server) -> None:
@@ -166,14 +156,10 @@ def test_an_unanswered_request_holds_up_neither_stream_nor_diagnostics(node: Nod
     node.do("get_settings")
 
 
-def test_a_connection_that_ends_before_the_reply(node: Node, scripted: Server) -> None:
-    scripted.answers["tare"] = lambda _: scripted.drop()
-    node.refuse("sensor_tare", "the server at localhost:12001 is gone: the connection ended before the reply")
-
-
 def test_without_a_server(node: Node, scripted: Server) -> None:
+    scripted.answers["tare"] = lambda _: scripted.drop()
     scripted.listens = False
-    scripted.drop()
+    node.refuse("sensor_tare", "the server at localhost:12001 is gone: the connection ended before the reply")
     node.run(0.1)
     assert node.parameters(*NAMES) == [None] * 4
     refused = "there is no server at localhost:12001"

@@ -10,27 +10,22 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-import rclpy
 from geometry_msgs.msg import WrenchStamped
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Temperature
 
 from bota_ethercat.cdr import StampedNumbers
-from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import encode
 from bridge.node import StartError
-from bridge.parameters.table import PARAMETERS, ParameterError, gather, parse_frames
-from bridge.publishing.compensated_wrench import make_frames
+from bridge.parameters.table import ParameterError, parse_frames
 from ft_compensation.outputs import FilterSettings, WrenchFilter
 from tests.bridge.fake_tf import FakeTf
-from tests.bridge.real_node import retire
 from tests.bridge.scripted_server import process_data
-from tests.bridge.simulated_node import RATE_HZ, STEP_S, Node, Server, six, stamp_ns
-from tests.server.running import wait_until
+from tests.bridge.simulated_node import RATE_HZ, STEP_S, Node, Server, six, stamp_ns, values
 
 QUATERNION = {"orientation.x": 0.5, "orientation.y": -0.5, "orientation.z": 0.5, "orientation.w": 0.5}
-RAW = [2.0 + i / 16 for i in range(12)]  # what `process_data(2.0)` has
+NAMES = [f"{name}.{axis}" for name in ("force", "torque", "acceleration", "angular_rate") for axis in "xyz"]
+RAW = [2.0 + i / 16 for i in range(12)]
 TOPICS = (
     "sensone_sensor_data", "wrench", "imu/data_raw", "imu/data", "temperature", "wrench_compensated/tcp",
     "wrench_filtered",
@@ -77,7 +72,8 @@ def vector(message: Any) -> tuple[float, float, float]:
 
 def test_every_topic_of_one_sample(published: Published) -> None:
     stamp = 1_234_567_890_123_456_789
-    heard = published.of({"process_data": process_data(2.0), "stamp_ns": stamp})
+    data = encode(61, dict(zip(NAMES, RAW, strict=True)) | {"temperature": 36.5})
+    heard = published.of({"process_data": data, "stamp_ns": stamp})
     one = {name: messages[0] for name, messages in heard.items() if messages}
     assert one.keys() == {*TOPICS} - {"imu/data"}, "there is no orientation"
     array, wrench, imu = one["sensone_sensor_data"], one["wrench"], one["imu/data_raw"]
@@ -89,6 +85,7 @@ def test_every_topic_of_one_sample(published: Published) -> None:
     assert [*vector(wrench.wrench.force), *vector(wrench.wrench.torque)] == RAW[:6]
     assert vector(imu.linear_acceleration) == pytest.approx(si[6:9])
     assert vector(imu.angular_velocity) == pytest.approx(si[9:])
+    assert (one["temperature"].temperature, one["temperature"].variance) == (36.5, 0.25)
     assert imu.orientation_covariance[0] == -1.0
     assert list(imu.linear_acceleration_covariance) == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]
     assert list(imu.angular_velocity_covariance) == [0.0] * 9
@@ -102,13 +99,13 @@ def test_every_topic_of_one_sample(published: Published) -> None:
 
 def test_orientation_where_the_sensor_estimates_one(published: Published) -> None:
     heard = published.of(
-        {"process_data": encode(77, QUATERNION | {"acceleration.z": 0.5}), "stamp_ns": 7},
+        {"process_data": encode(77, QUATERNION | {"acceleration.z": 0.5}), "stamp_ns": 7 * 10**9},
         {"process_data": encode(77, {"force.x": 1.0})},  # no estimate
         {"process_data": process_data(1.0, 61)},
-        {"process_data": encode(77, QUATERNION), "stamp_ns": 9},
+        {"process_data": encode(77, QUATERNION), "stamp_ns": 9 * 10**9},
     )
     oriented, raw = heard["imu/data"], heard["imu/data_raw"]
-    assert [stamp_ns(message) for message in oriented] == [7, 9]
+    assert [stamp_ns(message) for message in oriented] == [7 * 10**9, 9 * 10**9]
     for message in oriented:
         q = message.orientation
         assert (q.x, q.y, q.z, q.w) == (0.5, -0.5, 0.5, 0.5)
@@ -118,10 +115,43 @@ def test_orientation_where_the_sensor_estimates_one(published: Published) -> Non
     assert [(m.orientation_covariance[0], m.orientation.w) for m in raw] == [(-1.0, 1.0)] * 4
 
 
-def test_temperature(published: Published) -> None:
-    heard = published.of({"process_data": encode(61, {"temperature": 36.5})})
-    (message,) = heard["temperature"]
-    assert (message.temperature, message.variance) == (36.5, 0.25)
+def test_stamps_of_the_measurement_are_earlier_by_the_delay_of_the_channels_filter() -> None:
+    server = Server()
+    row = server.description["sensors"][0]
+    row["delay_ms"] = {"force_torque": 150.0, "acceleration": 20.0, "angular_rate": 30.0}
+    with Node(server, stamp="measurement", **{"filter.cutoff": 10.0}) as node:
+        names = "wrench", "wrench_compensated", "compensation/tool", "wrench_filtered", "imu/data_raw"
+        topics = [node.hear(name) for name in (*names, "temperature")]
+        node.run(0.2)
+
+        def earlier_ms() -> list[float]:
+            """Of the next sample, by topic."""
+            for messages in topics:
+                messages.clear()
+            server.once(stamp_ns=10**18)
+            node.step()
+            return [(10**18 - stamp_ns(message)) / 1e6 for (message,) in topics]
+
+        def clock(expected: str) -> dict[str, str]:
+            return values(node.until(clock=expected)["clock"])
+
+        assert earlier_ms() == [150.0] * 4 + [20.0, 0.0]
+        told = clock("ok")
+        assert (told["stamp"], told["delay_force_torque_ms"]) == ("measurement", "150.0")
+        # From the first sample after a change on.
+        server.reconfigure(fir=True, delay_ms={"force_torque": 1200.0 / 7, "acceleration": 35.7})
+        assert earlier_ms() == [pytest.approx(1200.0 / 7)] * 4 + [35.7, 0.0]
+        for _ in range(2):
+            server.reconfigure(chop=True, delay_ms={"force_torque": None, "acceleration": "x"})
+            assert earlier_ms() == [0.0] * 6
+        words = "the delay of the filters is not known, so wrench and imu topics have the time of the sample"
+        assert node.log.count(words) == 1
+        node.until(words, clock="warn")
+        server.reconfigure(delay_ms={"force_torque": 150.0, "acceleration": 20.0})
+        assert earlier_ms() == [150.0] * 4 + [20.0, 0.0]
+        node.set("stamp", "sample")
+        assert earlier_ms() == [0.0] * 6
+        assert clock("ok")["delay_acceleration_ms"] == "20.0"
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -203,18 +233,6 @@ def check_filtered(got: list[Any], raw: list[Any], fewest: int, **settings: floa
         assert six(message) == pytest.approx(expected[stamp_ns(message)], abs=1e-12)
 
 
-@pytest.mark.parametrize("no_frames", ["['']", "[]"])
-def test_nothing_more_unless_it_is_configured(no_frames: str) -> None:
-    with Node(Sensor(), wrench_frames=no_frames) as node:
-        prefix = node.name.removesuffix("bridge")
-        assert {name.removeprefix(prefix) for name in node.topics if name.startswith(prefix)} == {
-            "sensone_sensor_data", "wrench", "wrench_compensated", "compensation/bias",
-            "compensation/tool", "imu/data_raw", "imu/data", "temperature",
-        }  # fmt: skip
-        node.run(0.2)
-        assert "wrench_filtered" not in node.log
-
-
 # wrench_filtered
 
 
@@ -257,8 +275,14 @@ def test_a_limit_to_the_frequency_comes_after_the_filter() -> None:
 
 
 def test_it_can_be_configured_while_the_node_runs() -> None:
-    with Node(Sensor()) as node:
+    with Node(Sensor(), wrench_frames="[]") as node:
+        prefix = node.name.removesuffix("bridge")
+        assert {name.removeprefix(prefix) for name in node.topics if name.startswith(prefix)} == {
+            "sensone_sensor_data", "wrench", "wrench_compensated", "compensation/bias",
+            "compensation/tool", "imu/data_raw", "imu/data", "temperature",
+        }  # fmt: skip
         node.run(0.2)
+        assert "wrench_filtered" not in node.log
         node.set("filter.cutoff", 10)
         got = node.hear("wrench_filtered")
         node.run(0.5)
@@ -302,9 +326,11 @@ def test_a_frequency_that_the_sampling_rate_does_not_allow_is_refused(limit: flo
 
 def test_it_follows_the_sensors_rate() -> None:
     server = Sensor()
+    server.description["sensors"][0]["rate_hz"] = 0
     with Node(server, **{"filter.cutoff": 40.0}) as node:
         got = node.hear("wrench_filtered")
-        node.run(0.3)
+        node.until("wrench_filtered has stopped: the server does not report", compensation="error")
+        assert not got
         server.reconfigure(rate_hz=50)
         words = "filter.cutoff is 40 Hz, but must be below half of the sampling rate, 25 Hz"
         node.until(f"wrench_filtered has stopped: {words}", compensation="error")
@@ -314,15 +340,6 @@ def test_it_follows_the_sensors_rate() -> None:
         node.until(compensation="ok")
         assert got
         assert "cut-off 40 Hz, sampling rate 200 Hz" in node.log
-
-
-def test_a_server_that_does_not_tell_the_rate() -> None:
-    server = Sensor()
-    server.description["sensors"][0]["rate_hz"] = 0
-    with Node(server, **TEN_HZ) as node:
-        got = node.hear("wrench_filtered")
-        node.until("wrench_filtered has stopped: the server does not report", compensation="error")
-        assert not got
 
 
 # wrench_compensated/NAME
@@ -416,39 +433,6 @@ def test_a_frame_by_tf_and_a_transform_that_is_too_old(node: Node, server: Senso
     node.until(compensation="ok")
 
 
-def test_tf_in_a_real_executor(server: Sensor, tf: FakeTf) -> None:
-    """The guard condition and the timer, which nothing calls in simulated time."""
-    node = rclpy.create_node("bridge", namespace="/test_frames")
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    tf.error = None
-    defaults = {row.name: row.default for row in PARAMETERS}
-    (topic,) = make_frames(node, gather(defaults | {"wrench_frames": ("base",)}))
-    heard: list[Any] = []
-
-    def publishes() -> bool:
-        assert topic.is_wanted()
-        topic.send((1.0, 2.0, 3.0), (0.0, 0.0, 0.0), DataMessage(1, server.time_ns(), 0, 0, 0, 3, b""))
-        executor.spin_once(0.01)
-        return bool(heard)
-
-    def is_closed() -> bool:
-        executor.spin_once(0.01)
-        return not topic.is_wanted() and not tf.listening
-
-    try:
-        name = "/test_frames/wrench_compensated/base"
-        subscription = node.create_subscription(WrenchStamped, name, heard.append, 10)
-        wait_until(topic.is_wanted, "the subscription")
-        wait_until(publishes, "a wrench")
-        assert tf.listening == 1
-        node.destroy_subscription(subscription)
-        wait_until(is_closed, "the end")
-    finally:
-        executor.shutdown()
-        retire(node)
-
-
 def test_without_tf2_ros(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tf2_ros", None)
     with pytest.raises(
@@ -474,21 +458,14 @@ def test_what_is_no_frame(texts: list[str], words: str) -> None:
         parse_frames(texts)
 
 
-def qos(node: Node) -> dict[str, tuple[str, str, int]]:
-    """Reliability, durability and depth of the node's own topics."""
-    profiles = {name.rpartition("/")[2]: topic.qos_profile for name, topic in node.topics.items()}
-    del profiles["parameter_events"]  # rclpy's
-    return {name: (p.reliability.name, p.durability.name, p.depth) for name, p in profiles.items()}
-
-
 def test_every_topic_is_reliable_unless_its_qos_is_overridden() -> None:
     """A best-effort publisher never reaches a reliable subscriber, which is what most tools are."""
-    with Node(Sensor(), **{"filter.cutoff": 10.0, "wrench_frames": "[tcp 0 0 0.5]"}) as node:
-        expected = dict.fromkeys(qos(node), ("RELIABLE", "VOLATILE", 10))
-        assert {"wrench", "wrench_filtered", "tcp", "data_raw", "diagnostics"} <= expected.keys()
-        assert qos(node) == expected
+    given = {"filter.cutoff": 10.0, "wrench_frames": "[tcp 0 0 0.5]"}
     best_effort = {"qos_overrides./mine.publisher.reliability": "best_effort"}
-    with Node(Sensor(), "-r", "wrench:=/mine", **best_effort) as node:
-        assert {name for name, (reliability, *_) in qos(node).items() if reliability != "RELIABLE"} == {
-            "mine"
-        }
+    with Node(Sensor(), "-r", "wrench:=/mine", **given, **best_effort) as node:
+        profiles = {name.rpartition("/")[2]: topic.qos_profile for name, topic in node.topics.items()}
+        del profiles["parameter_events"]  # rclpy's
+        got = {name: (p.reliability.name, p.durability.name, p.depth) for name, p in profiles.items()}
+    assert got.pop("mine") == ("BEST_EFFORT", "VOLATILE", 10)
+    assert {"wrench_compensated", "wrench_filtered", "tcp", "data_raw", "diagnostics"} <= got.keys()
+    assert got == dict.fromkeys(got, ("RELIABLE", "VOLATILE", 10))

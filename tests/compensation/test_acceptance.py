@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bota_ethercat.sensor.response import force_torque_response
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 from ethercat_server.virtual_sensor import signals
 from ethercat_server.virtual_sensor.signals import TURN_LENGTH
+from ft_compensation.alignment import Alignment, alignment_taps
 from ft_compensation.compensator import Compensator
 from ft_compensation.identification.payload import Identified, identify
 from ft_compensation.quantities import Payload, Wrench
@@ -35,13 +38,20 @@ SHAKEN = 128  # SINC length where the wrist sways: what compensation does not kn
 WITHIN_3_SIGMA = 0.9973  # the share of pure noise that lies within three standard deviations
 
 
-def compensated(stream: Stream, payload: Payload, bias: Wrench) -> tuple[Rows, Rows]:
+def filters(sinc: int) -> dict[str, int]:
+    return {"sinc_length": sinc, "fir": False, "acceleration_filter": 1}
+
+
+def compensated(stream: Stream, payload: Payload, bias: Wrench, sinc: int = SINC) -> tuple[Rows, Rows]:
     """Times (n,) and what compensation leaves (n, 6)."""
     imu, compensator = ImuSpecificForce(payload.center), Compensator(payload, bias)
+    rate_hz = BASE_SAMPLING_RATE_HZ / sinc
+    alignment = Alignment(alignment_taps(filters(sinc), rate_hz), 1 / rate_hz)
     times, rows = [], []
     for time_s, sample in stream:
         felt = imu.follow(sample.acceleration, sample.angular_rate, time_s)
         assert felt is not None
+        felt = alignment.follow(felt, time_s)
         times.append(time_s)
         rows.append(compensator.compensate(sample.force, sample.torque, felt).final.values)
     return np.array(times), np.array(rows)
@@ -54,8 +64,10 @@ def within_three_sigma(left: Rows, sinc: int = SINC) -> Rows:
 
 
 def truth(times: Rows) -> Rows:
-    """What the tool of `scene` is touched with, (n, 6)."""
-    return np.array([contact(float(time_s)) for time_s in times])
+    """What the tool of `scene` is touched with, (n, 6), as late as it is measured."""
+    delay_s = force_torque_response(filters(SHAKEN)).delay_s
+    assert delay_s is not None
+    return np.array([contact(float(time_s) - delay_s) for time_s in times])
 
 
 def smooth(left: Rows, count: int = 40) -> Rows:
@@ -98,7 +110,7 @@ def test_through_a_slow_full_turn_only_noise_is_left(identified: Identified) -> 
 
 
 def test_contacts_of_the_scene_show_up_undistorted(identified: Identified, touched: Stream) -> None:
-    times, left = compensated(touched, identified.payload, identified.bias)
+    times, left = compensated(touched, identified.payload, identified.bias, SHAKEN)
     touch = truth(times)
     error = left - touch
     assert within_three_sigma(error, SHAKEN).min() > WITHIN_3_SIGMA - 0.004

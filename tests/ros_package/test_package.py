@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import os
 import re
 import runpy
@@ -15,14 +14,12 @@ import types
 import zipfile
 from pathlib import Path
 from typing import Any, Final
-from xml.etree import ElementTree
 
 import pytest
 import setuptools
-import yaml
 from catkin_pkg.package import parse_package
 
-from tests.ros_package.package_files import PACKAGE, ROOT, SHARED_FOLDERS, in_text, shared_files
+from tests.ros_package.package_files import PACKAGE, ROOT, SHARED_FOLDERS, commands, shared_files
 from tests.test_architecture import imports
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -133,18 +130,15 @@ def test_what_is_for_an_index_is_built_and_checked_and_has_its_files_where_ros_l
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", bota], check=True)
     pip = [sys.executable, "-m", "pip", f"--python={bota}/bin/python", "install", "--quiet"]
     subprocess.run([*pip, "--no-deps", "--no-index", wheel], check=True)
-    (export,) = [
-        command.text for command in in_text("ros2-workspace.md") if command.text.startswith("export")
-    ]
+    (export,) = [command for command in commands("ros2-workspace.md") if command.startswith("export")]
     shell = f'{export}; cd "${{AMENT_PREFIX_PATH%%:*}}" && ls {MARKER}/bridge && lib/bridge/client --help'
     environment = os.environ | {"HOME": str(tmp_path)}
     used = subprocess.run(["bash", "-c", shell], env=environment, check=True, capture_output=True, text=True)
     assert "usage: ros2 run bridge client" in used.stdout
 
 
-CONFIG: Final = PACKAGE / "config"
-# Topics of the node in the root namespace, with their types.
-TOPICS: Final = {
+# Topics of the node in the root namespace, with what a layout plots of them.
+PLOTTED: Final = {
     "/sensone_sensor_data": "std_msgs/Float64MultiArray",
     "/wrench": "geometry_msgs/WrenchStamped",
     "/wrench_compensated": "geometry_msgs/WrenchStamped",
@@ -152,51 +146,24 @@ TOPICS: Final = {
     "/compensation/tool": "geometry_msgs/WrenchStamped",
     "/imu/data_raw": "sensor_msgs/Imu",
     "/temperature": "sensor_msgs/Temperature",
-    "/diagnostics": "diagnostic_msgs/DiagnosticArray",
 }
 
 
-def assert_shown(topic: str, fields: list[str]) -> None:
-    """The topic is the node's, and its messages have the field (if ROS is there to tell)."""
-    package, name = TOPICS[topic].split("/")
-    messages = pytest.importorskip(f"{package}.msg", reason="ROS messages are missing")
-    assert isinstance(functools.reduce(getattr, fields, getattr(messages, name)()), float), fields
-
-
-def test_plotjuggler_plots_fields_of_the_nodes_topics() -> None:
-    root = ElementTree.parse(CONFIG / "plotjuggler_layout.xml").getroot()
-    streamer, plugin = root.find("previouslyLoaded_Streamer"), root.find("Plugins/plugin")
-    selected = root.find("Plugins/plugin/selected_topics")
-    assert streamer is not None
-    assert plugin is not None
-    assert selected is not None
-    assert streamer.get("name") == plugin.get("ID") == "ROS2 Topic Subscriber"
-    subscribed = set(str(selected.get("value")).split(";"))
-    shown = set()
-    for curve in [str(curve.get("name")) for curve in root.iter("curve")]:
-        (topic,) = [topic for topic in subscribed if curve.startswith(topic + "/")]
-        assert_shown(topic, curve.removeprefix(topic + "/").split("/"))
-        shown.add(topic)
-    assert shown == subscribed
-
-
-def test_foxglove_plots_fields_of_the_nodes_topics_and_shows_the_diagnostics() -> None:
-    panels = json.loads((CONFIG / "foxglove_layout.json").read_text())["configById"].values()
-    values = [path["value"] for panel in panels for path in panel.get("paths", ())]
-    assert values
-    for value in values:
-        topic, *fields = value.split(".")
-        assert_shown(topic, fields)
-    assert {panel["topicToRender"] for panel in panels if "topicToRender" in panel} == {"/diagnostics"}
-
-
-def test_rviz_shows_the_wrenches() -> None:
-    manager = yaml.safe_load((CONFIG / "wrench.rviz").read_text())["Visualization Manager"]
-    shown = {
-        display["Topic"]["Value"]: display["Class"] for display in manager["Displays"] if "Topic" in display
-    }
-    assert shown == dict.fromkeys(("/wrench", "/wrench_compensated"), "rviz_default_plugins/Wrench")
-    (model,) = [display for display in manager["Displays"] if display["Class"].endswith("/RobotModel")]
-    assert model["Description Topic"]["Value"] == "/robot_description"  # of robot_state_publisher
-    assert all("Topic" not in tool for tool in manager["Tools"])
-    assert manager["Global Options"]["Fixed Frame"] == "base_link"  # of urdf/example.urdf.xacro
+@pytest.mark.parametrize(
+    ("layout", "path"),
+    [
+        ("plotjuggler_layout.xml", r'curve [^>]*name="([^"]+)"'),
+        ("foxglove_layout.json", r'"value": "(/[^"]+)"'),
+        ("wrench.rviz", r"Value: (/wrench.*)"),
+    ],
+)
+def test_a_layout_plots_fields_of_the_nodes_topics(layout: str, path: str) -> None:
+    shown = set(re.findall(path, (PACKAGE / "config" / layout).read_text()))
+    assert shown
+    for each in shown:
+        topic = max((topic for topic in PLOTTED if re.match(rf"{topic}(?![a-z_])", each)), key=len)
+        package, name = PLOTTED[topic].split("/")
+        messages = pytest.importorskip(f"{package}.msg", reason="ROS messages are missing")
+        fields = re.split(r"[./]", each.removeprefix(topic))[1:]
+        value = functools.reduce(getattr, fields, getattr(messages, name)())
+        assert not fields or isinstance(value, float), each

@@ -1,29 +1,20 @@
-"""colcon builds, installs and tests the package; docs/ros2-workspace.md is followed word for word."""
+"""colcon builds, installs and tests the package."""
 
 from __future__ import annotations
 
 import os
-import re
-import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 from catkin_pkg.packages import find_packages
 
-from tests.ros_package.package_files import PACKAGE, ROOT, Command, console, in_text, shared_files
+from tests.ros_package.package_files import PACKAGE, ROOT, commands, shared_files
 
 # What colcon needs for a Python package comes from PyPI; setuptools 80 has lost what --symlink-install needs.
 TOOLS = ("colcon-common-extensions", "rosdep", "setuptools<80", "pytest")
-PAGE = "ros2-workspace.md"
-# Not run with the others: one writes to /etc; test_data_files.py and the first test below have the other two.
-ELSEWHERE = ("sudo rosdep init", "export AMENT_PREFIX_PATH=", "colcon build --symlink-install")
-COMMANDS = [*console(PAGE), *(c for c in in_text(PAGE) if not c.text.startswith(ELSEWHERE))]
-ENDLESS_S = 5
 
 
 @pytest.fixture(scope="module")
@@ -86,101 +77,11 @@ def test_a_workspace_with_only_this_repository(colcon: Path, tmp_path: Path, how
     assert "0 errors, 0 failures" in run("colcon", "test-result")
 
 
-@dataclass(frozen=True)
-class Ran:
-    status: int
-    output: str
-    missing: str
-
-
-# Where there is no ROS, what needs it is missing, but not the others; endless programs get Ctrl-C.
-SHELL = """
-source() { [ "$1" = /opt/ros/jazzy/setup.bash ] && ! [ -e "$1" ] || builtin source "$@"; }
-ros2() { timeout --signal=INT --preserve-status ENDLESS_S "$(type -P ros2)" "$@"; }
-rviz2() { timeout --signal=INT --preserve-status ENDLESS_S "$(type -P rviz2)" "$@"; }
-"""
-
-
-def rosdep_database(folder: Path) -> dict[str, str]:
-    """The environment for a rosdep that asks this folder and not the network."""
-    needs = {
-        depend.text for depend in ElementTree.parse(PACKAGE / "package.xml").iter() if "depend" in depend.tag
-    }
-    (folder / "sources").mkdir(parents=True)
-    (folder / "sources/20-default.list").write_text(f"yaml file://{folder}/base.yaml")
-    (folder / "base.yaml").write_text(
-        "".join(f"{need}: {{ubuntu: []}}\n" for need in sorted(map(str, needs)))
-    )
-    (folder / "index.yaml").write_text(
-        "distributions: {jazzy: {distribution: [jazzy.yaml], distribution_type: ros2, python_version: 3}}\n"
-        "type: index\nversion: 4\n"
-    )
-    (folder / "jazzy.yaml").write_text(
-        "type: distribution\nversion: 2\nrelease_platforms: {ubuntu: [noble]}\nrepositories: {}\n"
-    )
-    return {
-        "ROSDEP_SOURCE_PATH": f"{folder}/sources",
-        "ROSDISTRO_INDEX_URL": f"file://{folder}/index.yaml",
-        "ROS_OS_OVERRIDE": "ubuntu:24.04:noble",
-        "ROS_DISTRO": "jazzy",
-        "ROS_HOME": f"{folder}/home",
-    }
-
-
-@pytest.fixture(scope="module")
-def session(colcon: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Ran]:
-    """One shell in this repository, into which the page's commands are typed one after the other."""
-    home = tmp_path_factory.mktemp("home")
-    environment = clean_environment() | rosdep_database(home / "rosdep") | {
-        "HOME": str(home),
-        "PATH": f"{colcon}:{os.environ['PATH']}",
-        "PYTHONWARNINGS": "",
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }  # fmt: skip
-    typed = [SHELL.replace("ENDLESS_S", str(ENDLESS_S))]
-    for number, command in enumerate(COMMANDS):
-        quoted = shlex.quote(command.text.replace("FILE", "/dev/null"))
-        typed.append(
-            f"eval {quoted} >{home}/{number}.output 2>&1 </dev/null; echo $? >{home}/{number}.status"
-        )
-    subprocess.run(["bash", "-c", "\n".join(typed)], cwd=ROOT, env=environment, check=True)
-    return {
-        command.text: Ran(
-            int((home / f"{number}.status").read_text()),
-            (home / f"{number}.output").read_text(),
-            missing(command, environment["PATH"]),
-        )
-        for number, command in enumerate(COMMANDS)
-    }
-
-
-def missing(command: Command, path: str) -> str:
-    """The program that the command needs and this machine lacks, if any."""
-    for name in ("rosdep", "colcon", "ros2", "xacro", "rviz2"):
-        if name in command.text.split() and shutil.which(name, path=path) is None:
-            return name
-    return "a display" if "rviz2" in command.text and "DISPLAY" not in os.environ else ""
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.text.strip()[:40])
-def test_a_command_of_the_page(session: dict[str, Ran], command: Command) -> None:
-    """Those that do not end by themselves take real seconds: what they show needs their processes."""
-    ran = session[command.text]
-    if ran.missing:
-        pytest.skip(f"{ran.missing} is missing")
-    if re.search(r"Package '(?!bridge')\w+' not found", ran.output):
-        pytest.skip(ran.output.strip())
-    assert ran.status == 0, ran.output
-    if command.text.startswith("ros2 run bridge client"):
-        assert "no server at localhost:12001" in ran.output
-
-
 def test_the_link_makes_no_loop_in_a_workspace_inside_the_repository(tmp_path: Path) -> None:
     """rosdep searches with catkin_pkg, which follows links and refuses a package that it finds twice."""
     (tmp_path / "ros2_bridge").mkdir()
     shutil.copy(PACKAGE / "package.xml", tmp_path / "ros2_bridge")
-    (link,) = [command.text for command in COMMANDS if "ln -s" in command.text]
+    (link,) = [command for command in commands("ros2-workspace.md") if "ln -s" in command]
     for _ in range(2):  # A second time, which must not put a link into the package.
         subprocess.run(
             ["bash", "-c", link], cwd=tmp_path, env=os.environ | {"HOME": str(tmp_path)}, check=True

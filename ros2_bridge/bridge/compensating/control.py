@@ -13,9 +13,8 @@ from typing import Any, Final
 from rclpy.node import Node
 
 from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper, OwnOffset
-from bridge.compensating.orientations import SourceChoice
-from bridge.compensating.tool_sources import IMU_IS_OFF
-from bridge.diagnostics.health import CompensationState
+from bridge.compensating.sources import IMU_IS_OFF, SourceChoice
+from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import LiveParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
@@ -26,11 +25,13 @@ from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
 
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
+_KEPT: Final = ("bias", "payload", "bias_keep", "bias_directory")  # what the file of the bias depends on
+_NOTHING_CURRENT: Final = "no current orientation"
 _LOOKING_UP: Final = "the bias of this sensor is being looked up"
 
 
 class CompensationControl:
-    """Wires parameters, bias and source to `output`, from `start` to `close`."""
+    """Wires parameters, bias and source to `output`, from `start` on."""
 
     def __init__(
         self,
@@ -44,17 +45,15 @@ class CompensationControl:
         self.parameters, self.output = parameters, output
         self.reader, self.link, self._live = reader, reader.link, live
         self.origin = FROM_PARAMETER  # where the bias in force comes from
-        self.sensors = 1  # how many have been there: what was measured on one is of no use with another
-        self._model = ""  # of the sensor that is or was there
         self._log = node.get_logger()
-        self.choice = SourceChoice(node, parameters.frame_id, self.link)
+        self.choice = SourceChoice(node, self.link)
         self.keeper = BiasKeeper(self._log)
         self.own_offset = OwnOffset(self.link)
         # Origin of the bias that is being put in force, and what it was taken with if by a tare.
         self._next: tuple[str, Taken | None] = (FROM_PARAMETER, None)
         self.choice.check(parameters)
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
-        self._shifting = threading.Lock()  # for whoever shifts the ramp, or replaces it and the plan
+        self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
         self._payload_watch: PayloadWatch | None = None
         self._watched: object = None
         live.check = self._check
@@ -62,12 +61,8 @@ class CompensationControl:
 
     def start(self) -> None:
         """Open the orientation's source, before any sample comes; ParameterError if it cannot be had."""
-        self.choice.open(self.parameters, self._model)
+        self.choice.open(self.parameters)
         self._make_plan()
-
-    def close(self) -> None:
-        """Stop listening for orientations."""
-        self.choice.close()
 
     def link_changed(self) -> None:
         """There is another connection, or none; for the reader's thread."""
@@ -93,7 +88,7 @@ class CompensationControl:
         age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
         parts = ["bias"] if bias != NO_WRENCH else []
         if payload.mass:
-            parts.append("weight and inertia of the tool" if source.is_imu else "weight of the tool")
+            parts.append("weight and inertia of the tool" if source.has_inertia else "weight of the tool")
         none = "nothing is subtracted: there is no bias and no tool_mass"
         good = f"subtracted: {', '.join(parts)}" if parts else none
         return CompensationState(
@@ -113,24 +108,21 @@ class CompensationControl:
                 "compensated": output.published,
                 "withheld": output.withheld,
             },
-            has_subscribers=has_subscribers,
-            has_tool=payload.mass > 0.0,
-            source=source.describe,
-            withheld=output.withheld,
-            why_stopped=self._why_stopped(),
-            why_partly=output.problem,
-            stops_on_saturation=output.stops_on_saturation,
-            problem=self.conflict()
+            stopped=self._why_stopped() or output.problem,
+            doubtful=self.conflict()
             or self.own_offset.doubt()
             or self._ramp.taken.doubt(payload)
             or self.keeper.problem
             or (self._payload_watch.finding if self._payload_watch is not None else ""),
+            follows_imu=source.is_imu and payload.mass > 0.0,
+            withheld=output.withheld,
+            why_withheld=output.why_withheld or f"{_NOTHING_CURRENT} ({source.describe})",
         )
 
-    def conflict(self, *, needs_tool: bool = False) -> str | None:
+    def conflict(self, *, needs_tool: bool = False) -> str:
         """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
         specific force in the frame of the wrench, a sentence that says what to do."""
-        settings = self.link.settings
+        settings = self.link.info.settings
         if settings.get("calibration_matrix") is False:
             return (
                 "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
@@ -141,37 +133,36 @@ class CompensationControl:
                 "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
                 "or set tool_mass to 0"
             )
-        return self._blind() if needs_tool else None
+        return self._why_unknown() if needs_tool else ""
 
-    def _blind(self) -> str | None:
-        if self.parameters.orientation.source != "imu":
-            return None
-        if self.link.settings.get("coordinate_system") is True:
+    def _why_unknown(self) -> str:
+        """Why these settings of the sensor hide the specific force, a sentence; empty if they do not."""
+        if self.parameters.gravity_source != "imu":
+            return ""
+        if self.link.info.settings.get("coordinate_system") is True:
             return (
                 "settings.coordinate_system is on, so the wrench is in a frame configured in the sensor, and "
                 "the rotation from the IMU to it is unknown: switch it off, or take the orientation of that "
                 "frame from the robot (gravity_source)"
             )
-        return IMU_IS_OFF if self.link.settings.get("imu_active") == 0 else None
+        return IMU_IS_OFF if self.link.info.settings.get("imu_active") == 0 else ""
 
     def _hold(self) -> None:
         """Publish nothing while the specific force is needed and cannot be known."""
-        self.output.hold = self._blind() if self.parameters.payload.mass else None
+        self.output.hold = self._why_unknown() if self.parameters.payload.mass else ""
 
-    def _why_stopped(self) -> str | None:
+    def _why_stopped(self) -> str:
         """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
         output, source, watch = self.output, self.choice.source, self.reader.watch
-        sample, stamp_s = output.sample, output.stamp_s
         if not output.has_subscribers:
-            if not self.parameters.payload.mass:
-                return output.hold
-            sample, stamp_s = watch.sample, watch.stamp_ns * 1e-9
-        elif not output.is_stopped:
-            return None
-        elif output.is_saturated:
-            return output.hold or "force or torque is saturated, and on_saturation is stop"
-        why = source.why_none(sample, stamp_s) if sample is not None else ""
-        return output.hold or why or ("what is known of the tool is too old" if output.is_stopped else None)
+            why = output.hold
+            if not why and self.parameters.payload.mass and watch.sample is not None:
+                why = source.why_none(watch.sample, watch.stamp_ns * 1e-9)
+            return why and f"wrench_compensated could not be published if somebody subscribed: {why}"
+        if not output.is_stopped or output.sample is None:
+            return ""
+        why = output.why_withheld or source.why_none(output.sample, output.stamp_s) or _NOTHING_CURRENT
+        return f"wrench_compensated has stopped: {why}"
 
     def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
         """Put a bias in force, `taken` by a tare, and keep it if that is asked for."""
@@ -207,7 +198,7 @@ class CompensationControl:
     def _check(self, wanted: Parameters) -> None:
         """ParameterError if they cannot be had here."""
         self.choice.check(wanted)
-        if self.link.is_connected and (rate_hz := self.link.rate_hz):
+        if self.link.is_connected and (rate_hz := self.link.info.rate_hz):
             known = self.parameters.filter.problems(rate_hz)
             for problem in wanted.filter.problems(rate_hz):
                 if problem not in known:
@@ -236,19 +227,18 @@ class CompensationControl:
             self._guard.trigger()  # the parameter follows
         if self.output.hold is not _LOOKING_UP:
             self._hold()
-        if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
-            self.keeper.kept = None
-        self.keeper.keep(self._ramp, wanted, self.own_offset.to_keep)
+        if is_wish or any(getattr(was, name) != getattr(wanted, name) for name in _KEPT):
+            self.keeper.keep(self._ramp, wanted, self.own_offset.to_keep)
 
     def _open_source(self) -> None:
         try:
-            self.choice.open(self.parameters, self._model)
+            self.choice.open(self.parameters)
         except ParameterError as error:  # too late to refuse the parameter
             self._log.error(str(error))
 
     def _make_plan(self) -> None:
         payload, rest = self.parameters.payload, self.parameters.rest
-        watched = payload, self.bias, self.sensors
+        watched = payload, self.bias, self.keeper.serial
         if watched != self._watched:
             self._watched = watched
             self._payload_watch = PayloadWatch(payload, self._log.warning, rest) if payload.mass else None
@@ -256,18 +246,15 @@ class CompensationControl:
         self.output.plan = Plan(source, Compensator(payload), self._ramp, has_tool, self._payload_watch)
 
     def _is_same_sensor(self) -> bool:
-        info = self.link.info
-        return not self.link.is_connected or info is None or info.serial == self.keeper.serial
+        return not self.link.is_connected or self.link.info.serial == self.keeper.serial
 
     def _follow_sensor(self) -> None:
-        """Find the bias of the sensor that is there now."""
+        """Find the bias of the connected sensor."""
         while not self._is_same_sensor():
-            info = self.link.info
-            if info is None:
-                break
             is_another = self.keeper.serial is not None
             offset = self.own_offset.begin(self.bias)
-            begin = self.keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)
+            serial = self.link.info.serial
+            begin = self.keeper.take(serial, self.bias, self.origin, self.parameters, offset)
             if begin is not None:
                 self.own_offset.has_bias = begin.is_one
                 problem = self.keeper.problem
@@ -277,9 +264,7 @@ class CompensationControl:
             elif is_another:
                 # What was before in its history was the other's too.
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
-            self._model = info.name
             self._open_source()
-            self.sensors += is_another
             self._make_plan()
             if not self.keeper.problem and self.bias != NO_WRENCH:
                 self.keeper.keep(self._ramp, self.parameters, self.own_offset.to_keep)

@@ -116,16 +116,9 @@ def _refuse_unknown_types(set_parameters: Callable[[Any, Any], Any]) -> Callable
     """rclpy's callback of a service, which raises where anybody sends a type that there is not."""
 
     def callback(request: Any, response: Any) -> Any:
-        unknown = {parameter.value.type for parameter in request.parameters} - _TYPES
-        if not unknown:
+        if {parameter.value.type for parameter in request.parameters} <= _TYPES:
             return set_parameters(request, response)
-        reason = f"there is no parameter type {unknown.pop()}: see rcl_interfaces/msg/ParameterType"
-        result = SetParametersResult(successful=False, reason=reason)
-        if isinstance(response, SetParameters.Response):
-            response.results = [result] * len(request.parameters)
-        else:
-            response.result = result
-        return response
+        return response  # nothing was set
 
     return callback
 
@@ -201,7 +194,7 @@ class SettingsParameters:
 
     def _follow(self) -> None:
         """Make the parameters what the settings are."""
-        in_force = self._link.settings
+        in_force = self._link.info.settings
         self._following = True
         try:
             for setting in SETTINGS.values():
@@ -227,7 +220,6 @@ class SettingsParameters:
 
     def _configure(self, wanted: dict[str, SettingValue]) -> None:
         reply = self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=self._link.sensor, settings=wanted)
-        self._link.take_settings(reply)
         in_force = known_settings(reply.get("settings"))
         for name, value in wanted.items():
             if (held := in_force.get(name)) != value:

@@ -37,7 +37,6 @@ _PORT: Final = 12001
 _COVARIANCE_LENGTHS: Final = (3, 9)
 _COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
 _LEAST_GRAVITY: Final = 0.1
-_LEAST_SCALE: Final = 0.5
 _FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _FARTHEST_M: Final = 10.0
 _REST: Final = StationaryLimits()
@@ -50,8 +49,8 @@ class ParameterError(Exception):
 class Row(NamedTuple):
     """One parameter. The default's type is the parameter's; a tuple is texts, or numbers, `lengths` how many.
 
-    `low` and `high` bound a number, or the magnitude of each of several. `live`: can be set while the node
-    runs; others are read-only.
+    `low` and `high` bound a number; of several, each from -`high` if `low` is 0. `live`: can be set while the
+    node runs; others are read-only.
     """
 
     name: str
@@ -62,6 +61,7 @@ class Row(NamedTuple):
     choices: tuple[str, ...] = ()
     lengths: tuple[int, ...] = _COVARIANCE_LENGTHS
     live: bool = True
+    optional: bool = False  # whether a text may be empty
 
     def check(self, value: object) -> ParameterValue:
         """Return `value`, a whole number as float where one is meant; ParameterError if it cannot be."""
@@ -87,10 +87,11 @@ class Row(NamedTuple):
         if type(item) is not kind and (kind, type(item)) != (float, int):
             return False
         if isinstance(item, str):
-            return item in self.choices if self.choices else several or bool(item)
+            return item in self.choices if self.choices else several or self.optional or bool(item)
         if isinstance(item, bool) or not isinstance(item, int | float):
             return True
-        return self.low <= (abs(item) if several else item) <= self.high  # nor is it a NaN
+        # Nor is it a NaN.
+        return self.low <= (abs(item) if several and not self.low else item) <= self.high
 
     def allowed(self) -> str:
         """The values that it may have, in words."""
@@ -101,9 +102,9 @@ class Row(NamedTuple):
                 return "a list of texts"
             if self.lengths == _COVARIANCE_LENGTHS:
                 return "3 numbers, the variances, or 9, the covariance row by row"
-            return f"{self.lengths[0]} numbers, none beyond {self.high:g} either way"
+            return f"{self.lengths[0]} numbers from {self.low or -self.high:g} to {self.high:g}"
         if isinstance(self.default, str):
-            return "text that is not empty"
+            return "text" if self.optional else "text that is not empty"
         if isinstance(self.default, bool):
             return "true or false"
         kind = "a whole number" if isinstance(self.default, int) else "a number"
@@ -119,8 +120,13 @@ PARAMETERS: Final = (
         "SCHED_FIFO priority of the stream's thread, if allowed; 0 = as the node was started",
         0, HIGHEST_PRIORITY, live=False),
     Row("cpu", -1, "CPU of the stream's thread; -1 = any", -1, 1023, live=False),
-    Row("publishing_frequency", 0.0, "Most messages a second, always the newest; 0 = every sample", 0, 1e6),
+    Row("publishing_frequency", 0.0, "Most messages a second, no low-pass; 0 = every sample", 0, 1e6),
     Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray", live=False),
+    Row("supervisor_topic", "/supervisor_status_data", "Topic that stops server and node; empty = none",
+        live=False, optional=True),
+    Row("stamp", "sample",
+        "What stamps are the time of: the sample, or the measurement, earlier by the sensor's filter delay",
+        choices=("sample", "measurement")),
     Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature",
         live=False),
     Row("wrench_frames", NO_TEXTS,
@@ -134,20 +140,13 @@ PARAMETERS: Final = (
     Row("linear_acceleration_covariance", ZERO, f"Of the IMU, (m/s²)²: {_COVARIANCE}", 0, 1e12),
     Row("temperature_variance", 0.0, "Of the temperature, K²; 0 = unknown", 0, 1e6),
     # Those limits of every verdict that can be set for this node.
-    Row("diagnostics.stale_after", LIMITS.stale_after,
-        "Seconds without a new sample that are an error", 0.05, 60),
-    Row("diagnostics.rate_tolerance", LIMITS.rate_tolerance,
-        "Part by which the rate may differ before it is a warning", 0, 1),
-    Row("diagnostics.age_warn", LIMITS.age_warn,
-        "Age of the samples (p99), s, from which it is a warning", 0, 60),
-    Row("diagnostics.age_error", LIMITS.age_error,
-        "Age of the samples (p99), s, from which it is an error", 0, 60),
-    Row("diagnostics.lost_warn", LIMITS.lost_warn,
-        "Samples lost or skipped in a second that are a warning", 1, 10**6),
-    Row("diagnostics.temperature_warn", LIMITS.temperature_warn,
-        "Temperature, °C, from which it is a warning", -40, 200),
-    Row("diagnostics.temperature_error", LIMITS.temperature_error,
-        "Temperature, °C, from which it is an error", -40, 200),
+    Row("diagnostics.stale_after", LIMITS.stale_after, "Error: no new sample for so many s", 0.05, 60),
+    Row("diagnostics.rate_tolerance", LIMITS.rate_tolerance, "Warning: relative error of the rate", 0, 1),
+    Row("diagnostics.age_warn", LIMITS.age_warn, "Warning: age of the samples (p99), s", 0, 60),
+    Row("diagnostics.age_error", LIMITS.age_error, "Error: age of the samples (p99), s", 0, 60),
+    Row("diagnostics.lost_warn", LIMITS.lost_warn, "Warning: samples lost or skipped in 1 s", 1, 10**6),
+    Row("diagnostics.temperature_warn", LIMITS.temperature_warn, "Warning: temperature, °C", -40, 200),
+    Row("diagnostics.temperature_error", LIMITS.temperature_error, "Error: temperature, °C", -40, 200),
     Row("tool_mass", 0.0, "Mass of what hangs on the sensor, kg; 0 = it is not compensated", 0, 1000),
     Row("tool_center_of_gravity", ZERO, "Its center of gravity in frame_id, m", 0, 10, lengths=(3,)),
     Row("gravity", DEFAULT_GRAVITY,
@@ -159,12 +158,13 @@ PARAMETERS: Final = (
     Row("bias_directory", AUTO,
         "Where it is kept; auto = bota-ethercat-bridge in $XDG_STATE_HOME or ~/.local/state"),
     Row("imu_position", ZERO,
-        "Position of the IMU in frame_id, m; zeros = that of the sensor's model", 0, 1, lengths=(3,)),
+        "Position in frame_id of the IMU that gravity_source names, m; zeros = that of the sensor's model",
+        0, 1, lengths=(3,)),
     Row("on_saturation", "publish",
         "What wrench_compensated does on samples whose force or torque is saturated",
         choices=("publish", "stop")),
     Row("gravity_source", "imu",
-        "Where the tool's weight is from: imu (with its inertia), or an orientation of the robot's",
+        "Where the tool's weight and inertia are from: the sensor's IMU, or the robot (topics, TF)",
         choices=("none", "imu", *TOPIC_SOURCES, "tf")),
     Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
     Row("orientation.base_frame", "base_link", "Frame that gravity is given in, for the source tf"),
@@ -173,23 +173,23 @@ PARAMETERS: Final = (
     Row("orientation.stale_after", 0.1,
         "Largest difference of the stamps of orientation and sample, s", 0.001, 10),
     Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
-    Row("accelerometer.scale", EXACT.scale, "Its scale factors; ~/identify finds them", 0, 2, lengths=(3,)),
+    Row("accelerometer.scale", EXACT.scale, "Its scale factors; ~/identify finds them", 0.5, 2, lengths=(3,)),
     Row("accelerometer.offset_interval", EXACT.offset_interval,
         "Half of the 95 % interval of its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
     Row("accelerometer.scale_interval", EXACT.scale_interval,
         "Half of the 95 % interval of its scale; ~/identify finds it", 0, 1, lengths=(3,)),
     Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
-    Row("rest.force_spread", _REST.force_spread, "Largest standard deviation when stationary, N", 0, 1e3),
-    Row("rest.torque_spread", _REST.torque_spread, "Largest standard deviation when stationary, Nm", 0, 1e3),
-    Row("rest.force_wander", _REST.force_wander, "Largest drift of the mean when stationary, N", 0, 1e3),
-    Row("rest.torque_wander", _REST.torque_wander, "Largest drift of the mean when stationary, Nm", 0, 1e3),
-    Row("rest.angular_rate", _REST.angular_rate, "Largest mean angular rate when stationary, rad/s", 0, 10),
-    Row("rest.angular_rate_spread", _REST.angular_rate_spread,
-        "Largest standard deviation when stationary, rad/s", 0, 10),
-    Row("rest.acceleration_spread", _REST.acceleration_spread,
-        "Largest standard deviation when stationary, m/s²", 0, 100),
-    Row("rest.acceleration_wander", _REST.acceleration_wander,
-        "Largest drift of the mean when stationary, m/s²", 0, 100),
+    Row("rest.force_deviation", _REST.force_deviation, "Largest standard deviation at rest, N", 0, 1e3),
+    Row("rest.torque_deviation", _REST.torque_deviation, "Largest standard deviation at rest, Nm", 0, 1e3),
+    Row("rest.force_drift", _REST.force_drift, "Largest drift of the mean at rest, N", 0, 1e3),
+    Row("rest.torque_drift", _REST.torque_drift, "Largest drift of the mean at rest, Nm", 0, 1e3),
+    Row("rest.angular_rate", _REST.angular_rate, "Largest mean angular rate at rest, rad/s", 0, 10),
+    Row("rest.angular_rate_deviation", _REST.angular_rate_deviation,
+        "Largest standard deviation at rest, rad/s", 0, 10),
+    Row("rest.acceleration_deviation", _REST.acceleration_deviation,
+        "Largest standard deviation at rest, m/s²", 0, 100),
+    Row("rest.acceleration_drift", _REST.acceleration_drift,
+        "Largest drift of the mean at rest, m/s²", 0, 100),
     Row("filter.cutoff", 0.0, "Low-pass of wrench_filtered, -3 dB, Hz; 0 = no such topic", 0, 1000),
     Row("filter.notch", 0.0, "Center of its notch, Hz; 0 = none", 0, 1000),
     Row("filter.notch_width", 5.0, "Width of the notch between -3 dB points, Hz", 0.1, 1000),
@@ -200,16 +200,6 @@ PARAMETERS: Final = (
 )  # fmt: skip
 
 
-class OrientationParameters(NamedTuple):
-    """Where the orientation comes from."""
-
-    source: str
-    topic: str
-    base_frame: str
-    mounting: Quaternion
-    stale_after: float
-
-
 class WrenchFrame(NamedTuple):
     """A frame of the compensated wrench besides the sensor's, and the end of a topic's name."""
 
@@ -218,7 +208,7 @@ class WrenchFrame(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """The parameters' values, checked."""
+    """The parameters' values, checked; `a.b` is `a_b`, unless it is part of a group that has its own type."""
 
     server_host: str
     server_port: int
@@ -227,6 +217,8 @@ class Parameters(NamedTuple):
     cpu: int
     publishing_frequency: float
     array_topic: str
+    supervisor_topic: str
+    stamp: str
     imu_units: ImuUnits
     frame_id: str
     imu_frame_id: str
@@ -244,7 +236,11 @@ class Parameters(NamedTuple):
     bias_directory: str
     imu_position: Vector3
     on_saturation: str
-    orientation: OrientationParameters
+    gravity_source: str
+    orientation_topic: str
+    orientation_base_frame: str
+    orientation_mounting: Quaternion
+    orientation_stale_after: float
     accelerometer: Accelerometer
     rest_duration: float
     rest: StationaryLimits
@@ -278,11 +274,6 @@ def gather(given: Mapping[str, Any]) -> Parameters:
         values["orientation.mounting"] = unit_quaternion(mounting)
     except ValueError as error:
         raise ParameterError(f"parameter orientation.mounting is {list(mounting)}: {error}") from None
-    if min(scale := values["accelerometer.scale"]) < _LEAST_SCALE:
-        raise ParameterError(
-            f"parameter accelerometer.scale is {list(scale)}: each must be at least {_LEAST_SCALE}; 1 is an "
-            "exact axis"
-        )
     for name, least in (("filter.cutoff", LEAST_CUTOFF_HZ), ("filter.notch", LEAST_NOTCH_HZ)):
         if 0.0 < values[name] < least:
             raise ParameterError(
@@ -293,20 +284,18 @@ def gather(given: Mapping[str, Any]) -> Parameters:
         return {name.removeprefix(prefix): values.pop(name) for name in given if name.startswith(prefix)}
 
     rest = group("rest.")
-    return Parameters(
-        limits=LIMITS._replace(**group("diagnostics.")),
-        imu_units=ImuUnits(values.pop("imu_raw_units")),
-        wrench_frames=parse_frames(values.pop("wrench_frames")),
-        payload=Payload(values.pop("tool_mass"), values.pop("tool_center_of_gravity")),
-        bias=Wrench.of(values.pop("bias")),
-        orientation=OrientationParameters(values.pop("gravity_source"), **group("orientation.")),
-        accelerometer=Accelerometer(**group("accelerometer.")),
-        rest_duration=rest.pop("duration"),
-        rest=StationaryLimits(**rest),
-        identify_file=values.pop("identify.file"),
-        filter=FilterSettings(**group("filter.")),
-        **values,
-    )
+    groups: dict[str, Any] = {
+        "limits": LIMITS._replace(**group("diagnostics.")),
+        "imu_units": ImuUnits(values.pop("imu_raw_units")),
+        "wrench_frames": parse_frames(values.pop("wrench_frames")),
+        "payload": Payload(values.pop("tool_mass"), values.pop("tool_center_of_gravity")),
+        "bias": Wrench.of(values.pop("bias")),
+        "accelerometer": Accelerometer(**group("accelerometer.")),
+        "rest_duration": rest.pop("duration"),
+        "rest": StationaryLimits(**rest),
+        "filter": FilterSettings(**group("filter.")),
+    }
+    return Parameters(**groups, **{name.replace(".", "_"): value for name, value in values.items()})
 
 
 def parse_frames(texts: Sequence[str]) -> tuple[WrenchFrame, ...]:
@@ -345,6 +334,3 @@ def _parse_frame(text: str) -> WrenchFrame:
             f"in m ({error})"
         ) from None
     return WrenchFrame(name, pose.inverse())
-
-
-DEFAULTS: Final = gather({row.name: row.default for row in PARAMETERS})

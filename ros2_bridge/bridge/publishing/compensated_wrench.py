@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
+import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -18,72 +19,60 @@ from rclpy.node import Node
 from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample, Vector3
-from bridge.compensating.orientations import LookUp, UnusableError, check_tf, follow_tf
-from bridge.compensating.tool_sources import Source
-from bridge.parameters.table import Parameters
-from bridge.publishing.messages import Topic
+from bridge.compensating.sources import LookUp, Source, UnusableError, check_tf, follow_tf, why_off
+from bridge.parameters.table import Parameters, WrenchFrame
+from bridge.publishing.messages import Stamps, Topic
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.outputs import FilterSettings, WrenchFilter, WrenchTransform
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
-from ft_compensation.stationary import StationaryWindow
+from ft_compensation.stationary import StationaryWindow, triple
 from ft_compensation.stationary_limits import StationaryLimits
 
 # Failed lookups after the first subscription before it is a problem: TF has to arrive first.
 _PATIENCE: Final = 200
 _NS_PER_S: Final = 1_000_000_000
+_SATURATED: Final = "force or torque was saturated, and on_saturation is stop"
 
 
 class WrenchTopic(Topic):
     """`geometry_msgs/WrenchStamped` of one stage of the compensation."""
 
-    takes_all = False  # whether `note` wants what `publishing_frequency` leaves out
     problem = ""  # why nothing is published, a sentence
 
-    def __init__(self, node: Node, topic: str, frame_id: str, stage: str = "final") -> None:
+    def __init__(self, node: Node, topic: str, frame_id: str, stamps: Stamps, stage: str = "final") -> None:
         super().__init__(node, WrenchStamped, topic)
-        self._pack = StampedNumbers(frame_id, 6).pack
+        self._pack, self._stamps = StampedNumbers(frame_id, 6).pack, stamps
         self.index = Stages._fields.index(stage)
 
     def configure(self, parameters: Parameters) -> None:
         """Take other parameters from the next sample on; for the executor's thread."""
 
-    def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        """Take note of a sample that is not published."""
-
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Publish a force, N, and a torque, Nm."""
-        self._send(self._pack(frame.stamp_ns, *force, *torque))
+        self._send(self._pack(frame.stamp_ns - self._stamps.wrench_ns, *force, *torque))
 
 
-class FixedFrameTopic(WrenchTopic):
-    """`wrench_compensated/NAME` in a frame fixed to the sensor's."""
+class FrameTopic(WrenchTopic):
+    """`wrench_compensated/NAME`: in a frame fixed to the sensor's, or known to TF.
 
-    def __init__(self, node: Node, name: str, transform: WrenchTransform) -> None:
-        super().__init__(node, f"wrench_compensated/{name}", name)
-        self._transform = transform
+    `look` is for one thread, `send` the reader's.
+    """
 
-    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        """Publish them in this frame."""
-        super().send(*self._transform.apply(force, torque), frame)
-
-
-class TfFrameTopic(WrenchTopic):
-    """`wrench_compensated/NAME` in a frame known to TF: `look` is for one thread, `send` the reader's."""
-
-    def __init__(self, node: Node, name: str, parameters: Parameters) -> None:
-        super().__init__(node, f"wrench_compensated/{name}", name)
-        self._name, self._source = name, parameters.frame_id
+    def __init__(self, node: Node, frame: WrenchFrame, stamps: Stamps, parameters: Parameters) -> None:
+        super().__init__(node, f"wrench_compensated/{frame.name}", frame.name, stamps)
+        self._name, self._source = frame.name, parameters.frame_id
         self.wanted = False  # whether anybody had subscribed at the last look
         self.on_change: Callable[[], object] = lambda: None  # called when that changes
-        self._found: tuple[WrenchTransform, int] | None = None  # 0: it holds at any time
+        # The transform, and of which time it is, ns; 0: it holds at any time.
+        self._found: tuple[WrenchTransform, int] | None = frame.fixed and (frame.fixed, 0)
         self._error, self._misses, self._asked_ns = "", 0, 0
         self.configure(parameters)
 
     def configure(self, parameters: Parameters) -> None:
         """Take the limit of the age."""
-        self._limit_ns = parameters.orientation.stale_after * _NS_PER_S
+        self._limit_ns = parameters.orientation_stale_after * _NS_PER_S
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed."""
@@ -120,29 +109,22 @@ class TfFrameTopic(WrenchTopic):
         what = f"wrench_compensated/{self._name} has stopped: "
         if self._found is None:
             return "" if self._misses < _PATIENCE else what + self._error
-        behind_ns = self._asked_ns - self._found[1]
-        if not self._found[1] or not self._asked_ns or abs(behind_ns) <= self._limit_ns:
-            return ""
-        differs_s, order = abs(behind_ns) / _NS_PER_S, "older" if behind_ns > 0 else "newer"
-        return (
-            f"{what}TF's latest pose of {self._source} in {self._name} is {differs_s:.3g} s {order} than the "
-            f"sample (limit {self._limit_ns / _NS_PER_S:g} s, orientation.stale_after)"
-        )
+        behind_ns = self._asked_ns - self._found[1] if self._found[1] and self._asked_ns else 0
+        off = why_off(behind_ns / _NS_PER_S, self._limit_ns / _NS_PER_S)
+        return off and f"{what}TF's latest pose of {self._source} in {self._name} {off}"
 
 
-def make_frames(node: Node, parameters: Parameters) -> list[WrenchTopic]:
+def make_frames(node: Node, parameters: Parameters, stamps: Stamps) -> list[FrameTopic]:
     """A topic for each of the parameter `wrench_frames`; ParameterError if one needs TF and there is none."""
-    frames = parameters.wrench_frames
+    frames = {frame: FrameTopic(node, frame, stamps, parameters) for frame in parameters.wrench_frames}
     by_tf = [frame.name for frame in frames if frame.fixed is None]
     if by_tf:
         check_tf(f"parameter wrench_frames has {by_tf[0]!r} by TF", f"give its pose: '{by_tf[0]} x y z'")
-    followed = [TfFrameTopic(node, name, parameters) for name in by_tf]
-    if followed:
-        _follow_tf(node, followed)
-    return [*(FixedFrameTopic(node, name, fixed) for name, fixed in frames if fixed is not None), *followed]
+        _follow_tf(node, [topic for frame, topic in frames.items() if frame.fixed is None])
+    return list(frames.values())
 
 
-def _follow_tf(node: Node, topics: Sequence[TfFrameTopic]) -> None:
+def _follow_tf(node: Node, topics: Sequence[FrameTopic]) -> None:
     """Listen to TF while one of `topics` is wanted."""
     group, close = MutuallyExclusiveCallbackGroup(), list[Callable[[], None]]()
 
@@ -169,11 +151,13 @@ class FilteredTopic:
     """`wrench_filtered`, if configured, from every sample: `publishing_frequency` comes after it."""
 
     index = Stages._fields.index("final")
-    takes_all = True
 
-    def __init__(self, node: Node, parameters: Parameters, rate_hz: Callable[[], float]) -> None:
+    def __init__(
+        self, node: Node, parameters: Parameters, stamps: Stamps, rate_hz: Callable[[], float]
+    ) -> None:
         """`rate_hz` tells the sensor's sampling rate, 0 if it is not known."""
-        self._node, self._frame_id, self._rate_hz = node, parameters.frame_id, rate_hz
+        self._node, self._frame_id, self._stamps = node, parameters.frame_id, stamps
+        self._rate_hz = rate_hz
         self.problem = ""
         self._topic: WrenchTopic | None = None
         self._filter = WrenchFilter()
@@ -184,7 +168,7 @@ class FilteredTopic:
         """Take other settings from the next sample on; for the executor's thread."""
         self._settings = parameters.filter
         if self._settings.cutoff and self._topic is None:
-            self._topic = WrenchTopic(self._node, "wrench_filtered", self._frame_id)
+            self._topic = WrenchTopic(self._node, "wrench_filtered", self._frame_id, self._stamps)
 
     def is_wanted(self) -> bool:
         """Whether it is configured and anybody has subscribed."""
@@ -197,31 +181,27 @@ class FilteredTopic:
 
     def _is_ready(self) -> bool:
         """Whether there is a filter for the current settings and sampling rate."""
-        wanted = self._settings, self._rate_hz()
+        settings, rate_hz = wanted = self._settings, self._rate_hz()
         if wanted != self._designed:
-            why_not = self._design(*wanted)
-            self.problem = f"wrench_filtered has stopped: {why_not}" if why_not else ""
             self._designed = wanted
-            if self.problem:
+            try:
+                self._design(settings, rate_hz)
+                self.problem = ""
+            except CompensationError as error:
+                self.problem = f"wrench_filtered has stopped: {error}"
                 self._node.get_logger().warning(self.problem)
         return not self.problem
 
-    def _design(self, settings: FilterSettings, rate_hz: float) -> str:
-        """Make it; why not, a sentence."""
-        if not settings.cutoff:
-            return "filter.cutoff is 0"
-        if not rate_hz:
-            return "the server does not report the sampling rate"
-        try:
-            self._filter.design(settings, rate_hz)
-        except CompensationError as error:
-            return str(error)
+    def _design(self, settings: FilterSettings, rate_hz: float) -> None:
+        if not settings.cutoff or not rate_hz:
+            why = "the server does not report the sampling rate" if settings.cutoff else "filter.cutoff is 0"
+            raise CompensationError(why)
+        self._filter.design(settings, rate_hz)
         notch = f", notch {settings.notch:g} Hz" if settings.notch else ""
         self._node.get_logger().info(
             f"wrench_filtered is delayed by {self._filter.delay_s * 1e3:.1f} ms: cut-off "
             f"{settings.cutoff:g} Hz{notch}, sampling rate {rate_hz:g} Hz"
         )
-        return ""
 
     def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Filter a sample that is not published."""
@@ -252,27 +232,25 @@ class RestWindow(StationaryWindow):
         super().__init__(seconds, limits)
         self.source = source
         self.done = threading.Event()
-        self._sum, self._felt = ZERO, 0
-        self._blind = ""
+        self._taken, self._unknown = list[Vector3](), ""
 
-    def take(self, sample: Sample, time_s: float, stamp_s: float, felt: Vector3 | None) -> bool:
+    def take(self, sample: Sample, time_s: float, stamp_s: float, specific_force: Vector3 | None) -> bool:
         """Take a sample and its specific force, for the reader. True: the window is complete."""
-        if felt is None:
-            self._blind = self._blind or self.source.why_none(sample, stamp_s) or "not in every sample"
+        if specific_force is None:
+            self._unknown = self._unknown or self.source.why_none(sample, stamp_s) or "not in every sample"
         else:
-            (x, y, z), (fx, fy, fz) = self._sum, felt
-            self._sum = (x + fx, y + fy, z + fz)
-            self._felt += 1
+            self._taken.append(specific_force)
         if self.add(sample, time_s):
             self.done.set()
         return self.done.is_set()
 
     def specific_force(self) -> Vector3:
         """Its mean in the sensor's frame, m/s²; CompensationError if it was not known all the time."""
-        if self._blind or not self._felt:
-            raise CompensationError(f"the weight of the tool is not known: {self._blind or 'no sample came'}")
-        x, y, z = self._sum
-        return x / self._felt, y / self._felt, z / self._felt
+        if self._unknown or not self._taken:
+            raise CompensationError(
+                f"the weight of the tool is not known: {self._unknown or 'no sample came'}"
+            )
+        return triple(np.mean(self._taken, axis=0))
 
 
 class CompensatedOutput:
@@ -280,23 +258,27 @@ class CompensatedOutput:
 
     fields = ("force", "torque")
 
-    def __init__(self, node: Node, parameters: Parameters, rate_hz: Callable[[], float]) -> None:
+    def __init__(
+        self, node: Node, parameters: Parameters, stamps: Stamps, rate_hz: Callable[[], float]
+    ) -> None:
         """ParameterError if a frame cannot be had. `rate_hz` as for `FilteredTopic`."""
         stages = {"wrench_compensated": "final", "compensation/bias": "bias", "compensation/tool": "tool"}
+        frame_id = parameters.frame_id
+        self._filtered = FilteredTopic(node, parameters, stamps, rate_hz)
         self._all: tuple[WrenchTopic | FilteredTopic, ...] = (
-            *(WrenchTopic(node, topic, parameters.frame_id, stage) for topic, stage in stages.items()),
-            *make_frames(node, parameters),
-            FilteredTopic(node, parameters, rate_hz),
+            *(WrenchTopic(node, topic, frame_id, stamps, stage) for topic, stage in stages.items()),
+            *make_frames(node, parameters, stamps),
+            self._filtered,
         )
         self._wanted: tuple[WrenchTopic | FilteredTopic, ...] = ()
-        self._noting: tuple[WrenchTopic | FilteredTopic, ...] = ()
+        self.has_subscribers = False  # as of the last look
         self.plan = Plan(Source(), Compensator(), BiasRamp(), has_tool=False)
         self.window: RestWindow | None = None  # the one that is open
-        self.hold: str | None = None  # why nothing may be published for now, whatever else is known
-        # Whether saturated samples are not published, and whether the latest was one of them.
-        self.stops_on_saturation = self.is_saturated = False
+        self.hold = ""  # why nothing may be published for now, whatever else is known
+        self.stops_on_saturation = False  # whether saturated samples are not published
         # Samples since the node started that were compensated, and that were not.
         self.published = self.withheld = 0
+        self.why_withheld = ""  # the latest of them; empty: the source knew nothing
         self.is_stopped = False  # whether the latest could not be compensated
         self.sample: Sample | None = None  # the latest that came here
         # Its time, s: by the server's monotonic clock, and since the Unix epoch.
@@ -306,15 +288,10 @@ class CompensatedOutput:
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
         self._wanted = tuple(topic for topic in self._all if topic.is_wanted())
-        self._noting = tuple(topic for topic in self._wanted if topic.takes_all)
+        self.has_subscribers = bool(self._wanted)
         if not self._wanted:
-            self.is_stopped = False  # nobody misses anything
-        return bool(self._wanted) or self.window is not None
-
-    @property
-    def has_subscribers(self) -> bool:
-        """Whether anybody has subscribed, as of the last look."""
-        return bool(self._wanted)
+            self.is_stopped = False
+        return self.has_subscribers or self.window is not None
 
     @property
     def problem(self) -> str:
@@ -328,47 +305,46 @@ class CompensatedOutput:
             topic.configure(parameters)
 
     def follow(self, sample: Sample, frame: DataMessage) -> None:
-        """Give source, open window and filters a sample that is not published."""
+        """Give source, open window and filter a sample that is not published."""
         plan = self.plan
-        felt = self._felt(plan, sample, frame)
-        if self._noting and felt is not None and self.hold is None:
-            stages = self._stages(plan, sample, felt, self.time_s)
-            for topic in self._noting:
-                topic.note(*stages[topic.index], frame)
+        specific_force = self._specific_force(plan, sample, frame)
+        if self._filtered in self._wanted and specific_force is not None and not self.hold:
+            self._filtered.note(*self._stages(plan, sample, specific_force, self.time_s).final, frame)
 
-    def _felt(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
+    def _specific_force(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
         """The specific force as far as it is needed, None if it is not known; the window takes the sample."""
         self.sample, time_s, stamp_s = sample, frame.monotonic_ns * 1e-9, frame.stamp_ns * 1e-9
         self.time_s, self.stamp_s = time_s, stamp_s
         window = self.window
         if not plan.has_tool and window is None:
             return ZERO
-        felt = plan.source.specific_force(sample, time_s, stamp_s)
-        if window is not None and window.take(sample, time_s, stamp_s, felt):
+        specific_force = plan.source.specific_force(sample, time_s, stamp_s)
+        if window is not None and window.take(sample, time_s, stamp_s, specific_force):
             self.window = None
-        return felt if plan.has_tool else ZERO
+        return specific_force if plan.has_tool else ZERO
 
     def publish(self, sample: Sample, frame: DataMessage) -> None:
         """Compensate a sample and publish its stages; nothing if the tool's weight is not known."""
         plan = self.plan
-        felt = self._felt(plan, sample, frame)
+        specific_force = self._specific_force(plan, sample, frame)
         time_s = self.time_s
-        self.is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
-        if felt is None or self.hold is not None or self.is_saturated:
+        is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
+        if specific_force is None or self.hold or is_saturated:
             self.is_stopped = True
             self.withheld += 1
+            self.why_withheld = self.hold or (_SATURATED if is_saturated else "")
             return
         self.is_stopped = False
-        stages = self._stages(plan, sample, felt, time_s)
+        stages = self._stages(plan, sample, specific_force, time_s)
         if (watch := plan.watch) is not None and watch.is_due(time_s):
-            gravity = -felt[0], -felt[1], -felt[2]
+            gravity = -specific_force[0], -specific_force[1], -specific_force[2]
             watch.look(stages.final.force, gravity, sample.angular_rate, time_s)
         for topic in self._wanted:
             topic.send(*stages[topic.index], frame)
         self.published += 1
 
     @staticmethod
-    def _stages(plan: Plan, sample: Sample, felt: Vector3, time_s: float) -> Stages:
+    def _stages(plan: Plan, sample: Sample, specific_force: Vector3, time_s: float) -> Stages:
         compensator = plan.compensator
         compensator.bias = plan.ramp.at(time_s)
-        return compensator.compensate(sample.force, sample.torque, felt)
+        return compensator.compensate(sample.force, sample.torque, specific_force)

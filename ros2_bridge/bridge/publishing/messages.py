@@ -24,6 +24,7 @@ from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample
 from bridge.parameters.table import Numbers, Parameters
+from bridge.stream.link import Link
 from bridge.stream.reader import Output
 
 # The label of the array's one dimension: what its values are, in order.
@@ -34,6 +35,7 @@ _NO_ORIENTATION: Final = (-1.0, *(0.0,) * 8)  # REP 145: the covariance of a mis
 _DEPTH: Final = 10  # short: what a subscriber is too slow for is replaced by newer samples
 Send = Callable[[bytes], None]
 Publish = Callable[[Sample, DataMessage], None]
+Make = Callable[[Send, Parameters, "Stamps"], Publish]
 
 
 def create_publisher(node: Node, message_type: Any, topic: str) -> Any:
@@ -56,39 +58,67 @@ class Topic:
         return bool(self._publisher.get_subscription_count())
 
 
+class Stamps:
+    """How much earlier than the samples their stamps are, ns: by the parameter `stamp` and the filters."""
+
+    def __init__(self, log: Any) -> None:
+        self.kind = "sample"  # what stamps are the time of
+        self.wrench_ns = self.imu_ns = 0
+        self.problem = ""  # why some are not those of the measurement, a sentence
+        self._log = log
+
+    def update(self, kind: str, link: Link) -> None:
+        """The parameter or the filters may have changed; from any thread."""
+        self.kind = kind
+        if not link.is_connected:
+            return
+        delay_ms = link.info.delay_ms if kind == "measurement" else {"force_torque": 0.0, "acceleration": 0.0}
+        self.wrench_ns = round(1e6 * delay_ms.get("force_torque", 0.0))
+        self.imu_ns = round(1e6 * delay_ms.get("acceleration", 0.0))
+        named = {"force_torque": "wrench", "acceleration": "imu"}
+        unknown = " and ".join(topics for channel, topics in named.items() if channel not in delay_ms)
+        problem = (
+            f"stamp is measurement, but the delay of the filters is not known, so {unknown} topics have the "
+            "time of the sample: switch settings.chop and settings.fast off, or update the server"
+        )
+        before, self.problem = self.problem, problem if unknown else ""
+        if self.problem and self.problem != before:
+            self._log.warning(self.problem)
+
+
 class MeasuredTopic(Topic):
     """A topic of what the sensor measures; `make` gives what publishes a sample with these parameters."""
 
     def __init__(
-        self, node: Node, parameters: Parameters, topic: str, message_type: Any, fields: Sequence[str],
-        make: Callable[[Send, Parameters], Publish],
+        self, node: Node, parameters: Parameters, stamps: Stamps, topic: str, message_type: Any,
+        fields: Sequence[str], make: Make,
     ) -> None:  # fmt: skip
         super().__init__(node, message_type, topic)
-        self.fields, self._make = fields, make
+        self.fields, self._make, self._stamps = fields, make, stamps
         self.configure(parameters)
 
     def configure(self, parameters: Parameters) -> None:
         """Take these covariances."""
-        self.publish = self._make(self._send, parameters)
+        self.publish = self._make(self._send, parameters, self._stamps)
 
     def follow(self, sample: Sample, frame: DataMessage) -> None:
         """Nothing: each message stands by itself."""
 
 
-def make_measured(node: Node, parameters: Parameters) -> list[Output]:
+def make_measured(node: Node, parameters: Parameters, stamps: Stamps) -> list[Output]:
     """The topics of what the sensor measures."""
     wrench, motion = ("force", "torque"), ("acceleration", "angular_rate")
-    topics: tuple[tuple[str, Any, Sequence[str], Callable[[Send, Parameters], Publish]], ...] = (
+    topics: tuple[tuple[str, Any, Sequence[str], Make], ...] = (
         (parameters.array_topic, Float64MultiArray, (*wrench, *motion), _array),
         ("wrench", WrenchStamped, wrench, _wrench),
         ("imu/data_raw", Imu, motion, _imu),
         ("imu/data", Imu, (*motion, "orientation"), partial(_imu, oriented=True)),
         ("temperature", Temperature, ("temperature",), _temperature),
     )
-    return [MeasuredTopic(node, parameters, *topic) for topic in topics]
+    return [MeasuredTopic(node, parameters, stamps, *topic) for topic in topics]
 
 
-def _array(send: Send, _: Parameters) -> Publish:
+def _array(send: Send, _: Parameters, __: Stamps) -> Publish:
     """`std_msgs/Float64MultiArray`: N, Nm, m/s², rad/s, in the order of ARRAY_LABEL; it has no header."""
     message, values = Float64MultiArray(), struct.Struct(f"<{_ARRAY_SIZE}d")
     message.layout.dim = [MultiArrayDimension(label=ARRAY_LABEL, size=_ARRAY_SIZE, stride=_ARRAY_SIZE)]
@@ -97,13 +127,13 @@ def _array(send: Send, _: Parameters) -> Publish:
     return lambda sample, _: send(layout + pack(*sample.array))
 
 
-def _wrench(send: Send, parameters: Parameters) -> Publish:
+def _wrench(send: Send, parameters: Parameters, stamps: Stamps) -> Publish:
     """`geometry_msgs/WrenchStamped`: N and Nm, in the sensor's frame."""
     pack = StampedNumbers(parameters.frame_id, 6).pack
-    return lambda sample, frame: send(pack(frame.stamp_ns, *sample.force, *sample.torque))
+    return lambda sample, frame: send(pack(frame.stamp_ns - stamps.wrench_ns, *sample.force, *sample.torque))
 
 
-def _imu(send: Send, parameters: Parameters, *, oriented: bool = False) -> Publish:
+def _imu(send: Send, parameters: Parameters, stamps: Stamps, *, oriented: bool = False) -> Publish:
     """`sensor_msgs/Imu`: m/s² and rad/s; `oriented`: with the sensor's own estimate of its orientation, and
     nothing where there is none."""
     pack = StampedNumbers(parameters.imu_frame_id, 37).pack
@@ -116,7 +146,7 @@ def _imu(send: Send, parameters: Parameters, *, oriented: bool = False) -> Publi
         if orientation is not None:
             send(
                 pack(
-                    frame.stamp_ns, *orientation, *of_orientation,
+                    frame.stamp_ns - stamps.imu_ns, *orientation, *of_orientation,
                     *sample.angular_rate, *of_rate, *sample.acceleration, *of_acceleration,
                 )
             )  # fmt: skip
@@ -124,7 +154,7 @@ def _imu(send: Send, parameters: Parameters, *, oriented: bool = False) -> Publi
     return publish
 
 
-def _temperature(send: Send, parameters: Parameters) -> Publish:
+def _temperature(send: Send, parameters: Parameters, _: Stamps) -> Publish:
     """`sensor_msgs/Temperature`: °C, inside the sensor."""
     pack, variance = StampedNumbers(parameters.frame_id, 2).pack, parameters.temperature_variance
     return lambda sample, frame: send(pack(frame.stamp_ns, sample.temperature, variance))

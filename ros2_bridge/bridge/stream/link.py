@@ -1,7 +1,7 @@
-"""What is known of the server and the sensor, and requests. The reader writes it, every thread may read it.
+"""What is known of the server and the sensor, and requests.
 
-Attributes are replaced, never changed in place, so that reading one needs no lock. What the server says is
-not trusted.
+The reader writes it, and the monitor what it has asked for; every thread may read it without a lock:
+attributes are replaced, never changed in place. What the server says is not trusted.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0
 SHUTDOWN_TIMEOUT_S: Final = 3.0
 _MOST_HZ: Final = 1e6
+LONGEST_DELAY_MS: Final = 1000
+_NEWER_IN_DESCRIPTIONS: Final = ("name", "serial", "state", "hardware", "firmware", "rate_hz", "settling")
 
 
 class Clock:
@@ -48,24 +50,25 @@ class RequestRefusedError(RequestFailedError):
 
 
 class SensorInfo(NamedTuple):
-    """What the server says about the sensor, made safe to print."""
+    """What the server says about the sensor, made safe to print; so far nothing."""
 
-    sensor: int
-    name: str
-    serial: str
-    rate_hz: str
-    state: str
-    hardware: str = "?"
-    firmware: str = "?"
-    rate: float = 0.0  # `rate_hz` as a number; 0 if it is none
-    settings: Mapping[str, SettingValue] = {}
+    sensor: int = 0
+    name: str = ""
+    serial: str = ""
+    state: str = "?"
+    hardware: str = ""
+    firmware: str = ""
+    rate_hz: float = 0.0  # samples a second that are to be expected; 0 if the server does not say
+    settings: Mapping[str, SettingValue] = {}  # empty without a connection
+    delay_ms: Mapping[str, float] = {}  # of the filters, by channel, as far as it is known
     settling: bool = False  # whether its data has not settled
-    # Its own force/torque offset, N and Nm; None if the server does not say.
+    # The sensor's own force/torque offset, part of every sample, N and Nm; None if it is not known.
     offset: tuple[float, ...] | None = None
 
     def __str__(self) -> str:
         """One phrase for the log."""
-        return f"sensor {self.sensor} ({self.name}, serial {self.serial}, {self.rate_hz} Hz, {self.state})"
+        rate_hz = f"{self.rate_hz:g}" if self.rate_hz else "?"
+        return f"sensor {self.sensor} ({self.name}, serial {self.serial}, {rate_hz} Hz, {self.state})"
 
 
 class Link:
@@ -78,32 +81,26 @@ class Link:
         self.sensor = sensor
         self.on_change: Callable[[], object] = lambda: None
         self.is_connected = False
-        # The sensor as the server described it last; kept when the connection ends.
-        self.info: SensorInfo | None = None
-        self.settings: Mapping[str, SettingValue] = {}  # the sensor's settings; empty without a connection
-        # The sensor's own force/torque offset, part of every sample, N and Nm; None: not known.
-        self.offset: tuple[float, ...] | None = None
-        self.rate_hz = 0.0  # samples a second that are to be expected; 0 if the server does not say
+        self.info = SensorInfo()  # of the sensor that is or was there
+        self._changing = threading.Lock()  # `info`
         self.problem = client.session.problem  # why there is no connection
         # Whether there is a server there for all that; it may be too old, or have no such sensor.
         self.is_reachable = False
         self.lost: str | None = None  # the server's words, while the sensor is lost
         self.connects = 0
         self.since_s = clock.monotonic()  # CLOCK_MONOTONIC when the connection was made or lost
-        self.ending = False  # the node ends: whoever waits for something gives up
+        self.ending = False  # the node ends: services that wait give up
         self.epoch = 0  # raised by everything that interrupts the stream or changes its rate
 
-    def connected(self, description: JsonObject) -> SensorInfo:
+    def connected(self, description: JsonObject) -> None:
         """The stream begins."""
-        self.info = info = find_sensor(description, self.sensor)
-        self.settings, self.rate_hz, self.offset = info.settings, info.rate, info.offset
+        self.info = find_sensor(description, self.sensor)
         self.connects += 1
         self.since_s = self.clock.monotonic()
         self.lost = None
         self.epoch += 1
         self.is_connected = True
         self.on_change()
-        return info
 
     @property
     def absence(self) -> str:
@@ -114,7 +111,8 @@ class Link:
     def disconnected(self, event: Disconnected) -> None:
         """There is no connection (any more)."""
         had, self.is_connected = self.is_connected, False
-        self.settings, self.problem, self.lost = {}, event.reason, None
+        self._change(settings={})
+        self.problem, self.lost = event.reason, None
         # One that has just gone away is not there, whatever it said last.
         self.is_reachable = event.reachable and not had
         if had:
@@ -132,38 +130,35 @@ class Link:
         elif event in (Event.SENSOR_BACK, Event.RECONFIGURED):
             self.lost = None
             self.epoch += 1
-            self.take_settings(message)
+            self._take_settings(message)
         elif event != Event.OFFSET_CHANGED:
             return True
         if "offset" in message:
-            self.offset = known_offset(message["offset"])
+            self._change(offset=known_offset(message["offset"]))
         self.on_change()
         return True
 
-    def take_settings(self, message: JsonObject) -> None:
-        """Note the settings, and the rate, that a message says are in force."""
-        found = known_settings(message.get("settings"))
-        if not found or not self.is_connected:
-            return
-        rate_hz = known_rate(message.get("rate_hz"))
-        if rate_hz not in (0.0, self.rate_hz):
-            self.rate_hz = rate_hz
-            self.epoch += 1
-        self.settings = found
+    def _take_settings(self, message: JsonObject) -> None:
+        if found := known_settings(message.get("settings")):
+            rate_hz = known_rate(message.get("rate_hz")) or self.info.rate_hz
+            self._change(settings=found, rate_hz=rate_hz, delay_ms=known_delays(message.get("delay_ms")))
+
+    def _change(self, **values: Any) -> None:
+        with self._changing:
+            self.info = self.info._replace(**values)
 
     def described(self, description: JsonObject) -> None:
-        """Take a later reply to `describe`. Settings and offset come with events, which are never stale."""
+        """Take a later reply to `describe`. What events carry may be newer."""
         self.client.session.describe(description)
         with contextlib.suppress(RequestFailedError):  # not there any more: its frames will say so
-            self.info = info = find_sensor(description, self.sensor)
-            if info.rate != self.rate_hz:
-                self.epoch += 1
-            self.rate_hz = info.rate
+            info = find_sensor(description, self.sensor)
+            self.epoch += info.rate_hz != self.info.rate_hz
+            self._change(**{name: getattr(info, name) for name in _NEWER_IN_DESCRIPTIONS})
 
     # -- requests, from other threads than the reader's: every one answered, refused or timed out
 
     def cancel(self) -> None:
-        """Make whoever waits for a reply give up, now and from now on: the node ends."""
+        """Fail all requests, now and from now on: the node ends."""
         self.ending = True
         self.client.close()
 
@@ -185,9 +180,9 @@ class Link:
             ) from None
 
     def shut_server_down(self, timeout_s: float = SHUTDOWN_TIMEOUT_S) -> str:
-        """Ask the server to shut down; a sentence. RequestRefusedError if it will not, RequestFailedError if
-        nobody knows.
+        """Ask the server to shut down; a sentence.
 
+        RequestRefusedError if it refuses, RequestFailedError if its answer is unknown.
         Where there is no connection it makes one attempt of its own.
         """
         client, address = self.client, self.address
@@ -215,6 +210,13 @@ def known_rate(rate_hz: object) -> float:
     return float(rate_hz) if isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ else 0.0
 
 
+def known_delays(delay_ms: object) -> Mapping[str, float]:
+    """The delays of the filters that a message gives, ms by channel; without those that it does not know."""
+    given = delay_ms if isinstance(delay_ms, dict) else {}
+    found = {channel: number(given.get(channel)) for channel in ("force_torque", "acceleration")}
+    return {channel: ms for channel, ms in found.items() if ms is not None and 0 <= ms <= LONGEST_DELAY_MS}
+
+
 def known_offset(offset: object) -> tuple[float, ...] | None:
     """The sensor's own offset from a message; None if missing or invalid."""
     try:
@@ -234,12 +236,13 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
     found = rows(description.get("sensors"))
     for row in found:
         if row.get("sensor") == sensor and not isinstance(row.get("sensor"), bool):
-            keys = "name", "serial", "rate_hz", "state", "hardware", "firmware"
+            keys = "name", "serial", "state", "hardware", "firmware"
             return SensorInfo(
                 sensor=sensor,
                 **{key: printable(row.get(key, "?"), 40) for key in keys},
-                rate=known_rate(row.get("rate_hz")),
+                rate_hz=known_rate(row.get("rate_hz")),
                 settings=known_settings(row.get("settings")),
+                delay_ms=known_delays(row.get("delay_ms")),
                 settling=row.get("settling") is True,
                 offset=known_offset(row.get("offset")),
             )

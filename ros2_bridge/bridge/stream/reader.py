@@ -15,7 +15,6 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.client.channel import Channel
 from bota_ethercat.client.client import Client
-from bota_ethercat.client.reading import Condition
 from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
 from bota_ethercat.control import Event
 from bota_ethercat.errors import ConnectionFailedError
@@ -24,12 +23,13 @@ from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
 from bridge.parameters.table import Parameters
 from bridge.process import Worker
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
-from bridge.stream.link import SYSTEM_CLOCK, Clock, Link, sentence
+from bridge.stream.link import LONGEST_DELAY_MS, SYSTEM_CLOCK, Clock, Link, sentence
 
-SILENCE_S: Final = 1.0
-_SILENCE_NS: Final = round(0.99e9 * SILENCE_S)  # a wait may end some microseconds early
-_LAST_STAMP_NS: Final = (2**31 - 1) * 10**9  # the latest time that a ROS message can carry
-_WARN_EVERY_S: Final = 10.0
+_WAIT_S: Final = 1.0
+# Times that a ROS message can carry, less the longest delay of a filter.
+_FIRST_STAMP_NS: Final = LONGEST_DELAY_MS * 10**6
+_LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
+_SOMETIMES: Final = {"throttle_duration_sec": 10.0}
 _MOST_NOTED: Final = 8192
 
 
@@ -103,7 +103,7 @@ class Output(Protocol):
         """The fields of `Sample` that it publishes: all of them are finite when `publish` is called."""
 
     def is_wanted(self) -> bool:
-        """Whether anybody is there for what `publish` does. Asked now and then, not by the reader."""
+        """Whether anything needs `publish`. Called now and then, not by the reader."""
 
     def publish(self, sample: Sample, frame: DataMessage, /) -> None:
         """Publish `sample`, which came in `frame`: its stamp, and for intervals its monotonic time."""
@@ -160,8 +160,7 @@ class Reader:
         self.client = Client(
             parameters.server_port, parameters.server_host, sensors=[self._sensor], channel=channel
         )
-        self._state = self.client.session.state(self._sensor)
-        self.accounting = self._state.accounting
+        self.accounting = self.client.session.state(self._sensor).accounting
         self.accounting.counts = self.counts
         self._clock = clock
         self.link = Link(self.client, self._sensor, clock)
@@ -169,8 +168,6 @@ class Reader:
         self._limit_hz = parameters.publishing_frequency
         self._selector = FrameSelector(self.counts, same_clock=True, limit_hz=self._limit_hz)
         self._problem: str | None = None
-        self._is_silent = False
-        self._next_warning_s = 0.0
         self.thread = Worker("reader", self.run, on_failure)
 
     def stop(self) -> bool:
@@ -183,27 +180,16 @@ class Reader:
         if hz != self._limit_hz:
             self._limit_hz = hz
             self._selector.limit(hz)
-            self._warn_of_aliases()
-
-    def _warn_of_aliases(self) -> None:
-        if 0 < self._limit_hz < self.link.rate_hz:
-            self._log.warning(
-                f"publishing_frequency {self._limit_hz:g} takes the newest of {self.link.rate_hz:g} samples "
-                f"a second, without a low-pass: noise and vibration above {self._limit_hz / 2:g} Hz appear "
-                "at lower frequencies (aliasing); take every sample, or a longer sinc_length"
-            )
 
     def run(self) -> None:
         """Connect and read, again and again, until `stop`."""
         with contextlib.suppress(ConnectionFailedError):
             while True:
-                self.read(SILENCE_S)
+                self.read(_WAIT_S)
 
     def read(self, timeout_s: float) -> None:
         """Publish what arrives within `timeout_s`; ConnectionFailedError once `client` has been closed."""
         items = self.client.poll_all(timeout_s)
-        if self._is_silent or not items:
-            self._watch_silence()
         frames = []
         for item in items:
             if isinstance(item, DataMessage):
@@ -215,16 +201,6 @@ class Reader:
             self._take_event(item)
         self._publish(frames)
 
-    def _watch_silence(self) -> None:
-        """Log, once, that nothing came for SILENCE_S, and that something came again."""
-        was, connected = self._is_silent, self.link.is_connected
-        why = self._state.why_old(_SILENCE_NS, self._clock.monotonic_ns(), connected=connected)
-        self._is_silent = why is Condition.SILENT
-        if self._is_silent and not was:
-            self._log.warning(f"nothing came from {self.link.address} for {SILENCE_S:g} s")
-        elif was and not self._is_silent and connected:
-            self._log.info(f"{self.link.address} sends again")
-
     def _publish(self, frames: Sequence[DataMessage]) -> None:
         if not frames:
             return
@@ -235,9 +211,9 @@ class Reader:
             self._follow(frame)
         for frame in selected:
             sample = self._decoders[len(frame.process_data)].decode(frame.process_data)
-            if frame.stamp_ns > _LAST_STAMP_NS:
-                self._warn_sometimes(
-                    f"a sample with the impossible time {frame.stamp_ns} ns was not published"
+            if not _FIRST_STAMP_NS <= frame.stamp_ns <= _LAST_STAMP_NS:
+                self._log.warning(
+                    f"a sample with the impossible time {frame.stamp_ns} ns was not published", **_SOMETIMES
                 )
             elif sample.is_finite:
                 for output in self._outputs.wanted:
@@ -246,16 +222,11 @@ class Reader:
             else:
                 self._outputs.publish_finite(sample, frame)
                 self.not_finite += 1
-                self._warn_sometimes(
-                    f"a sample with numbers that are not finite was not published ({self.not_finite} so far)"
+                self._log.warning(
+                    f"a sample with numbers that are not finite was not published ({self.not_finite} so far)",
+                    **_SOMETIMES,
                 )
             watch.ages.append(monotonic_ns() - frame.monotonic_ns)
-
-    def _warn_sometimes(self, text: str) -> None:
-        now_s = self._clock.monotonic()
-        if now_s >= self._next_warning_s:
-            self._next_warning_s = now_s + _WARN_EVERY_S
-            self._log.warning(text)
 
     def _follow(self, frame: DataMessage) -> None:
         """A sample that the limit to the rate leaves out: some outputs go by all of them."""
@@ -272,18 +243,17 @@ class Reader:
             self._selector = FrameSelector(
                 self.counts, same_clock=self.client.session.same_machine, limit_hz=self._limit_hz
             )
-            info = link.connected(event.description)
+            link.connected(event.description)
             again = " again" if event.again else ""
-            self._log.info(f"connected{again} to {link.address}: {info}")
+            self._log.info(f"connected{again} to {link.address}: {link.info}")
             self._problem = None
-            self._warn_of_aliases()
         elif isinstance(event, Disconnected):
             if event.reason.startswith("the server has no sensor"):
                 event = event._replace(reason=f"{event.reason}: set the parameter 'sensor' to one it has")
             link.disconnected(event)
             self._log_problem(event)
         else:
-            before = link.settings
+            before = link.info.settings
             if not link.take_event(event):
                 return
             text = sentence(event, before)

@@ -1,0 +1,381 @@
+"""/diagnostics: a thread that checks subscribers and state ten times a second, and what it reports.
+
+A thread of its own, so that neither a service that waits for the server nor the stream holds it up. It
+publishes every second, and at once when a level changes. What happened for a moment only is kept until a
+regular report, a second after the one before, has carried it. Five statuses: a message says what is wrong, as
+`bota_ethercat.health` judges it, and what to do; the values are for those who look closer.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any, Final, NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from bota_ethercat.errors import ConnectionFailedError
+from bota_ethercat.health.judge import SATURATIONS, Observation, emergency, judge
+from bota_ethercat.health.observer import p99
+from bota_ethercat.health.verdict import About, Level, Limits
+from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import number, printable, whole
+from bridge.process import Worker
+from bridge.publishing.messages import Stamps, create_publisher
+from bridge.stream.reader import Flags, Outputs, Reader
+
+TICK_S: Final = 0.1
+_REPORT_S: Final = 1.0
+_SHORTEST_RATE_S: Final = 0.8  # a rate measured over less time than this says little
+_SLOW_ANSWER_S: Final = 2.0  # a server that owes an answer for this time is stopped or overloaded
+_OF_SERVER: Final = ("lost_samples", "not_finite", "recoveries", "missed_deadlines")
+_LEVELS: Final = {
+    Level.GOOD: DiagnosticStatus.OK,
+    Level.LOOK: DiagnosticStatus.WARN,
+    Level.TROUBLE: DiagnosticStatus.ERROR,
+    Level.NOT_POSSIBLE: DiagnosticStatus.STALE,
+}
+Problems = list[tuple[Level, str]]  # how bad, and a sentence
+
+
+class CompensationState(NamedTuple):
+    """How the compensation is at one moment. What is wrong is a sentence each, empty if nothing is."""
+
+    good: str = ""  # what to say when all is well
+    values: Mapping[str, object] = {}
+    stopped: str = ""  # why nothing is published, or would be with a subscriber, or single topics are silent
+    doubtful: str = ""  # why what is published may be wrong
+    withheld: int = 0  # samples since the node started that were not compensated
+    why_withheld: str = ""  # the latest of them
+    follows_imu: bool = False  # whether the tool's weight and inertia are from the sensor's IMU
+
+
+class Monitor:
+    """Its `thread` runs until `stop`. `on_failure` is called with an unexpected error."""
+
+    def __init__(
+        self,
+        node: Node,
+        limits: Limits,
+        reader: Reader,
+        compensation: Callable[[], CompensationState],
+        outputs: Outputs,
+        stamps: Stamps,
+        on_failure: Callable[[str], object],
+    ) -> None:
+        self.limits = limits  # may be replaced at any time
+        self._reader, self._link, self._clock = reader, reader.link, reader.link.clock
+        self._compensation, self._outputs, self._stamps = compensation, outputs, stamps
+        self._log = node.get_logger()
+        self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
+        self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
+        self._published_s = now_s = self._clock.monotonic()
+        self._levels: list[Level] = []
+        # The server's newest `status` reply of this connection, when it was asked, and what it owes.
+        self._server: Mapping[str, Any] = {}
+        self._row: Mapping[str, Any] = {}  # our sensor's in it
+        self._connects, self._asked_s, self._waiting = 0, 0.0, dict[str, Future[JsonObject]]()
+        # Since the node and, of the server's ("server_..."), the server started.
+        self._counts = self._then = self._count(0)  # now, and as of the last regular report
+        self._new = Counter[str]()  # since then
+        self._flags = Flags()  # likewise
+        # Of the last second, p50 and p99; None without samples, or by the clock of another machine.
+        self._age_us: tuple[float, float] | None = None
+        self._rate_hz: float | None = None  # measured; None while that is not possible yet
+        # Where the rate is measured from: samples, time here, and the newest one's stamp.
+        self._rate_fresh, self._rate_s, self._rate_ns = 0, now_s, -1
+        # When the number of fresh samples changed, whether that is long ago, and the link's epoch.
+        self._fresh_s, self._is_silent, self._epoch = now_s, False, -1
+        self._stopping = threading.Event()
+        self.thread = Worker("monitor", self._run, on_failure)
+
+    def stop(self) -> bool:
+        """Stop and wait for the thread; False if it does not end in time."""
+        self._stopping.set()
+        return self.thread.has_ended()
+
+    def _run(self) -> None:
+        while not self._clock.wait(self._stopping, TICK_S):
+            self.tick()
+
+    def tick(self) -> None:
+        """Look once, and publish if it is time or a level has changed."""
+        self._outputs.refresh()
+        now_s = self._clock.monotonic()
+        regular = now_s - self._published_s >= _REPORT_S
+        if regular:
+            self._measure(now_s)
+        self._collect()
+        compensation = self._compensation()
+        self._look(now_s, compensation.withheld)
+        statuses = self._judge(now_s, compensation)
+        levels = [status.level for status in statuses]
+        if regular or levels != self._levels:
+            self._levels, self._published_s = levels, now_s
+            message = DiagnosticArray(status=statuses)
+            stamp = message.header.stamp
+            stamp.sec, stamp.nanosec = divmod(self._clock.time_ns(), 1_000_000_000)
+            self._publisher.publish(message)
+        if regular:
+            self._begin_interval(now_s)
+
+    def _measure(self, now_s: float) -> None:
+        """Work out rate and ages of the interval that ends."""
+        ages, link = self._reader.watch.take_ages(), self._link
+        self._age_us = None
+        if ages and link.is_connected and link.client.session.same_machine:
+            self._age_us = ages[len(ages) // 2] / 1e3, (p99(ages) or 0) / 1e3
+        if link.epoch != self._epoch:
+            return
+        fresh, elapsed_s = self._reader.counts.new, now_s - self._rate_s
+        newest_ns = self._reader.accounting.new_ns
+        # By the stamps, as a delay here is none of the sensor's; by the clock if it has become silent.
+        span_s = (newest_ns - self._rate_ns) * 1e-9 if self._rate_ns >= 0 else 0.0
+        span_s = span_s if span_s >= _SHORTEST_RATE_S else elapsed_s
+        self._rate_hz = (fresh - self._rate_fresh) / span_s if elapsed_s >= _SHORTEST_RATE_S else None
+        self._rate_fresh, self._rate_s, self._rate_ns = fresh, now_s, newest_ns
+
+    def _collect(self) -> None:
+        """Take what the server has answered, without waiting; the link gets the description."""
+        link = self._link
+        if not link.is_connected or link.connects != self._connects:
+            self._connects, self._server, self._waiting = link.connects, {}, {}
+        for action in [action for action, reply in self._waiting.items() if reply.done()]:
+            reply = self._waiting.pop(action)
+            if reply.exception() is None and (content := reply.result()).get("ok") is True:
+                if action == "status":
+                    self._server = content
+                else:
+                    link.described(content)
+        self._row = row_of(self._server.get("sensors"), link.sensor)
+
+    def _count(self, withheld: int) -> Counter[str]:
+        """All counts: of the node, and those that the server has reported."""
+        seen, row = self._reader.counts, {**self._server, **self._row}
+        reported = {f"server_{name}": row.get(name) for name in _OF_SERVER} if row else {}
+        return Counter(
+            connects=self._link.connects, samples=seen.new, lost=seen.missing, stale=seen.stale,
+            limited=seen.limited, repeated=seen.repeated, invalid=seen.invalid,
+            not_finite=self._reader.not_finite, saturated=self._reader.watch.saturated, withheld=withheld,
+            **{name: count if type(count) is int else 0 for name, count in reported.items()},
+        )  # fmt: skip
+
+    def _look(self, now_s: float, withheld: int) -> None:
+        """Count."""
+        link, then, before = self._link, self._then, self._counts["samples"]
+        counts = self._counts = self._count(withheld)
+        self._new = Counter({name: max(counts[name] - then[name], 0) for name in counts if name in then})
+        self._flags = self._flags.merge(self._reader.watch.take_flags())
+        if link.epoch != self._epoch:
+            self._epoch, self._rate_hz = link.epoch, None
+            self._rate_fresh, self._rate_s = counts["samples"], now_s
+            self._rate_ns = self._reader.accounting.new_ns
+        if counts["samples"] != before:
+            self._fresh_s = now_s
+
+    def _begin_interval(self, now_s: float) -> None:
+        """A regular report was made: what is new counts from there on. Asks the server again."""
+        self._flags, link = Flags(), self._link
+        # What a server has counted is compared with what the same one had counted before.
+        self._then = Counter({**(self._then if link.is_connected else {}), **self._counts})
+        if link.is_connected and not self._waiting:  # unless an answer is still owed
+            self._asked_s = now_s
+            try:
+                for action in ("status", "describe"):
+                    self._waiting[action] = link.client.request(action)
+            except ConnectionFailedError:
+                self._waiting = {}  # the reader will notice
+
+    # -- the statuses
+
+    def _judge(self, now_s: float, compensation: CompensationState) -> list[DiagnosticStatus]:
+        """The five statuses, in the order in which one would look for a cause."""
+        link, new = self._link, self._new
+        silent_s = max(now_s - max(self._fresh_s, link.since_s), 0.0)
+        answer_s = now_s - self._asked_s if self._waiting else 0.0  # how long the server has owed an answer
+        mode = mapping(self._row.get("clock")).get("mode")
+        sample = self._reader.watch.sample
+        temperature = None if sample is None else sample.temperature
+        seen = Observation(
+            seconds=1.0,
+            samples=new["samples"],
+            lost=max(new["lost"], new["server_lost_samples"]),
+            repeated=new["repeated"],
+            invalid=new["invalid"],
+            silent_s=silent_s,
+            rate_hz=self._rate_hz,
+            nominal_hz=link.info.rate_hz,
+            age_p99_us=None if self._age_us is None else self._age_us[1],
+            # The node checks those that it publishes, the server all.
+            not_finite=max(new["not_finite"], new["server_not_finite"]),
+            **{name: bits for name, bits in self._flags._asdict().items() if name != "status"},
+            temperature=temperature,
+            locked=None if mode is None else mode == "locked",
+            recoveries=new["server_recoveries"],
+            missed_deadlines=new["server_missed_deadlines"],
+            reconnects=new["connects"] if self._counts["connects"] > 1 else 0,
+            is_lost=link.lost is not None,
+            state=link.info.state,
+            server_silent=answer_s > _SLOW_ANSWER_S / 2,
+            emergency=emergency(self._row.get("emergency")),
+            settings=link.info.settings,
+        )
+        findings = judge(seen, self.limits).findings
+
+        def about(subject: About) -> Problems:
+            return [(finding.level, finding.sentence) for finding in findings if finding.about is subject]
+
+        was_silent, self._is_silent = self._is_silent, silent_s > self.limits.stale_after
+        if self._is_silent and not was_silent and link.is_connected and link.lost is None:
+            self._log.warning(findings[0].sentence)
+        has_samples = link.is_connected and link.lost is None and not self._is_silent
+        return [
+            self._judge_link(about(About.LINK), now_s, answer_s),
+            self._judge_stream(about(About.STREAM)),
+            self._judge_sensor(about(About.SENSOR), temperature),
+            self._judge_clock(about(About.CLOCK), has_samples=has_samples),
+            self._judge_compensation(compensation, has_samples=has_samples),
+        ]
+
+    def _status(
+        self, name: str, problems: Problems, good: str, values: Mapping[str, object]
+    ) -> DiagnosticStatus:
+        """The worst level, and all sentences, the worst first; `good` if there is none."""
+        problems, info = sorted(problems, key=lambda problem: -problem[0]), self._link.info
+        return DiagnosticStatus(
+            name=self._prefix + name,
+            level=_LEVELS[problems[0][0] if problems else Level.GOOD],
+            message="; ".join(sentence for _, sentence in problems) or good,
+            hardware_id=f"{info.name} {info.serial}".strip(),
+            values=[KeyValue(key=key, value=text_of(value)) for key, value in values.items()],
+        )
+
+    def _judge_link(self, problems: Problems, now_s: float, answer_s: float) -> DiagnosticStatus:
+        link = self._link
+        if not link.is_connected:
+            text = f"not connected to {link.address}: {link.problem}"
+            if not link.is_reachable:
+                text = f"no server at {link.address}: {link.problem}; start ethercat-server there, or set "
+                text += "server_host and server_port to where it is"
+            problems = [(Level.TROUBLE, f"{text} (the node keeps trying)")]
+        elif answer_s > _SLOW_ANSWER_S:
+            text = f"the server at {link.address} has not answered for {answer_s:.0f} s"
+            problems = [(Level.LOOK, f"{text}: it is stopped or overloaded")]
+        values = {
+            "address": link.address,
+            "connected": link.is_connected,
+            "connected_s" if link.is_connected else "disconnected_s": round(now_s - link.since_s, 1),
+            "reconnects": max(self._counts["connects"] - 1, 0),
+            "server_uptime_s": self._server.get("uptime_s", ""),
+            "last_problem": link.problem,
+        }
+        return self._status("link", problems, f"connected to {link.address}", values)
+
+    def _judge_stream(self, problems: Problems) -> DiagnosticStatus:
+        link, counts, skipped = self._link, self._counts, self._new["stale"]
+        if not link.is_connected:
+            problems = [(Level.NOT_POSSIBLE, "no samples: there is no connection to the server, see link")]
+        elif skipped >= self.limits.lost_warn:
+            text = f"{skipped} old samples skipped: the node or the server was stopped"
+            problems = [*problems, (Level.LOOK, text)]
+        recent = mapping(self._server.get("last_10s"))
+        age = row_of(recent.get("age_us"), link.sensor)
+        wake, exchange = mapping(recent.get("wake_us")), mapping(recent.get("exchange_us"))
+        values = {
+            "rate_hz": "" if self._rate_hz is None else round(self._rate_hz, 1),
+            "expected_hz": link.info.rate_hz or "",
+            "age_p50_us": "" if self._age_us is None else round(self._age_us[0]),
+            "age_p99_us": "" if self._age_us is None else round(self._age_us[1]),
+            "samples": counts["samples"],
+            "lost": counts["lost"],
+            "skipped": counts["stale"],
+            **{name: counts[name] for name in ("limited", "repeated", "invalid", "not_finite")},
+            "server_not_finite": self._row.get("not_finite", ""),
+            "server_lost": self._row.get("lost_samples", ""),
+            "server_recoveries": self._row.get("recoveries", ""),
+            "server_missed_deadlines": self._server.get("missed_deadlines", ""),
+            "server_lost_frames": self._server.get("lost_frames", ""),
+            "server_late_p50_us": wake.get("p50", ""),
+            "server_late_p99_us": wake.get("p99", ""),
+            "server_exchange_p99_us": exchange.get("p99", ""),
+            "server_age_p50_us": age.get("p50", ""),
+            "server_age_p99_us": age.get("p99", ""),
+        }
+        good = "samples arrive" if self._rate_hz is None else f"{self._rate_hz:.0f} samples a second"
+        return self._status("stream", problems, good, values)
+
+    def _judge_sensor(self, problems: Problems, temperature: float | None) -> DiagnosticStatus:
+        link, info, flags = self._link, self._link.info, self._flags
+        if not link.is_connected:
+            problems = [(Level.NOT_POSSIBLE, "unknown: there is no connection to the server, see link")]
+        elif link.lost is not None:  # the server's words, with what to do if they do not say it
+            lost = link.lost if "check " in link.lost else f"{link.lost}; check its cable and power"
+            problems = [(Level.TROUBLE, lost)]
+        elif self._is_silent:
+            problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
+        last = mapping(self._row.get("emergency"))
+        code, ago_s = whole(last.get("code")), number(last.get("ago_s"))
+        text = "" if code is None else f"emergency 0x{code:04X} ({printable(last.get('text'), 80)})"
+        values = {
+            **{name: getattr(info, name) for name in ("name", "serial", "hardware", "firmware")},
+            "al_state": info.state if link.is_connected else "",
+            "temperature_c": "" if temperature is None else round(temperature, 2),
+            "status_byte": f"{flags.status:#04x}",
+            "warnings_register": f"{flags.warnings:#010x}",
+            **{row.field: f"{getattr(flags, row.field):#x}" for row in SATURATIONS},
+            "saturated_samples": self._counts["saturated"],
+            "emergencies": self._row.get("emergencies", ""),
+            "last_emergency": text,
+            "last_emergency_ago_s": "" if ago_s is None else ago_s,
+        }
+        return self._status("sensor", problems, "as it should be", values)
+
+    def _judge_clock(self, problems: Problems, *, has_samples: bool) -> DiagnosticStatus:
+        clock, delay_ms = mapping(self._row.get("clock")), self._link.info.delay_ms
+        if not has_samples:
+            problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
+        elif clock.get("mode") is None:
+            problems = [(Level.NOT_POSSIBLE, "the server has not said yet")]
+        elif self._stamps.problem:
+            problems = [*problems, (Level.LOOK, self._stamps.problem)]
+        names = "mode", "stamps", "period_us", "offset_ppm", "uncertainty_us"
+        values = {name: clock.get(name, "") for name in names} | {
+            "stamp": self._stamps.kind,
+            "delay_force_torque_ms": delay_ms.get("force_torque", ""),
+            "delay_acceleration_ms": delay_ms.get("acceleration", ""),
+        }
+        return self._status("clock", problems, "locked to the sensor's clock", values)
+
+    def _judge_compensation(self, c: CompensationState, *, has_samples: bool) -> DiagnosticStatus:
+        problems, flags = Problems(), self._flags
+        if not has_samples:
+            problems.append((Level.NOT_POSSIBLE, "there are no new samples, see stream"))
+        elif c.stopped:
+            problems.append((Level.TROUBLE, c.stopped))
+        elif c.follows_imu and (flags.acceleration_saturated or flags.angular_rate_saturated):
+            text = "the IMU's range was exceeded, so wrench_compensated was wrong meanwhile: set "
+            text += "settings.acceleration_range_g and settings.angular_rate_range_dps higher"
+            problems.append((Level.LOOK, text))
+        elif count := self._new["withheld"]:
+            problems.append((Level.LOOK, f"{count} samples were not compensated: {c.why_withheld}"))
+        if c.doubtful:
+            problems.append((Level.LOOK if has_samples else Level.NOT_POSSIBLE, c.doubtful))
+        return self._status("compensation", problems, c.good, c.values)
+
+
+def text_of(value: object) -> str:
+    """A value as a KeyValue carries it."""
+    return str(value).lower() if isinstance(value, bool) else printable(value)
+
+
+def mapping(value: object) -> Mapping[str, Any]:
+    """`value` if it is a JSON object, else an empty one: the server's word is not trusted to have a form."""
+    return value if isinstance(value, dict) else {}
+
+
+def row_of(rows: object, position: int) -> Mapping[str, Any]:
+    """The object at `position` of a JSON list; empty if there is none."""
+    return mapping(rows[position] if isinstance(rows, list) and position < len(rows) else None)
