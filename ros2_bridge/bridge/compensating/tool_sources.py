@@ -12,8 +12,9 @@ from typing import NamedTuple, Protocol
 from bota_ethercat.pdo import Sample, Vector3
 from bota_ethercat.settings import SettingValue
 from bridge.parameters.table import Parameters
-from ft_compensation.alignment import NOT_DELAYED, Alignment, alignment_taps
-from ft_compensation.quantities import Quaternion
+from ft_compensation.alignment import align
+from ft_compensation.motion_error import MotionError
+from ft_compensation.quantities import STILL, Quaternion, Turning
 from ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
 
 IMU_IS_OFF = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
@@ -31,6 +32,7 @@ class Source:
 
     describe = "none"  # its name for people
     is_imu = False  # whether it is measured, with what the tool accelerates; else it is minus gravity
+    turning: Turning = STILL  # of the latest sample, where it is measured
 
     def __init__(self, why: str = "gravity_source is none") -> None:
         """`why` there is none."""
@@ -54,6 +56,10 @@ class Source:
         """How old the orientation in use is; 0 where every sample brings its own, infinite where none is."""
         return math.inf
 
+    def error(self, mass: float) -> MotionError | None:  # noqa: ARG002
+        """What the latest second of motion leaves of this mass, kg; None where it is not known."""
+        return None
+
 
 class Filters(Protocol):
     """What is known of the sensor's filters: the node's `Link`."""
@@ -72,19 +78,17 @@ class ImuSource(Source):
         """`imu_position` is the IMU's, m from the wrench origin."""
         (cx, cy, cz), (x, y, z) = parameters.payload.center, imu_position
         self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), parameters.accelerometer)
-        self._filters, self._alignment = filters, Alignment()
+        self._filters = filters
         self._settings: Mapping[str, SettingValue] | None = None  # those of the alignment
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """Of this sample."""
         if self._filters.settings is not self._settings:
-            self._settings, rate_hz = self._filters.settings, self._filters.rate_hz
-            taps = alignment_taps(self._settings, rate_hz) if rate_hz else NOT_DELAYED
-            self._alignment = Alignment(taps, 1 / rate_hz if rate_hz else 0.0)
+            self._settings = self._filters.settings
+            self._imu.align(align(self._settings, self._filters.rate_hz))
         found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
-        if found is None or not any(sample.acceleration):
-            return None
-        return self._alignment.follow(found, time_s)
+        self.turning = self._imu.turning
+        return found if any(sample.acceleration) else None
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """The IMU is off or broken."""
@@ -95,6 +99,10 @@ class ImuSource(Source):
     def age_s(self, time_s: float) -> float:  # noqa: ARG002
         """Every sample brings its own."""
         return 0.0
+
+    def error(self, mass: float) -> MotionError | None:
+        """As far as it is known."""
+        return self._imu.error(mass)
 
 
 class Listening(Protocol):
