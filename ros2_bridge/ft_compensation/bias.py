@@ -46,8 +46,11 @@ def force_bound_95(payload: Payload, accelerometer: Accelerometer) -> float:
 
     A tare with the tool on takes the offset's part off.
     """
-    intervals = zip(accelerometer.offset_interval, accelerometer.scale_interval, strict=True)
-    halves = [math.hypot(offset, STANDARD_GRAVITY * scale) for offset, scale in intervals]
+    cross = accelerometer.cross_axis_interval
+    per_axis = zip(
+        accelerometer.offset_interval, accelerometer.scale_interval, cross[::2], cross[1::2], strict=True
+    )
+    halves = [math.hypot(offset, STANDARD_GRAVITY * max(parts)) for offset, *parts in per_axis]
     return payload.mass * _ABOUT_THREE_AXES * max(halves)
 
 
@@ -91,7 +94,7 @@ class Taken(NamedTuple):
         """Why the bias may not fit this payload, a sentence; empty if it does."""
         if self.specific_force is not None or payload == self.payload:
             return ""
-        (was, (ax, ay, az)), (mass, (bx, by, bz)) = self.payload, payload
+        (was, (ax, ay, az), _), (mass, (bx, by, bz), _) = self.payload, payload
         moved = mass * bx - was * ax, mass * by - was * ay, mass * bz - was * az
         return (
             f"the bias was taken with {self.payload}, and in which pose is not known: with {payload} it may "

@@ -534,8 +534,10 @@ def test_what_the_accelerometers_own_errors_may_make_is_told_in_newtons(arm: Arm
         return float(values(moved.until(compensation="ok")["compensation"])["accelerometer_force"])
 
     assert told() == pytest.approx(force_bound_95(HEAVY, Accelerometer()), abs=1e-3)
-    known = Accelerometer(offset_interval=(0.02,) * 3, scale_interval=(0.0,) * 3)
-    for name in ("offset_interval", "scale_interval"):
+    known = Accelerometer(
+        offset_interval=(0.02,) * 3, scale_interval=(0.0,) * 3, cross_axis_interval=(0.0,) * 6
+    )
+    for name in ("offset_interval", "scale_interval", "cross_axis_interval"):
         moved.set(f"accelerometer.{name}", [*getattr(known, name)])
     assert told() == pytest.approx(force_bound_95(HEAVY, known), abs=1e-3)
     assert force_bound_95(HEAVY, known) < 0.1 * force_bound_95(HEAVY, Accelerometer())

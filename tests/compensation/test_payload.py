@@ -35,9 +35,9 @@ def circle(count: int = 8, tilt: float = 0.0) -> list[Up]:
     return [(tilt, math.sin(turn), math.cos(turn)) for turn in turns]
 
 
-def refusal(poses: list[Pose], *, one_axis: bool = False) -> str:
+def refusal(poses: list[Pose]) -> str:
     with pytest.raises(IdentificationError) as caught:
-        identify(poses, one_axis=one_axis)
+        identify(poses)
     text = str(caught.value)
     assert "\n" not in text
     return text
@@ -181,7 +181,7 @@ def test_an_offset_that_the_poses_do_not_determine_stays_open_and_the_result_say
     """Turned about x only: an offset along x tilts every pose alike, as a bias would."""
     reading, noise = Reading(2, length=0.3), random.Random(1)
     poses = [reading.pose(up)._replace(wrench=pose(up, noise=noise).wrench) for up in circle()]
-    found = identify(poses, one_axis=True)
+    found = identify(poses)
     assert found.accelerometer is not None
     assert found.accelerometer.undetermined == "x"
     x, y, z = found.accelerometer.calibration.offset_interval
@@ -277,12 +277,12 @@ def test_poses_that_do_not_suffice_are_refused_with_what_is_unseen(ups: list[Up]
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5])
 def test_one_axis_is_taken_on_request(tilt: float) -> None:
-    found = identify([pose(up) for up in circle(tilt=tilt)], one_axis=True)
+    found = identify([pose(up) for up in circle(tilt=tilt)])
     assert found.payload.mass == pytest.approx(TOOL.mass)
     assert found.payload.center == pytest.approx(TOOL.center)
     assert found.bias.values == pytest.approx(BIAS.values)
     two = [pose(UPWARD), pose((0, 1, 0))] * 4
-    assert "center of gravity along it is unseen" in refusal(two, one_axis=True)
+    assert "center of gravity along it is unseen" in refusal(two)
     identify([pose(up) for up in (UPWARD, (0, 1, 0), (1, 0, 0), DOWNWARD)])
 
 

@@ -23,8 +23,9 @@ from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.settings import SettingValue
 from bridge.parameters.table import TOPIC_SOURCES, ParameterError, Parameters
 from bridge.stream.link import Link
-from ft_compensation.alignment import NOT_DELAYED, Alignment, alignment_taps
-from ft_compensation.quantities import Quaternion, unit_quaternion, vector
+from ft_compensation.alignment import align
+from ft_compensation.motion_error import MotionError
+from ft_compensation.quantities import STILL, Quaternion, Turning, unit_quaternion, vector
 from ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
 
 IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
@@ -49,6 +50,7 @@ class Source:
     describe = "none"  # its name for people
     is_imu = False  # whether it is the sensor's own
     has_inertia = False  # whether it has the tool's acceleration in it; else it is minus gravity
+    turning: Turning = STILL  # of the latest sample, where it has
 
     def __init__(self, why: str = "gravity_source is none") -> None:
         """`why` there is none."""
@@ -73,6 +75,10 @@ class Source:
         """How old the robot's orientation is; infinite where there is none."""
         return math.inf
 
+    def error(self, mass: float) -> MotionError | None:  # noqa: ARG002
+        """What the latest second of motion leaves of this mass, kg; None where it is not known."""
+        return None
+
 
 class ImuSource(Source):
     """The sensor's own accelerometer and gyroscope, at the instant of its force and torque."""
@@ -84,25 +90,27 @@ class ImuSource(Source):
         """`imu_position` is the IMU's, m from the wrench origin; `link` knows the sensor's filters."""
         super().__init__()
         self._imu = ImuSpecificForce(_lever(parameters, imu_position), parameters.accelerometer)
-        self._link, self._alignment = link, Alignment()
+        self._link = link
         self._settings: Mapping[str, SettingValue] | None = None  # those of the alignment
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """Of this sample."""
         if self._link.info.settings is not self._settings:
-            self._settings, rate_hz = self._link.info.settings, self._link.info.rate_hz
-            taps = alignment_taps(self._settings, rate_hz) if rate_hz else NOT_DELAYED
-            self._alignment = Alignment(taps, 1 / rate_hz if rate_hz else 0.0)
+            self._settings = self._link.info.settings
+            self._imu.align(align(self._settings, self._link.info.rate_hz))
         found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
-        if found is None or not any(sample.acceleration):
-            return None
-        return self._alignment.follow(found, time_s)
+        self.turning = self._imu.turning
+        return found if any(sample.acceleration) else None
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """The IMU is off or broken."""
         if not any(sample.acceleration):
             return IMU_IS_OFF
         return "" if sample.is_finite else "the IMU sends NaN or infinity: see the status stream"
+
+    def error(self, mass: float) -> MotionError | None:
+        """As far as it is known."""
+        return self._imu.error(mass)
 
 
 class Oriented(NamedTuple):
@@ -127,7 +135,7 @@ class RobotSource(Source):
         self.problem = "nothing has come yet"  # what was wrong with what came last; empty if nothing was
         self._gravity, self._limit_s = parameters.gravity, parameters.orientation_stale_after
         self._turn = QuaternionGravity(stale_after_s=self._limit_s)
-        self._lever = ImuSpecificForce(_lever(parameters, parameters.imu_position))
+        self._imu = ImuSpecificForce(_lever(parameters, parameters.imu_position))
         self._taken: Oriented | None = None
 
     @property
@@ -160,7 +168,9 @@ class RobotSource(Source):
         x, y, z = found
         if latest.apparent_gravity is None:
             return -x, -y, -z
-        return self._lever.follow((-x, -y, -z), sample.angular_rate, time_s)
+        felt = self._imu.follow((-x, -y, -z), sample.angular_rate, time_s)
+        self.turning = self._imu.turning
+        return felt
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """Nothing has come, it stopped, it is of no use, or its stamps are of another time."""

@@ -356,4 +356,4 @@ class CompensatedOutput:
     def _stages(plan: Plan, sample: Sample, felt: Vector3, time_s: float) -> Stages:
         compensator = plan.compensator
         compensator.bias = plan.ramp.at(time_s)
-        return compensator.compensate(sample.force, sample.torque, felt)
+        return compensator.compensate(sample.force, sample.torque, felt, plan.source.turning)
