@@ -20,6 +20,7 @@ from sensor_msgs.msg import Imu
 
 from bota_ethercat.pdo import Sample, Vector3
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
+from bota_ethercat.sensor.response import force_torque_response
 from bota_ethercat.settings import SettingValue
 from bridge.parameters.table import TOPIC_SOURCES, ParameterError, Parameters
 from bridge.stream.link import Link
@@ -128,14 +129,16 @@ class RobotSource(Source):
     `take` is for the thread that listens; what it leaves is replaced, never changed in place.
     """
 
-    def __init__(self, parameters: Parameters, describe: str) -> None:
+    def __init__(self, parameters: Parameters, describe: str, link: Link) -> None:
+        """`link` knows the sensor's filters."""
         super().__init__()
-        self.describe = describe
+        self.describe, self._link = describe, link
         self.latest: Oriented | None = None
         self.problem = "nothing has come yet"  # what was wrong with what came last; empty if nothing was
         self._gravity, self._limit_s = parameters.gravity, parameters.orientation_stale_after
         self._turn = QuaternionGravity(stale_after_s=self._limit_s)
         self._imu = ImuSpecificForce(_lever(parameters, parameters.imu_position))
+        self._settings: Mapping[str, SettingValue] | None = None  # those of its alignment
         self._taken: Oriented | None = None
 
     @property
@@ -168,6 +171,11 @@ class RobotSource(Source):
         x, y, z = found
         if latest.apparent_gravity is None:
             return -x, -y, -z
+        if self._link.info.settings is not self._settings:
+            self._settings, rate_hz = self._link.info.settings, self._link.info.rate_hz
+            # The robot's accelerometer is taken to have no delay.
+            filters = {name: value for name, value in self._settings.items() if name != "acceleration_filter"}
+            self._imu.align(align(filters, rate_hz, force_torque_response(filters, rate_hz or None).delay_s))
         felt = self._imu.follow((-x, -y, -z), sample.angular_rate, time_s)
         self.turning = self._imu.turning
         return felt
@@ -268,10 +276,10 @@ def follow_tf(node: Node, group: CallbackGroup, look: Callable[[LookUp], object]
     return close
 
 
-def open_tf(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSource:
+def open_tf(node: Node, wanted: Parameters, group: CallbackGroup, link: Link) -> RobotSource:
     """A source that looks up the orientation of the sensor in TF."""
     base, frame = wanted.orientation_base_frame, wanted.frame_id
-    source = RobotSource(wanted, f"TF from {base} to {frame}")
+    source = RobotSource(wanted, f"TF from {base} to {frame}", link)
 
     def read(look_up: LookUp) -> Oriented:
         _, rotation, stamp = look_up(base, frame)
@@ -281,11 +289,11 @@ def open_tf(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSource
     return source
 
 
-def open_topic(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSource:
+def open_topic(node: Node, wanted: Parameters, group: CallbackGroup, link: Link) -> RobotSource:
     """A source that listens to `orientation.topic`; ParameterError if ROS refuses to listen there."""
     kind, _ = TOPIC_KINDS[wanted.gravity_source]
     topic = node.resolve_topic_name(wanted.orientation_topic)
-    source = RobotSource(wanted, f"topic {topic}")
+    source = RobotSource(wanted, f"topic {topic}", link)
     source.problem = "nothing has come on it yet"
     profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -392,7 +400,8 @@ class SourceChoice:
             elif name == "none":
                 self.source = Source()
             else:
-                self.source = (open_tf if name == "tf" else open_topic)(self._node, wanted, self._group)
+                open_source = open_tf if name == "tf" else open_topic
+                self.source = open_source(self._node, wanted, self._group, self._link)
         except ParameterError as error:
             self.source = Source(str(error))
             raise
