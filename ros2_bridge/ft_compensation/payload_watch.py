@@ -49,7 +49,7 @@ class PayloadWatch:
         self.finding = ""  # what does not agree, a sentence; empty as long as all does
         self.due_s = 0.0  # when the next sample is to be looked at, by the samples' time
         self._payload, self._say = payload, say
-        self._variance = (limits or StationaryLimits()).force_spread ** 2
+        self._variance = (limits or StationaryLimits()).force_deviation ** 2
         self._windows: list[_Window] = []
         self._since_s: float | None = None
         self._confirmed: list[_Window] = []

@@ -114,14 +114,14 @@ def stationary_means(rows: Array, seconds: float, limits: StationaryLimits) -> S
             "the sensor's IMU reads only zeros, so it is unknown whether the sensor moves: switch the IMU on "
             "(imu_active)"
         )
-    _check(spread, limits.spreads, spread, "moved by {} (standard deviation)")
+    _check(spread, limits.deviations, spread, "moved by {} (standard deviation)")
     if len(rows) >= 2 * _BLOCKS:
         blocks = [block[:, :9] for block in np.array_split(rows, _BLOCKS)]
         drift = np.ptp([block.mean(axis=0) for block in blocks], axis=0)
         # The noise within the blocks, which a drifting mean does not raise.
         noise = np.sqrt(np.mean([block.var(axis=0, ddof=1) for block in blocks], axis=0))
         excess = drift - CHANCE * noise / math.sqrt(len(blocks[-1]))
-        _check(excess, limits.wanders, drift, "drifted by {} within the window")
+        _check(excess, limits.drifts, drift, "drifted by {} within the window")
     rate = float(np.linalg.norm(mean[9:12]))
     if rate > limits.angular_rate:
         raise NotStationaryError(

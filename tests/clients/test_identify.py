@@ -183,7 +183,7 @@ def test_a_gap_or_a_restarted_server_ends_a_rest_but_not_the_wall_clock(tmp_path
 
 
 def test_what_cannot_be_used_is_one_sentence(recording: Path, tmp_path: Path) -> None:
-    wide = ("--limit", "angular_rate=10", "--limit", "angular_rate_spread=10")
+    wide = ("--limit", "angular_rate=10", "--limit", "angular_rate_deviation=10")
     assert "check imu_raw_units" in refused(recording, "--imu-raw-units", "si", *wide)
     record(path := tmp_path / "scene.mcap", frames(process_data("scene", 4.0, sinc=SINC)))
     assert "never stationary for 1 s" in refused(path)
@@ -197,7 +197,7 @@ def test_what_cannot_be_used_is_one_sentence(recording: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     "arguments",
     [[], ["a.mcap", "b.mcap"], ["a.mcap", "--gravity", "1"], ["a.mcap", "--limit", "speed=1"],
-     ["a.mcap", "--limit", "force_spread=x"], ["a.mcap", "--confidence", "1"], ["a.mcap", "--sensor", "-1"]],
+     ["a.mcap", "--limit", "force_drift=x"], ["a.mcap", "--confidence", "1"], ["a.mcap", "--sensor", "-1"]],
 )  # fmt: skip
 def test_wrong_usage_is_exit_code_2(arguments: list[str]) -> None:
     ended = run_here(main, *arguments)

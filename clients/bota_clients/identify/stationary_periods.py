@@ -102,7 +102,7 @@ def _stretches(
     blocks = rows[: count * size].reshape(count, size, rows.shape[1])
     mean, deviation = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
     quiet = good[: count * size].reshape(count, size).all(axis=1)
-    quiet &= (deviation <= limits.spreads).all(axis=1)
+    quiet &= (deviation <= limits.deviations).all(axis=1)
     quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= limits.angular_rate
 
     def goes_on(start: int, number: int) -> bool:
@@ -115,7 +115,7 @@ def _stretches(
             return False
         by_chance = CHANCE * (deviation[start] + deviation[number]) / math.sqrt(size)
         moved = np.abs(b - a) - by_chance
-        return bool((moved[:6] <= limits.wanders[:6]).all())  # of the acceleration the pose was compared
+        return bool((moved[:6] <= limits.drifts[:6]).all())  # of the acceleration the pose was compared
 
     start = 0
     for number in range(1, count + 1):
