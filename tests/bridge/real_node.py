@@ -131,12 +131,13 @@ class Listener(Asking):
 
 
 class Log:
-    """The node's logger: passes on to rclpy's and keeps the text."""
+    """The node's logger: passes on to rclpy's and keeps the text, of what is throttled the first."""
 
     def __init__(self, logger: Any) -> None:
         self._logger = logger
         self.lines: list[str] = []
         self.warnings: list[str] = []
+        self._throttled: set[str] = set()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._logger, name)
@@ -144,7 +145,12 @@ class Log:
     def info(self, text: str) -> None:
         self.lines.append(text)
 
-    def warning(self, text: str) -> None:
+    def warning(self, text: str, throttle_duration_sec: float = 0.0) -> None:
+        if throttle_duration_sec:
+            kind = text.partition("(")[0]
+            if kind in self._throttled:
+                return
+            self._throttled.add(kind)
         self.warnings.append(text)
         self.info(text)
 

@@ -29,21 +29,18 @@ class BiasKeeper:
     def __init__(self, log: Any) -> None:
         self.serial: str | None = None  # of that sensor, for any thread; None until there was one
         self.problem = ""  # why the bias could not be kept or read, a sentence; empty if it could
-        # The content of the file, None to store it again: a bias, how it was taken, the sensor's own offset.
-        self.kept: tuple[Wrench, Taken, Wrench | None] | None = None
         self._log = log
 
     def keep(self, ramp: BiasRamp, parameters: Parameters, offset: Wrench | None) -> None:
-        """Store the bias that `ramp` leads to, for the connected sensor, if enabled and changed.
+        """Store the bias that `ramp` leads to, for the connected sensor, if enabled.
 
         `offset` is the sensor's own at that time, None if it is unknown, or if there is no bias.
         """
         if not parameters.bias_keep:
             self.problem = ""
+        if not parameters.bias_keep or self.serial is None:
             return
         bias, taken = ramp.target, ramp.taken
-        if self.serial is None or (bias, taken, offset) == self.kept:
-            return
         try:
             path = _store(parameters).save(
                 _number(self.serial), bias, taken.payload, offset, taken.specific_force
@@ -51,7 +48,7 @@ class BiasKeeper:
         except StoreError as error:
             self._say_not_kept(str(error))
             return
-        self.kept, self.problem = (bias, taken, offset), ""
+        self.problem = ""
         self._log.info(f"the bias is kept in {path}")
 
     def take(
@@ -65,7 +62,7 @@ class BiasKeeper:
         """Another sensor was connected, with its own `offset`; `bias` from `origin` is in force. None: keep
         it."""
         is_first, self.serial = self.serial is None, serial
-        self.kept, self.problem = None, ""
+        self.problem = ""
         stored = None
         try:
             if parameters.bias_keep:
@@ -87,8 +84,6 @@ class BiasKeeper:
             )
             return None
         before = Taken(stored.payload or parameters.payload, stored.specific_force)
-        if stored.offset == offset:
-            self.kept = stored.bias, before, offset
         self._log.info(f"the sensor with serial number {serial} has the bias that was kept at {stored.saved}")
         change, taken = before.weighed(parameters.payload)
         if warning := taken.warning(change, parameters.payload):

@@ -26,6 +26,7 @@ from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
 
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
+_KEPT: Final = ("bias", "payload", "bias_keep", "bias_directory")  # what the file of the bias depends on
 _NOTHING_CURRENT: Final = "no current orientation"
 _MOTION_S: Final = 1.0  # how often it is looked up what motion leaves
 _LEAST_TOLD_N: Final = 0.2  # about the noise of a force
@@ -47,7 +48,6 @@ class CompensationControl:
         self.parameters, self.output = parameters, output
         self.reader, self.link, self._live = reader, reader.link, live
         self.origin = FROM_PARAMETER  # where the bias in force comes from
-        self._model = ""  # of the sensor that is or was there
         self._log = node.get_logger()
         self.choice = SourceChoice(node, self.link)
         self.keeper = BiasKeeper(self._log)
@@ -67,7 +67,7 @@ class CompensationControl:
 
     def start(self) -> None:
         """Open the orientation's source, before any sample comes; ParameterError if it cannot be had."""
-        self.choice.open(self.parameters, self._model)
+        self.choice.open(self.parameters)
         self._make_plan()
 
     def close(self) -> None:
@@ -243,13 +243,12 @@ class CompensationControl:
             self._guard.trigger()  # the parameter follows
         if self.output.hold is not _LOOKING_UP:
             self._hold()
-        if wanted.bias_keep and (not was.bias_keep or wanted.bias_directory != was.bias_directory):
-            self.keeper.kept = None
-        self.keeper.keep(self._ramp, wanted, self.own_offset.to_keep)
+        if is_wish or any(getattr(was, name) != getattr(wanted, name) for name in _KEPT):
+            self.keeper.keep(self._ramp, wanted, self.own_offset.to_keep)
 
     def _open_source(self) -> None:
         try:
-            self.choice.open(self.parameters, self._model)
+            self.choice.open(self.parameters)
         except ParameterError as error:  # too late to refuse the parameter
             self._log.error(str(error))
 
@@ -268,10 +267,10 @@ class CompensationControl:
     def _follow_sensor(self) -> None:
         """Find the bias of the sensor that is there now."""
         while not self._is_same_sensor():
-            info = self.link.info
             is_another = self.keeper.serial is not None
             offset = self.own_offset.begin(self.bias)
-            begin = self.keeper.take(info.serial, self.bias, self.origin, self.parameters, offset)
+            serial = self.link.info.serial
+            begin = self.keeper.take(serial, self.bias, self.origin, self.parameters, offset)
             if begin is not None:
                 self.own_offset.has_bias = begin.is_one
                 problem = self.keeper.problem
@@ -281,7 +280,6 @@ class CompensationControl:
             elif is_another:
                 # What was before in its history was the other's too.
                 self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
-            self._model = info.name
             self._open_source()
             self._make_plan()
             if not self.keeper.problem and self.bias != NO_WRENCH:

@@ -42,6 +42,13 @@ TOPIC_KINDS: Final[dict[str, tuple[Any, Callable[[Any], Any]]]] = {
 }
 
 
+# What a source depends on, besides the sensor's model.
+_DEPENDS_ON: Final = (
+    "gravity_source", "gravity", "payload", "accelerometer", "imu_position", "orientation_topic",
+    "orientation_base_frame", "orientation_mounting", "orientation_stale_after",
+)  # fmt: skip
+
+
 class Source:
     """The specific force at the tool's center of gravity, m/s² in the sensor's frame. Of this class: none.
 
@@ -87,10 +94,13 @@ class ImuSource(Source):
     describe = "imu"
     is_imu = has_inertia = True
 
-    def __init__(self, parameters: Parameters, imu_position: Vector3, link: Link) -> None:
-        """`imu_position` is the IMU's, m from the wrench origin; `link` knows the sensor's filters."""
+    def __init__(self, parameters: Parameters, link: Link) -> None:
+        """`link` knows the sensor's model and filters."""
         super().__init__()
-        self._imu = ImuSpecificForce(_lever(parameters, imu_position), parameters.accelerometer)
+        position = parameters.imu_position
+        if not any(position):  # as the drawings of the model have it
+            position = 0.0, 0.0, IMU_HEIGHTS.get(link.info.name[4:8], 0.0)
+        self._imu = ImuSpecificForce(_lever(parameters, position), parameters.accelerometer)
         self._link = link
         self._settings: Mapping[str, SettingValue] | None = None  # those of the alignment
 
@@ -182,22 +192,11 @@ class RobotSource(Source):
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """Nothing has come, it stopped, it is of no use, or its stamps are of another time."""
-        latest, problem, name = self.latest, self.problem, self.describe
-        if latest is None:
-            return f"no orientation from {name}: {problem}"
-        behind_s = stamp_s - latest.stamp_ns * 1e-9
-        if abs(behind_s) <= self._limit_s:
-            return ""
-        limit = f"(limit {self._limit_s:g} s)"
-        if behind_s < 0:
-            return (
-                f"the orientation from {name} is stamped {_seconds(-behind_s)} after the sample {limit}: the "
-                "clocks of the two computers differ"
-            )
-        why = problem or "it has stopped, is slow, or has another clock"
-        return (
-            f"the latest orientation from {name} is {_seconds(behind_s)} older than the sample {limit}: {why}"
-        )
+        if self.latest is None:
+            return f"no orientation from {self.describe}: {self.problem}"
+        off = why_off(stamp_s - self.latest.stamp_ns * 1e-9, self._limit_s)
+        why = self.problem or "it has stopped, is slow, or has another clock"
+        return off and f"the latest orientation from {self.describe} {off}: {why}"
 
     def age_s(self, time_s: float) -> float:
         """Between the stamps of sample and orientation."""
@@ -210,8 +209,12 @@ def _lever(parameters: Parameters, imu_position: Vector3) -> Vector3:
     return cx - x, cy - y, cz - z
 
 
-def _seconds(value: float) -> str:
-    return f"{value:.3f} s" if value < 100 else f"{value:.3g} s"
+def why_off(behind_s: float, limit_s: float) -> str:
+    """That something is too far from the sample in time, the end of a clause; empty if it is not."""
+    if abs(behind_s) <= limit_s:
+        return ""
+    order = "older" if behind_s > 0 else "newer"
+    return f"is {abs(behind_s):.3g} s {order} than the sample (limit {limit_s:g} s, orientation.stale_after)"
 
 
 # What is listened to.
@@ -375,33 +378,22 @@ class SourceChoice:
                 f"parameter orientation.topic is {wanted.orientation_topic!r}: {reason}"
             ) from None
 
-    def open(self, wanted: Parameters, model: str) -> None:
-        """Open the source that is wanted, for a sensor of this model, unless it is open.
+    def open(self, wanted: Parameters) -> None:
+        """Open the source that is wanted, for the sensor that is or was there, unless it is open.
 
         ParameterError if that cannot be; then there is none.
         """
-        name, position = wanted.gravity_source, wanted.imu_position
-        lever = (position, wanted.payload.center) if name in ("imu", "topic_imu") else None
-        if name == "imu":
-            # As given, else as the drawings of the model have it.
-            position = position if any(position) else (0.0, 0.0, IMU_HEIGHTS.get(model[4:8], 0.0))
-            opened: tuple[object, ...] = name, lever, position, wanted.accelerometer
-        else:
-            opened = (
-                name, lever, wanted.gravity, wanted.orientation_topic, wanted.orientation_base_frame,
-                wanted.orientation_mounting, wanted.orientation_stale_after,
-            )  # fmt: skip
+        opened = [getattr(wanted, name) for name in _DEPENDS_ON] + [self._link.info.name]
         if opened == self._opened:
             return
         self.close()
         try:
-            if name == "imu":
-                self.source = ImuSource(wanted, position, self._link)
-            elif name == "none":
-                self.source = Source()
-            else:
-                open_source = open_tf if name == "tf" else open_topic
-                self.source = open_source(self._node, wanted, self._group, self._link)
+            if wanted.gravity_source == "imu":
+                self.source = ImuSource(wanted, self._link)
+            elif wanted.gravity_source == "tf":
+                self.source = open_tf(self._node, wanted, self._group, self._link)
+            elif wanted.gravity_source in TOPIC_SOURCES:
+                self.source = open_topic(self._node, wanted, self._group, self._link)
         except ParameterError as error:
             self.source = Source(str(error))
             raise

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample, Vector3
-from bridge.compensating.sources import LookUp, Source, UnusableError, check_tf, follow_tf
+from bridge.compensating.sources import LookUp, Source, UnusableError, check_tf, follow_tf, why_off
 from bridge.parameters.table import Parameters, WrenchFrame
 from bridge.publishing.messages import Stamps, Topic
 from ft_compensation.bias import BiasRamp
@@ -108,14 +108,9 @@ class FrameTopic(WrenchTopic):
         what = f"wrench_compensated/{self._name} has stopped: "
         if self._found is None:
             return "" if self._misses < _PATIENCE else what + self._error
-        behind_ns = self._asked_ns - self._found[1]
-        if not self._found[1] or not self._asked_ns or abs(behind_ns) <= self._limit_ns:
-            return ""
-        differs_s, order = abs(behind_ns) / _NS_PER_S, "older" if behind_ns > 0 else "newer"
-        return (
-            f"{what}TF's latest pose of {self._source} in {self._name} is {differs_s:.3g} s {order} than the "
-            f"sample (limit {self._limit_ns / _NS_PER_S:g} s, orientation.stale_after)"
-        )
+        behind_ns = self._asked_ns - self._found[1] if self._found[1] and self._asked_ns else 0
+        off = why_off(behind_ns / _NS_PER_S, self._limit_ns / _NS_PER_S)
+        return off and f"{what}TF's latest pose of {self._source} in {self._name} {off}"
 
 
 def make_frames(node: Node, parameters: Parameters, stamps: Stamps) -> list[FrameTopic]:

@@ -29,7 +29,7 @@ _WAIT_S: Final = 1.0
 # Times that a ROS message can carry, less the longest delay of a filter.
 _FIRST_STAMP_NS: Final = LONGEST_DELAY_MS * 10**6
 _LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
-_WARN_EVERY_S: Final = 10.0
+_SOMETIMES: Final = {"throttle_duration_sec": 10.0}
 _MOST_NOTED: Final = 8192
 
 
@@ -168,7 +168,6 @@ class Reader:
         self._limit_hz = parameters.publishing_frequency
         self._selector = FrameSelector(self.counts, same_clock=True, limit_hz=self._limit_hz)
         self._problem: str | None = None
-        self._next_warning_s = 0.0
         self.thread = Worker("reader", self.run, on_failure)
 
     def stop(self) -> bool:
@@ -223,8 +222,8 @@ class Reader:
         for frame in selected:
             sample = self._decoders[len(frame.process_data)].decode(frame.process_data)
             if not _FIRST_STAMP_NS <= frame.stamp_ns <= _LAST_STAMP_NS:
-                self._warn_sometimes(
-                    f"a sample with the impossible time {frame.stamp_ns} ns was not published"
+                self._log.warning(
+                    f"a sample with the impossible time {frame.stamp_ns} ns was not published", **_SOMETIMES
                 )
             elif sample.is_finite:
                 for output in self._outputs.wanted:
@@ -233,16 +232,11 @@ class Reader:
             else:
                 self._outputs.publish_finite(sample, frame)
                 self.not_finite += 1
-                self._warn_sometimes(
-                    f"a sample with numbers that are not finite was not published ({self.not_finite} so far)"
+                self._log.warning(
+                    f"a sample with numbers that are not finite was not published ({self.not_finite} so far)",
+                    **_SOMETIMES,
                 )
             watch.ages.append(monotonic_ns() - frame.monotonic_ns)
-
-    def _warn_sometimes(self, text: str) -> None:
-        now_s = self._clock.monotonic()
-        if now_s >= self._next_warning_s:
-            self._next_warning_s = now_s + _WARN_EVERY_S
-            self._log.warning(text)
 
     def _follow(self, frame: DataMessage) -> None:
         """A sample that the limit to the rate leaves out: some outputs go by all of them."""
