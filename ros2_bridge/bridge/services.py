@@ -95,15 +95,8 @@ class SensorServices:
 
     def _save_settings(self) -> str:
         # `configure` wants at least one setting: one as it is.
-        setting = next(iter(self._link.info.settings.items()), None)
-        sensor = self._link.sensor
-        if setting is None:
-            raise RequestFailedError(
-                f"the settings of sensor {sensor} are not known: there is no server at {self._link.address}, "
-                "or the sensor has none"
-            )
-        name, value = setting
-        self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=sensor, settings={name: value}, save=True)
+        sensor, settings = self._link.sensor, dict(list(self._link.info.settings.items())[:1])
+        self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=sensor, settings=settings, save=True)
         return f"sensor {sensor} keeps its settings and offset in its flash now"
 
 
@@ -119,17 +112,19 @@ class BiasServices:
         payload = control.parameters.payload
         window = take_window(control, needs_tool=payload.mass > 0)
         means = window.means()
-        felt: Vector3 | None = None
+        specific_force: Vector3 | None = None
         try:
             if conflict := control.conflict(needs_tool=True):
                 raise CompensationError(conflict)
-            felt = window.specific_force()
-            check_at_rest(felt, length(control.parameters.gravity))
+            specific_force = window.specific_force()
+            check_at_rest(specific_force, length(control.parameters.gravity))
         except CompensationError:
             if payload.mass:
                 raise
-            felt = None  # until there is a tool_mass nobody needs it
-        control.set_bias(estimate_bias(means, payload, felt or ZERO), "tare", Taken(payload, felt))
+            specific_force = None  # until there is a tool_mass nobody needs it
+        control.set_bias(
+            estimate_bias(means, payload, specific_force or ZERO), "tare", Taken(payload, specific_force)
+        )
         if payload.mass:
             weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
         else:

@@ -114,6 +114,16 @@ def test_the_file_is_one_that_the_node_starts_with(started: Node, take: Take, tm
     assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
 
 
+def test_the_answer_names_a_pose_in_which_the_tool_was_touched(
+    started: Node, take: Take, server: Server
+) -> None:
+    take(*AXES[:3])
+    server.hold((1, 1, 1), bias=BIAS, force_x=2.0)
+    started.do("identify/add_pose")
+    take(*AXES[3:], (1, -1, 1), (-1, 1, -1))
+    started.do("identify/solve", "pose 4 ", "if something touched the tool, take it again")
+
+
 def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(started: Node, take: Take) -> None:
     started.refuse("identify/solve", "there is no pose yet")
     take(UP, UP, UP, UP)

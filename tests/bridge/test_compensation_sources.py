@@ -64,8 +64,7 @@ class Robot(Server):
 
     def restore(self) -> None:
         self.quaternion, self.offset_s, self.stamped, self.sending = UPRIGHT, 0.0, True, True
-        # What the arm's IMU feels, m/s²; the covariance that says that it feels nothing.
-        self.felt, self.unfelt = (0.0, 0.0, 0.0), -1.0
+        self.acceleration, self.covariance = (0.0, 0.0, 0.0), 0.0  # of the arm's IMU, m/s²
         self.hold(UP, acceleration_x=3.0)  # the sensor's own accelerometer says something else
 
     def listening(self) -> list[Any]:
@@ -84,8 +83,8 @@ class Robot(Server):
             q.x, q.y, q.z, q.w = self.quaternion
             if isinstance(message, Imu):
                 a = message.linear_acceleration
-                a.x, a.y, a.z = self.felt
-                message.linear_acceleration_covariance[0] = 0.0 if any(self.felt) else self.unfelt
+                a.x, a.y, a.z = self.acceleration
+                message.linear_acceleration_covariance[0] = self.covariance
             subscription.callback(message)
 
 
@@ -195,14 +194,14 @@ def test_accelerations_of_the_robots_imu_are_weight_and_inertia(
     quarter = math.sqrt(0.5)
     node.set("orientation.mounting", [0.0, 0.0, quarter, quarter])
     node.set("gravity_source", "topic_imu")
-    node.until("subtracted: weight of the tool", compensation="ok")
+    node.until("subtracted: weight of the tool", compensation="ok")  # nothing filled in is no free fall
     robot.quaternion = (math.nan,) * 4  # it is not asked
-    robot.felt = 1.0, 0.0, STANDARD_GRAVITY
+    robot.acceleration = 1.0, 0.0, STANDARD_GRAVITY
     pulled: dict[str, Any] = {"force_y": TOOL.mass, "torque_x": -TOOL.mass * TOOL.center[2]}
     stages.at(UP, acceleration_x=3.0, torque_z=TOOL.mass * TOOL.center[0], **pulled)
     node.until("subtracted: weight and inertia of the tool", compensation="ok")
     robot.restore()
-    robot.unfelt = 0.0  # nothing filled in is no free fall
+    robot.acceleration, robot.covariance = (1.0, 2.0, 3.0), -1.0  # which says that it has none
     stages.at(OVER, wanted=[a - b for a, b in zip(weight(OVER), weight(UP), strict=True)])
     node.until("subtracted: weight of the tool", compensation="ok")
 

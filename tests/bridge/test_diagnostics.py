@@ -196,6 +196,7 @@ def test_a_server_that_does_not_answer(node: Node, server: Server) -> None:
 
 
 def test_a_server_that_is_gone_and_comes_back(node: Node, server: Server) -> None:
+    node.run(2.0)
     server.listens = False
     server.drop()
     words = ("no server at localhost:12001", "start ethercat-server")
@@ -205,9 +206,12 @@ def test_a_server_that_is_gone_and_comes_back(node: Node, server: Server) -> Non
     server.description["sensors"] = []
     node.until("not connected to localhost:12001: the server has no sensor 0", link="error")
     server.description["sensors"] = sensors
+    server.answers["status"] = lambda _: status(lost_samples=500)
     array = node.until("was interrupted", link="warn")
     link = values(array["link"])
     assert (link["reconnects"], link["server_uptime_s"]) == ("1", ""), (
         "what the other server said is of the other"
     )
+    arrays = node.hear("/diagnostics")
+    assert not [array for array in node.fresh(arrays, 3.0) if "lost" in array.status[1].message], "by another"
     node.until(**HEALTHY)

@@ -150,9 +150,10 @@ class CompensationControl:
                 "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
                 "or set tool_mass to 0"
             )
-        return self._blind() if needs_tool else ""
+        return self._why_unknown() if needs_tool else ""
 
-    def _blind(self) -> str:
+    def _why_unknown(self) -> str:
+        """Why these settings of the sensor hide the specific force, a sentence; empty if they do not."""
         if self.parameters.gravity_source != "imu":
             return ""
         if self.link.info.settings.get("coordinate_system") is True:
@@ -165,7 +166,7 @@ class CompensationControl:
 
     def _hold(self) -> None:
         """Publish nothing while the specific force is needed and cannot be known."""
-        self.output.hold = self._blind() if self.parameters.payload.mass else ""
+        self.output.hold = self._why_unknown() if self.parameters.payload.mass else ""
 
     def _why_stopped(self) -> str:
         """Why the newest sample was not compensated, or would not be if anybody had subscribed."""

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
+import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -26,7 +27,7 @@ from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.outputs import FilterSettings, WrenchFilter, WrenchTransform
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
-from ft_compensation.stationary import StationaryWindow
+from ft_compensation.stationary import StationaryWindow, triple
 from ft_compensation.stationary_limits import StationaryLimits
 
 # Failed lookups after the first subscription before it is a problem: TF has to arrive first.
@@ -231,27 +232,25 @@ class RestWindow(StationaryWindow):
         super().__init__(seconds, limits)
         self.source = source
         self.done = threading.Event()
-        self._sum, self._felt = ZERO, 0
-        self._blind = ""
+        self._taken, self._unknown = list[Vector3](), ""
 
-    def take(self, sample: Sample, time_s: float, stamp_s: float, felt: Vector3 | None) -> bool:
+    def take(self, sample: Sample, time_s: float, stamp_s: float, specific_force: Vector3 | None) -> bool:
         """Take a sample and its specific force, for the reader. True: the window is complete."""
-        if felt is None:
-            self._blind = self._blind or self.source.why_none(sample, stamp_s) or "not in every sample"
+        if specific_force is None:
+            self._unknown = self._unknown or self.source.why_none(sample, stamp_s) or "not in every sample"
         else:
-            (x, y, z), (fx, fy, fz) = self._sum, felt
-            self._sum = (x + fx, y + fy, z + fz)
-            self._felt += 1
+            self._taken.append(specific_force)
         if self.add(sample, time_s):
             self.done.set()
         return self.done.is_set()
 
     def specific_force(self) -> Vector3:
         """Its mean in the sensor's frame, m/s²; CompensationError if it was not known all the time."""
-        if self._blind or not self._felt:
-            raise CompensationError(f"the weight of the tool is not known: {self._blind or 'no sample came'}")
-        x, y, z = self._sum
-        return x / self._felt, y / self._felt, z / self._felt
+        if self._unknown or not self._taken:
+            raise CompensationError(
+                f"the weight of the tool is not known: {self._unknown or 'no sample came'}"
+            )
+        return triple(np.mean(self._taken, axis=0))
 
 
 class CompensatedOutput:
@@ -311,44 +310,44 @@ class CompensatedOutput:
     def follow(self, sample: Sample, frame: DataMessage) -> None:
         """Give source, open window and filter a sample that is not published."""
         plan = self.plan
-        felt = self._felt(plan, sample, frame)
-        if self._filtered in self._wanted and felt is not None and not self.hold:
-            self._filtered.note(*self._stages(plan, sample, felt, self.time_s).final, frame)
+        specific_force = self._specific_force(plan, sample, frame)
+        if self._filtered in self._wanted and specific_force is not None and not self.hold:
+            self._filtered.note(*self._stages(plan, sample, specific_force, self.time_s).final, frame)
 
-    def _felt(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
+    def _specific_force(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
         """The specific force as far as it is needed, None if it is not known; the window takes the sample."""
         self.sample, time_s, stamp_s = sample, frame.monotonic_ns * 1e-9, frame.stamp_ns * 1e-9
         self.time_s, self.stamp_s = time_s, stamp_s
         window = self.window
         if not plan.has_tool and window is None:
             return ZERO
-        felt = plan.source.specific_force(sample, time_s, stamp_s)
-        if window is not None and window.take(sample, time_s, stamp_s, felt):
+        specific_force = plan.source.specific_force(sample, time_s, stamp_s)
+        if window is not None and window.take(sample, time_s, stamp_s, specific_force):
             self.window = None
-        return felt if plan.has_tool else ZERO
+        return specific_force if plan.has_tool else ZERO
 
     def publish(self, sample: Sample, frame: DataMessage) -> None:
         """Compensate a sample and publish its stages; nothing if the tool's weight is not known."""
         plan = self.plan
-        felt = self._felt(plan, sample, frame)
+        specific_force = self._specific_force(plan, sample, frame)
         time_s = self.time_s
         is_saturated = self.stops_on_saturation and sample.force_torque_saturated != 0
-        if felt is None or self.hold or is_saturated:
+        if specific_force is None or self.hold or is_saturated:
             self.is_stopped = True
             self.withheld += 1
             self.why_withheld = self.hold or (_SATURATED if is_saturated else "")
             return
         self.is_stopped = False
-        stages = self._stages(plan, sample, felt, time_s)
+        stages = self._stages(plan, sample, specific_force, time_s)
         if (watch := plan.watch) is not None and watch.is_due(time_s):
-            gravity = -felt[0], -felt[1], -felt[2]
+            gravity = -specific_force[0], -specific_force[1], -specific_force[2]
             watch.look(stages.final.force, gravity, sample.angular_rate, time_s)
         for topic in self._wanted:
             topic.send(*stages[topic.index], frame)
         self.published += 1
 
     @staticmethod
-    def _stages(plan: Plan, sample: Sample, felt: Vector3, time_s: float) -> Stages:
+    def _stages(plan: Plan, sample: Sample, specific_force: Vector3, time_s: float) -> Stages:
         compensator = plan.compensator
         compensator.bias = plan.ramp.at(time_s)
-        return compensator.compensate(sample.force, sample.torque, felt, plan.source.turning)
+        return compensator.compensate(sample.force, sample.torque, specific_force, plan.source.turning)
