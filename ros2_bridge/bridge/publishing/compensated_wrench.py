@@ -271,6 +271,7 @@ class CompensatedOutput:
             self._filtered,
         )
         self._wanted: tuple[WrenchTopic | FilteredTopic, ...] = ()
+        self.has_subscribers = False  # as of the last look
         self.plan = Plan(Source(), Compensator(), BiasRamp(), has_tool=False)
         self.window: RestWindow | None = None  # the one that is open
         self.hold = ""  # why nothing may be published for now, whatever else is known
@@ -287,14 +288,10 @@ class CompensatedOutput:
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed to any of the topics, or a window is open."""
         self._wanted = tuple(topic for topic in self._all if topic.is_wanted())
+        self.has_subscribers = bool(self._wanted)
         if not self._wanted:
             self.is_stopped = False  # nobody misses anything
-        return bool(self._wanted) or self.window is not None
-
-    @property
-    def has_subscribers(self) -> bool:
-        """Whether anybody has subscribed, as of the last look."""
-        return bool(self._wanted)
+        return self.has_subscribers or self.window is not None
 
     @property
     def problem(self) -> str:

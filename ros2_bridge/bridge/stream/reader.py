@@ -180,16 +180,6 @@ class Reader:
         if hz != self._limit_hz:
             self._limit_hz = hz
             self._selector.limit(hz)
-            self._warn_of_aliases()
-
-    def _warn_of_aliases(self) -> None:
-        rate_hz = self.link.info.rate_hz
-        if 0 < self._limit_hz < rate_hz:
-            self._log.warning(
-                f"publishing_frequency {self._limit_hz:g} takes the newest of {rate_hz:g} samples "
-                f"a second, without a low-pass: noise and vibration above {self._limit_hz / 2:g} Hz appear "
-                "at lower frequencies (aliasing); take every sample, or a longer sinc_length"
-            )
 
     def run(self) -> None:
         """Connect and read, again and again, until `stop`."""
@@ -257,7 +247,6 @@ class Reader:
             again = " again" if event.again else ""
             self._log.info(f"connected{again} to {link.address}: {link.info}")
             self._problem = None
-            self._warn_of_aliases()
         elif isinstance(event, Disconnected):
             if event.reason.startswith("the server has no sensor"):
                 event = event._replace(reason=f"{event.reason}: set the parameter 'sensor' to one it has")
