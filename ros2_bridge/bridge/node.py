@@ -189,7 +189,7 @@ def spin(node: BridgeNode, on_started: Callable[[], object] = lambda: None) -> i
             node.get_logger().error("a thread did not end in time")
         else:
             prompt.shutdown()
-        node.compensation.close()
+        node.compensation.choice.close()
         executor.shutdown()
         node.destroy_node()
 

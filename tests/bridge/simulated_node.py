@@ -264,7 +264,7 @@ class Node(Asking):
     def close(self) -> None:
         assert self.node.exit_code != 1, self.log
         self.node.reader.client.close()
-        self.node.compensation.close()
+        self.node.compensation.choice.close()
         retire(self.node)
 
     @property

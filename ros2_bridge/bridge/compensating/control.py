@@ -34,7 +34,7 @@ _LOOKING_UP: Final = "the bias of this sensor is being looked up"
 
 
 class CompensationControl:
-    """Wires parameters, bias and source to `output`, from `start` to `close`."""
+    """Wires parameters, bias and source to `output`, from `start` on."""
 
     def __init__(
         self,
@@ -69,10 +69,6 @@ class CompensationControl:
         """Open the orientation's source, before any sample comes; ParameterError if it cannot be had."""
         self.choice.open(self.parameters)
         self._make_plan()
-
-    def close(self) -> None:
-        """Stop listening for orientations."""
-        self.choice.close()
 
     def link_changed(self) -> None:
         """There is another connection, or none; for the reader's thread."""
