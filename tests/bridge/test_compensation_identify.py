@@ -124,6 +124,15 @@ def test_the_answer_names_a_pose_in_which_the_tool_was_touched(
     started.do("identify/solve", "pose 4 ", "if something touched the tool, take it again")
 
 
+def test_the_answer_names_a_drift_of_the_bias(started: Node, server: Server) -> None:
+    """By 0.5 N a minute; a pose takes half a minute."""
+    for number, up in enumerate((*AXES, (1, -1, 1), AXES[0])):
+        server.hold(up, bias=BIAS, force_z=0.25 * number)
+        started.run(29.7)
+        started.do("identify/add_pose")
+    started.do("identify/solve", "the bias drifted by 0.5 N and ", " Nm a minute")
+
+
 def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(started: Node, take: Take) -> None:
     started.refuse("identify/solve", "there is no pose yet")
     take(UP, UP, UP, UP)
