@@ -1,4 +1,4 @@
-"""/diagnostics: a thread that looks ten times a second who listens and how things are, and what it says.
+"""/diagnostics: a thread that checks subscribers and state ten times a second, and what it reports.
 
 A thread of its own, so that neither a service that waits for the server nor the stream holds it up. It
 publishes every second, and at once when a level changes. What happened for a moment only is kept until a
@@ -55,7 +55,7 @@ class CompensationState(NamedTuple):
 
 
 class Monitor:
-    """Its `thread` runs until `stop`. `on_failure` hears of an error that should not be."""
+    """Its `thread` runs until `stop`. `on_failure` is called with an unexpected error."""
 
     def __init__(
         self,
@@ -154,14 +154,14 @@ class Monitor:
         self._row = row_of(self._server.get("sensors"), link.sensor)
 
     def _count(self, withheld: int) -> Counter[str]:
-        """All counts: of the node, and those that the server has told."""
+        """All counts: of the node, and those that the server has reported."""
         seen, row = self._reader.counts, {**self._server, **self._row}
-        told = {f"server_{name}": row.get(name) for name in _OF_SERVER} if row else {}
+        reported = {f"server_{name}": row.get(name) for name in _OF_SERVER} if row else {}
         return Counter(
             connects=self._link.connects, samples=seen.new, lost=seen.missing, stale=seen.stale,
             limited=seen.limited, repeated=seen.repeated, invalid=seen.invalid,
             not_finite=self._reader.not_finite, saturated=self._reader.watch.saturated, withheld=withheld,
-            **{name: count if type(count) is int else 0 for name, count in told.items()},
+            **{name: count if type(count) is int else 0 for name, count in reported.items()},
         )  # fmt: skip
 
     def _look(self, now_s: float, withheld: int) -> None:

@@ -81,7 +81,7 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
                 parameters.supervisor_topic,
                 self._on_supervisor,
                 10,
-                callback_group=MutuallyExclusiveCallbackGroup(),  # it is heard while a service waits
+                callback_group=MutuallyExclusiveCallbackGroup(),  # received while a service waits
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
 

@@ -1,4 +1,4 @@
-"""The services, all `std_srvs/Trigger`; the message says what came of it.
+"""The services, all `std_srvs/Trigger`; the message is the result.
 
 Each blocks the executor, and never the stream: until the server has answered or a time-out, or for the
 `rest.duration` of a window.
@@ -121,7 +121,7 @@ class BiasServices:
         except CompensationError:
             if payload.mass:
                 raise
-            specific_force = None  # until there is a tool_mass nobody needs it
+            specific_force = None  # not needed without a tool_mass
         control.set_bias(
             estimate_bias(means, payload, specific_force or ZERO), "tare", Taken(payload, specific_force)
         )

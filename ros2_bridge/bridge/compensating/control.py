@@ -56,7 +56,7 @@ class CompensationControl:
         self._next: tuple[str, Taken | None] = (FROM_PARAMETER, None)
         self.choice.check(parameters)
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
-        self._shifting = threading.Lock()  # for whoever shifts the ramp, or replaces it and the plan
+        self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
         self._payload_watch: PayloadWatch | None = None
         # What the latest second of motion left, and when that was looked up, s.
         self._motion: MotionError | None = None
@@ -262,7 +262,7 @@ class CompensationControl:
         return not self.link.is_connected or self.link.info.serial == self.keeper.serial
 
     def _follow_sensor(self) -> None:
-        """Find the bias of the sensor that is there now."""
+        """Find the bias of the connected sensor."""
         while not self._is_same_sensor():
             is_another = self.keeper.serial is not None
             offset = self.own_offset.begin(self.bias)

@@ -1,7 +1,7 @@
 """The specific force at the tool, sample by sample: from the sensor's IMU, or from the robot (messages, TF).
 
-What the robot tells is listened to in a callback group of its own, which waits for no service: a pose that is
-not taken is old. TF is looked up at intervals, also for other frames of the wrench.
+Messages of the robot have a callback group of their own, which waits for no service: a pose that is not taken
+is stale. TF is looked up at intervals, also for other frames of the wrench.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Source:
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """m/s², for this sample; None if what is known is too old, or nothing is.
 
-        `time_s` is by a clock that nobody sets, `stamp_s` by the wall clock, which others stamp by.
+        `time_s` is by a monotonic clock, `stamp_s` by the wall clock, as in the stamps of messages.
         """
         return None
 
@@ -125,7 +125,7 @@ class ImuSource(Source):
 
 
 class Oriented(NamedTuple):
-    """What the robot told once."""
+    """One orientation, or acceleration, of the robot."""
 
     quaternion: Quaternion  # the rotation that takes the sensor's vectors to those of a frame
     stamp_ns: int  # since the Unix epoch
@@ -134,9 +134,9 @@ class Oriented(NamedTuple):
 
 
 class RobotSource(Source):
-    """A topic or TF: what came last, turned on to the sample's time by the sensor's gyroscope.
+    """A topic or TF: the latest value, propagated to the sample's time by the sensor's gyroscope.
 
-    `take` is for the thread that listens; what it leaves is replaced, never changed in place.
+    `take` is for the subscriber's thread; `latest` and `problem` are replaced, never changed in place.
     """
 
     def __init__(self, parameters: Parameters, describe: str, link: Link) -> None:
@@ -144,7 +144,7 @@ class RobotSource(Source):
         super().__init__()
         self.describe, self._link = describe, link
         self.latest: Oriented | None = None
-        self.problem = "nothing has come yet"  # what was wrong with what came last; empty if nothing was
+        self.problem = "nothing has come yet"  # why the latest message is unusable; empty if it is not
         self._gravity, self._limit_s = parameters.gravity, parameters.orientation_stale_after
         self._turn = QuaternionGravity(stale_after_s=self._limit_s)
         self._imu = ImuSpecificForce(_lever(parameters, parameters.imu_position))
@@ -164,7 +164,7 @@ class RobotSource(Source):
             self.problem = str(error)
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:
-        """From what came last, if its time is close to the sample's."""
+        """From the latest value, if its time is close to the sample's."""
         turn, latest = self._turn, self.latest
         turn.follow(sample.angular_rate, time_s)
         if latest is not self._taken and latest is not None:
@@ -172,7 +172,7 @@ class RobotSource(Source):
             turn.base_gravity = latest.apparent_gravity or self._gravity
             then_s = latest.stamp_ns * 1e-9 - stamp_s + time_s
             if not turn.update(latest.quaternion, then_s):
-                # The publisher's clock went back, or it is another publisher: what came last is what counts.
+                # The publisher's clock went back, or it is another publisher: the latest counts.
                 turn.reset()
                 turn.update(latest.quaternion, then_s)
         found = turn.gravity(time_s)

@@ -290,7 +290,7 @@ class CompensatedOutput:
         self._wanted = tuple(topic for topic in self._all if topic.is_wanted())
         self.has_subscribers = bool(self._wanted)
         if not self._wanted:
-            self.is_stopped = False  # nobody misses anything
+            self.is_stopped = False
         return self.has_subscribers or self.window is not None
 
     @property

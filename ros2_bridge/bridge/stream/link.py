@@ -89,7 +89,7 @@ class Link:
         self.lost: str | None = None  # the server's words, while the sensor is lost
         self.connects = 0
         self.since_s = clock.monotonic()  # CLOCK_MONOTONIC when the connection was made or lost
-        self.ending = False  # the node ends: whoever waits for something gives up
+        self.ending = False  # the node ends: services that wait give up
         self.epoch = 0  # raised by everything that interrupts the stream or changes its rate
 
     def connected(self, description: JsonObject) -> None:
@@ -158,7 +158,7 @@ class Link:
     # -- requests, from other threads than the reader's: every one answered, refused or timed out
 
     def cancel(self) -> None:
-        """Make whoever waits for a reply give up, now and from now on: the node ends."""
+        """Fail all requests, now and from now on: the node ends."""
         self.ending = True
         self.client.close()
 
@@ -180,9 +180,9 @@ class Link:
             ) from None
 
     def shut_server_down(self, timeout_s: float = SHUTDOWN_TIMEOUT_S) -> str:
-        """Ask the server to shut down; a sentence. RequestRefusedError if it will not, RequestFailedError if
-        nobody knows.
+        """Ask the server to shut down; a sentence.
 
+        RequestRefusedError if it refuses, RequestFailedError if its answer is unknown.
         Where there is no connection it makes one attempt of its own.
         """
         client, address = self.client, self.address

@@ -103,7 +103,7 @@ class Output(Protocol):
         """The fields of `Sample` that it publishes: all of them are finite when `publish` is called."""
 
     def is_wanted(self) -> bool:
-        """Whether anybody is there for what `publish` does. Asked now and then, not by the reader."""
+        """Whether anything needs `publish`. Called now and then, not by the reader."""
 
     def publish(self, sample: Sample, frame: DataMessage, /) -> None:
         """Publish `sample`, which came in `frame`: its stamp, and for intervals its monotonic time."""
