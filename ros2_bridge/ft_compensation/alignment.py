@@ -33,6 +33,10 @@ _NEGLIGIBLE: Final = 0.1  # of a sample period
 _PARABOLA_S, _LINE_S = 0.014, 0.0025  # lengths of the fits
 _LATEST_SLOPE_S: Final = 0.0015
 _FURTHEST_S: Final = 0.002
+# Over lost samples the IMU's are interpolated: with FIR on, as its window is longer, for so long; else an
+# angular acceleration would be too late by half of the gap.
+_LONGEST_GAP_S: Final = 0.1
+_GAP_S, _GAP_PERIODS = 0.008, 2.5
 
 
 class Alignment(NamedTuple):
@@ -41,6 +45,8 @@ class Alignment(NamedTuple):
     period_s: float
     taps: Array  # (3, n): to acceleration, angular rate and angular acceleration
     lag_s: float | None  # by which force and torque are later than the accelerometer; None: unknown
+    gap_s: float  # samples further apart do not belong together
+    lead: int  # so many samples after a gap tell nothing of the instant that force and torque are of
     settings: Mapping[str, SettingValue]
 
 
@@ -52,16 +58,19 @@ def align(
     Where the lag is unknown, acceleration is used as it comes.
     """
     known_s = force_lag_s(settings, rate_hz or None) if lag_s is None else lag_s
-    rate_hz = rate_hz or _UNKNOWN_HZ
+    is_known, rate_hz = rate_hz > 0.0, rate_hz or _UNKNOWN_HZ
     delays_s = [response(settings).delay_s for response in (acceleration_response, angular_rate_response)]
     accelerometer_s, gyroscope_s = (delay_s or 0.0 for delay_s in delays_s)
     at_s = min(-(known_s or 0.0), _FURTHEST_S)  # after the newest sample
     turned_s = min(at_s + gyroscope_s - accelerometer_s, _FURTHEST_S)
+    gap_s = _LONGEST_GAP_S
     if settings.get("fir") and known_s is not None:
         window = _window(-at_s * rate_hz)
         slope = np.convolve(_window(-turned_s * rate_hz - 1.0), (0.5 * rate_hz, 0.0, -0.5 * rate_hz))
         rows = [window, _window(-turned_s * rate_hz), slope]
     else:
+        if is_known:
+            gap_s = max(_GAP_S, _GAP_PERIODS / rate_hz)
         count = max(3, round(_PARABOLA_S * rate_hz) + 1)
         slope_at = min(turned_s, -_LATEST_SLOPE_S) * rate_hz
         rows = [
@@ -72,7 +81,8 @@ def align(
     taps = np.zeros((3, max(map(len, rows))))
     for row, weights in zip(taps, rows, strict=True):
         row[len(row) - len(weights) :] = weights[::-1]
-    return Alignment(1.0 / rate_hz, taps, known_s, settings)
+    lead = 1 + math.floor(max(-at_s, 0.0) * rate_hz)
+    return Alignment(1.0 / rate_hz, taps, known_s, gap_s, lead, settings)
 
 
 def _value(at: float, count: int) -> Array:

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.compensator import Compensator
+from ft_compensation.motion_error import MotionError
 from ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
@@ -41,17 +42,20 @@ def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.
         )
 
 
-def force_bound_95(payload: Payload, accelerometer: Accelerometer) -> float:
-    """N: in 95 % of cases the accelerometer's own offset and scale show as less force than this.
+def force_bound_95(
+    payload: Payload, accelerometer: Accelerometer, motion: MotionError | None = None
+) -> float:
+    """N: in 95 % of cases what is not known of the accelerometer, and of `motion`, shows as less force.
 
-    A tare with the tool on takes the offset's part off.
+    A tare with the tool on takes the part of the accelerometer's offset off.
     """
     cross = accelerometer.cross_axis_interval
     per_axis = zip(
         accelerometer.offset_interval, accelerometer.scale_interval, cross[::2], cross[1::2], strict=True
     )
     halves = [math.hypot(offset, STANDARD_GRAVITY * max(parts)) for offset, *parts in per_axis]
-    return payload.mass * _ABOUT_THREE_AXES * max(halves)
+    bound = payload.mass * _ABOUT_THREE_AXES * max(halves)
+    return bound if motion is None else math.hypot(bound, NORMAL_95 * motion.filters) + motion.out_of_range
 
 
 def estimate_bias(means: StationaryMeans, payload: Payload, specific_force: Vector3) -> Wrench:

@@ -22,10 +22,10 @@ from ft_compensation.alignment import Alignment, Array
 from ft_compensation.quantities import length
 
 FEWEST: Final = 64  # samples
-_NEAR_LIMIT: Final = 0.9  # of the range: offset and scale shift where an axis ends
+_NEAR_LIMIT: Final = 0.95  # of the range: offset and scale shift where an axis ends
 _ABOVE_NOISE: Final = 10.0  # times the noise's power: less is noise
 _GAINS: Final = 65  # frequencies at which the filters' magnitudes are computed
-_FLAT: Final = 0.004  # of the range: noise of what reads the limit
+_FLAT: Final = 0.002  # of the range: noise of what reads the limit
 
 
 class MotionError(NamedTuple):
@@ -85,10 +85,11 @@ def _exceeded(rows: Array, axis: int, alignment: Alignment, lever: Vector3) -> I
     values = np.abs(rows[:, axis])
     if not values.max() > _NEAR_LIMIT * limit:
         return
-    flat = values > values.max() - _FLAT * limit
+    # The gyroscope is not corrected: an axis that reads its limit reads one number.
+    flat = values >= values.max() - (_FLAT * limit if axis < 3 else 0.0)
     edges = np.flatnonzero(np.diff(flat, prepend=False, append=False))
     for begin, end in edges.reshape(-1, 2).tolist():
-        if begin and end - begin > 1:
-            slope = (values[begin] - values[begin - 1]) / alignment.period_s
+        if begin > 1 and end - begin > 1:
+            slope = (values[begin - 1] - values[begin - 2]) / alignment.period_s
             seconds = (end - begin) * alignment.period_s
             yield float(0.25 * slope * seconds if axis < 3 else slope * length(lever))

@@ -34,7 +34,6 @@ from ft_compensation.quantities import (
     Quaternion,
 )
 
-_GAP_S: Final = 0.1  # samples further apart say nothing of what was between them
 _TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
 _KEPT_S: Final = 1.0
 Row = tuple[float, ...]
@@ -70,8 +69,8 @@ class ImuSpecificForce:
     def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
         """m/s² at the center of gravity, when force and torque of this sample were (m/s², rad/s).
 
-        None if it is not finite, or if the sensor turns and no sample shortly before tells how fast it spins
-        up.
+        None if it is not finite, or if the sensor turns and what was before the sample, and so how fast it
+        spins up, is not known.
         """
         if self._correct is not None:
             acceleration = self._correct(acceleration)
@@ -82,13 +81,16 @@ class ImuSpecificForce:
             return None
         passed_s, self._time_s = time_s - self._time_s, time_s
         dx, dy, dz = self.lever
-        if 0.0 < passed_s <= _GAP_S:
-            self._take(row, passed_s)
+        if 0.0 < passed_s <= self.alignment.gap_s:
+            if self._filled == 1 or passed_s > 1.5 * self.alignment.period_s:
+                self._bridge(row, passed_s)
+            self._append(row)
         else:
             self._filled = 1
             self._ring[:] = row
+        if self._filled <= self.alignment.lead and (dx or dy or dz):
             wx, wy, wz = angular_rate
-            if wx * wx + wy * wy + wz * wz > _TURNING * _TURNING and (dx or dy or dz):
+            if wx * wx + wy * wy + wz * wz > _TURNING * _TURNING:
                 return None
         end = self._at + self._size + 1
         found = self.alignment.taps.dot(self._ring[end - self._count : end]).tolist()
@@ -101,8 +103,8 @@ class ImuSpecificForce:
             az + tx * dy - ty * dx + wx * vy - wy * vx,
         )
 
-    def _take(self, row: Row, passed_s: float) -> None:
-        """Append a sample that comes so long after the one before."""
+    def _bridge(self, row: Row, passed_s: float) -> None:
+        """What precedes a sample that comes so long after the one before."""
         ring, size = self._ring, self._size
         periods = round(passed_s / self.alignment.period_s)
         if self._filled == 1:  # of two samples only, the slope is that between them
@@ -113,9 +115,8 @@ class ImuSpecificForce:
             ring[:size, 3:] = ring[size:, 3:] = turned
         if periods > 1:
             before = ring[self._at].copy()
-            for lost in range(max(1, periods - size), periods):
+            for lost in range(1, periods):
                 self._append(before + lost / periods * (row - before))
-        self._append(row)
 
     def _append(self, row: Row | Array) -> None:
         self._filled += 1

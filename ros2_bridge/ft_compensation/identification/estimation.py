@@ -23,7 +23,7 @@ from ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
 _LENGTH_DEVIATION: Final = 0.002
 _LENGTH_DEGREES: Final = 6.0  # ... as if it were estimated from so many residuals.
 # N, Nm, m/s²: standard deviations below which nothing is believed, where equations of all kinds meet.
-_FLOOR: Final = np.array([1e-6] * 3 + [1e-7] * 3 + [1e-6])
+_FLOOR: Final = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4])
 _FLOOR_ALONE: Final = 1e-12
 # Of an axis' variance at the offset that the lengths alone give: six poses could be made to fit one axis
 # perfectly by an offset that they hardly determine.
