@@ -171,7 +171,17 @@ class LoggedNode(BridgeNode):
         return "\n".join(self.get_logger().lines)
 
 
-class NodeThread:
+class Started:
+    """A node that runs."""
+
+    log: str  # all that it has said
+
+    def says(self, words: str) -> None:
+        """Wait until it has said `words`."""
+        wait_until(lambda: words in self.log, f"{words!r} in the log")
+
+
+class NodeThread(Started):
     """The node in a thread of this process, as `bridge.node.run` runs it."""
 
     def __init__(self, *arguments: str) -> None:
@@ -182,13 +192,8 @@ class NodeThread:
         self._thread.start()
 
     @property
-    def log(self) -> str:
-        """All that it has said."""
+    def log(self) -> str:  # type: ignore[override]
         return self.node.text
-
-    def says(self, words: str) -> None:
-        """Wait until it has said `words`."""
-        wait_until(lambda: words in self.log, f"{words!r} in the log")
 
     def ends(self) -> int:
         """Wait until it has ended; its exit code."""
@@ -202,7 +207,7 @@ class NodeThread:
         self.ends()
 
 
-class NodeProcess:
+class NodeProcess(Started):
     """`bridge-client` in a process of its own."""
 
     def __init__(self, *arguments: str) -> None:
@@ -212,14 +217,9 @@ class NodeProcess:
         )
 
     @property
-    def log(self) -> str:
-        """All that it has said."""
+    def log(self) -> str:  # type: ignore[override]
         self._log.seek(0)
         return self._log.read()
-
-    def says(self, words: str) -> None:
-        """Wait until it has said `words`."""
-        wait_until(lambda: words in self.log, f"{words!r} in the log")
 
     def ends(self) -> int:
         """Wait until it has ended; its exit code."""

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import gc
 import os
+import queue
 import signal
-import subprocess
 import sys
 import threading
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -28,49 +29,28 @@ from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import DEFAULTS
 from tests.rights import needs_root, skip_if_forbidden
 
-PROGRAM = """
-import sys, types
-from bridge import process
 
-def monotonic():
-    seen = now  # the test sets it on as soon as it reads the line
-    print("looked at the time", flush=True)
-    return seen
+def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with the time at which it comes: a terminal and a launcher may send theirs within a second."""
+    signals = iter([(100.0, signal.SIGINT), (100.9, signal.SIGINT), (101.0, signal.SIGTERM)])
+    now_s, called, ended = 0.0, list[int](), queue.Queue[int]()
 
-now = 100.0
-process.time = types.SimpleNamespace(monotonic=monotonic)
-process.block_stop_signals()
-process.call_on_stop_signal(lambda number: print("called", int(number), flush=True))
-print("ready", flush=True)
-for line in sys.stdin:
-    now = float(line)
-    print("time passes", flush=True)
-"""
+    def wait(_: object) -> int:
+        nonlocal now_s
+        now_s, number = next(signals)
+        return number
 
+    def end(code: int) -> None:
+        ended.put(code)
+        threading.Event().wait()  # as a process that ends
 
-def test_a_second_signal_counts_only_when_it_is_meant() -> None:
-    """With a clock of its own, so that the machine may be busy."""
-    command = [sys.executable, "-c", PROGRAM]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, bufsize=1) as program:
-        assert program.stdin is not None
-        assert program.stdout is not None
-
-        def says(words: str) -> None:
-            assert program.stdout is not None
-            assert program.stdout.readline() == f"{words}\n"
-
-        says("ready")
-        program.send_signal(2)
-        says("called 2")
-        says("looked at the time")
-        for number, now in ((2, 100.9), (15, 101.0)):  # a terminal and a launcher may each send theirs
-            program.send_signal(number)
-            says("looked at the time")
-            program.stdin.write(f"{now}\n")
-            says("time passes")
-        program.send_signal(15)
-        assert program.wait(timeout=30) == 128 + 15
+    monkeypatch.setattr(signal, "sigwait", wait)
+    monkeypatch.setattr(os, "_exit", end)
+    monkeypatch.setattr(process, "time", SimpleNamespace(monotonic=lambda: now_s))
+    process.call_on_stop_signal(called.append)
+    assert ended.get(timeout=PATIENCE_S) == 128 + signal.SIGTERM
+    assert called == [signal.SIGINT]
+    assert next(signals, None) is None
 
 
 DEFAULT = DEFAULTS.rt_priority
