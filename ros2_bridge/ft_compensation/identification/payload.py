@@ -192,14 +192,7 @@ class _Equations:
 
     def solve(self, confidence: float, regressor: Array | None = None) -> Estimate:
         """The estimate; of several regressors (k, n), each for itself."""
-        many = () if regressor is None else regressor.shape[:-1]
-        wrench, gravity, acceleration = (
-            None if each is None else np.broadcast_to(each, (*many, *each.shape))
-            for each in (self.wrench, self.gravity, self._acceleration)
-        )
-        assert wrench is not None
-        assert gravity is not None
-        return estimate(wrench, gravity, confidence, acceleration, self._noise, regressor)
+        return estimate(self.wrench, self.gravity, confidence, self._acceleration, self._noise, regressor)
 
 
 class _Touched(NamedTuple):
