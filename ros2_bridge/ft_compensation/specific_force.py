@@ -25,17 +25,10 @@ import numpy as np
 from bota_ethercat.pdo import Vector3
 from ft_compensation.alignment import Alignment, Array, align
 from ft_compensation.motion_error import MotionError, motion_error
-from ft_compensation.quantities import (
-    DEFAULT_GRAVITY,
-    EXACT,
-    STILL,
-    ZERO,
-    Accelerometer,
-    Quaternion,
-)
+from ft_compensation.quantities import DEFAULT_GRAVITY, EXACT, STILL, ZERO, Accelerometer, Quaternion
 
 _TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
-_KEPT_S: Final = 1.0
+_KEPT_S: Final = 1.0  # of samples, for `error`
 Row = tuple[float, ...]
 _MOST_RATES: Final = 4096  # remembered for orientations that come late: 2.5 s at 1600 Hz
 

@@ -72,6 +72,11 @@ def estimate(
     means by the sensor's noise, (m/s²)²; and the `regressor` (..., n). LinAlgError if the equations leave an
     unknown open.
     """
+    if regressor is not None:  # of several regressors, each is a problem
+        many = regressor.shape[:-1]
+        wrench = np.broadcast_to(wrench, (*many, *wrench.shape[-2:]))
+        gravity = np.broadcast_to(gravity, (*many, *gravity.shape[-2:]))
+        acceleration = None if acceleration is None else np.broadcast_to(acceleration, gravity.shape)
     measured = np.swapaxes(wrench, -1, -2)
     scale = offset = cross_axis = shift = None
     if acceleration is None:

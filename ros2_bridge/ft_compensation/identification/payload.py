@@ -83,8 +83,6 @@ class Identified(NamedTuple):
     # Of the intervals: 0.95 as a rule. Student's t; each axis has the variance that its residuals show.
     confidence: float
     residuals: tuple[Wrench, ...]  # what the answer leaves of each pose, in order: measured minus modelled
-    force_rms: float  # of the residuals, with the degrees of freedom taken into account, N
-    torque_rms: float  # likewise, Nm
     # Of the problem with each unknown in a unit of its own size: 1.2 is ideal, beyond 10 is bad.
     condition: float
     coverage: Coverage
@@ -155,8 +153,6 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95) -> Identified:
         Wrench.of(found.bias.half.tolist()),
         confidence,
         tuple(map(Wrench.of, found.residuals.tolist())),
-        force.rms,
-        torque.rms,
         _condition(equations.gravity),
         seen,
         (
@@ -192,14 +188,7 @@ class _Equations:
 
     def solve(self, confidence: float, regressor: Array | None = None) -> Estimate:
         """The estimate; of several regressors (k, n), each for itself."""
-        many = () if regressor is None else regressor.shape[:-1]
-        wrench, gravity, acceleration = (
-            None if each is None else np.broadcast_to(each, (*many, *each.shape))
-            for each in (self.wrench, self.gravity, self._acceleration)
-        )
-        assert wrench is not None
-        assert gravity is not None
-        return estimate(wrench, gravity, confidence, acceleration, self._noise, regressor)
+        return estimate(self.wrench, self.gravity, confidence, self._acceleration, self._noise, regressor)
 
 
 class _Touched(NamedTuple):
@@ -306,10 +295,10 @@ def _check_mass(mass: float, interval: float) -> None:
 
 def _check_fit(fit: Fit, touched: _Touched | None, limit: float, unit: str) -> None:
     if fit.rms > limit:
-        worst = f"pose {touched.pose + 1} fits worst; " if touched is not None else ""
+        again = "take all again" if touched is None else f"pose {touched.pose + 1} fits worst: take it again"
         raise IdentificationError(
             f"the poses do not fit one payload: the residual is {fit.rms:.2g} {unit}, the limit {limit:.2g} "
-            f"{unit}; {worst}something touched the tool, or it moved: take that pose again"
+            f"{unit}; something touched the tool, or it moved; {again}"
         )
 
 
@@ -383,8 +372,8 @@ def summary(result: Identified) -> str:
     text = (
         f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity "
         f"{_millimeters(result.payload.center, result.centre_interval)} ({100 * result.confidence:g} % "
-        f"confidence) from {result.coverage.poses} poses; residual {result.force_rms:.2g} N "
-        f"({result.force_fit.verdict}), {result.torque_rms:.2g} Nm ({result.torque_fit.verdict})"
+        f"confidence) from {result.coverage.poses} poses; residual {result.force_fit.rms:.2g} N "
+        f"({result.force_fit.verdict}), {result.torque_fit.rms:.2g} Nm ({result.torque_fit.verdict})"
     )
     return ". ".join([text, *result.notes])
 
