@@ -23,7 +23,7 @@ from ethercat_server.serving.sensor_actions import SensorActions
 
 
 class NoWatchdog:
-    """Nobody waits for a sign of life."""
+    """No watchdog is configured."""
 
     feed_every_ns = 1 << 62
 
@@ -77,7 +77,7 @@ class Server:
         )
 
     def run(self) -> None:
-        """Stream until `stop`; the clients hear of the end."""
+        """Stream until `stop`; then tell the clients."""
         try:
             self.cycle.run()
         finally:

@@ -22,22 +22,18 @@ from ethercat_server.ethercat.exchange import DistributedClock, Latched
 SECOND: Final = 1e9
 _SEND_NS: Final = 8_000.0
 _DISTRIBUTED: Final = DistributedClock(0, 0, 20_000)
-_HAND_OUT_NS: Final = 30_000.0
-"""What the program needs for a poll, and for an answer."""
+_HAND_OUT_NS: Final = 30_000.0  # what the program needs for a poll, and for an answer
 
 
 @dataclass(frozen=True)
 class Machine:
     """How the program gets to run. Times in ns."""
 
-    wake_ns: float = 12_000.0
-    """Mean lateness of a wake-up; exponentially distributed."""
-    stolen: float = 0.0
-    """Part of the time that others take away,"""
-    steal_ns: float = 1_000_000.0
-    """on average so much at once; exponentially distributed."""
+    wake_ns: float = 12_000.0  # mean lateness of a wake-up; exponentially distributed
+    stolen: float = 0.0  # fraction of the time that others take
+    steal_ns: float = 1_000_000.0  # mean time that they take at once; exponentially distributed
+    # Additional stalls: when, in s from the start, and for how long.
     stops: tuple[tuple[float, float], ...] = ()
-    """When it stands still besides, in s from the start, and for how long."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +41,11 @@ class Card:
     """What an exchange takes. Answers come in the order of the polls."""
 
     round_trip_ns: float = 110_000.0
-    spread: float = 0.25
-    """Standard deviation of the logarithm of the round trip; 0: it is constant,"""
-    jitter_ns: float = 0.0
-    """but for up to so much on top; uniformly distributed."""
-    excess_ns: float = 0.0
-    """So much comes on top of all but one in 1000, which find everybody awake,"""
-    outward: float = 0.5
-    """and this part of it before the sensor looks."""
-    lost: float = 0.0
-    """Chance that an exchange does not come back."""
+    spread: float = 0.25  # standard deviation of the logarithm of the round trip; 0: constant
+    jitter_ns: float = 0.0  # up to this much on top, where it is constant; uniformly distributed
+    excess_ns: float = 0.0  # on top of all exchanges except one in 1000
+    outward: float = 0.5  # fraction of it before the sensor looks
+    lost: float = 0.0  # chance that an exchange does not come back
 
     def exchange(self, chance: random.Random) -> tuple[float, float]:
         """From sending until the sensor looks at its data, and until the answer is there, in ns."""
@@ -72,20 +63,14 @@ class Sensor:
     """When samples come to be. Times in ns where nothing else is said."""
 
     rate_hz: float = 1600.0
-    ppm: float = -300.0
-    """How much faster it really samples."""
-    ppm_per_minute: float = -1.0
-    """How much faster it gets as its temperature changes."""
-    white_ns: float = 0.0
-    """Standard deviation of each instant alone."""
+    ppm: float = -300.0  # by how much it samples faster than its nominal rate
+    ppm_per_minute: float = -1.0  # change of that with its temperature
+    white_ns: float = 0.0  # standard deviation of each instant alone
+    # Mean excess of each period, as of a program that sleeps in between; gamma distributed.
     sleep_ns: float = 0.0
-    """Mean of what each period takes longer: a program that sleeps in between; gamma distributed."""
-    scatter: float = 0.0
-    """Each period differs by up to this part of it: 0.9 is no clock at all."""
-    silent_s: tuple[float, float] = (math.inf, math.inf)
-    """No samples between these."""
-    restart_s: float = math.inf
-    """The clock starts again with another phase."""
+    scatter: float = 0.0  # each period differs by up to this part of it: 0.9 is no clock at all
+    silent_s: tuple[float, float] = (math.inf, math.inf)  # no samples between these
+    restart_s: float = math.inf  # the clock starts again with another phase
 
     def instants(self, chance: random.Random) -> Iterator[float]:
         """When they come to be, without end."""
@@ -109,30 +94,18 @@ class Sensor:
 class Controller:
     """A slave controller with a distributed clock, that may lie. Times in ns."""
 
-    ppm: float = 35.0
-    """How much faster its crystal is,"""
-    step_ppm: float = 0.0
-    """and by how much more, later."""
-    start: int = 2**32 - 2_000_000_000
-    """Local time at the start: it wraps after 2 s."""
-    jump_ns: float = 0.0
-    """By so much the local time jumps."""
-    stops: bool = False
-    """The local time stands still."""
-    stuck: bool = False
-    """The event time stands still."""
-    late_ns: float = 0.0
-    """The event time is late; early if negative: that of the buffer's start."""
-    jitter_ns: float = 0.0
-    """It is off by so much at random (standard deviation)."""
-    lags: int = 0
-    """It is that of a sample so many before."""
-    counter: int = 1
-    """Working counter of its registers."""
-    lies_from_s: float = 0.0
-    """When all this begins, in s from the start,"""
-    lies_until_s: float = math.inf
-    """and ends, but for a local time that was another meanwhile."""
+    ppm: float = 35.0  # by how much its crystal is faster
+    step_ppm: float = 0.0  # by how much more from `lies_from_s` on
+    start: int = 2**32 - 2_000_000_000  # local time at the start: it wraps after 2 s
+    jump_ns: float = 0.0  # step of the local time
+    stops: bool = False  # the local time stands still
+    stuck: bool = False  # the event time stands still
+    late_ns: float = 0.0  # the event time is late; early if negative: that of the buffer's start
+    jitter_ns: float = 0.0  # its random error (standard deviation)
+    lags: int = 0  # number of samples by which it lags behind
+    counter: int = 1  # working counter of its registers
+    lies_from_s: float = 0.0  # when all this begins, in s from the start
+    lies_until_s: float = math.inf  # when it ends, except for a step of the local time
 
     def local(self, at_ns: float) -> int:
         """The local time then."""
@@ -163,15 +136,11 @@ class Controller:
 class Sample(NamedTuple):
     """One that was handed out. Times in ns."""
 
-    number: int
-    """Counted by the sensor, from 0."""
-    instant_ns: float
-    """When it really came to be."""
-    back_ns: float
-    """When its exchange was back."""
+    number: int  # counted by the sensor, from 0
+    instant_ns: float  # true instant
+    back_ns: float  # when its exchange was back
     stamp_ns: float
-    uncertainty_ns: float
-    """What the clock said of its instant."""
+    uncertainty_ns: float  # as the clock gave it
     locked: bool
     steps: int
     uncertain: bool
@@ -194,19 +163,17 @@ class Outcome:
         self.samples = samples
         self.polls = polls
         pairs = [(after.number - before.number - 1, after) for before, after in pairwise(samples)]
-        self.lost = sum(missing for missing, _ in pairs)
-        """Samples that were not handed out,"""
-        self.counted = sum(after.steps - 1 for _, after in pairs)
-        """and how many the clock said that were."""
+        self.lost = sum(missing for missing, _ in pairs)  # samples that were not handed out
+        self.counted = sum(after.steps - 1 for _, after in pairs)  # samples lost by the count of the clock
+        # Losses that the clock did not flag.
         self.unflagged = sum(
             missing > 0 and after.steps < 2 and not after.uncertain for missing, after in pairs
         )
-        """Times that some were lost and the clock did not say that they may be."""
         self.unlocked = sum(not sample.locked for sample in samples)
         self.ages_ns = sorted(sample.age_ns for sample in samples)
         self.errors_ns = sorted(abs(sample.error_ns) for sample in samples)
+        # Stamps with an error above the uncertainty that the clock gave.
         self.outside = sum(abs(sample.error_ns) > sample.uncertainty_ns for sample in samples)
-        """Stamps that were off by more than the clock said."""
 
     @property
     def exchanges(self) -> float:
@@ -219,10 +186,8 @@ class Exchange(NamedTuple):
 
     sent_ns: float
     back_ns: float
-    number: int
-    """Of the newest sample when the sensor looked."""
-    latched: Latched | None
-    """By its controller."""
+    number: int  # of the newest sample when the sensor looked
+    latched: Latched | None  # by its controller
 
 
 class ClockSimulation:
@@ -238,14 +203,11 @@ class ClockSimulation:
         events = EventTimes(_DISTRIBUTED, self.timing, 0) if controller else None
         self.clock = SampleClock(SECOND / sensor.rate_hz, self.timing, events)
         self.now_ns = 1.0
-        self.polls_ns: list[float] = []
-        """When they were sent."""
-        self.samples: list[Sample] = []
-        """All that were handed out."""
-        self.unlocked_ns: list[float] = []
-        """When exchanges came back after which the clock was not locked."""
+        self.polls_ns: list[float] = []  # when they were sent
+        self.samples: list[Sample] = []  # all that were handed out
+        self.unlocked_ns: list[float] = []  # when exchanges came back after which the clock was not locked
+        # True instants of the samples, by number; the last is in the future.
         self.instants_ns: list[float] = []
-        """When samples really came to be, by number; the last is yet to come."""
         self._chance = random.Random(seed)
         self._instants = sensor.instants(random.Random(seed + 1))
         self._flying: deque[Exchange] = deque()

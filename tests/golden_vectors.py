@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
-from bota_ethercat.framing import DataMessage
-from bota_ethercat.pdo import Sample
-from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.address import boot_id
+from bota_ethercat.errors import BadMessageError, RemoteProtocolError
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
+from bota_ethercat.pdo import Sample, encode
+from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject
 
 _FOLDER: Final = Path(__file__).parent / "protocol" / "golden"
 
@@ -95,6 +97,94 @@ def _accounted(entry: JsonObject) -> AccountedStream:
 ACCOUNTED: Final = [_accounted(entry) for entry in _read("accounting.json")]
 
 
+BEGIN_NS: Final = 10**15  # both clocks of readings.json at 0 ms
+CHANNELS: Final = ("force_torque", "acceleration", "angular_rate")
+_DELAYS: Final = {"force_torque": 1.88, "acceleration": 1.94, "angular_rate": 2.9}
+_DESCRIPTION: Final = {"protocol": 1, "sensors": [{"sensor": 0, "rate_hz": 800, "delay_ms": _DELAYS}]}
+
+
+class Player(Protocol):
+    """A client, the server that it talks to, and a clock: what plays a stream of readings.json."""
+
+    def now(self, now_ns: int) -> None:
+        """It is this time."""
+
+    def connect(self, description: JsonObject) -> None:
+        """A new connection, to a server that describes itself so."""
+
+    def send(self, message: bytes) -> None:
+        """The server sends this."""
+
+    def end(self) -> None:
+        """The server closes the connection."""
+
+    def read(self, sensor: int) -> dict[str, object]:
+        """What `latest` gives, by the names of readings.json, in ns."""
+
+
+class ReadStream(NamedTuple):
+    """A stream of readings.json."""
+
+    name: str
+    steps: list[list[Any]]
+    max_age_ms: int = 10
+    every: int = 1
+    sensors: Sequence[int] = (0,)
+    connect: Mapping[str, Any] = {}
+
+    def play(self, player: Player) -> None:
+        """Every reading is what the stream says."""
+        for ms, kind, *rest in [[0, "connect", self.connect], *self.steps]:
+            now_ns = BEGIN_NS + round(ms * 1e6)
+            player.now(now_ns)
+            if kind == "connect":
+                clock = json.loads(json.dumps(rest[0]).replace("OURS", str(boot_id())))
+                player.connect({**_DESCRIPTION, **clock})
+            elif kind == "frame":
+                player.send(_frame(now_ns, *rest))
+            elif kind == "message":
+                player.send(encode_json(rest[0]))
+            elif kind == "end":
+                player.end()
+            else:
+                wanted, told = _in_ns(rest[0]), player.read(*(rest[1:] or [self.sensors[0]]))
+                assert {name: told[name] for name in wanted} == wanted, (self.name, ms)
+
+
+def _frame(now_ns: int, sequence: int, flags: str = "", values: Mapping[str, Any] = {}) -> bytes:
+    values = {"age_ms": 0, "sensor": 0, "size": 61, "force.x": sequence, **values}
+    age_ms, sensor, size = (values.pop(name) for name in ("age_ms", "sensor", "size"))
+    at_ns = now_ns - round(age_ms * 1e6)
+    bits = sum(DataFlag[flag] for flag in flags.split())
+    data = encode(size, {name: float(value) for name, value in values.items()})
+    return encode_data(sequence, at_ns, at_ns, sensor, bits, 3, data)
+
+
+def _in_ns(reading: JsonObject) -> dict[str, object]:
+    found = dict(reading)
+    if "age_ms" in found:
+        age_ms = found.pop("age_ms")
+        found["age_ns"] = None if age_ms is None else round(age_ms * 1e6)
+    if "measured_ms" in found:
+        times = found.pop("measured_ms")
+        found["measured_ns"] = [None if ms is None else BEGIN_NS + round(ms * 1e6) for ms in times]
+    return found
+
+
+READ: Final = [ReadStream(**entry) for entry in _read("readings.json")]
+
+
+def odd_messages() -> Iterator[JsonObject]:
+    """Events and replies with odd values where others are expected."""
+    for odd in (None, True, -1, 256, 1.5, 10**30, "0", "", [], {}, [0], {"sensor": 0}, "\\ud800\\u0000"):
+        for name in ("sensor_lost", "sensor_back", "reconfigured", "emergency", "unknown", odd):
+            yield {"event": name, "sensor": odd, "message": odd}
+        yield {"event": "sensor_lost", "sensor": 1, "message": odd}
+        yield {"reply": odd, "ok": odd, "error": odd}
+        yield {"reply": odd, "ok": False, "error": {"message": odd}}
+        yield {"event": "reconfigured", "sensor": 0, "settings": odd, "rate_hz": odd, "delay_ms": odd}
+
+
 def expected(vectors: Sequence[Vector]) -> list[Outcome]:
     """What comes of these vectors, sent one behind the other."""
     found: list[Outcome] = []
@@ -102,6 +192,25 @@ def expected(vectors: Sequence[Vector]) -> list[Outcome]:
         found.append(vector.outcome)
         if vector.outcome == "broken":
             break
+    return found
+
+
+def outcomes(chunks: Sequence[bytes], max_json_length: int = MAX_JSON_LENGTH) -> list[Outcome]:
+    """What the Python decoder makes of these bytes."""
+    decoder, found = FrameDecoder(max_json_length=max_json_length), list[Outcome]()
+    for chunk in chunks:
+        decoder.feed(chunk)
+        while True:
+            try:
+                message = decoder.next_message()
+            except BadMessageError:
+                found.append("refused")
+                continue
+            except RemoteProtocolError:
+                return [*found, "broken"]
+            if message is None:
+                break
+            found.append(message)
     return found
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from bota_ethercat.framing import encode_data, encode_json
-from bota_ethercat.text.bare_json import encode_bare_json
+from ethercat_server.serving.bare_json import encode_bare_json
 
 MESSAGES: Final[Sequence[dict[str, Any]]] = (
     {"action": "describe", "id": 1},

@@ -47,7 +47,6 @@ class _Transport(SocketTransport):
     def wait(
         self, readers: Collection[int], writers: Collection[int], seconds: float
     ) -> tuple[Sequence[int], Sequence[int]]:
-        """See `Transport`."""
         until_ns = self._clock.now_ns + round(seconds * 1e9)
         ready = super().wait(readers, writers, max(0, until_ns - time.monotonic_ns()) * 1e-9)
         self._clock.advance(min(until_ns, time.monotonic_ns()) if any(ready) else until_ns)

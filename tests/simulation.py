@@ -40,7 +40,6 @@ from ethercat_server.access import private_server, sensors
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.acquisition.start_up import AsFound, Wanted
 from ethercat_server.acquisition.stream import OutgoingFrame
-from ethercat_server.doctor import bus_checks
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import ByPosition
@@ -52,10 +51,10 @@ from ethercat_server.sensor import scan
 from ethercat_server.sensor.sensor import Identity
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.in_memory import InMemoryStream, InMemoryTransport
 from ethercat_server.serving.transport import Transport
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
+from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -63,10 +62,25 @@ from ethercat_server.virtual_sensor.sensor import Firmware
 from ethercat_server.virtual_sensor.signals import ClockReading, decode_clock
 from tests.server.running import OLD, Commanded, FramedClient
 
-PATIENCE_S = 60.0
-"""Simulated time that anything may take."""
+PATIENCE_S = 60.0  # simulated time that anything may take
 AT_REST = SensorOptions(signal="rest")
 _EXCUSE = int(DataFlag.GAP | DataFlag.REPEATED)
+
+
+class ManualClock:
+    """A clock that stands still until it is advanced."""
+
+    def __init__(self, now_ns: int = 1_000_000_000) -> None:
+        self.now_ns = now_ns
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    def time_ns(self) -> int:
+        return self.now_ns
+
+    def sleep(self, seconds: float, /) -> None:
+        self.now_ns += round(seconds * 1e9)
 
 
 class Asked:
@@ -130,8 +144,8 @@ def registers(backend: MemoryBackend) -> list[bytes]:
 class SimulatedBus(Commanded):
     """Virtual sensors in memory."""
 
+    # The doctor asks the kernel about it, so there must be such an interface; nothing is sent there.
     near = "lo"
-    """The doctor asks the kernel about it, so there must be such an interface; nothing is sent there."""
 
     def __init__(self, backend: MemoryBackend) -> None:
         self.backend, self.clock = backend, backend.clock
@@ -157,8 +171,7 @@ class Exchange:
 
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
-        self.inputs: dict[int, bytes] = {}
-        """Of each sensor, as of the last exchange that came back."""
+        self.inputs: dict[int, bytes] = {}  # of each sensor, as of the last exchange that came back
 
     def __call__(self, timeout_s: float = 0.01) -> int:
         """The working counter of all frames; -1 if one did not come back in time."""
@@ -196,11 +209,9 @@ class Simulation(SimulatedBus):
         self.started_ns = self.clock.now_ns
         self.transport = InMemoryTransport(self.clock)
         self.frames: list[DataMessage] = []
-        self.published_ns: list[int] = []
-        """When each was handed out."""
+        self.published_ns: list[int] = []  # when each was handed out
         self.events: list[JsonObject] = []
-        self.announced_ns: list[int] = []
-        """When each was announced."""
+        self.announced_ns: list[int] = []  # when each was announced
         self._decoder = FrameDecoder()
         self._awaited: Callable[[], object] = lambda: False
         self.on_serve: Callable[[int], None] = lambda _: None
@@ -210,8 +221,7 @@ class Simulation(SimulatedBus):
         self.sensors, self.streams, self.others = self.server.sensors, self.server.streams, self.server.others
         self.recovery, self.jobs, self.cycle = self.server.recovery, self.server.jobs, self.server.cycle
         self.clients: list[Client] = []
-        self.hangs = False
-        """Whether somebody has stopped it; time passes all the same."""
+        self.hangs = False  # whether somebody has stopped it; time passes all the same
 
     def listen(self) -> Transport:
         """Where its clients come from."""
@@ -296,8 +306,7 @@ class Client(FramedClient):
         self.simulation = simulation
         self.stream = simulation.transport.connect(uid, buffer_size=buffer_size)
         super().__init__(self.stream.send, simulation.run_until)
-        self.reads = True
-        """Whether it takes what arrives."""
+        self.reads = True  # whether it takes what arrives
         simulation.clients.append(self)
 
     def receive(self) -> None:
@@ -355,24 +364,20 @@ class MemoryChannel:
             self._stream.other.close()
 
     def monotonic_ns(self) -> int:
-        """See `Channel`."""
         now_ns: int = self._clock.monotonic_ns()
         return now_ns
 
     def wait(self, event: threading.Event, seconds: float, /) -> bool:
-        """See `Channel`."""
         self._pass(event.is_set, seconds)
         return event.is_set()
 
     def connect(self, timeout_s: float) -> bool:
-        """See `Channel`."""
         if self.server is None:
             raise UnreachableError("Connection refused")
         self._stream = self.server.transport.connect(0, buffer_size=1 << 20)
         return True
 
     def receive(self, buffer: memoryview, timeout_s: float) -> int:
-        """See `Channel`."""
         stream = self._stream
         if stream is None:
             raise ConnectionFailedError("Bad file descriptor")
@@ -387,22 +392,18 @@ class MemoryChannel:
         return len(data)
 
     def send(self, data: bytes) -> None:
-        """See `Channel`."""
         assert self._stream is not None
         self._stream.send(data)
 
     def shutdown(self) -> None:
-        """See `Channel`."""
         self.close()
 
     def close(self) -> None:
-        """See `Channel`."""
         if self._stream is not None:
             self._stream.close()
             self._stream = None
 
     def fileno(self) -> int:
-        """See `Channel`."""
         return -1
 
     def _pass(self, until: Callable[[], object], seconds: float) -> None:
@@ -459,8 +460,8 @@ def check_frames(frames: Iterable[DataMessage], *, complete: bool = True) -> Non
 
 # -- the buses of the tool and the doctor
 
+# What a server sets the sensors to: the fewer samples, the faster it is simulated.
 SINC_LENGTH, RATE_HZ = 512, 100
-"""What a server sets the sensors to: the fewer samples, the faster it is simulated."""
 _READ_IMAGE = scan.read_image
 
 
@@ -479,8 +480,7 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
     bus = SimulatedBus(MemoryBackend(*slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scan, "read_image", _read_image)
-        for module in (private_server, bus_checks):
-            patch.setattr(module, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
+        patch.setattr(private_server, "open_bus", lambda _ifname, **_: contextlib.closing(Bus(bus.backend)))
 
         def private(_ifname: str, *, force: bool = False, **_: object) -> PrivateServer:
             server = PrivateServer(bus, AsFound(force=force))
@@ -522,7 +522,6 @@ class PrivateServer(SimulatedServer):
         self.channel = MemoryChannel(self)
 
     def interrupt(self) -> None:
-        """See `PrivateServer`."""
         self.server.jobs.interrupt(private_server.STOPPED)
 
 
@@ -543,13 +542,10 @@ class _ServersClock:
         self._server = server
 
     def monotonic_ns(self) -> int:
-        """See `Clock`."""
         return self._server.clock.monotonic_ns()
 
     def time_ns(self) -> int:
-        """See `Clock`."""
         return self._server.clock.time_ns()
 
     def sleep(self, seconds: float, /) -> None:
-        """See `Clock`."""
         self._server.go_on(lambda: False, seconds)

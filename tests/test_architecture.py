@@ -40,7 +40,7 @@ PUBLIC: Final = ("bota_ethercat", "bota_ethercat.client")
 
 ROOMS: Final[dict[str, set[str]]] = {
     "bota_ethercat": PROTOCOL - {"bota_ethercat.health", "bota_ethercat.program"},
-    "bota_ethercat.program": {"bota_ethercat", "bota_ethercat.program"},
+    "bota_ethercat.program": {"bota_ethercat", "bota_ethercat.program", "bota_ethercat.sensor"},
     "bota_ethercat.text": {"bota_ethercat.text", "bota_ethercat.errors"},
     "bota_ethercat.sensor": PROTOCOL - {"bota_ethercat.health", "bota_ethercat.program"},
     "bota_ethercat.health": PROTOCOL,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Final
@@ -35,6 +36,13 @@ quietly bash "$1/pip" "$1"
     assert code == 0
     line = said.splitlines()[-1]
     assert re.fullmatch(rf"\d+ s, \d+ MB in {tmp_path} \(numpy\)", line), said
+
+
+def test_an_activated_environment_does_not_make_the_next_one(tmp_path: Path) -> None:
+    """It may be .venv, which is removed first."""
+    (tmp_path / "python3").symlink_to(sys.executable)
+    code, said = run(f'PATH="{tmp_path}:$PATH"; find_python >&2', tmp_path)
+    assert (code, said) == (0, f"{Path(sys.executable).resolve()}\n")
 
 
 def test_without_a_network_it_is_one_sentence(tmp_path: Path) -> None:

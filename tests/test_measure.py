@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import re
 
-import numpy as np
 import pytest
 
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import SampleDecoder, encode
 from scripts.demonstration import program
-from scripts.demonstration.measure import Measurement, explanation, verdict
+from scripts.demonstration.measure import Measurement, verdict
 from scripts.demonstration.program import Screen, print_summary
 
 PERIOD_NS = 1_250_000
@@ -92,29 +91,11 @@ def test_the_rate_is_judged_and_what_came_before_is_lost_too() -> None:
     assert gap.summary().lost_before == 4
 
 
-def test_what_the_machines_stops_took_is_told_apart_and_in_words() -> None:
-    measurement = measured()
-    measurement.take_frame(frame(821, DataFlag.GAP), 821 * PERIOD_NS)  # 801 to 820 never came
-    measurement.take_frame(frame(822), 822 * PERIOD_NS)  # and these two not to the subscriber
-    measurement.take_message(values(822), 823 * PERIOD_NS)
-    stops = np.array([[799 * PERIOD_NS, 815 * PERIOD_NS], [900 * PERIOD_NS, 902 * PERIOD_NS]])
-    summary = measurement.summary(stops)
-    assert (summary.lost_before, summary.lost, summary.lost_in_stops) == (20, 1, 14)
-    assert "21 samples are missing, 14 of them made while this machine itself stopped" in str(
-        explanation(summary)
-    )
-    assert "2 times, for up to 20.0 ms" in str(explanation(summary))
-    assert "never stopped" in str(explanation(measurement.summary()))
-    assert explanation(measured().summary(stops)) is None
-
-
 def test_a_gap_without_numbers_is_as_long_as_the_rate_has_it() -> None:
     measurement = measured()
     data = frame(850).process_data
     measurement.take_frame(DataMessage(801, 0, 850 * PERIOD_NS, 0, DataFlag.GAP, 3, data), 851 * PERIOD_NS)
     assert measurement.lost_before == 49
-    stops = np.array([[790 * PERIOD_NS, 851 * PERIOD_NS]])
-    assert measurement.summary(stops).lost_in_stops == 49
 
 
 def test_the_live_figure_of_what_is_lost_is_the_summarys(
@@ -132,7 +113,7 @@ def test_the_live_figure_of_what_is_lost_is_the_summarys(
     shown = capsys.readouterr().out
     assert re.search(r"Lost +│ +5 ", shown)
     assert max(map(len, shown.splitlines())) <= 80, "the terminal would break words"
-    assert " ".join(shown.split()).endswith(str(explanation(measurement.summary())))
+    assert "Samples are missing" in shown
 
 
 @pytest.mark.parametrize("text", ["abc", "", "0.1", "nan", "inf"])

@@ -11,12 +11,10 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Final
 
 import pytest
 
-from bota_clients import program
 from bota_ethercat.program.output import never_fail
 from ethercat_server import programs
 from ethercat_server.virtual_sensor.cli import main as virtual_sensor
@@ -26,7 +24,6 @@ ROOT: Final = Path(__file__).parent.parent
 SCRIPTS: Final[dict[str, str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 PROGRAMS: Final = {name: entry for name, entry in SCRIPTS.items() if name != "bridge-client"}
 CLIENTS: Final = [name for name, entry in PROGRAMS.items() if entry.startswith("bota_clients.")]
-UNKNOWN: Final = "numpy is not installed: in this project's folder run PIP '.[client]'"
 EXTRA: Final = ("jinja2", "matplotlib", "mcap", "numpy", "rich", "textual", "zstandard")
 
 INTERRUPTED: Final = """
@@ -117,17 +114,6 @@ def test_a_terminal_without_the_characters_gets_them_spelled(monkeypatch: pytest
     assert json.loads(as_json) == {"name": "é😀 5 us"}
 
 
-def test_the_doctor_writes_to_an_ascii_terminal() -> None:
-    """A process, because Python makes its output at the start."""
-    package, _, entry = PROGRAMS["ethercat-doctor"].partition(":")
-    done = subprocess.run(
-        [sys.executable, "-c", f"from {package} import {entry}; {entry}()", "no-such-one", "--seconds", "0"],
-        env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, check=False,
-    )  # fmt: skip
-    assert b"Traceback" not in done.stderr
-    assert b"no-such-one" in done.stdout.decode("ascii").encode()
-
-
 def test_help_needs_nothing_of_the_extra() -> None:
     """A process, in which none of it can be imported."""
     script = f"""
@@ -145,27 +131,6 @@ for name, entry in {[(name, PROGRAMS[name]) for name in CLIENTS]!r}:
     assert (done.returncode, done.stderr) == (0, "")
     for name in CLIENTS:
         assert f"usage: {name}" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("url", "what"),
-    [
-        ({"url": ROOT.as_uri(), "dir_info": {}}, f"numpy is not installed: PIP '{ROOT}[client]'"),
-        (
-            {"url": "https://example.org/a.git", "vcs_info": {"vcs": "git"}},
-            "numpy is not installed: PIP 'bota-ethercat-bridge[client] @ git+https://example.org/a.git'",
-        ),
-        ({"url": "file:///no/such/folder"}, UNKNOWN),
-        (None, UNKNOWN),
-    ],
-)
-def test_what_is_missing_comes_from_where_this_came_from(
-    url: object, what: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = None if url is None else json.dumps(url)
-    monkeypatch.setattr(program, "_CHECKOUT", Path("/no/checkout"))
-    monkeypatch.setattr(program, "distribution", lambda _: SimpleNamespace(read_text=lambda _: text))
-    assert program.missing("numpy.linalg") == what.replace("PIP", f"{sys.executable} -m pip install")
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def typed(convert: Callable[[str], _Value], what: str = "") -> Callable[[str], _
 
 
 def number(low: float, high: float, what: str = "") -> Callable[[str], float]:
-    """The type of an argument that is a number from `low` to `high`; `what` is said if it is not."""
+    """The type of an argument that is a number from `low` to `high`; `what` is in the error if it is not."""
 
     def within(text: str) -> float:
         if low <= (value := float(text)) <= high:

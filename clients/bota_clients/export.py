@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from functools import cache, partial
@@ -35,8 +33,6 @@ COLUMNS: Final = (
     *(str(flag.name).lower() for flag in _FLAGS),
     *_REGISTERS,
 )  # fmt: skip
-_SHOW_EVERY_S: Final = 0.5
-_LINES_BETWEEN: Final = 1000
 
 _say = partial(say, _PROGRAM)
 
@@ -128,10 +124,13 @@ def _seconds(ns: int) -> str:
 
 def run(options: ExportOptions) -> int:
     """Export; returns the exit code. Ctrl-C ends it at any time and leaves no file."""
-    from bota_clients.recording.reader import open_recording  # noqa: PLC0415 - needs the extra
+    from rich.console import Console  # noqa: PLC0415 - needs the extra, and so do these
+    from rich.progress import track  # noqa: PLC0415
+
+    from bota_clients.recording.reader import open_recording  # noqa: PLC0415
 
     interrupt_on_signals()
-    table = Table(options.imu_units, everything=options.all)
+    table, console = Table(options.imu_units, everything=options.all), Console(stderr=True)
     try:
         with open_recording(options.recording) as recording:
             there = {sensor.sensor: sensor.frames for sensor in recording.sensors if sensor.frames}
@@ -142,7 +141,10 @@ def run(options: ExportOptions) -> int:
                 _say(f"{options.recording} was cut off ({recording.cut_off}): the intact part is exported")
             total = sum(there.values()) if options.sensor is None else there[options.sensor]
             with NewFile(options.output, force=options.force) as file:
-                for line in _shown(table.lines(recording.frames(options.sensor)), total):
+                lines = table.lines(recording.frames(options.sensor))
+                for line in track(
+                    lines, total=total, console=console, transient=True, disable=not console.is_terminal
+                ):
                     file.write(line)
                 file.finish()
     except KeyboardInterrupt:
@@ -151,19 +153,6 @@ def run(options: ExportOptions) -> int:
     left = f"; {count(table.left_out, 'frame')} without a new sample left out" if table.left_out else ""
     _say(f"{options.output}: {count(table.written, 'sample')}{left}")
     return 0
-
-
-def _shown(lines: Iterable[str], total: int) -> Iterator[str]:
-    """The same lines, with the progress on a terminal."""
-    terminal, due = sys.stderr.isatty(), time.monotonic() + _SHOW_EVERY_S
-    for number, line in enumerate(lines):
-        yield line
-        if terminal and number % _LINES_BETWEEN == 0 and time.monotonic() >= due:
-            due += _SHOW_EVERY_S
-            sys.stderr.write(f"\r\x1b[K{100 * number // total} %")
-            sys.stderr.flush()
-    if terminal:
-        sys.stderr.write("\r\x1b[K")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

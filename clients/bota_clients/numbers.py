@@ -89,11 +89,3 @@ def duration(seconds: float) -> str:
 def milliseconds(value_us: float) -> str:
     """A time in µs as milliseconds."""
     return f"{value_us / 1e3:.2f}" if value_us < 99_950 else f"{value_us / 1e3:.0f}"
-
-
-def data_size(size: int) -> str:
-    """A number of bytes with its unit: `16.0 MB`."""
-    for unit, factor in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
-        if size >= factor:
-            return f"{size / factor:.1f} {unit}"
-    return f"{size} bytes"

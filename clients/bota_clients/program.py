@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shlex
 import signal
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, distribution
-from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Final
-from urllib.parse import unquote, urlsplit
+from typing import TYPE_CHECKING
 
 from bota_clients.errors import ClientError
 from bota_ethercat.errors import ProtocolError
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
-
-_PROJECT: Final = "bota-ethercat-bridge"
-_CHECKOUT: Final = Path(__file__).parents[2]  # the project's folder if this runs from there
 
 
 def say(program: str, sentence: str) -> None:
@@ -33,32 +26,15 @@ def say(program: str, sentence: str) -> None:
 
 
 def missing(name: str) -> str:
-    """That a package or program is not installed, and how to install it from where this was installed."""
-    source = _source()
-    where = "" if source else "in this project's folder run "
-    command = shlex.join([sys.executable, "-m", "pip", "install", source or ".[client]"])
-    return f"{name.partition('.')[0]} is not installed: {where}{command}"
-
-
-def _source() -> str | None:
-    """What pip installed, with the extra: a folder, a wheel or a repository; None if that is not known."""
-    if (_CHECKOUT / "pyproject.toml").exists():
-        return f"{_CHECKOUT}[client]"
-    try:
-        found = json.loads(distribution(_PROJECT).read_text("direct_url.json") or "")
-        url, vcs = str(found["url"]), found.get("vcs_info", {}).get("vcs")
-    except (PackageNotFoundError, ValueError, LookupError, TypeError, AttributeError):
-        return None
-    if url.startswith("file:") and vcs is None:
-        path = unquote(urlsplit(url).path)
-        return f"{path}[client]" if Path(path).exists() else None
-    return f"{_PROJECT}[client] @ {vcs}+{url}" if vcs else f"{_PROJECT}[client] @ {url}"
+    """That a package or program is not installed, and how to install it."""
+    command = shlex.join([sys.executable, "-m", "pip", "install", ".[client]"])
+    return f"{name.partition('.')[0]} is not installed: in this project's folder run {command}"
 
 
 def start(program: str, module: str, *arguments: object) -> int:
     """The exit code of `run` in a module that is imported only now: `--help` needs nothing of the extra.
 
-    What it raises of ours is said in its sentence.
+    Errors of this project become one sentence and exit code 1.
     """
     try:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)

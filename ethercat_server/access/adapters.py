@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
-import socket
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -22,7 +21,7 @@ from bota_ethercat.program.server_choice import default_server
 from ethercat_server.ethercat.nic import Routes, find_routes, master_sockets, table, users_of
 from ethercat_server.process.signals import signals_held_back
 
-_IFF_UP, _IFF_LOOPBACK, _IFF_PROMISC = 0x1, 0x8, 0x100
+_IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
 _ETHERNET: Final = 1
 # Kinds that a sensor can be connected to: network cards, and what tests use for one.
 _CARDS: Final = frozenset({"", "veth"})
@@ -53,7 +52,6 @@ class Adapter(NamedTuple):
     up: bool = True
     carrier: bool = True
     loopback: bool = False
-    promiscuous: bool = False
     ethernet: bool = True  # wired Ethernet, or a virtual interface like it
     master: str = ""  # bridge or bond that it is a part of
     upper: tuple[str, ...] = ()  # interfaces that stand on it, such as VLANs
@@ -84,31 +82,25 @@ class Adapter(NamedTuple):
 
 def adapters() -> list[Adapter]:
     """All interfaces of this machine, with their routes and users. Nothing is sent on them."""
-    return [row._replace(routes=_routes(row.name), holder=find_holder(row.name)) for row in links()]
-
-
-def _routes(ifname: str) -> Routes:
-    try:
-        return find_routes(ifname)
-    except OSError:  # it has just gone
-        return Routes()
+    found = []
+    for row in links():
+        with contextlib.suppress(OSError):  # it has just gone
+            found.append(row._replace(routes=find_routes(row.name), holder=find_holder(row.name)))
+    return found
 
 
 def links() -> list[Adapter]:
     """All interfaces of this machine, without their routes and users."""
-    with open_routes() as route:
-        rows = list(route.get_links())
-    names = {row["index"]: row.get_attr("IFLA_IFNAME") for row in rows}
-    upper: dict[int, list[str]] = {}
-    for row in rows:
-        below = row.get_attr("IFLA_LINK")
-        # A veth's other end, or an interface of another namespace, is not below it.
-        if below != row["index"] and row.get_attr("IFLA_LINK_NETNSID") is None and _kind(row) != "veth":
-            upper.setdefault(below, []).append(names[row["index"]])
-    return [_link(row, names, upper.get(row["index"], ())) for row in rows]
+    # Signals wait meanwhile: pyroute2's import and its event loop do not bear an exception.
+    with signals_held_back():
+        from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
+
+        with IPRoute() as route:
+            rows = list(route.get_links())
+    return [_link(row, rows) for row in rows]
 
 
-def _link(row: Any, names: Mapping[int, str], upper: Iterable[str]) -> Adapter:
+def _link(row: Any, rows: Sequence[Any]) -> Adapter:
     name, up = row.get_attr("IFLA_IFNAME"), bool(row["flags"] & _IFF_UP)
     stats = row.get_attr("IFLA_STATS64") or row.get_attr("IFLA_STATS") or {}
     wireless = any(Path(f"/sys/class/net/{name}/{mark}").exists() for mark in ("wireless", "phy80211"))
@@ -120,14 +112,17 @@ def _link(row: Any, names: Mapping[int, str], upper: Iterable[str]) -> Adapter:
         up=up,
         carrier=up and row.get_attr("IFLA_CARRIER") == 1,
         loopback=bool(row["flags"] & _IFF_LOOPBACK),
-        promiscuous=bool(row["flags"] & _IFF_PROMISC),
         ethernet=row["ifi_type"] == _ETHERNET and not wireless,
-        master=names.get(row.get_attr("IFLA_MASTER"), ""),
-        upper=tuple(upper),
+        master=next((_name(each) for each in rows if each["index"] == row.get_attr("IFLA_MASTER")), ""),
+        upper=tuple(_name(each) for each in rows if _stands_on(each, row["index"])),
         parent=row.get_attr("IFLA_PARENT_DEV_NAME") or "",
         counters={key: int(stats[key]) for key in stats.keys() if isinstance(stats[key], int)},  # noqa: SIM118
         carrier_changes=row.get_attr("IFLA_CARRIER_CHANGES"),
     )
+
+
+def _name(row: Any) -> str:
+    return str(row.get_attr("IFLA_IFNAME"))
 
 
 def _kind(row: Any) -> str:
@@ -135,45 +130,19 @@ def _kind(row: Any) -> str:
     return (info.get_attr("IFLA_INFO_KIND") if info else None) or ""
 
 
-@contextlib.contextmanager
-def open_routes() -> Iterator[Any]:
-    """pyroute2's IPRoute. Signals wait meanwhile: its import and its event loop do not bear an exception."""
-    with signals_held_back():
-        from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
-
-        with IPRoute() as route:
-            yield route
-
-
-@contextlib.contextmanager
-def promiscuity_kept(ifname: str) -> Iterator[None]:
-    """Restore promiscuous mode to off afterwards if it was off before: SOEM switches it on and leaves it."""
-
-    def is_promiscuous() -> bool | None:
-        return {row.name: row.promiscuous for row in links()}.get(ifname)
-
-    before = is_promiscuous()
-    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - loaded by now
-
-    try:
-        yield
-    finally:
-        if before is False and is_promiscuous():
-            with open_routes() as route, contextlib.suppress(NetlinkError, OSError):
-                route.link("set", index=socket.if_nametoindex(ifname), flags=0, change=_IFF_PROMISC)
+def _stands_on(row: Any, index: int) -> bool:
+    """A veth's other end, or an interface of another namespace, is not below it."""
+    of_here = row.get_attr("IFLA_LINK_NETNSID") is None and _kind(row) != "veth"
+    return of_here and row.get_attr("IFLA_LINK") == index != row["index"]
 
 
 def find_holder(ifname: str) -> Holder | None:
     """The process with the EtherCAT socket on `ifname`; None if there is none, or no such interface."""
     if not (inodes := master_sockets(ifname)):
         return None
-    return next(owners(inodes), None) or Holder(None, "ethercat-server", _default_server(ifname))
-
-
-def owners(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Holder]:
-    """The visible processes that have one of these sockets."""
-    for process in users_of(inodes, processes):
-        yield Holder(process.pid, process.name, _listening(processes / str(process.pid), process.sockets))
+    for pid, name, sockets in users_of(inodes):
+        return Holder(pid, name, _listening(Path(f"/proc/{pid}"), sockets))
+    return Holder(None, "ethercat-server", _default_server(ifname))
 
 
 def _default_server(ifname: str) -> Address | None:

@@ -7,10 +7,12 @@ as they are set, and go to INIT at the end.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import gc
 import os
 import signal
 import socket
+import struct
 import threading
 from collections.abc import Iterator
 from typing import Final
@@ -28,15 +30,33 @@ from ethercat_server.virtual_sensor.virtual_bus import VIRTUAL_INTERFACE, Virtua
 
 STOPPED: Final = BusError("stopped before it was done")
 _END_S: Final = 5.0
+_SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_PROMISC = 0x8913, 0x8914, 0x100
+_IFREQ: Final = struct.Struct("16sH14x")
 
 
 @contextlib.contextmanager
 def open_interface(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
-    """The open bus on `ifname`, or on a virtual bus for `virtual`."""
+    """The open bus on `ifname`, or on a virtual bus for `virtual`.
+
+    Promiscuous mode, which SOEM switches on and leaves on, is switched off again unless it was on before.
+    """
     with contextlib.ExitStack() as cleanup:
         if ifname == VIRTUAL_INTERFACE:
             ifname = cleanup.enter_context(VirtualBus()).ifname
+        if not change_flags(ifname) & _IFF_PROMISC:
+            cleanup.callback(change_flags, ifname, off=_IFF_PROMISC)
         yield cleanup.enter_context(open_bus(ifname, allow_ip=allow_ip))
+
+
+def change_flags(ifname: str, *, on: int = 0, off: int = 0) -> int:
+    """Change the flags of an interface (linux/if.h), if it is there and that is allowed; what they were."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket, contextlib.suppress(OSError):
+        answer = fcntl.ioctl(any_socket, _SIOCGIFFLAGS, _IFREQ.pack(ifname.encode(), 0))
+        flags: int = _IFREQ.unpack(answer)[1]
+        if (wanted := (flags | on) & ~off) != flags:
+            fcntl.ioctl(any_socket, _SIOCSIFFLAGS, _IFREQ.pack(ifname.encode(), wanted))
+        return flags
+    return 0
 
 
 class PrivateServer:

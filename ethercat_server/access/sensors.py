@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
-from bota_ethercat.control import ErrorCode, Event
+from bota_ethercat.control import ErrorCode
 from bota_ethercat.errors import (
     ConnectionFailedError,
     NoReplyError,
@@ -18,7 +17,7 @@ from bota_ethercat.errors import (
     RefusedError,
     UnreachableError,
 )
-from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.server_choice import default_server, is_address
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import SettingValue
@@ -37,38 +36,30 @@ from ethercat_server.sensor.tare import LATER
 _ANSWER_TIMEOUT_S: Final = 30.0
 # Upper bound for the time per sample of a tare: CHOP may divide 25 Hz by 8, and a tare takes two windows.
 _SLOWEST_SAMPLE_S: Final = 1.0
-_BACK_S: Final = 10.0
-_IDLE_S: Final = 0.05
+_BACK_S: Final = 10.0  # how long a sensor that was lost in a tare has to come back
 _SETTLED_WITHIN_S: Final = 10.0  # timeout for what settles
+_IDLE_S: Final = 0.05
 _READ_ATTEMPTS: Final = 3
 _READ_PAUSE_S: Final = 0.1
-
-
-# What is told of a watched sensor, unless the event has a message of its own.
-_TOLD: Final[Mapping[str, str]] = {
-    Event.SENSOR_LOST: "sensor {sensor} is lost",
-    Event.SENSOR_BACK: "sensor {sensor} is back after {lost_s} s",
-    Event.EMERGENCY: "sensor {sensor} reports an emergency",
-    Event.RECONFIGURED: "the settings of sensor {sensor} have changed",
-}
 
 
 class Sensors:
     """The sensors of one bus, over one framed connection to their server. Errors are ServerErrors.
 
     Attributes:
+        client: the connection.
+        private: the server, if it is this process's own, which `close` ends. What it changed is not written
+            again when a sensor was powered off.
         used: description of the interface or server.
         sensors: those that there are, by number.
-        restores: whether settings and offsets are written again when a sensor was powered off.
     """
 
     clock: Clock = SYSTEM_CLOCK
 
     def __init__(self, client: Client, name: str, used: str, private: PrivateServer | None = None) -> None:
-        """`name`: the server's, in messages; `private`: it is this process's own, which `close` ends."""
-        self._client, self._name, self._private = client, name, private
-        self.used = used
-        self.restores = private is None
+        """`name`: the server's, in messages."""
+        self.client, self.used, self.private = client, used, private
+        self._name = name
         self.sensors = [
             Found(row["sensor"], Identity(row["name"], row["serial"], row["hardware"], row["firmware"]))
             for row in client.description["sensors"]
@@ -83,14 +74,12 @@ class Sensors:
             return cls(client.connect(), name, used or name)
         except UnreachableError as error:
             raise ServerError(error.at(address)) from None
-        except ProtocolError as error:
+        except (ProtocolError, KeyError, TypeError) as error:
+            client.close()
             raise ServerError(
                 f"the program at {address} is not a compatible ethercat-server ({error}): "
                 "check the port, or install the same version of both"
             ) from None
-        except (KeyError, TypeError):
-            client.close()
-            raise ServerError(f"the program at {address} is not an ethercat-server: check the port") from None
 
     @classmethod
     def on_interface(cls, ifname: str, **options: Any) -> Sensors:
@@ -106,15 +95,15 @@ class Sensors:
 
     def close(self) -> None:
         """End the connection."""
-        self._client.close()
-        if self._private is not None:
+        self.client.close()
+        if self.private is not None:
             with signals_call(lambda: None):  # what was asked for is done, and this takes a moment only
-                self._private.close()
+                self.private.close()
 
     def ask(self, action: str, timeout_s: float = _ANSWER_TIMEOUT_S, **values: object) -> JsonObject:
         """The reply to a request; SdoAbortError, UsageError or BusError if it is refused."""
         try:
-            return self._client.ask(action, timeout_s, **values)
+            return self.client.ask(action, timeout_s, **values)
         except RefusedError as error:
             if error.code == ErrorCode.SENSOR:
                 raise SdoAbortError(str(error), error.abort_code or 0) from None
@@ -126,17 +115,9 @@ class Sensors:
             raise self._closed(error) from None
 
     def _closed(self, error: ConnectionFailedError) -> Exception:
-        if self._private is not None and self._private.error is not None:
-            return self._private.error
+        if self.private is not None and self.private.error is not None:
+            return self.private.error
         return ServerError(f"{self._name} closed the connection ({error}): see its log")
-
-    def choose(self, wanted: str | None) -> Found:
-        """The sensor selected by `--sensor`; UsageError if it is not unique."""
-        return choose(self.sensors, wanted)
-
-    def chosen(self, wanted: str | None) -> list[Found]:
-        """The same for read-only commands: all sensors if None."""
-        return self.sensors if wanted is None else [self.choose(wanted)]
 
     def in_force(self, found: Found, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Sensor:
         """The sensor with its present settings, also as the wanted ones; see `read_in_force` for `asked`."""
@@ -161,8 +142,8 @@ class Sensors:
         timeout_s, signals = _ANSWER_TIMEOUT_S + samples * _SLOWEST_SAMPLE_S, itertools.count()
 
         def interrupt() -> None:
-            if self._private is not None:
-                self._private.interrupt()
+            if self.private is not None:
+                self.private.interrupt()
             elif next(signals):
                 raise ServerError(f"interrupted before {self._name} replied: it may still tare the sensor")
             else:
@@ -173,7 +154,7 @@ class Sensors:
             try:
                 return self.ask("tare", timeout_s, sensor=number, samples=samples, target=list(target))
             except BusError as error:
-                if self._private is None or not str(error).endswith(LATER):
+                if self.private is None or not str(error).endswith(LATER):
                     raise
                 raise BusError(f"{str(error).removesuffix(LATER)}{self._wait_back(number)}") from None
 
@@ -187,79 +168,26 @@ class Sensors:
             self.clock.sleep(_IDLE_S)
         return "; it is back with its old offset"
 
-    def watch(
-        self, numbers: Sequence[int], on_frame: Callable[[DataMessage], bool], on_idle: Callable[[], bool]
-    ) -> None:
-        """Stream until `on_frame` or the periodic `on_idle` returns False.
+    def stream(self, **subscription: Any) -> Iterator[tuple[list[DataMessage], list[JsonObject]]]:
+        """Subscribe; every 50 ms or sooner the frames that have come, and the server's events. Never ends."""
+        self.ask("subscribe", **subscription)
+        while True:
+            try:
+                frames = self.client.poll(_IDLE_S)
+            except ConnectionFailedError as error:
+                raise self._closed(error) from None
+            events = [event for event in self.client.events if isinstance(event, dict)]
+            self.client.events.clear()
+            yield frames, events
 
-        Samples of settling sensors are left out, and their GAP is the next frame's; it begins when they have
-        settled.
-        """
-        self.wait_settled(numbers)
-        self.ask("subscribe", sensors=list(numbers))
-        gaps, settling, asked = dict[int, int](), set[int](), Deadline(self.clock, 0.0)
-        while on_idle():
-            later = settling
-            if settling and asked.passed:
-                later, asked = self._settling(numbers), Deadline(self.clock, _IDLE_S)
-            frames = self._poll()
-            for event in self._events():
-                if event["event"] == Event.SHUTTING_DOWN:
-                    raise ServerError(f"{self._name} is shutting down")
-                told = _TOLD.get(str(event["event"]))
-                if told is not None and event.get("sensor") in numbers:
-                    note(str(event.get("message") or told.format_map({"lost_s": None, **event})))
-                    if event["event"] in (Event.SENSOR_BACK, Event.RECONFIGURED):
-                        settling = later = later | {event["sensor"]}
-            for frame in frames:  # those on the way while it was asked are judged by what it said before
-                gap = gaps.pop(frame.sensor, 0) | frame.flags & DataFlag.GAP
-                if frame.sensor in settling and not frame.flags & NOT_NEW:
-                    gaps[frame.sensor] = gap
-                elif not on_frame(frame._replace(flags=frame.flags | gap)):
-                    return
-            settling = later
-
-    def _poll(self) -> list[DataMessage]:
-        try:
-            return self._client.poll(_IDLE_S)
-        except ConnectionFailedError as error:
-            raise self._closed(error) from None
-
-    @property
-    def real_time(self) -> bool:
-        """Whether a server of this process's own has real-time scheduling."""
-        return self._private is not None and self._private.real_time
-
-    @property
-    def same_machine(self) -> bool:
-        """Whether CLOCK_MONOTONIC is the server's."""
-        return self._client.session.same_machine
-
-    def listen(self, seconds: float, on_frames: Callable[[Sequence[DataMessage]], None]) -> list[JsonObject]:
-        """Stream every frame of all sensors to `on_frames` for some seconds; the events meanwhile."""
-        self.ask("subscribe", fresh_only=False)
-        end = Deadline(self.clock, seconds)
-        while not end.passed:
-            on_frames(self._poll())
-        self.ask("unsubscribe")
-        return self._events()
-
-    def _events(self) -> list[JsonObject]:
-        """The server's since the last call."""
-        events = [event for event in self._client.events if isinstance(event, dict)]
-        self._client.events.clear()
-        return events
-
-    def wait_settled(self, numbers: Sequence[int]) -> None:
+    def wait_settled(self, numbers: Collection[int]) -> None:
         """Wait until the data of these sensors has settled."""
         deadline = Deadline(self.clock, _SETTLED_WITHIN_S)
-        while self._settling(numbers) and not deadline.passed:
+        while numbers and not deadline.passed:
+            rows = self.ask("describe")["sensors"]
+            if not any(row.get("settling") is True for row in rows if row["sensor"] in numbers):
+                return
             self.clock.sleep(_IDLE_S)
-
-    def _settling(self, numbers: Sequence[int]) -> set[int]:
-        """Those among these sensors whose data has not settled."""
-        rows = self.ask("describe")["sensors"]
-        return {row["sensor"] for row in rows if row.get("settling") is True} & set(numbers)
 
 
 class _ServerSdo:
@@ -272,15 +200,15 @@ class _ServerSdo:
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """See `Sdo`."""
         yield from ()
-        keys = {"sensor": self._number, "index": index, "subindex": subindex}
-        for _ in range(_READ_ATTEMPTS - 1):
+        for left in reversed(range(_READ_ATTEMPTS)):
             try:
-                return bytes.fromhex(self._sensors.ask("sdo_read", **keys)["hex"])
-            except SdoAbortError:
-                raise
-            except BusError:
+                reply = self._sensors.ask("sdo_read", sensor=self._number, index=index, subindex=subindex)
+                break
+            except BusError as error:
+                if isinstance(error, SdoAbortError) or not left:
+                    raise
                 self.clock.sleep(_READ_PAUSE_S)  # the sensor may be lost for a moment
-        return bytes.fromhex(self._sensors.ask("sdo_read", **keys)["hex"])
+        return bytes.fromhex(reply["hex"])
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """See `Sdo`."""

@@ -3,7 +3,7 @@
 The sensor samples freely; an exchange tells whether its process data changed since the one before, and a
 slave controller with a distributed clock when it did (`slave_clock`). From that `Estimate` says when the next
 sample comes to be, and `SampleClock` when to look for it. What is not known well, because a frame was lost or
-the machine stood still, leaves it as it is: it holds over, and its uncertainty grows as crystals wander.
+the machine stood still, leaves it as it is: it holds over, and its uncertainty grows as crystals drift.
 docs/sample-clock.md derives it. Times are CLOCK_MONOTONIC in ns, variances in ns².
 """
 
@@ -16,93 +16,71 @@ from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.slave_clock import EventTimes
 from ethercat_server.ethercat.exchange import Latched
 
-# The estimate
+# -- the estimate
 _ROOT_2_PI: Final = math.sqrt(2 * math.pi)
 _ROOT_HALF: Final = math.sqrt(0.5)
-# How much each period of a crystal differs from the one before, at most.
-_JITTER_NS: Final = 30.0
-# By what part of it the period changes from sample to sample: 1 ppm in a minute at 1600 Hz.
-_WANDER: Final = 3e-9
-# Of the instant of a look: what shows of it in no round trip.
-_LOOK_VARIANCE: Final = 2_000.0**2
-# Chance that a bit says nothing: it came from a stall, or was another sample's.
+_JITTER_NS: Final = 30.0  # period jitter of a crystal, at most
+_DRIFT: Final = 3e-9  # relative change of the period from sample to sample: 1 ppm in a minute at 1600 Hz
+_LOOK_VARIANCE: Final = 2_000.0**2  # variance of the instant of a look that no round trip shows
+# Probability that a bit is meaningless: it came from a stall, or belongs to another sample.
 _WRONG: Final = 0.005
 _FARTHEST: Final = 8.0
-_RESTLESS_GAIN: Final = 0.05
-_RESTLESS_STEP: Final = 0.4
-# A clock whose phase walks is of unknown rate, too.
-_RESTLESS_RATE: Final = 1.4
-_MOST_RESTLESS: Final = math.log(1e7)
-# Looks in a row that were all late have this negative log-likelihood: about one in a thousand.
+_NOISE_GAIN: Final = 0.05
+_NOISE_STEP: Final = 0.4
+# Where the phase is a random walk, the rate is uncertain too: exponent of its process noise.
+_NOISE_RATE: Final = 1.4
+_MOST_NOISE: Final = math.log(1e7)
+# Negative log-likelihood of a run of late looks from which noise is raised: about one run in a thousand.
 _UNLIKELY_RUN: Final = 7.0
-# A measurement further out than so many standard deviations contradicts the model.
-_CONTRADICTS: Final = 3.0
-# So many in a row mean that the sensor's clock started anew.
-_CONTRADICTIONS: Final = 4
-# Beyond so many standard deviations nothing is learned from a bit that is as expected.
-_CERTAIN: Final = 5.0
-# Standard deviation of a phase of which nothing is known, in periods: 1/sqrt(12).
-_UNKNOWN: Final = 0.3
+_CONTRADICTS: Final = 3.0  # standard deviations beyond which a measurement contradicts the model
+_CONTRADICTIONS: Final = 4  # consecutive contradictions after which the sensor's clock has started anew
+_CERTAIN: Final = 5.0  # standard deviations beyond which an expected bit carries no information
+_UNKNOWN: Final = 0.3  # standard deviation of an unknown phase, in periods: 1/sqrt(12)
 _FIRST_PULL: Final = 0.001
-# Standard deviation of the period at first, and after contradictions, as part of it.
+# Largest standard deviation of the period, as part of it; it is reached after contradictions.
 _MOST_PULL: Final = 0.03
 # The period may differ from the nominal one by this part. Oscillators are off by 0.0005 at most, but a
 # simulated sensor that sleeps between its samples is slower by much more.
 _LARGEST_PULL: Final = 0.12
-# The period is known to this part of it (standard deviation).
-_STEADY: Final = 2e-6
-# The margin
-# Age that is given up to save an exchange.
+_STEADY: Final = 2e-6  # relative standard deviation of the period below which it counts as known
+# -- the margin
+# Cost of an exchange, as age.
 _PRICE_NS: Final = 15_000.0
-# Age that is given up to lose no sample, in periods, where there is no time for a second poll.
+# Cost of a lost sample, as age in periods, where there is no time for a second poll.
 _LOSS_PERIODS: Final = 10.0
-# There is none if a round trip takes more than this part of a period.
-_NO_TIME: Final = 0.5
+_NO_TIME: Final = 0.5  # round trip, in periods, beyond which there is no time for one
 _LARGEST_MARGIN: Final = 0.4
-# By this factor an early look costs more where nothing is learned from it, for events date the samples.
+# Factor by which an early look costs more where nothing is learned from it: events date the samples.
 _NOTHING_LEARNED: Final = 1.2
-# The clock
-# The clock is followed while the phase is known to this part of a period (standard deviation).
+# -- the clock
+# Standard deviation of the phase, in periods, below which the clock is followed.
 _LOCKED: Final = 0.125
-# Exchanges a sample while it is not.
-_POLLS_UNLOCKED: Final = 4
-# Exchanges a sample once one is overdue.
-_SEARCH_STEPS: Final = 8
-# It is, so many standard deviations after it was expected.
-_OVERDUE: Final = 2.0
-# A real sensor's period differs from the nominal one by less than this part.
-PLAUSIBLE_PULL: Final = 0.002
-# A sensor that has given nothing new for so long counts as silent, not just late.
-SILENT_PERIODS: Final = 3
-# Part of the samples whose first poll is to be early.
-_EARLY_POLLS: Final = 0.11
+_POLLS_UNLOCKED: Final = 4  # exchanges per sample while it is not
+_SEARCH_STEPS: Final = 8  # exchanges per period once a sample is overdue
+_OVERDUE: Final = 2.0  # standard deviations after which it is
+PLAUSIBLE_PULL: Final = 0.002  # a real sensor's period differs from the nominal one by less than this part
+SILENT_PERIODS: Final = 3  # periods without a new sample after which a sensor is silent, not just late
+_EARLY_POLLS: Final = 0.11  # fraction of the samples whose first poll is to be early
 _CAUTION_GAIN: Final = 0.05
-# The margin is derived anew every so many calls of `learn`, and when the variance has changed by this factor.
+# Calls of `learn` after which the margin is derived anew, and change of the variance by which it is at once.
 _TURNS: Final = 3
 _CHANGED: Final = 1.25
-# A steady clock is learned from one sample in this time: by its event, and by polls.
+# Interval at which a steady clock learns from a sample: by its event, and by polls.
 _LEARN_BY_EVENT_EVERY_NS: Final = 10e6
 _LEARN_BY_POLL_EVERY_NS: Final = 6.25e6
-# A phase known so well needs no probes, however well polls could tell it.
+# Variance of the phase below which no probes are needed, however precise polls are.
 _PROBE_BELOW: Final = 5_000.0**2
-# After so many samples without an early look it is tried whether the phase is still what it was.
-_UNPROBED: Final = 500
-# The sensor looks at its data within this part of a period after the frame usually has reached it.
+_UNPROBED: Final = 500  # samples without an early look after which the phase is probed
+# Excess of an exchange, in periods, beyond which it says nothing of when the sensor looked.
 _LONGEST_LOOK: Final = 0.5
-# A sample that comes so much early, in periods, is the one expected before it.
-_EARLY: Final = -0.25
+_EARLY: Final = -0.25  # lateness in periods below which a sample is the one expected before
 _BIAS_GAIN: Final = 1 / 64
-# Only one sample can have come in this part of a period; more may have in this.
+# Time without a look, in periods: below the first only one sample can have come, above the second more may.
 _ONE_ONLY, _MISSABLE = 0.8, 1.25
 
 
 class Estimate:
-    """Of one clock. Times in ns, variances in ns²."""
-
-    __slots__ = (
-        "_contradictions", "_covariance", "_jitter", "_nominal_ns", "_period_variance", "_pull", "_run",
-        "_wander", "period_ns", "phase_ns", "restless", "variance",
-    )  # fmt: skip
+    """Phase and period of one clock. Times in ns, variances in ns²."""
 
     def __init__(self, period_ns: float) -> None:
         """`period_ns` is the nominal period."""
@@ -114,21 +92,21 @@ class Estimate:
         self._period_variance = (_FIRST_PULL * period_ns) ** 2
         self._pull = _FIRST_PULL
         self._jitter = _JITTER_NS**2
-        self._wander = (_WANDER * period_ns) ** 2  # variances that phase and period gain with each sample
-        # Logarithm of how much more the clock wanders than a crystal: a program that sleeps does.
-        self.restless = 0.0
+        self._drift = (_DRIFT * period_ns) ** 2  # variances that phase and period gain with each sample
+        # Logarithm of the factor by which its process noise exceeds a crystal's, as that of a program does.
+        self.excess_noise = 0.0
         self._run = 0.0  # negative log-likelihood of the looks since the last that was early
         self._contradictions = 0
 
     @property
     def pull(self) -> float:
-        """By what part the period differs from the nominal one."""
+        """Relative deviation of the period from the nominal one."""
         return self.period_ns / self._nominal_ns - 1
 
     @property
     def is_steady(self) -> bool:
         """Whether the clock runs as a crystal does, and its period is known."""
-        return not self.restless and self._period_variance < (_STEADY * self.period_ns) ** 2
+        return not self.excess_noise and self._period_variance < (_STEADY * self.period_ns) ** 2
 
     def begin(self, low_ns: float, high_ns: float) -> None:
         """The first sample came to be between these two; the next one is expected."""
@@ -140,14 +118,14 @@ class Estimate:
     def advance(self, samples: int) -> None:
         """Expect a later sample (an earlier one if negative)."""
         self.phase_ns += samples * self.period_ns
-        self.hold(samples)
+        self.hold_over(samples)
 
-    def hold(self, samples: int) -> None:
-        """Be as uncertain as that makes it."""
+    def hold_over(self, samples: int) -> None:
+        """Have the variances grow as those samples make them."""
         many = abs(samples)
         self.variance += 2 * samples * self._covariance + many * (many * self._period_variance + self._jitter)
         self._covariance += samples * self._period_variance
-        self._period_variance += many * self._wander
+        self._period_variance += many * self._drift
         if self.variance > (most := (_UNKNOWN * self.period_ns) ** 2):
             self._covariance *= math.sqrt(most / self.variance)
             self.variance = most
@@ -187,14 +165,14 @@ class Estimate:
         self._move(-slope)
         surprise = -math.log(chance)
         if sign > 0 and late > 0:
-            # That a look was late says nothing of how late: it pulls, but makes nothing more certain.
+            # A late look bounds the phase on one side only: it pulls, but reduces no variance.
             self._run += surprise
             if self._run > _UNLIKELY_RUN:
-                self.restless += _RESTLESS_STEP
+                self.excess_noise += _NOISE_STEP
         else:
             self._run = 0.0
             self._narrow(slope * slope + slope * late / deviation_ns)
-        self._stir((1 - chance) * (surprise + math.log(1 - chance)))
+        self._adapt_noise((1 - chance) * (surprise + math.log(1 - chance)))
 
     def learn_instant(self, instant_ns: float, variance: float) -> None:
         """The sample came to be then."""
@@ -207,19 +185,19 @@ class Estimate:
         self._contradictions = 0
         self._move(error_ns / total)
         self._narrow(1 / total)
-        self._stir((surprise - 1) / 2)
+        self._adapt_noise((surprise - 1) / 2)
 
     def expect(self, variance: float) -> None:
-        """Instants are about so far from those of a crystal."""
-        self._stir(math.log(max(variance, _JITTER_NS**2) / _JITTER_NS**2) / _RESTLESS_GAIN)
+        """The instants have about this variance about those of a crystal."""
+        self._adapt_noise(math.log(max(variance, _JITTER_NS**2) / _JITTER_NS**2) / _NOISE_GAIN)
 
-    def _stir(self, excess: float) -> None:
-        """Something was more surprising than the model has it, by so much."""
-        restless = self.restless + _RESTLESS_GAIN * excess
-        if restless > 0 or self.restless > 0:
-            self.restless = min(max(restless, 0.0), _MOST_RESTLESS)
-            self._jitter = math.exp(self.restless) * _JITTER_NS**2
-            self._wander = math.exp(_RESTLESS_RATE * self.restless) * (_WANDER * self._nominal_ns) ** 2
+    def _adapt_noise(self, excess: float) -> None:
+        """A measurement was more surprising than the model expects, by `excess`."""
+        excess_noise = self.excess_noise + _NOISE_GAIN * excess
+        if excess_noise > 0 or self.excess_noise > 0:
+            self.excess_noise = min(max(excess_noise, 0.0), _MOST_NOISE)
+            self._jitter = math.exp(self.excess_noise) * _JITTER_NS**2
+            self._drift = math.exp(_NOISE_RATE * self.excess_noise) * (_DRIFT * self._nominal_ns) ** 2
 
     def _move(self, weight: float) -> None:
         self.phase_ns += self.variance * weight
@@ -233,7 +211,7 @@ class Estimate:
         self.variance -= self.variance * self.variance * information
 
     def _is_contradicted(self) -> bool:
-        """Something did not fit; whether that happened so often that the clock is unknown from here on."""
+        """A measurement did not fit; whether as many did that the phase is unknown from here on."""
         self._contradictions += 1
         if self._contradictions < _CONTRADICTIONS:
             return False
@@ -245,32 +223,8 @@ class Estimate:
         return True
 
 
-def has_no_time_for_two(timing: ExchangeTiming, period_ns: float) -> bool:
-    """Whether there is no time for a second poll of a sample."""
-    return timing.usual_ns > _NO_TIME * period_ns
-
-
-def margin_ns(
-    timing: ExchangeTiming, period_ns: float, phase_variance: float, *, by_events: bool = False
-) -> float:
-    """How long after the expected instant a poll should look, so that samples are youngest on the whole.
-
-    An early look costs a second exchange, or the sample where there is no time for one. The margin is where
-    a little more of it costs as much as it saves: where the density of the look's instant is 1 / cost.
-    """
-    single = has_no_time_for_two(timing, period_ns)
-    cost_ns = _LOSS_PERIODS * period_ns if single else timing.usual_ns + _PRICE_NS
-    if by_events:
-        cost_ns *= _NOTHING_LEARNED
-    deviation_ns = math.sqrt(phase_variance + timing.variance)
-    ratio = cost_ns / (deviation_ns * _ROOT_2_PI)
-    if ratio <= 1:
-        return 0.0
-    return min(deviation_ns * math.sqrt(2 * math.log(ratio)), _LARGEST_MARGIN * period_ns)
-
-
 class SampleClock:
-    """The sampling clock of one sensor, as far as the exchanges have shown it.
+    """The sampling clock of one sensor, as observed through the exchanges.
 
     Call `take` for every valid exchange, in the order in which they were sent, then `learn` unless it
     `goes_on`; ask `next_poll_ns` when the next exchange is wanted. Exchanges are back when this program has
@@ -285,7 +239,7 @@ class SampleClock:
             lost; 0, one was counted as lost that was not.
         uncertain: whether more may have been lost than `steps` says. The samples after it tell, and their
             `steps` put it right.
-        quiet_ns: an exchange that is back so long before the phase has certainly nothing new.
+        quiet_ns: an exchange that is back this long before the phase certainly brings nothing new.
     """
 
     __slots__ = (
@@ -319,37 +273,29 @@ class SampleClock:
         self.quiet_ns = math.inf
         # The last exchange: when it was sent, and whether it brought a new sample.
         self._sent_ns, self._fresh = 0, False
-        # Instant of the newest sample as its event has it, less the outward part; 0: it says nothing.
-        self._by_event = 0.0
+        self._by_event = 0.0  # instant of the newest sample by its event, less the outward part; 0: unknown
         # When the last valid exchange was sent from which was learned, or that went on.
         self._looked_ns = 0
         self._moved_ns = timing.moved_ns
-        # By how much events are later than polls show, where both are followed.
-        self._bias_ns = 0.0
-        # Number of the newest sample, counted from the one before it by the phase alone.
-        self._newest = 1
+        self._bias_ns = 0.0  # by how much events are later than polls show, where both are followed
+        self._newest = 1  # number of the newest sample, counted from the one before it by the phase alone
         # When the sensor had certainly looked in the exchange that brought the newest sample.
         self._seen_by_ns = 0.0
-        # Samples in a row that were watched for and did not come.
-        self._absent = 0
-        # Whether a sample was seen coming; whether the sample before was `uncertain`.
+        self._absent = 0  # consecutive samples that were polled for and did not come
+        # Whether an instant is known; whether the sample before was `uncertain`; whether the next is overdue.
         self._begun = self._doubtful = self._overdue = False
-        # Whether there is no time for a second poll of a sample.
-        self._single = True
-        # Whether the phase is known worse than polls can tell it, or has not been tried for long.
+        self._single = True  # whether there is no time for a second poll of a sample
+        # Whether the next poll is to be early: polls can tell the phase better, or did not for long.
         self._probing = False
-        # Samples since a look was early.
-        self._hits = 0
-        # Part of the margin that is needed: looks are spread less evenly than a margin assumes.
+        self._hits = 0  # samples since a look was early
+        # κ, the fraction of the margin that is needed: looks are distributed less evenly than it assumes.
         self._caution = 1.0
         # Between these variances the margin is as it was derived last.
         self._turn, self._least_variance, self._most_variance = 0, 0.0, 0.0
         self._usual_margin_ns = self._margin_ns = self._probed_above = 0.0
-        # How long after the phase the next poll should be sent.
-        self._aim_after_ns = 0.0
-        # Whether the next sample is expected with no doubt about which it is, if its exchange is back less
-        # than `_sure_ns` after its phase; its event is then within `_doubt_ns` of it, and it is missed after
-        # `_late_ns`.
+        self._aim_after_ns = 0.0  # how long after the phase the next poll should be sent
+        # Whether the next sample is certainly the expected one if its exchange is back less than `_sure_ns`
+        # after its phase; its event is then within `_doubt_ns` of it, and it is overdue after `_late_ns`.
         self._steady = False
         self._sure_ns = self._doubt_ns = self._late_ns = self._outward_ns = 0.0
         # Samples since something was learned, and how many at most.
@@ -363,10 +309,10 @@ class SampleClock:
 
     @property
     def uncertainty_ns(self) -> float:
-        """How far `instant_ns` may be off: two standard deviations, and where the slave is on the way.
+        """Uncertainty of `instant_ns`: two standard deviations, and the asymmetry of the round trip.
 
-        What a round trip usually takes beyond the shortest may be on one side of it, which none can tell. A
-        sample that may be another one than thought may be off by a period.
+        What a round trip usually takes beyond the shortest may be on either way, which cannot be observed. A
+        sample that may be mistaken for another may be off by a period.
         """
         events, timing = self.events, self._timing
         if events is not None and events.are_trusted:
@@ -384,8 +330,8 @@ class SampleClock:
     def _follows_events(self) -> bool:
         """Whether phase and period are learned from events.
 
-        Where an early poll costs a sample, only polls tell when to poll: event times may be off by more than
-        polls stand, and agree with polling as far as the long round trip tells.
+        Where an early poll costs a sample, polls are timed by polls only: the asymmetry of a long round trip
+        may put event times off by more than polls tolerate.
         """
         return self.by_events and not self._single
 
@@ -405,7 +351,7 @@ class SampleClock:
         if not self.locked:
             return sent_ns + period_ns / _POLLS_UNLOCKED
         if self._single:
-            # The polls that are on their way are for the samples before: the first that has none is next.
+            # The polls in flight are for the samples before: the next is for the first that has none.
             guard_ns = self._margin_ns / 2
             ahead_ns = max(0, int((sent_ns - aim_ns + guard_ns) // period_ns) + 1) * period_ns
             probe_ns = self.estimate.phase_ns - timing.look_ns + ahead_ns
@@ -417,7 +363,7 @@ class SampleClock:
             return max(aim_ns, sent_ns + min(timing.unanswered * timing.patience_ns, period_ns))
         if sent_ns < aim_ns:
             return aim_ns
-        # It was early: again, at once, or in steps if the sample is overdue.
+        # It was early: poll again at once, or in steps if the sample is overdue.
         return sent_ns + period_ns / _SEARCH_STEPS if self._overdue else sent_ns
 
     def _settle(self) -> None:
@@ -430,8 +376,8 @@ class SampleClock:
         if self._turn < 0 or not self._least_variance < variance < self._most_variance:
             self._turn = _TURNS
             self._least_variance, self._most_variance = variance / _CHANGED, variance * _CHANGED
-            self._single = has_no_time_for_two(timing, period_ns)
-            self._usual_margin_ns = margin_ns(timing, period_ns, variance, by_events=self._follows_events)
+            self._single = timing.usual_ns > _NO_TIME * period_ns
+            self._usual_margin_ns = self._best_margin_ns()
             self._probed_above = (timing.look_variance + _PROBE_BELOW) / 4
         self._margin_ns = self._usual_margin_ns * (1.0 if self._single or self.by_events else self._caution)
         self._probing = self._hits > _UNPROBED or (variance > self._probed_above and not self._follows_events)
@@ -452,10 +398,27 @@ class SampleClock:
             and (events is None or events.is_steady)
         )
 
+    def _best_margin_ns(self) -> float:
+        """How long after the expected instant a poll should look, so that samples are youngest on the whole.
+
+        An early look costs a second exchange, or the sample where there is no time for one. The margin is
+        where a little more of it costs as much as it saves: where the density of the look's instant is
+        1 / cost.
+        """
+        timing, period_ns = self._timing, self.estimate.period_ns
+        cost_ns = _LOSS_PERIODS * period_ns if self._single else timing.usual_ns + _PRICE_NS
+        if self._follows_events:
+            cost_ns *= _NOTHING_LEARNED
+        deviation_ns = math.sqrt(self.estimate.variance + timing.variance)
+        ratio = cost_ns / (deviation_ns * _ROOT_2_PI)
+        if ratio <= 1:
+            return 0.0
+        return min(deviation_ns * math.sqrt(2 * math.log(ratio)), _LARGEST_MARGIN * period_ns)
+
     # -- what an exchange says
 
-    def take(self, sent_ns: int, back_ns: int, latched: Latched | None, *, fresh: bool) -> None:
-        """Say of an exchange what can be said before learning from it.
+    def take(self, sent_ns: int, back_ns: int, latched: Latched | None, *, fresh: bool) -> bool:
+        """Date what an exchange brought, before learning from it; whether it is certainly the next sample.
 
         `latched` is what the slave controller has latched. If it brought a new sample (`fresh`) this sets
         `steps`, `uncertain` and `instant_ns`.
@@ -464,7 +427,7 @@ class SampleClock:
         if latched is not None and events is not None:
             events.take(latched, sent_ns, back_ns, fresh, self.estimate.period_ns)
         if not fresh:
-            return
+            return False
         phase_ns, outward_ns = self.estimate.phase_ns, self._outward_ns
         if self._steady and back_ns < phase_ns + self._sure_ns:
             if events is None or not events.are_trusted:
@@ -475,14 +438,15 @@ class SampleClock:
                 self._by_event = instant_ns - outward_ns
             if -self._doubt_ns < instant_ns - outward_ns - phase_ns < self._doubt_ns:
                 self.instant_ns = instant_ns if instant_ns < back_ns else back_ns
-                return
+                return True
         self._skips = 0
         self._predict(sent_ns, back_ns)
+        return self.steps == 1 and not self.uncertain
 
     def goes_on(self) -> bool:
         """Whether the last exchange needs no `learn`: a steady clock is learned from some samples only.
 
-        Which ones is decided before they come. Else they would be those of which looks were early, or late.
+        Which ones is decided before they come: early and late looks must not be selected by what they say.
         """
         if self._skipped >= self._skips or self._timing.moved_ns != self._moved_ns:
             return False
@@ -497,15 +461,15 @@ class SampleClock:
         return True
 
     def _predict(self, sent_ns: int, back_ns: int) -> None:
-        """What `take` says of a new sample, where it needs thought."""
+        """Date a new sample where it may not be the expected one."""
         phase_ns, period_ns = self.estimate.phase_ns, self.estimate.period_ns
         looked_ns, least_ns = self._looked_ns, self._timing.least_ns
         outward_ns = least_ns / 2 + self._passing_ns
         unwatched_ns = back_ns - looked_ns
         if not self._begun:
             self._newest = 1
-            # Only what fell into the time the sensor was not watched can have been lost; before the first
-            # exchange there was none to lose.
+            # Only what came while the sensor was not polled can have been lost; before the first exchange
+            # there was nothing to lose.
             self.steps = 1 + int(unwatched_ns // period_ns) if looked_ns else 1
             self.uncertain = unwatched_ns >= period_ns
             self.instant_ns = min(back_ns, sent_ns + period_ns)
@@ -527,12 +491,12 @@ class SampleClock:
                 return
         excess_ns = max(0.0, back_ns - sent_ns - least_ns)
         watched_ns, self._seen_by_ns = looked_ns - self._seen_by_ns, sent_ns + excess_ns
-        # A long exchange was a stall after the frame had left, as far as anybody knows: what it brought is
-        # dated from before, never as younger than it may be.
+        # A long exchange is taken for a stall after the frame had left: what it brought is dated from before,
+        # never as younger than it may be.
         looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
         late = (looked_at_ns - phase_ns) / period_ns
         if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
-            # It was seen coming: whichever it was expected next to.
+            # It came between two looks: it is the one expected nearest to them.
             late = ((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns
             newest = 1 + round(late)
         else:
@@ -546,7 +510,7 @@ class SampleClock:
             self.uncertain = self._doubtful or lost_track or (most > 0 and least < most)
         self._count(newest, late, watched_ns)
         instant_ns = max(phase_ns + (self._newest - 1) * period_ns, looked_ns) + outward_ns
-        # After a stall in the exchange its end says nothing of when the sample came to be.
+        # After a stall in the exchange its end says nothing of the sample's instant.
         self.instant_ns = min(instant_ns if self.locked else sent_ns + period_ns, back_ns)
         if events is not None and self.locked and not (events.are_trusted or self.uncertain):
             difference_ns = events.instant_ns - instant_ns
@@ -556,18 +520,18 @@ class SampleClock:
                     self.estimate.expect(variance)
 
     def _count(self, newest: int, late: float, watched_ns: float) -> None:
-        """The new sample is this one by the estimate, and so late there, in periods.
+        """Set `steps`: the new sample is number `newest` by the phase, and `late` periods later than that.
 
-        `watched_ns`: for so long exchanges brought nothing new that were sent after it was certain which
-        sample is the newest. What does not come while the sensor itself is held up exists all the same.
+        `watched_ns`: time in which exchanges brought nothing new that were sent after the newest sample was
+        identified. Samples that pass while the slave holds up the frames exist, although none brings them.
         """
-        if newest < 1:  # too early for the next one: it is that, or the one before was counted twice
+        if newest < 1:  # too early for the next one: it is that, or one too many was counted before
             newest = 0 if self._doubtful and late < -0.5 else 1
         self._newest = self.steps = newest
         if self._absent >= SILENT_PERIODS and watched_ns > (SILENT_PERIODS - 1) * self.period_ns:
-            self.steps = 1  # a silent sensor is told as such
+            self.steps = 1  # a silent sensor loses nothing
         elif late > _EARLY:
-            self.steps += self._absent  # those that did not come are missing, too
+            self.steps += self._absent
 
     @property
     def _goes_on(self) -> bool:
@@ -575,12 +539,12 @@ class SampleClock:
         return self.steps == self._newest == 1 and not (self.uncertain or self._doubtful or self._overdue)
 
     def _is_late(self, look_ns: float, variance: float) -> bool:
-        """Whether the sample that is expected should have been there at a look."""
+        """Whether a look came so late that the expected sample must have come, or was skipped."""
         estimate = self.estimate
         return look_ns > estimate.phase_ns + _CONTRADICTS * math.sqrt(estimate.variance + variance)
 
     def learn(self, arrived_ns: int) -> None:  # noqa: PLR0915 - one step of one filter
-        """Learn from the exchange that was taken last, whose answer began to arrive then."""
+        """Learn from the exchange that was taken last, whose answer began to arrive at `arrived_ns`."""
         estimate, moved_ns = self.estimate, self._timing.moved_ns
         sent_ns, fresh = self._sent_ns, self._fresh
         estimate.phase_ns += moved_ns - self._moved_ns
@@ -588,13 +552,13 @@ class SampleClock:
         if self.events is not None:
             self.events.learn(sent_ns, arrived_ns, 1 + self._skipped)
         if self._skipped:
-            estimate.hold(self._skipped)
+            estimate.hold_over(self._skipped)
             self._hits += self._skipped
             self._skipped = 0
         look_ns, variance = self._timing.look(sent_ns, arrived_ns)
         looked_ns, self._looked_ns = self._looked_ns, sent_ns
         if not self._begun:
-            # The first exchange brings what was there before: it has no instant.
+            # The instant of what the first exchange brings is unknown.
             if fresh and looked_ns:
                 self._begun = True
                 estimate.begin(max(looked_ns, look_ns - estimate.period_ns), look_ns)
@@ -622,7 +586,7 @@ class SampleClock:
                 estimate.advance(absent)
                 self._absent += absent
             self._overdue = look_ns > estimate.phase_ns + _OVERDUE * math.sqrt(estimate.variance + variance)
-            # One in doubt may have been seen already; one that is late may be missing. The next one tells.
+            # In doubt it may have been seen already; late it may have been skipped: the next one shows.
             if self.locked and not (self._doubtful or self._is_late(look_ns, variance)):
                 if not self._follows_events:
                     estimate.learn_bit(look_ns, variance, -1)

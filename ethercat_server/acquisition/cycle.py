@@ -1,6 +1,6 @@
 """The acquisition loop: exchange, hand out, learn, serve the sockets until the next exchange is due.
 
-Each sensor has a clock of its own, an exchange reads all of them: `Schedule` says when one is due. Answers
+Each sensor has a clock of its own, an exchange reads all of them: `Cycle._due_ns` merges their polls. Answers
 are handed out whenever they arrive, so that a slow network card has several exchanges on their way. One
 thread does everything. docs/architecture.md draws the way of a sample; `scripts/benchmark --path` counts what
 it takes.
@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 from itertools import cycle
 from typing import Any, Final, Protocol
 
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.clock import SampleClock
+from ethercat_server.acquisition.exchange_timing import SLOT_NS, ExchangeTiming, RecentDistribution
 from ethercat_server.acquisition.health import RoundTripHealth
-from ethercat_server.acquisition.histogram import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import OutgoingFrame, SensorStream
@@ -24,36 +24,33 @@ from ethercat_server.sensor.sensor import Sensor, SensorState
 
 # Sockets are served this often even if every deadline has passed,
 _SERVE_EVERY_NS: Final = 10_000_000
-# and, without waiting, while an exchange is on its way.
-_SERVE_IN_FLIGHT_NS: Final = 2_000_000
-# Interval between chores: such as looks at whether CLOCK_REALTIME was set.
-_CHORES_EVERY_NS: Final = 20_000_000
-# Time between two exchanges while all sensors are lost.
-_RECOVERY_STEP_NS: Final = 500_000
+_SERVE_IN_FLIGHT_NS: Final = 2_000_000  # and, without waiting, while an exchange is on its way
+_CHORES_EVERY_NS: Final = 20_000_000  # interval between chores, such as whether CLOCK_REALTIME was set
+_RECOVERY_STEP_NS: Final = 500_000  # time between two exchanges while all sensors are lost
 # Interval between summaries of the distributions, which take some 100 µs each.
 _SUMMARY_NS: Final = 200_000_000
 _COST_GAIN: Final = 1 / 64
 _FIRST_COST_NS: Final = 50_000.0
-# Part of the time that exchanges may take.
-_BUDGET: Final = 1 / 4
-# What a poll may wait for another, in shortest sample periods.
-_LARGEST_WAIT: Final = 0.3
-# By how much polls are brought forward at most because this machine wakes late.
+_BUDGET: Final = 1 / 4  # fraction of the time that exchanges may take
+_LARGEST_WAIT: Final = 0.3  # longest time that a poll waits for another, in shortest sample periods
+# Read for every sample: as an attribute of its Enum it takes ten times as long.
+_STREAMING: Final = SensorState.STREAMING
+# Longest time by which polls are brought forward because this machine wakes late.
 _LONGEST_LEAD_NS: Final = 200_000.0
 
 
 class Outlet(Protocol):
-    """Where the samples go: the server's `Hub`, or a tool that wants them in its own process."""
+    """Where the samples go: the server's `Hub`."""
 
     def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
         """Take the DATA frames that an exchange made, one for a sensor; `now_ns` is when it was back."""
 
     def serve(self, until_ns: int) -> None:
-        """Do what else there is to do, or wait, until CLOCK_MONOTONIC is `until_ns`."""
+        """Serve the clients, or wait, until CLOCK_MONOTONIC is `until_ns`."""
 
 
 class Watchdog(Protocol):
-    """Has to be fed as long as the loop runs."""
+    """systemd's watchdog: it has to be fed as long as the loop runs."""
 
     @property
     def feed_every_ns(self) -> int:
@@ -61,45 +58,6 @@ class Watchdog(Protocol):
 
     def feed(self) -> None:
         """The loop runs."""
-
-
-class Schedule:
-    """When the next exchange is due, for all sensors of a bus.
-
-    Polls that lie close together are merged: the earlier one waits for the later, by no more than the time
-    that four exchanges cost this machine, as measured. So three quarters of its time are left.
-
-    Attributes:
-        shortest_ns: the shortest sample period; it changes with the rates.
-        one_by_one: whether the answer to an exchange is usually back before the next one is due.
-    """
-
-    def __init__(self, streams: Sequence[SensorStream], timing: ExchangeTiming) -> None:
-        self._streams = streams
-        self._timing = timing
-        self._cost_ns = _FIRST_COST_NS
-        self.roll()
-
-    def next_ns(self) -> float:
-        """When the next exchange is due."""
-        streams, timing = self._streams, self._timing
-        if len(streams) == 1:
-            due_ns = streams[0].clock.next_poll_ns()
-        else:
-            wanted = [stream.clock.next_poll_ns() for stream in streams]
-            latest_ns = min(wanted) + self._spacing_ns
-            due_ns = max([each for each in wanted if each <= latest_ns])
-        return max(due_ns - min(timing.late_ns, _LONGEST_LEAD_NS), timing.sent_ns + self._spacing_ns)
-
-    def cost(self, busy_ns: int) -> None:
-        """An exchange has kept the loop busy for so long."""
-        self._cost_ns += _COST_GAIN * (busy_ns - self._cost_ns)
-
-    def roll(self) -> None:
-        """Once a second."""
-        self.shortest_ns = min(stream.clock.period_ns for stream in self._streams)
-        self._spacing_ns = min(self._cost_ns / _BUDGET, _LARGEST_WAIT * self.shortest_ns)
-        self.one_by_one = all(stream.clock.one_by_one for stream in self._streams)
 
 
 class Cycle:
@@ -127,7 +85,7 @@ class Cycle:
         self._recovery = recovery
         self._missed_deadlines = 0
         self._timing = timing
-        self._schedule = Schedule(streams, timing)
+        self._cost_ns = _FIRST_COST_NS  # what an exchange and its samples keep the loop busy
         self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
         timing.wire_ns = max(self._wire_ns)
         self._round_trip = RoundTripHealth(timing, bus.ifname)
@@ -139,17 +97,17 @@ class Cycle:
             ]
             for each in bus.process_data.inputs
         ]
-        # What the last step took, and whether all sensors took part in it that are not lost.
+        # The answer that the last step took, and whether all sensors that are not lost took part in it.
         self._answer: Exchange | None = None
         self._complete = False
         self._wake = RecentDistribution()
         self._exchange = RecentDistribution()
         self._everyone = [self._wake, self._exchange, *(stream.age for stream in streams)]
         self._in_turn = cycle(self._everyone)
-        self._idle_at_ns = 0.0
         self._started_ns = bus.clock.monotonic_ns()
         self._summarize_at_ns = 0
         self._summaries: list[tuple[dict[str, float], dict[str, float]]] = []
+        self._plan()
 
     def stop(self) -> None:
         """End `run` after the current cycle."""
@@ -172,14 +130,11 @@ class Cycle:
             if jobs.waiting:
                 jobs.step(due)
                 due = self._due_ns()
-            now, slept = monotonic_ns(), False
-            if not timing.in_flight:
-                if due > now or now > serve_by:
-                    hub.serve(due)
-                    serve_by, slept = now + _SERVE_EVERY_NS, due > now
-            elif now > serve_by:
-                hub.serve(now)
-                serve_by = now + _SERVE_IN_FLIGHT_NS
+            now = monotonic_ns()
+            slept = due > now and not timing.in_flight
+            if slept or now > serve_by:
+                hub.serve(now if timing.in_flight else due)
+                serve_by = now + (_SERVE_IN_FLIGHT_NS if timing.in_flight else _SERVE_EVERY_NS)
             self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS, slept=slept)
             now = monotonic_ns()
             if self._answer is not None:
@@ -191,10 +146,29 @@ class Cycle:
                 self._do_chores(now)
 
     def _due_ns(self) -> int:
-        """When the next exchange is due."""
+        """When the next exchange is due.
+
+        Polls that lie close together are merged: the earlier one waits for the later, by no more than the
+        time that four exchanges cost this machine, as measured. So three quarters of its time are left.
+        """
+        timing, streams = self._timing, self._streams
         if self._recovery.all_lost:
-            return self._timing.sent_ns + _RECOVERY_STEP_NS
-        return max(int(self._schedule.next_ns()), self._bus.process_data.blocked_until_ns)
+            return timing.sent_ns + _RECOVERY_STEP_NS
+        if len(streams) == 1:
+            poll_ns = streams[0].clock.next_poll_ns()
+        else:
+            wanted = [stream.clock.next_poll_ns() for stream in streams]
+            latest_ns = min(wanted) + self._spacing_ns
+            poll_ns = max([each for each in wanted if each <= latest_ns])
+        due_ns = poll_ns - min(timing.late_ns, _LONGEST_LEAD_NS)
+        return int(max(due_ns, timing.sent_ns + self._spacing_ns, self._bus.process_data.blocked_until_ns))
+
+    def _plan(self) -> None:
+        """Derive from the sensors' rates, which change, how exchanges follow each other; once a second."""
+        self._shortest_ns = min(stream.clock.period_ns for stream in self._streams)
+        self._spacing_ns = min(self._cost_ns / _BUDGET, _LARGEST_WAIT * self._shortest_ns)
+        # Whether the answer to an exchange is usually back before the next one is due.
+        self._one_by_one = all(stream.clock.one_by_one for stream in self._streams)
 
     def _next_frame(self, until_ns: int) -> bytes | None:
         """The next frame before `until_ns` that answers no exchange; the exchanges go on meanwhile."""
@@ -220,22 +194,22 @@ class Cycle:
             if self._answer or (now := monotonic_ns()) < due:
                 return frame
             slept = slept or wait > 0
-        if (late := now - due) > self._schedule.shortest_ns:
-            self._missed_deadlines += int(late // self._schedule.shortest_ns)
+        if (late := now - due) > self._shortest_ns:
+            self._missed_deadlines += int(late // self._shortest_ns)
             if slept:  # else the answer was held up, and what is due was past when it came
                 self._recovery.causes.stood_still(late, now)
-        if timing.unanswered == 1:
-            timing.unanswered_since_ns = timing.sent_ns
+        if timing.unanswered:
+            if timing.unanswered == 1:
+                timing.unanswered_since_ns = timing.sent_ns
+            self._show_silence(now)
         timing.sent_ns = sent = bus.process_data.send()
         timing.in_flight, timing.unanswered = True, timing.unanswered + 1
         if slept:
             self._wake.record(sent - due)
             if timing.woke_late_ns is None:
                 timing.woke_late_ns = sent - due
-        if now >= self._idle_at_ns:
-            self._show_silence(now)
         if frame is None:
-            most = int(timing.patience_ns) if self._schedule.one_by_one else self._due_ns() - monotonic_ns()
+            most = int(timing.patience_ns) if self._one_by_one else self._due_ns() - monotonic_ns()
             if (wait := min(most, until_ns - now)) > 0:
                 return self._receive(wait)
         return frame
@@ -256,66 +230,67 @@ class Cycle:
         if exchange is None:
             self._recovery.causes.stray(frame, back)
             return frame
-        self._answer = exchange
-        self._hand_out(exchange)
-        self._learn(exchange)
+        self._take(exchange)
         return None
 
-    def _show_silence(self, now: int) -> None:
-        """Hand out frames of the sensors that have been silent for too long."""
-        for stream in self._streams:
-            if now >= stream.idle_at_ns and (made := stream.idle(now)):
-                self._hub.publish((made,), now)
-        self._idle_at_ns = min(stream.idle_at_ns for stream in self._streams)
-
-    def _hand_out(self, exchange: Exchange) -> None:
-        """Hand out what an exchange brought."""
-        _, back, frame, wkc, which = exchange
-        self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
+    def _take(self, exchange: Exchange) -> None:
+        """Hand out what an exchange brought; then learn from it."""
+        sent, back, frame, wkc, which = self._answer = exchange
+        timing, carried = self._timing, self._carried[which]
         new: list[OutgoingFrame] = []
-        for start, end, untouched, at, sensor, stream in self._carried[which]:
+        self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
+        for start, end, untouched, at, sensor, stream in carried:
             if back < stream.clock.estimate.phase_ns - stream.clock.quiet_ns:
                 continue  # the poll was for another sensor
             data = frame[start:end]
-            # One that is out may be counted in place of one that is not there any more.
-            if not complete or sensor.state is not SensorState.STREAMING or data == untouched:
-                stream.invalid(wkc)
-            elif made := stream.take(data, exchange, LATCHED.unpack_from(frame, at) if at else None):
+            # The working counter does not tell sensors apart: one that is out may be counted for another.
+            if not complete or sensor.state is not _STREAMING or data == untouched:
+                made = stream.invalid(wkc, back)
+            else:
+                made = stream.take(data, exchange, LATCHED.unpack_from(frame, at) if at else None)
+            if made is not None:
                 new.append(made)
         if new:
             self._hub.publish(new, back)
-
-    def _learn(self, exchange: Exchange) -> None:
-        """Learn from an exchange, once its samples are on their way."""
-        sent, back, _, _, which = exchange
-        timing = self._timing
         timing.in_flight, timing.unanswered = sent < timing.sent_ns, 0
         self._exchange.record(back - sent)
-        learners = [row[-1].clock for row in self._carried[which] if row[-1].finish(exchange)]
-        if not learners and timing.short_ns < back - sent < timing.usual_ns + self._schedule.shortest_ns:
-            return
+        learners = [row[-1].clock for row in carried if row[-1].finish(exchange)]
+        if learners or not timing.short_ns < back - sent < timing.usual_ns + self._shortest_ns:
+            self._learn(exchange, learners)
+
+    def _show_silence(self, now: int) -> None:
+        """Hand out frames of the sensors that have been silent for too long while no answer comes."""
+        if new := [made for stream in self._streams if (made := stream.idle(now))]:
+            self._hub.publish(new, now)
+
+    def _learn(self, exchange: Exchange, learners: Sequence[SampleClock]) -> None:
+        """Learn from an exchange that `learners` need, was a short one, or was held up."""
+        sent, back, _, _, which = exchange
+        timing = self._timing
         arrived = self._bus.backend.arrived_ns()
         if not sent < arrived < back:  # the kernel does not say, or CLOCK_REALTIME was set
             arrived = back
-        if (late := back - sent - timing.usual_ns) > self._schedule.shortest_ns:  # the computer stood still
-            self._missed_deadlines += int(late // self._schedule.shortest_ns)
+        if (late := back - sent - timing.usual_ns) > self._shortest_ns:  # the computer stood still
+            self._missed_deadlines += int(late // self._shortest_ns)
             self._recovery.causes.stood_still(back - arrived, back)
         arrived = max(sent, arrived - self._wire_ns[which])
         if learners:
             timing.took(sent, arrived, back)
             for clock in learners:
                 clock.learn(arrived)
-            self._schedule.cost(self._bus.clock.monotonic_ns() - back)
+            self._cost_ns += _COST_GAIN * (self._bus.clock.monotonic_ns() - back - self._cost_ns)
         else:
             timing.shorten(sent, arrived)
             for row in self._carried[which]:
                 row[-1].learn_short(exchange, arrived)
 
     def _do_chores(self, now: int) -> None:
-        """What is done now and then, a little at a time."""
+        """Housekeeping that is not done for every exchange, a little at a time."""
         self._chores_at_ns = now + _CHORES_EVERY_NS
         self._streams[0].realtime_offset.follow()
         next(self._in_turn).count()
+        for stream in self._streams:
+            stream.health.count()
         if now >= self._feed_at_ns:
             self._feed_at_ns = now + self._watchdog.feed_every_ns
             self._watchdog.feed()
@@ -327,7 +302,7 @@ class Cycle:
         """Once a second."""
         for distribution in self._everyone:
             distribution.roll()
-        self._schedule.roll()
+        self._plan()
         self._round_trip.check()
         self._recovery.check()
         for stream in self._streams:

@@ -1,4 +1,5 @@
-"""How long exchanges take on this bus and how late this machine wakes, measured all the time.
+"""How long exchanges take on this bus and how late this machine wakes, measured all the time; distributions
+of such durations in fixed memory.
 
 A round trip ends when the answer begins to arrive, as it begins when the frame leaves: neither its length nor
 how late this machine wakes counts. The shortest recent one is what the wire, the slaves and the network card
@@ -9,34 +10,28 @@ their data or after.
 from __future__ import annotations
 
 import math
+import sys
+from array import array
+from collections import Counter
+from itertools import repeat
+from operator import rshift
 from typing import Any, Final
 
 _GAIN: Final = 1 / 64
-# What follows from the averages is derived anew every so many exchanges.
-_TURNS: Final = 7
-# The shortest round trip is that of the last one or two of these.
-_WINDOW_NS: Final = 2_000_000_000
+_TURNS: Final = 7  # exchanges after which what follows from the averages is derived anew
+_WINDOW_NS: Final = 2_000_000_000  # the shortest round trip is that of the last one or two of these
 _FIRST_GUESS_NS: Final = 100_000.0
 _FIRST_EXCESS_NS: Final = 20_000.0
 _FIRST_LATE_NS: Final = 15_000.0
 _LEAST_VARIANCE: Final = 1_000.0**2
-# The shortest round trip has become another if it changes by this; below, it is jitter.
-_MOVED_NS: Final = 20_000.0
-# What lies further out than so many standard deviations counts as that far: a stall is no jitter.
-_OUTLIER: Final = 4.0
+_MOVED_NS: Final = 20_000.0  # change of the shortest round trip from which it is another; below, it is jitter
+_OUTLIER: Final = 4.0  # standard deviations at which outliers are clipped: a stall is no jitter
 _ROOM_NS: Final = 10_000.0
 _PATIENCE_NS: Final = 100_000.0
 
 
 class ExchangeTiming:
     """Round trips, and lateness of wake-ups, of one bus. All in ns; variances in ns²."""
-
-    __slots__ = (
-        "_excess_square", "_late_variance", "_least_now_ns", "_most_excess_ns", "_most_late_ns",
-        "_roll_at_ns", "_turn", "excess_ns", "in_flight", "late_ns", "least_ns", "look_ns", "look_variance",
-        "moved_ns", "patience_ns", "sent_ns", "short_ns", "taking_over_ns", "unanswered",
-        "unanswered_since_ns", "usual_ns", "variance", "wire_ns", "woke_late_ns",
-    )  # fmt: skip
 
     def __init__(self, now_ns: int = 0) -> None:
         self.sent_ns = now_ns  # when the last exchange was sent
@@ -54,7 +49,7 @@ class ExchangeTiming:
         self.excess_ns = _FIRST_EXCESS_NS  # what an exchange usually takes beyond the shortest
         self._excess_square = 2 * _FIRST_EXCESS_NS**2
         self._late_variance = _FIRST_LATE_NS**2
-        # An exchange that is back sooner is a short one, of which somebody wants to know when it arrived.
+        # An exchange that is back sooner is a short one, whose arrival the slave clocks learn from.
         self.short_ns = 0.0
         # Usual time from the arrival of an answer until the program has it.
         self.taking_over_ns = 0.0
@@ -114,7 +109,7 @@ class ExchangeTiming:
             self.moved_ns += more_ns / 2
 
     def woke(self, late_ns: float) -> None:
-        """The loop woke so long after it had wanted to."""
+        """Learn how late the loop woke."""
         error, most = late_ns - self.late_ns, self._most_late_ns
         if not -most < error < most:
             error = math.copysign(most, error)
@@ -138,3 +133,91 @@ class ExchangeTiming:
             "least_us": round((self.least_ns + self.wire_ns) / 1000, 1) if known else None,
             "usual_us": round(self.usual_ns / 1000, 1) if known else None,
         }
+
+
+_POINTS: Final = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
+SLOT_NS: Final = 1_000_000_000  # a recent distribution covers the last ten slots of this length
+_WINDOW_SLOTS: Final = 10
+# The upper bits of a float32 are its sign, its exponent and the first bits of its mantissa: of those, 5 tell
+# 32 buckets an octave apart.
+_UPPER_HALF: Final = slice(sys.byteorder == "little", None, 2)
+_DROPPED_BITS: Final = 7 - 5
+_SIGN: Final = 1 << 15 - _DROPPED_BITS
+
+
+class Distribution:
+    """Counts durations in ns, in buckets whose width grows with the value: exact to about 3 %.
+
+    Only buckets that something fell into are there, about a hundred as a rule, so that reading is quick too:
+    it happens between two exchanges. Negative durations count as 0.
+    """
+
+    def __init__(self) -> None:
+        self.counts: Counter[int] = Counter()  # by bucket
+        self._max = 0.0
+
+    def count(self, durations: array[float]) -> None:
+        """Sort durations (float32) into their buckets."""
+        if durations:
+            self._max = max(self._max, *durations)
+            halves = array("H", durations.tobytes())[_UPPER_HALF]
+            self.counts.update(map(rshift, halves, repeat(_DROPPED_BITS)))
+
+    def add(self, other: Distribution) -> None:
+        """Count everything that `other` has counted."""
+        self.counts.update(other.counts)
+        self._max = max(self._max, other._max)
+
+    def summary_us(self) -> dict[str, float]:
+        """p50, p99, p999 and max in microseconds, as `status` gives them; 0 without any duration."""
+        points, found = iter(_POINTS.values()), list[float]()
+        point, total, seen = next(points), self.counts.total(), 0
+        for bucket in sorted(self.counts, key=lambda each: 0 if each & _SIGN else each):
+            seen += self.counts[bucket]
+            while point < 1 and seen >= point * total:
+                found.append(min(_upper_edge(bucket), self._max))
+                point = next(points)
+        found += [self._max] * (len(_POINTS) - len(found))
+        return {name: round(ns) / 1000 for name, ns in zip(_POINTS, found, strict=True)}
+
+
+class RecentDistribution:
+    """Distributions of everything since the start and of the last ten seconds; call `roll` once a second.
+
+    `record` takes next to no time: what it takes is sorted by `count`, which is to be called now and then.
+    """
+
+    def __init__(self) -> None:
+        self._ring = array("f")
+        self.record = self._ring.append
+        self.slots = [Distribution()]
+        self.before = Distribution()  # what is older than the slots
+
+    def count(self) -> None:
+        """Sort what was recorded meanwhile."""
+        self.slots[-1].count(self._ring)
+        del self._ring[:]
+
+    def roll(self) -> None:
+        """A second has passed."""
+        self.count()
+        self.slots.append(Distribution())
+        if len(self.slots) > _WINDOW_SLOTS:
+            self.before.add(self.slots.pop(0))
+
+    def summaries_us(self) -> tuple[dict[str, float], dict[str, float]]:
+        """Summaries of all durations since the start, and of those of the last ten seconds."""
+        self.count()
+        total = Distribution()
+        for slot in self.slots:
+            total.add(slot)
+        recent = total.summary_us()
+        total.add(self.before)
+        return total.summary_us(), recent
+
+
+def _upper_edge(bucket: int) -> float:
+    bits = (
+        array("I", [bucket + 1 << _DROPPED_BITS + 16]) if bucket and not bucket & _SIGN else array("I", [0])
+    )
+    return float(memoryview(bits).cast("B").cast("f")[0])

@@ -1,33 +1,26 @@
-"""What is looked at about once a second while the bus runs, and told once: a slow network card, another
-master or a busy computer as causes of losses, emergencies in the sensors' mailboxes, and what a sensor's
-samples show of it.
+"""What is checked once a second while the bus runs: a slow network card, another master or a busy computer as
+causes of losses, and what the samples show of a sensor.
 
-While nobody asks a sensor for an object, nobody else reads what it puts into its mailbox. A wrong rate,
-silence, NaN and infinity are logged when they begin and when they end, so a sensor that does it all the
-time makes two lines.
+A wrong rate, silence, NaN and infinity are logged when they begin and when they end, so that a sensor which
+does it all the time makes two lines.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import math
+from itertools import chain
 from typing import Final
 
-from bota_ethercat.control import Event, event
-from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.pdo import is_finite, layout_for
 from ethercat_server.acquisition.clock import PLAUSIBLE_PULL, SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.slave_clock import Verdict
-from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import FIRST_INDEX
-from ethercat_server.ethercat.slave.emergencies import Emergency
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
-from ethercat_server.sensor.sensor import Sensor
 
-# A usual round trip above this is a slow network card's, or a slow driver's.
-SLOW_US: Final = 300.0
-# A usual round trip through a PCIe card, system calls included.
-_PCIE_US: Final = 100.0
+SLOW_US: Final = 300.0  # a usual round trip above this is a slow network card's, or a slow driver's
+_PCIE_US: Final = 100.0  # a usual round trip through a PCIe card, system calls included
 _SLOW_SECONDS: Final = 5
 
 log = logging.getLogger(__name__)
@@ -40,7 +33,7 @@ def cost(usual_us: float) -> str:
 
 
 class RoundTripHealth:
-    """Of the exchanges on `ifname`. `check` is to be called once a second."""
+    """Logs once that round trips on `ifname` are slow; call `check` once a second."""
 
     def __init__(self, timing: ExchangeTiming, ifname: str) -> None:
         self._timing = timing
@@ -48,7 +41,7 @@ class RoundTripHealth:
         self._slow_s = 0
 
     def check(self) -> None:
-        """What the last second showed."""
+        """Check the last second."""
         usual_us = self._timing.usual_ns / 1000
         if self._slow_s < _SLOW_SECONDS:
             self._slow_s = self._slow_s + 1 if usual_us > SLOW_US else 0
@@ -58,22 +51,21 @@ class RoundTripHealth:
 
 # Frames of others in a second that are a master's; fewer may be late answers from before the loop.
 _MASTER_FRAMES: Final = 3
-# Seconds without any after which it has gone.
-_GONE_S: Final = 10
+_GONE_S: Final = 10  # seconds without any after which it has gone
 _RECENT_NS: Final = 1_000_000_000
-# Standing still for so long in that time explains a missing answer, or the end of a watchdog.
+# Stalls of this length in that time explain a missing answer, or an expired watchdog.
 _STALL_NS: Final = 20_000_000
 
 
 class Causes:
-    """Of the bus on `ifname`. `check` is to be called once a second."""
+    """What may explain the loss of a sensor on `ifname`; call `check` once a second."""
 
     def __init__(self, ifname: str) -> None:
         self._ifname = ifname
         self._frames = self._frames_checked = 0  # of other masters
         # When the last one came, when this computer stood still last.
         self._frame_ns = self._stall_ns = -_RECENT_NS
-        self._stalled_ns = 0  # for how long, all in all, without longer breaks in between
+        self._stalled_ns = 0  # sum of the stalls that followed each other within `_RECENT_NS`
         self._gone_s = _GONE_S
 
     def stray(self, frame: bytes, now_ns: int) -> None:
@@ -88,7 +80,7 @@ class Causes:
             self._frame_ns = now_ns
 
     def stood_still(self, late_ns: float, now_ns: int) -> None:
-        """This computer did something else for so long."""
+        """The loop did not run for `late_ns`."""
         if now_ns - self._stall_ns > _RECENT_NS:
             self._stalled_ns = 0
         self._stalled_ns += int(late_ns)
@@ -104,7 +96,7 @@ class Causes:
         return f"{reason}: {otherwise}" if otherwise else reason
 
     def check(self) -> None:
-        """Say once that there is another master, and once that it has gone."""
+        """Log once that there is another master, and once that it has gone."""
         frames, self._frames_checked = self._frames - self._frames_checked, self._frames
         if frames >= _MASTER_FRAMES:
             if self._gone_s >= _GONE_S:
@@ -120,50 +112,37 @@ class Causes:
                 log.info("the other EtherCAT master on %s has stopped sending", self._ifname)
 
 
-class Mailboxes:
-    """Of all sensors of the bus. `announce` sends an event to the clients."""
-
-    def __init__(self, bus: Bus, sensors: Sequence[Sensor], announce: Callable[[JsonObject], None]) -> None:
-        self._bus = bus
-        self._sensors = sensors
-        self._announce = announce
-        self._turn = -1
-        bus.emergencies.tell = self._tell
-
-    def look_at_next(self) -> None:
-        """Look at the next sensor's: one datagram, a second one to read one message that is there."""
-        self._turn = (self._turn + 1) % len(self._sensors)
-        if self._sensors[self._turn].streams:
-            self._bus.slaves[self._turn].sdo.look()
-
-    def _tell(self, number: int, emergency: Emergency, count: int) -> None:
-        message = f"sensor {number} reports {emergency}"
-        keys = {**emergency.as_json(), "count": count, "message": message}
-        self._announce(event(Event.EMERGENCY, sensor=number, **keys))
-
-
 # Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment.
 _DEVIATING_SECONDS: Final = 10
-# Seconds with finite samples only after which it is over.
-_FINITE_SECONDS: Final = 10
+_FINITE_SECONDS: Final = 10  # seconds with finite samples only after which it is over
 
 
 class SampleHealth:
-    """Of the sensor `number`. `check` is to be called once a second."""
+    """What the samples of the sensor `number` show of it; call `check` once a second."""
 
     def __init__(self, number: int) -> None:
         self._number = number
         self.not_finite = 0  # new samples with a number that is NaN or infinite
+        self.newest: list[bytes] = []  # process data that was handed out since `count`
         self._checked = (0, 0, 0)  # the counts of the last check: fresh, repeated, not finite
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
         self._rate_reported = False
-        # Whether it was reported last that event times date the samples; that they do not.
-        self._trusted = self._distrusted = False
+        self._reported: Verdict | None = None  # of event times, what was reported last
         self._deviating_s = 0
 
+    def count(self) -> None:
+        """Find those of the newest samples that are not finite; to be called now and then."""
+        newest, self.newest = self.newest, []
+        # An infinity or a NaN survives the sum, so that one look is enough for all of them.
+        if newest and not math.isfinite(
+            sum(chain.from_iterable(layout_for(len(newest[0])).reals.iter_unpack(b"".join(newest))))
+        ):
+            self.not_finite += sum(not is_finite(each) for each in newest)
+
     def check(self, fresh: int, repeated: int, clock: SampleClock) -> None:
-        """What the last second showed; `fresh` and `repeated` count frames since the start."""
+        """Check the last second; `fresh` and `repeated` count frames since the start."""
+        self.count()
         now = fresh, repeated, self.not_finite
         new, repeats, not_finite = (count - before for count, before in zip(now, self._checked, strict=True))
         self._checked = now
@@ -203,7 +182,7 @@ class SampleHealth:
                 )
 
     def _check_rate(self, clock: SampleClock) -> None:
-        """Say once if the sensor samples at another rate than it is set to."""
+        """Log once that the sensor samples at another rate than it is set to."""
         pull = clock.estimate.pull
         deviates = clock.locked and abs(pull) > PLAUSIBLE_PULL
         self._deviating_s = self._deviating_s + 1 if deviates else 0
@@ -215,23 +194,22 @@ class SampleHealth:
             )  # fmt: skip
 
     def _check_events(self, clock: SampleClock) -> None:
-        """Say when the slave controller time-stamps the samples, and when it no longer does."""
+        """Log when the slave controller time-stamps the samples, and when it no longer does."""
         if clock.events is None:
             return
-        trust = clock.events.trust
-        if trust.verdict is Verdict.TRUSTED:
-            if not self._trusted:
-                log.info(
-                    "sensor %d: its samples are time-stamped by the distributed clock of its slave "
-                    "controller%s",
-                    self._number, " again" if self._distrusted else "",
-                )  # fmt: skip
-            self._trusted, self._distrusted = True, False
-        elif trust.verdict is Verdict.REFUSED and not self._distrusted:
+        verdict, before = clock.events.trust.verdict, self._reported
+        if verdict in (Verdict.TRIAL, before):
+            return
+        self._reported = verdict
+        if verdict is Verdict.TRUSTED:
+            log.info(
+                "sensor %d: its samples are time-stamped by the distributed clock of its slave controller%s",
+                self._number, "" if before is None else " again",
+            )  # fmt: skip
+        else:
             log.log(
-                logging.WARNING if self._trusted else logging.INFO,
+                logging.INFO if before is None else logging.WARNING,
                 "sensor %d: its samples are time-stamped by polling, for its slave controller's event times "
                 "are unusable: %s",
-                self._number, trust.why,
+                self._number, clock.events.trust.why,
             )  # fmt: skip
-            self._trusted, self._distrusted = False, True

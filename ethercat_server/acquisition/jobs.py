@@ -7,7 +7,6 @@ sensor does one job at a time, in the order asked.
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -30,23 +29,23 @@ Done = Callable[[Any, RequestError | None], None]  # called with the job's resul
 
 
 class _Job(NamedTuple):
-    """What is to be done on a sensor; whether it changes how the sensor is set or tared."""
+    """What is to be done on the sensor `number`; whether it changes how that is set or tared."""
 
+    number: int
     steps: Steps[Any]
     done: Done
     changes: bool
 
 
 class Jobs:
-    """The jobs of all sensors of the bus."""
+    """The jobs of all sensors of the bus; `waiting` are those that are not done."""
 
     def __init__(self, bus: Bus, sensors: Sequence[Sensor]) -> None:
         self._bus = bus
         self._sensors = sensors
-        self._queues: list[deque[_Job]] = [deque() for _ in sensors]
+        self.waiting: list[_Job] = []
         self._turn = 0
         self._stepped_ns = 0
-        self.waiting = 0  # jobs that are not done
         self._interrupted: BusError | None = None
 
     def start(
@@ -64,12 +63,11 @@ class Jobs:
         RequestError if it is lost already, or if `most` jobs wait for it.
         """
         self.check_present(number)
-        if len(self._queues[number]) >= most:
+        if sum(job.number == number for job in self.waiting) >= most:
             raise RequestError(
                 ErrorCode.BUSY, f"sensor {number} has {most} requests to do already: ask again later"
             )
-        self._queues[number].append(_Job(steps, done, changes))
-        self.waiting += 1
+        self.waiting.append(_Job(number, steps, done, changes))
 
     def interrupt(self, error: BusError) -> None:
         """Raise `error` in the job that is under way, if there is one; from any thread."""
@@ -77,7 +75,7 @@ class Jobs:
 
     def is_changing(self, number: int) -> bool:
         """Whether a job that changes the sensor `number` is under way or waits."""
-        return any(job.changes for job in self._queues[number])
+        return any(job.changes for job in self.waiting if job.number == number)
 
     def check_present(self, number: int) -> None:
         """RequestError if the sensor `number` cannot be talked to."""
@@ -90,26 +88,25 @@ class Jobs:
         if until_ns - now < _STEP_NS and now - self._stepped_ns < _AT_LEAST_EVERY_NS:
             return
         self._stepped_ns = now
-        for _ in self._queues:
-            self._turn = (self._turn + 1) % len(self._queues)
-            if self._queues[self._turn]:
-                self._step(self._turn)
-                return
+        numbers = sorted({job.number for job in self.waiting})
+        self._turn = next((number for number in numbers if number > self._turn), numbers[0])
+        self._step(next(job for job in self.waiting if job.number == self._turn))
 
-    def _step(self, number: int) -> None:
-        steps, done, _ = self._queues[number][0]
+    def _step(self, job: _Job) -> None:
+        number, steps, done, _ = job
         result: Any = None
         error: RequestError | None = None
         try:
-            if self._sensors[number].streams:
-                if (interrupted := self._interrupted) is None:
-                    next(steps)
-                else:
-                    self._interrupted = None
-                    steps.throw(interrupted)
-                return
-            steps.throw(CutOffError(f"sensor {number} {_AWAY}"))
-            raise CutOffError(f"sensor {number} {_AWAY}")
+            if not self._sensors[number].streams:
+                cut_off = CutOffError(f"sensor {number} {_AWAY}")
+                steps.throw(cut_off)
+                raise cut_off
+            if (interrupted := self._interrupted) is None:
+                next(steps)
+            else:
+                self._interrupted = None
+                steps.throw(interrupted)
+            return
         except StopIteration as stop:
             result = stop.value
         except RequestError as refused:
@@ -123,8 +120,7 @@ class Jobs:
                 ErrorCode.INTERNAL, "the request failed by a fault of this program: see its log"
             )
         steps.close()
-        self._queues[number].popleft()
-        self.waiting -= 1
+        self.waiting.remove(job)
         done(result, error)
 
 

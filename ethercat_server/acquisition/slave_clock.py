@@ -11,93 +11,67 @@ from __future__ import annotations
 
 import math
 from enum import Enum
-from typing import Final, NamedTuple
+from typing import Final
 
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.ethercat.exchange import DistributedClock, Latched
 
-# The local clock
-# Local times are given modulo this, in ns: 4.3 s.
-_WRAP: Final = 1 << 32
+# -- the local clock
+_WRAP: Final = 1 << 32  # local times are given modulo this, in ns: 4.3 s
 _HALF: Final = 1 << 31
-# Exchanges; the first blocks are shorter.
-_BLOCK: Final = 32
+_BLOCK: Final = 32  # exchanges of a block; the first ones are shorter
 _FIRST_BLOCK: Final = 4
-# Of the middle of the shortest round trip.
-_LEAST_VARIANCE: Final = 4_000.0**2
-# Standard deviation of the rate's error at first; crystals are off by 100e-6 at most.
-_FIRST_RATE: Final = 200e-6
-# A clock that is further off is none.
-_MOST_RATE: Final = 0.001
-# Variance that the phase gains, ns² in each ns: 10 ns in a ms.
-_JITTER: Final = 1e-4
-# Variance that the rate gains in each ns: 1 ppm in a minute.
-_DRIFT: Final = 1.7e-23
+_LEAST_VARIANCE: Final = 4_000.0**2  # of the middle of the shortest round trip
+_FIRST_RATE: Final = 200e-6  # standard deviation of the rate's error at first; crystals: 100e-6 at most
+_MOST_RATE: Final = 0.001  # a clock that is further off is none
+_JITTER: Final = 1e-4  # variance that the phase gains, ns² in each ns: 10 ns in a ms
+_DRIFT: Final = 1.7e-23  # variance that the rate gains in each ns: 1 ppm in a minute
 _EXCESS_GAIN: Final = 1 / 8
-_CONTRADICTS: Final = 5.0
-# Consecutive blocks beyond `_CONTRADICTS` standard deviations after which the clock has jumped.
-_JUMPED: Final = 3
+_CONTRADICTS: Final = 5.0  # standard deviations beyond which a block contradicts the clock
+_JUMPED: Final = 3  # consecutive contradictions after which the clock has jumped
 _PULL_GAIN: Final = 0.15
-_PULLED: Final = 1.0
-# The rate has changed by about this once the mean error exceeds `_PULLED` standard deviations.
-_RATE_STEP: Final = 50e-6
-_KNOWN_NS: Final = 10_000.0
-_KNOWN: Final = 1 / 32
-_KNOWN_BLOCKS: Final = 12
+_PULLED: Final = 1.0  # mean error, in standard deviations, beyond which the rate has changed
+_RATE_STEP: Final = 50e-6  # by about this
 # The clock is known after `_KNOWN_BLOCKS` blocks, once its standard deviation is below `_KNOWN_NS` or the
 # part `_KNOWN` of the shortest round trip, and until it exceeds that `_STILL` times.
+_KNOWN_BLOCKS: Final = 12
+_KNOWN_NS: Final = 10_000.0
+_KNOWN: Final = 1 / 32
 _STILL: Final = 5
-# Trust
-_SAMPLES: Final = 100
-# Minimum samples and duration of a trial.
-_TRIAL_NS: Final = 500_000_000
-# Part of them whose events must lie between the frames around the sample. All are in the same clock, so
+# -- trust
+_SAMPLES: Final = 100  # samples of a trial at least
+_TRIAL_NS: Final = 500_000_000  # duration of a trial at least
+# Fraction of them whose events must lie between the frames around the sample. All are in the same clock, so
 # right ones always do. One that is off at random does not only where a poll came close, as one in ten does.
 _FITTING: Final = 0.99
-# Standard deviations by which the mean difference from polling may deviate.
-_MOST_DEVIATIONS: Final = 3.0
-# Failed trials after which event times are not used, for a while.
-_MOST_FAILURES: Final = 5
-_FIRST_PAUSE_NS: Final = 10_000_000_000
-# That while at first, and at most: it doubles with each trial that fails after it.
+_MOST_DEVIATIONS: Final = 3.0  # standard deviations by which the mean difference from polling may deviate
+_RESTARTS: Final = 3  # restarts of the local clock in one trial beyond which it counts as not running
+_MOST_FAILURES: Final = 5  # failed trials after which event times are not used, for a while
+_FIRST_PAUSE_NS: Final = 10_000_000_000  # that while at first; it doubles with each trial that fails after it
 _LONGEST_PAUSE_NS: Final = 320_000_000_000
-# Time trusted after which earlier failures are forgotten.
-_PROVEN_NS: Final = 60_000_000_000
-# Restarts of the local clock in one trial beyond which it counts as not running.
-_RESTARTS: Final = 3
-_MOST_CONTRADICTIONS: Final = 4.0
-# Contradictions at which the trust ends; each sample that fits takes `_FORGET` back.
-_FORGET: Final = 1 / 100
-# Events
-# Tolerance between the latched times of an event and of a frame's arrival.
-_SLACK_NS: Final = 5_000
-# Standard deviations from the estimate beyond which an instant is not used.
-_SURE: Final = 5.0
-# Age of the newest event, in periods, beyond which samples have come without events.
-_OLDEST: Final = 1.5
+_PROVEN_NS: Final = 60_000_000_000  # time trusted after which earlier failures are forgotten
+_MOST_CONTRADICTIONS: Final = 4.0  # at which the trust ends
+_FORGET: Final = 1 / 100  # part of a contradiction that each sample which fits takes back
+# -- events
+_SLACK_NS: Final = 5_000  # tolerance between the latched times of an event and of a frame's arrival
+_SURE: Final = 5.0  # standard deviations from the estimate beyond which an instant is not used
+_OLDEST: Final = 1.5  # age of the newest event, in periods, beyond which samples have come without events
 _EVENT_VARIANCE: Final = 3_000.0**2
-# Standard deviation of the outward part of a round trip, as part of the shortest one.
-_ASYMMETRY: Final = 1 / 24
+_ASYMMETRY: Final = 1 / 24  # standard deviation of the outward part of a round trip, as part of the shortest
 
 
 class LocalClock:
-    """Of one slave. Local times are whole ns that never wrap; other times are CLOCK_MONOTONIC, ns.
+    """Local clock of a slave controller. Local times are whole ns that never wrap, others CLOCK_MONOTONIC.
 
     Attributes:
         local: local time of the newest exchange, which was back at `back_ns`.
         time_at: CLOCK_MONOTONIC at the local time `local_at`, once the clock `is_known`.
-        rate: by what part CLOCK_MONOTONIC is faster.
-        doubt_ns: how far that may be off.
+        rate: relative deviation of CLOCK_MONOTONIC from it.
+        doubt_ns: uncertainty of `time_at`.
         variance: of `time_at`.
         excess_ns: what the exchanges that count usually take beyond the shortest.
         restarts: how often it turned out to have jumped, or not to run like a clock.
     """
-
-    __slots__ = (
-        "_best_local", "_best_ns", "_best_took_ns", "_block", "_blocks", "_contradictions", "_covariance",
-        "_left", "_pull", "_rate_variance", "_timing", "back_ns", "doubt_ns", "excess_ns", "is_known",
-        "local", "local_at", "rate", "restarts", "time_at", "variance",
-    )  # fmt: skip
 
     def __init__(self, timing: ExchangeTiming) -> None:
         """`timing` is that of the bus: it knows the shortest round trip."""
@@ -124,7 +98,7 @@ class LocalClock:
     def learn(self, sent_ns: int, arrived_ns: int, count: int) -> None:
         """Learn from the exchange that was followed last: sent, and begun to arrive, then.
 
-        `count`: it stands for so many, of which the others were not learned from.
+        It stands for `count` exchanges, of which the others were not learned from.
         """
         took_ns = arrived_ns - sent_ns
         if took_ns < self._best_took_ns:
@@ -136,7 +110,7 @@ class LocalClock:
             excess_ns = self._best_took_ns - self._timing.least_ns
             self._best_took_ns = math.inf
             self.excess_ns += _EXCESS_GAIN * (excess_ns - self.excess_ns)
-            # Where within the excess the slave was is unknown, and the bias may be the same every time.
+            # The position of the slave within the excess is unknown, and the bias may be the same every time.
             self._correct(excess_ns * excess_ns / 4 + _LEAST_VARIANCE)
         self._timing.short_ns = self._best_took_ns + self._timing.taking_over_ns
 
@@ -185,22 +159,12 @@ class Verdict(Enum):
     REFUSED = "refused"
 
 
-class Evidence(NamedTuple):
-    """What is known of the local clock, and of the events, when a trial begins or ends."""
-
-    restarts: int  # how often the clock was found to be another
-    moved: int  # number of samples with an event of their own
-
-
 class Trust:
-    """In the event times of one sensor. Times in ns, variances in ns²."""
+    """Whether the event times of one sensor are believed. Times in ns, variances in ns²."""
 
-    __slots__ = (
-        "_again_ns", "_began", "_compared", "_failures", "_pause_ns", "_since_ns",
-        "_squares", "_sum_ns", "_unfit", "contradictions", "is_final", "verdict", "was_trusted", "why",
-    )  # fmt: skip
-
-    def __init__(self) -> None:
+    def __init__(self, local_clock: LocalClock) -> None:
+        self.local_clock = local_clock
+        self.moved = 0  # number of samples with an event of their own
         self.verdict = Verdict.TRIAL
         self.why = ""  # what was wrong with them last: part of a sentence
         self.is_final = False  # whether they are refused for good: the controller has never shown any
@@ -209,8 +173,8 @@ class Trust:
         self._pause_ns = _FIRST_PAUSE_NS
         self.contradictions = 0.0
         self._since_ns = 0
-        self._began = Evidence(0, 0)
-        self._compared = self._unfit = 0
+        self._began = 0, 0  # restarts of the local clock, and samples with an event, at the beginning
+        self._compared = self.unfit = 0  # events that could be the sample's, and that could not
         self._sum_ns = self._squares = 0.0
 
     def confirmed(self) -> None:
@@ -218,22 +182,19 @@ class Trust:
         if self.contradictions > 0:
             self.contradictions -= _FORGET
 
-    def contradicted(self, weight: float) -> None:
-        """A sample has no event that can be its own, or that agrees with the sensor's clock."""
-        self.contradictions += weight
-
-    def reconsider(self, evidence: Evidence, now_ns: int) -> None:
-        """End the trust if there were too many contradictions."""
+    def contradicted(self, now_ns: int) -> None:
+        """A sample has no event that can be its own, or none that agrees with the sensor's clock."""
+        self.contradictions += 1
         if self.contradictions > _MOST_CONTRADICTIONS:
             if now_ns - self._since_ns > _PROVEN_NS:
                 self._failures, self._pause_ns = 0, _FIRST_PAUSE_NS
             self._fail("they contradict the frames or the sensor's own clock", now_ns)
-            self.begin(evidence, now_ns)
+            self.begin(now_ns)
 
-    def begin(self, evidence: Evidence, now_ns: int) -> None:
+    def begin(self, now_ns: int) -> None:
         """Begin a trial."""
-        self._since_ns, self._began = now_ns, evidence
-        self._compared = self._unfit = 0
+        self._since_ns, self._began = now_ns, (self.local_clock.restarts, self.moved)
+        self._compared = self.unfit = 0
         self._sum_ns = self._squares = 0.0
 
     def is_due(self, now_ns: int) -> bool:
@@ -245,21 +206,17 @@ class Trust:
         self.verdict, self._since_ns = Verdict.TRIAL, 0
 
     def compare(self, difference_ns: float) -> None:
-        """An event is so much later than what polling says."""
+        """An event is later than polling says by `difference_ns`."""
         self._compared += 1
         self._sum_ns += difference_ns
         self._squares += difference_ns * difference_ns
 
     @property
     def mean_ns(self) -> float:
-        """By how much events were later than what polling says, in the latest trial."""
+        """Mean difference between events and polling in the latest trial."""
         return self._sum_ns / max(self._compared, 1)
 
-    def unfit(self) -> None:
-        """An event that cannot be the sample's."""
-        self._unfit += 1
-
-    def end(self, evidence: Evidence, variance: float, now_ns: int) -> float:
+    def end(self, variance: float, now_ns: int) -> float:
         """End the trial if it was long enough; `variance` is that of both estimates.
 
         Returns the variance of the differences between them if they are trusted now, else 0.
@@ -267,24 +224,24 @@ class Trust:
         if self.verdict is Verdict.REFUSED:
             return 0.0
         if not self._since_ns:
-            self.begin(evidence, now_ns)
+            self.begin(now_ns)
         if now_ns - self._since_ns < _TRIAL_NS:
             return 0.0
-        count = self._compared + self._unfit
-        if evidence.restarts - self._began.restarts > _RESTARTS:
+        count, (restarts, moved) = self._compared + self.unfit, self._began
+        if self.local_clock.restarts - restarts > _RESTARTS:
             self._refuse("its local clock does not run", now_ns)
             self.is_final = not self.was_trusted
         elif count < _SAMPLES:
             pass
-        elif evidence.moved == self._began.moved:
+        elif self.moved == moved:
             self._refuse("they stand still", now_ns)
             self.is_final = not self.was_trusted
         elif self._compared < _FITTING * count:
             self._fail("they contradict the frames", now_ns)
-            self.begin(evidence, now_ns)
+            self.begin(now_ns)
         elif abs(self.mean_ns) > _MOST_DEVIATIONS * math.sqrt(variance):
             self._fail(f"they differ from what polling shows by {self.mean_ns / 1000:+.0f} µs", now_ns)
-            self.begin(evidence, now_ns)
+            self.begin(now_ns)
         else:
             self.verdict, self._since_ns = Verdict.TRUSTED, now_ns
             self.was_trusted = True
@@ -304,23 +261,16 @@ class Trust:
 
 
 class EventTimes:
-    """Of one sensor. `take` follows every exchange; then, if it brought a new sample, `date` or `compare`;
+    """Event times of one sensor: `take` every exchange; if it brought a new sample, `date` or `compare` it;
     then `learn`."""
-
-    __slots__ = (
-        "_answers", "_compared_event", "_event", "_half_behind_ns", "_is_next", "_moved", "_offset",
-        "_passing_ns", "_reading_ns", "_timing", "_took_ns", "are_trusted", "instant_ns", "is_doubtful",
-        "local_clock",
-        "trust",
-    )  # fmt: skip
 
     def __init__(self, clock: DistributedClock, timing: ExchangeTiming, passing_ns: int) -> None:
         """`clock` is the slave controller's; `timing` that of the bus.
 
-        The process data passes so long after the frame has arrived.
+        The process data passes the slave `passing_ns` after the frame has arrived there.
         """
         self.local_clock = LocalClock(timing)
-        self.trust = Trust()
+        self.trust = Trust(self.local_clock)
         self.are_trusted = False  # whether samples are dated by them
         # CLOCK_MONOTONIC of the new sample of the newest exchange; 0 if its event does not say.
         self.instant_ns = 0.0
@@ -332,7 +282,6 @@ class EventTimes:
         self._took_ns = 0  # by the newest exchange
         self.is_doubtful = False  # whether samples may have been lost before it that nobody knows of
         self._is_next = False  # whether that event is the next sample's, which came while the frame passed
-        self._moved = 0
         self._answers = False  # whether the controller knows the registers
 
     def _use(self, clock: DistributedClock) -> None:
@@ -343,7 +292,7 @@ class EventTimes:
     def retry(self, clock: DistributedClock) -> None:
         """Try them again: another master may have changed the controller's clock, which now is `clock`."""
         if clock.offset != self._offset:
-            self.local_clock = LocalClock(self._timing)
+            self.local_clock = self.trust.local_clock = LocalClock(self._timing)
         self._use(clock)
         self.trust.retry()
 
@@ -359,17 +308,17 @@ class EventTimes:
 
     @property
     def variance(self) -> float:
-        """Of `instant_ns`, in ns², but for where on its way a round trip takes its time."""
+        """Variance of `instant_ns`, in ns², without the asymmetry of the round trip."""
         return self.local_clock.variance + _EVENT_VARIANCE
 
     @property
     def way_ns(self) -> float:
-        """Of the round trips by which the local clock is known, what is not spent behind the slave."""
+        """Time of the round trips by which the local clock is known that is not spent behind the slave."""
         return self._timing.least_ns + self.local_clock.excess_ns - 2 * self._half_behind_ns
 
     @property
     def has_none(self) -> bool:
-        """Whether the new sample of the newest exchange has none, although one would be known."""
+        """Whether the new sample of the newest exchange has no event although the local clock is known."""
         return self._answers and self.local_clock.is_known and not self.instant_ns
 
     def take(self, latched: Latched, sent_ns: int, back_ns: int, fresh: bool, period_ns: float) -> None:
@@ -425,11 +374,12 @@ class EventTimes:
             if not (is_old or is_late) and not doubt_ns < off_ns < self._took_ns / 2:
                 trust.confirmed()
                 return late
-            trust.contradicted(self._is_in_time and not is_old)
+            counts = self._is_in_time and not is_old
         else:
-            trust.contradicted(self._is_in_time)
+            counts = self._is_in_time
         self.is_doubtful = True
-        trust.reconsider(self._evidence, back_ns)
+        if counts:
+            trust.contradicted(back_ns)
         self.are_trusted = trust.verdict is Verdict.TRUSTED
         return None
 
@@ -440,21 +390,17 @@ class EventTimes:
         Returns the variance of the differences once they are trusted from here on, else 0.
         """
         trust = self.trust
-        self._moved += self._event != self._compared_event
+        trust.moved += self._event != self._compared_event
         self._compared_event = self._event
         if self._is_next:
             pass
         elif self.instant_ns:
             trust.compare(difference_ns)
         elif self._is_in_time and not (self._answers and not self.local_clock.is_known):
-            trust.unfit()
+            trust.unfit += 1
         # Polling does not tell where on its way a round trip takes its time.
         asymmetry_ns = _ASYMMETRY * self._timing.least_ns
         variance += self.variance + asymmetry_ns * asymmetry_ns
-        found = trust.end(self._evidence, variance, back_ns)
+        found = trust.end(variance, back_ns)
         self.are_trusted = trust.verdict is Verdict.TRUSTED
         return found
-
-    @property
-    def _evidence(self) -> Evidence:
-        return Evidence(self.local_clock.restarts, self._moved)

@@ -3,7 +3,7 @@
 A frame exists for every new sample. While the sensor is silent there is one REPEATED (or INVALID)
 frame for each sample period that passes, so that its silence is visible; the polls in between samples, which
 find the same data again only because the bus is read more often than the sensor samples, make none. An answer
-that was overtaken by a later one is no news.
+that was overtaken by a later one is ignored.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from bota_ethercat.framing import DataFlag, encode_data
-from bota_ethercat.pdo import is_finite
 from ethercat_server.acquisition.clock import SILENT_PERIODS, SampleClock
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming
+from ethercat_server.acquisition.exchange_timing import ExchangeTiming, RecentDistribution
 from ethercat_server.acquisition.health import SampleHealth
-from ethercat_server.acquisition.histogram import RecentDistribution
 from ethercat_server.acquisition.slave_clock import EventTimes
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, RealtimeOffset
@@ -24,8 +22,7 @@ from ethercat_server.ethercat.exchange import DUPLICATE, DistributedClock, Excha
 from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.sensor.sensor import Sensor
 
-# Bota's own driver discards the first three frames after entering OP.
-DISCARDED_AT_START: Final = 3
+DISCARDED_AT_START: Final = 3  # Bota's own driver discards the first three frames after entering OP
 
 # A DATA frame, the number of its sensor, its flags.
 OutgoingFrame = tuple[bytes, int, int]
@@ -67,16 +64,14 @@ class SensorStream:
         self.age = RecentDistribution()
         self.health = SampleHealth(number)
         self._discard = DISCARDED_AT_START
-        # So many new samples to come have GAP.
-        self._gap = 0
-        # Whether nothing new has come for long.
-        self._silent = False
+        self._gap = 0  # number of new samples to come that have GAP
+        self._silent = False  # whether REPEATED or INVALID frames were sent since the newest sample
         # The last valid exchange, and whether it brought a new sample.
         self._exchange, self._fresh = DUPLICATE, False
         # The working counter of an exchange since then that was not valid; 0 for none.
         self._short_wkc = 0
         self._moment_ns = 0  # of the newest sample
-        self.idle_at_ns = 0.0  # `idle` is to be called from then on
+        self.idle_at_ns = 0.0  # it is silent from then on
 
     def _new_clock(self, period_ns: float, latching: DistributedClock | None) -> SampleClock:
         events = latching and EventTimes(latching, self._timing, self._passing_ns)
@@ -97,31 +92,37 @@ class SensorStream:
             return None
         clock, self._exchange = self.clock, exchange
         self._fresh = fresh = data != self.process_data
-        clock.take(sent_ns, back_ns, latched, fresh=fresh)
+        is_next = clock.take(sent_ns, back_ns, latched, fresh=fresh)
         if not fresh:
-            return None
+            return self.idle(back_ns)
         self.process_data = data
-        self.idle_at_ns = back_ns + SILENT_PERIODS * clock.estimate.period_ns
         if self._discard:
-            self._discard -= 1
             return None
-        self._handed_out = data
-        flags = self._count_lost() if self._silent or self._gap or clock.steps != 1 or clock.uncertain else 0
-        # If it does not rise, the one before was dated too young.
-        self._moment_ns = moment_ns = max(int(clock.instant_ns), self._moment_ns + 1)
-        stamp_ns, sequence = moment_ns + self.realtime_offset.ns, self.sequence
-        self.sequence += 1
-        return encode_data(sequence, stamp_ns, moment_ns, self.number, flags, wkc, data), self.number, flags
+        flags = 0 if is_next and not (self._silent or self._gap) else self._count_lost()
+        if (moment_ns := int(clock.instant_ns)) <= self._moment_ns:  # the one before was dated too young
+            moment_ns = self._moment_ns + 1
+        self._moment_ns = moment_ns
+        stamp_ns = moment_ns + self.realtime_offset.ns
+        return (
+            encode_data(self.sequence, stamp_ns, moment_ns, self.number, flags, wkc, data),
+            self.number,
+            flags,
+        )
 
     def finish(self, exchange: Exchange) -> bool:
-        """Count what an exchange brought, once that is handed out; whether `clock.learn` must follow."""
+        """Account for what an exchange brought, once it is handed out; whether `clock.learn` must follow."""
         if exchange is not self._exchange:
             return False
         if self._fresh:
+            self.idle_at_ns = exchange.back_ns + SILENT_PERIODS * self.clock.estimate.period_ns
             if self.clock.locked:
                 self.age.record(exchange.back_ns - self.clock.instant_ns)
-            if self._handed_out is self.process_data and not is_finite(self.process_data):
-                self.health.not_finite += 1
+            if self._discard:
+                self._discard -= 1
+            else:
+                self.sequence += 1
+                self._handed_out = self.process_data
+                self.health.newest.append(self.process_data)
         return not self.clock.goes_on()
 
     def learn_short(self, exchange: Exchange, arrived_ns: int) -> None:
@@ -129,22 +130,23 @@ class SensorStream:
         if exchange is self._exchange and self.clock.events is not None:
             self.clock.events.learn(exchange.sent_ns, arrived_ns, 0)
 
-    def invalid(self, wkc: int) -> None:
-        """An exchange brought nothing of this sensor."""
+    def invalid(self, wkc: int, back_ns: int) -> OutgoingFrame | None:
+        """The frame for an exchange that brought nothing of this sensor, as `idle`."""
         self._short_wkc = wkc
+        return self.idle(back_ns)
 
     def idle(self, now_ns: int) -> OutgoingFrame | None:
-        """The frame that shows the sensor's silence; None before its first sample."""
-        if not self.process_data:
+        """The frame that shows the sensor's silence, one a period; None if there is none to show."""
+        if now_ns < self.idle_at_ns or not self.process_data:
             return None
         self._silent = True
         self._handed_out = self._handed_out or self.process_data
         period_ns = self.clock.period_ns
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
         self.idle_at_ns = max(self.idle_at_ns + period_ns, float(now_ns))
-        # A single lost frame is no news: a frame is INVALID once nothing valid has come for two periods.
+        # INVALID means that no valid exchange was back for two periods: a single lost frame does not suffice.
         if now_ns - self._exchange.back_ns < max(2 * period_ns, self._timing.patience_ns):
-            self._discard = 0  # what was to be discarded has passed: a sensor that is stuck is to be seen too
+            self._discard = 0  # a sensor that is stuck from the start has to be visible, too
             self.repeated += 1
             flags, wkc = REPEATED, self._exchange.wkc
         else:
@@ -159,12 +161,12 @@ class SensorStream:
     def _count_lost(self) -> int:
         """The flags of a new sample that may not be the next one after that before it."""
         lost = self.clock.steps - 1 if self.sequence else 0
-        # -1 takes back one that was counted after a stall but came after all.
+        # -1 corrects the count after a stall, if the sample came late.
         self.lost_samples = max(0, self.lost_samples + lost)
         flags = GAP if lost > 0 or self.clock.uncertain or self._gap else 0
         self._gap = max(0, self._gap - 1)
-        # What ended a silence may have been held back, where it has no event, as may be the next: one may be
-        # missing after either.
+        # Without an event, the slave may have held back the sample that ends a silence, or the one after it:
+        # one may be missing after either.
         if self._silent and (events := self.clock.events) is not None and events.has_none:
             self._gap = 2
         self._silent = False
@@ -191,8 +193,9 @@ class SensorStream:
             self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
 
     def status(self) -> dict[str, Any]:
-        """The sensor's part of the `status` reply, but for the age."""
+        """The sensor's part of the `status` reply, except for the age."""
         clock = self.clock
+        self.health.count()
         return {
             "sensor": self.number,
             "fresh": self.fresh,

@@ -41,11 +41,10 @@ class ServerSetting(NamedTuple):
     name: str
     metavar: str
     meaning: str
-    parse: Callable[[str], Any]  # ValueError says what a value must be
+    parse_argument: Callable[[str], Any]  # ArgumentTypeError says what a value must be
     default: Any
     many: bool = False  # takes several values: a repeatable flag, a list in the file
     at_once: bool = False  # a reload (SIGHUP) applies a change; others need a restart
-    text: bool = False  # a single string
 
     @property
     def flag(self) -> str:
@@ -53,43 +52,32 @@ class ServerSetting(NamedTuple):
         name = self.name.removesuffix("s") if self.many else self.name.removesuffix("_s")
         return "--" + name.replace("_", "-")
 
-    def parse_argument(self, text: str) -> Any:
-        """A value on the command line; argparse's error says what it must be."""
-        try:
-            return self.parse(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(f"{text!r} must be {error}") from None
-
     def check(self, value: object) -> Any:
-        """The value in a configuration file, checked; ValueError says what it must be."""
-        if self.many:
-            if isinstance(value, list) and all(isinstance(item, str) for item in value):
-                return tuple(map(self.parse, value))
-            raise ValueError('a list of strings, such as ["a", "b"]')
-        if self.text and not isinstance(value, str):
-            raise ValueError('a string, such as "a"')
-        if not self.text and (isinstance(value, bool) or not isinstance(value, int | float)):
-            raise ValueError("a number")
-        return self.parse(str(value))
+        """The value in a configuration file, checked; ArgumentTypeError says what it must be."""
+        values = value if self.many and isinstance(value, list) else [value]
+        checked = tuple(self.parse_argument(str(each)) for each in values)
+        return checked if self.many else checked[0]
 
 
 def _checked(
     convert: Callable[[str], Any], holds: Callable[[Any], object], what: str
 ) -> Callable[[str], Any]:
-    """Parses what `convert` takes and `holds` is true of; ValueError says `what` it must be."""
+    """Parses what `convert` takes and `holds` is true of; ArgumentTypeError says `what` it must be."""
 
     def parse(text: str) -> Any:
         with contextlib.suppress(ValueError):
             if holds(value := convert(text)):
                 return value
-        raise ValueError(what)
+        raise argparse.ArgumentTypeError(f"must be {what}, not {text!r}")
 
     return parse
 
 
-def _whole(high: int) -> Callable[[str], Any]:
-    what = f"a whole number from 0 to {high}"
-    return _checked(lambda text: int(text) if text.isdecimal() else -1, range(high + 1).__contains__, what)
+def _whole(low: int, high: int) -> Callable[[str], Any]:
+    what = f"a whole number from {low} to {high}"
+    return _checked(
+        lambda text: int(text) if text.isdecimal() else -1, range(low, high + 1).__contains__, what
+    )
 
 
 _ADDRESS: Final = _checked(
@@ -116,18 +104,18 @@ _ROWS: Final = (
     ServerSetting(
         "user", "NAME", "user that a server started by root becomes before it serves clients (default: who "
         "ran sudo; 'root' to stay root)",
-        _NAME, None, text=True,
+        _NAME, None,
     ),
     ServerSetting(
         "unset_settings", "WHAT", f"what settings that nobody set become at start: '{DEFAULTS}' writes the "
         f"server's, '{KEEP}' leaves the sensor's",
-        _UNSET, DEFAULTS, at_once=True, text=True,
+        _UNSET, DEFAULTS, at_once=True,
     ),
     ServerSetting(
         "rt_priority", "N", "SCHED_FIFO priority, if permitted; 0 for ordinary scheduling",
-        _whole(99), realtime.DEFAULT_PRIORITY,
+        _whole(0, 99), realtime.DEFAULT_PRIORITY,
     ),
-    ServerSetting("cpu", "N", "pin the server to this CPU, if permitted", _whole(4095), None),
+    ServerSetting("cpu", "N", "pin the server to this CPU, if permitted", _whole(0, 4095), None),
     ServerSetting(
         "stall_timeout_s", "S", "timeout in seconds for a client that does not read what is queued for it",
         _SECONDS, 10.0, at_once=True,
@@ -182,8 +170,8 @@ def _server(table: dict[str, Any]) -> dict[str, Any]:
             raise UsageError(f"[server] has no {key!r}: it takes {', '.join(SERVER_SETTINGS)}{guess}")
         try:
             values[key] = setting.check(value)
-        except ValueError as error:
-            raise UsageError(f"[server] {key} = {value!r} must be {error}") from None
+        except argparse.ArgumentTypeError as error:
+            raise UsageError(f"[server] {key} = {value!r}: it {error}") from None
     return values
 
 
@@ -293,10 +281,10 @@ def build_parser() -> argparse.ArgumentParser:
         description="EtherCAT master for Bota force/torque sensors: streams their samples over TCP.",
         epilog="settings: " + "; ".join(f"{row.name} ({row.meaning})" for row in SETTINGS.values()),
     )
-    parser.add_argument(
-        "arguments", nargs="+", metavar="IFACE [SENSOR_NAME] PORT",
-        help="network interface ('virtual' for a simulated sensor), model of the first sensor, TCP port",
-    )  # fmt: skip
+    interface = f"network interface ('{VIRTUAL_INTERFACE}' for a simulated sensor)"
+    parser.add_argument("ifname", metavar="IFACE", help=interface)
+    parser.add_argument("sensor_name", metavar="SENSOR_NAME", nargs="?", help="model of the first sensor")
+    parser.add_argument("port", metavar="PORT", type=_whole(1, 65535), help="TCP port")
     parser.add_argument(
         "--force", action="store_true",
         help="take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop",
@@ -317,7 +305,7 @@ def build_parser() -> argparse.ArgumentParser:
     for setting in SERVER_SETTINGS.values():
         text = setting.meaning + ("; repeatable" if setting.many else "")
         if not setting.many and setting.default is not None:
-            text += f" (default {setting.default if setting.text else format(setting.default, 'g')})"
+            text += f" (default {setting.default})"
         parser.add_argument(
             setting.flag, dest=setting.name, metavar=setting.metavar, help=text,
             type=setting.parse_argument, action="append" if setting.many else "store",
@@ -333,28 +321,19 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
     argparse itself exits with code 2 for the errors it finds.
     """
     parsed = build_parser().parse_intermixed_args(argv)
-    arguments: list[str] = parsed.arguments
-    if len(arguments) not in {2, 3}:
-        problem = "PORT is missing" if len(arguments) < 2 else f"unexpected argument {arguments[3]!r}"
-        raise UsageError(
-            f"{problem}: usage is ethercat-server IFACE [SENSOR_NAME] PORT, for example "
-            "'ethercat-server ens5 12001'"
-        )
     file = read_config(parsed.config) if parsed.config else EMPTY
-    given = {name: value for name in SERVER_SETTINGS if (value := getattr(parsed, name)) is not None}
-    many = {name: tuple(value) for name, value in given.items() if SERVER_SETTINGS[name].many}
+    given = {
+        name: tuple(value) if setting.many else value
+        for name, setting in SERVER_SETTINGS.items()
+        if (value := getattr(parsed, name)) is not None
+    }
     options = ServerOptions(
-        ifname=arguments[0],
-        port=_port(arguments[-1]),
-        sensor_name=arguments[1] if len(arguments) == 3 else None,
-        config=parsed.config,
-        file=file,
+        parsed.ifname, parsed.port, parsed.sensor_name, parsed.virtual, parsed.config, file,
         force=parsed.force,
         allow_ip=parsed.allow_ip,
-        virtual_arguments=parsed.virtual,
-        server=_defaults() | file.server | given | many,
+        server=_defaults() | file.server | given,
         assigned=parse_assignments(parsed.assignments),
-    )
+    )  # fmt: skip
     try:
         shlex.split(options.virtual_arguments)
     except ValueError as error:
@@ -384,13 +363,3 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, SettingValue]:
         except SettingError as error:
             raise UsageError(f"--set {assignment}: {error}") from None
     return values
-
-
-def _port(text: str) -> int:
-    try:
-        port = int(text)
-    except ValueError:
-        raise UsageError(f"port {text!r} is not a number: it must be from 1 to 65535") from None
-    if not 1 <= port <= 65535:
-        raise UsageError(f"port {port} is out of range: it must be from 1 to 65535")
-    return port

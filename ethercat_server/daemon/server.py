@@ -59,7 +59,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         try:
             server.run()
         finally:
-            notifier.stopping()
+            notifier.send("STOPPING=1")
         log.info("shutting down: the sensors go to INIT")
 
 

@@ -1,4 +1,4 @@
-"""What a service needs besides its loop: readiness, a status line, a watchdog's food, reload.
+"""The service manager's side of the server: readiness, status line, watchdog, reload.
 
 SIGHUP reads command line and file again in a thread, because looking up user names can require a directory
 server; the loop applies the result within a second.
@@ -49,25 +49,18 @@ class Notifier:
                 # A name that starts with @ is in the abstract namespace.
                 self._socket.connect("\0" + name[1:] if name.startswith("@") else name)
 
-    def ready(self) -> None:
-        """The server is streaming."""
-        self._send("READY=1")
-
     def feed(self) -> None:
         """The acquisition loop is running."""
-        self._send("WATCHDOG=1")
+        self.send("WATCHDOG=1")
 
     def status(self, text: str) -> None:
         """One line for `systemctl status`; sent only if it has changed."""
         if text != self._status:
             self._status = text
-            self._send(f"STATUS={text}")
+            self.send(f"STATUS={text}")
 
-    def stopping(self) -> None:
-        """The server is shutting down."""
-        self._send("STOPPING=1")
-
-    def _send(self, text: str) -> None:
+    def send(self, text: str) -> None:
+        """A state such as READY=1."""
         if self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.send(text.encode())
@@ -114,7 +107,7 @@ class Service:
 
     def ready(self) -> None:
         """The server streams."""
-        self._notifier.ready()
+        self._notifier.send("READY=1")
         self._update_status()
 
     def reload(self) -> None:
@@ -161,7 +154,7 @@ class Service:
         try:
             now.check_sensors({sensor.number: sensor.identity for sensor in self._server.sensors})
         except UsageError as error:
-            log.warning("%s", error)  # the other sensors get their settings all the same
+            log.warning("%s", error)  # the other sensors get their settings
         for number, settings in enumerate(changes):
             self._configure(number, settings)
 
@@ -187,7 +180,7 @@ class Service:
                 return
             log.info("sensor %d: applied %s", number, names)
             for name, value in changed.items():
-                if pending.get(name) == value:  # unless a later reload asked for another value meanwhile
+                if pending.get(name) == value:  # unless a later reload set another value
                     del pending[name]
 
         try:

@@ -22,28 +22,29 @@ from bota_ethercat.health.judge import Observation, emergency, judge
 from bota_ethercat.health.observer import StreamObserver
 from bota_ethercat.health.verdict import LIMITS, Level
 from bota_ethercat.text.untrusted import number
-from ethercat_server.access.adapters import Holder, find_holder, links, promiscuity_kept
+from ethercat_server.access.adapters import Holder, find_holder, links
+from ethercat_server.access.private_server import open_interface
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.acquisition.health import SLOW_US, cost
 from ethercat_server.doctor.machine import Machine
-from ethercat_server.doctor.machine_checks import missing_to_open, rising
+from ethercat_server.doctor.machine_checks import rising
 from ethercat_server.doctor.report import (
     CannotLookError,
     Finding,
     bad,
     examine,
     finding,
+    graded,
     note,
     ok,
     skipped,
     warning,
 )
-from ethercat_server.errors import ServerError
+from ethercat_server.errors import InterfaceError, ServerError
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.nic import network_trouble
+from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.sensor import scan
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import is_known_model
@@ -82,67 +83,57 @@ class Slave(NamedTuple):
     watchdogs: int = 0  # number of expired process data watchdogs
     left_alone: bool = False  # its SII was not read, for another master has the bus
 
-    def as_json(self) -> dict[str, Any]:
-        """Its JSON form."""
-        al, sii = self.looked.status, self.looked.sii or {"name": "", "serial": 0, "vendor": 0, "product": 0}
-        return {"sensor": self.looked.position, "name": sii["name"], "serial": sii["serial"],
-                "vendor": sii["vendor"], "product": sii["product"], "al_state": al.state.name,
-                "al_error": al.error, "al_status_code": al.code}  # fmt: skip
+    @classmethod
+    def look_at(cls, bus: Bus, position: int, *, in_use: bool) -> Slave:
+        """The slave at `position`; BusError if it does not answer. `in_use`: another master has the bus."""
+        looked = scan.look_at(bus, position)
+        (links,) = struct.unpack("<H", bus.read_surely_at(position, reg.DL_STATUS, 2))
+        return cls(
+            looked if in_use else scan.with_sii(bus, looked),
+            _read_errors(bus, position),
+            tuple(bool(links >> (4 + port) & 1) for port in range(MOST_PORTS)),
+            bus.read_surely_at(position, reg.WATCHDOG_COUNTER, 1)[0],
+            left_alone=in_use,
+        )
 
 
-def count_slaves(bus: Bus) -> int:
-    """Number of slaves that answer."""
-    return max(0, *(bus.count_slaves(_PROBE_SIZE, _FIND_TIMEOUT_S) for _ in range(_FIND_ATTEMPTS)))
-
-
-def look_at_slave(bus: Bus, position: int, *, in_use: bool) -> Slave:
-    """The slave at `position`; BusError if it does not answer. `in_use`: another master has the bus."""
-    looked = scan.look_at(bus, position)
-    (links,) = struct.unpack("<H", bus.read_surely_at(position, reg.DL_STATUS, 2))
-    return Slave(
-        looked if in_use else scan.with_sii(bus, looked),
-        read_errors(bus, position),
-        tuple(bool(links >> (4 + port) & 1) for port in range(MOST_PORTS)),
-        bus.read_surely_at(position, reg.WATCHDOG_COUNTER, 1)[0],
-        left_alone=in_use,
-    )
-
-
-def read_errors(bus: Bus, position: int) -> bytes:
-    """The registers of the slave's error counters; BusError if it does not answer."""
+def _read_errors(bus: Bus, position: int) -> bytes:
     return bus.read_surely_at(position, reg.RX_ERRORS, reg.ERROR_COUNTERS_SIZE)
 
 
 def answers(ifname: str, count: int) -> Finding:
     """Whether any slave answers."""
-    if count:
-        return ok(f"{count} {'slave answers' if count == 1 else 'slaves answer'}", slaves=count)
-    return bad(
-        "no EtherCAT slave answers",
-        "check the sensor's power, that it is on the injector's LAN side, and that this is its interface",
-        f"ethercat-sensor eeprom {ifname}", slaves=0,
+    text = "no EtherCAT slave answers" if not count else f"{count} slave{'s' if count > 1 else ''} answer"
+    why = "check the sensor's power, that it is on the injector's LAN side, and that this is its interface"
+    return graded(
+        text + "s" * (count == 1),
+        (not count, bad, why, f"ethercat-sensor eeprom {ifname}"),
+        slaves=count,
     )  # fmt: skip
 
 
 def identity(slave: Slave) -> Finding:
     """Identity, and whether the server supports it."""
-    values, looked = slave.as_json(), slave.looked
+    looked, al = slave.looked, slave.looked.status
+    sii = looked.sii or {"name": "", "serial": 0, "vendor": 0, "product": 0}
+    values = {key: sii[key] for key in ("name", "serial", "vendor", "product")}
+    values |= {"sensor": looked.position, "al_state": al.state.name}
+    values |= {"al_error": al.error, "al_status_code": al.code}
     if looked.at_work:
         return bad(
-            f"not a Bota sensor, and in {looked.status.state.name}: another master controls it",
+            f"not a Bota sensor, and in {al.state.name}: another master controls it",
             "the server does not start on this bus; use the interface that the sensor is connected to",
             **values,
         )
     if slave.left_alone:
-        state = looked.status.state.name
-        return warning(f"not read: in {state}, and another master has the bus", "", **values)
+        return warning(f"not read: in {al.state.name}, and another master has the bus", "", **values)
     if looked.problem:
         return warning(f"unknown: {looked.problem}", "its EEPROM does not answer", **values)
-    text = f"{looked.name}, serial {values['serial']}"
+    text = f"{looked.name}, serial {sii['serial']}"
     if not looked.is_sensor:
-        whose = f"vendor 0x{values['vendor']:08X}, product 0x{values['product']:08X}"
+        whose = f"vendor 0x{sii['vendor']:08X}, product 0x{sii['product']:08X}"
         return ok(f"{text}, {whose}: not a Bota Gen-0 sensor, the server leaves it alone", **values)
-    if not is_known_model(values["name"]):
+    if not is_known_model(sii["name"]):
         supported = ", ".join(dictionary.MODELS)
         return bad(text, f"not supported by the server, which supports {supported}", **values)
     return ok(f"{text}, supported", **values)
@@ -157,32 +148,33 @@ def any_sensor(slaves: Sequence[Slave]) -> Iterator[Finding]:
 
 def cabling(slaves: Sequence[Slave]) -> Iterator[Finding]:
     """Whether a connected device does not answer: each cable has two ends, one of them at the interface."""
-    values: dict[str, Any] = {"links": [list(slave.links) for slave in slaves]}
     linked = [
         f"port {port} of slave {slave.looked.position}"
         for slave in slaves for port, on in enumerate(slave.links) if on
     ]  # fmt: skip
-    if slaves and len(linked) > 2 * len(slaves) - 1:
-        why = "a device there does not answer: not an EtherCAT slave, or still starting"
-        yield note(f"more links than slaves: {', '.join(linked)}", why, **values)
-    elif slaves:
-        yield ok("every link leads to a slave", **values)
+    more = len(linked) > 2 * len(slaves) - 1
+    if slaves:
+        yield graded(
+            f"more links than slaves: {', '.join(linked)}" if more else "every link leads to a slave",
+            (more, note, "a device there does not answer: not an EtherCAT slave, or still starting"),
+            links=[list(slave.links) for slave in slaves],
+        )
 
 
 def al_state(slave: Slave) -> Finding:
     """Its AL state, which the doctor does not change."""
-    al, text = slave.looked.status, str(slave.looked.status)
-    values: dict[str, Any] = {
-        "al_state": al.state.name, "al_status_code": al.code, "watchdogs": slave.watchdogs,
-    }  # fmt: skip
-    if al.error and al.code == _WATCHDOG_CODE:
-        why = "its last master ended without taking it to INIT (crash, cable); starting a server clears it"
-        return note(text, why, **values)
-    if al.error:
-        return warning(text, "it reports an error: power it off and on", **values)
-    if al.state in {AlState.NONE, AlState.BOOT}:
-        return bad(text, "a server cannot use it in this state: power it off and on", **values)
-    return ok(f"{text}, without error", **values)
+    al = slave.looked.status
+    return graded(
+        str(al) if al.error or al.state in _UNUSABLE else f"{al}, without error",
+        (al.error and al.code == _WATCHDOG_CODE, note,
+         "its last master ended without taking it to INIT (crash, cable); starting a server clears it"),
+        (al.error, warning, "it reports an error: power it off and on"),
+        (al.state in _UNUSABLE, bad, "a server cannot use it in this state: power it off and on"),
+        al_state=al.state.name, al_status_code=al.code, watchdogs=slave.watchdogs,
+    )  # fmt: skip
+
+
+_UNUSABLE: Final = frozenset({AlState.NONE, AlState.BOOT})
 
 
 def error_counters(slave: Slave, count: int) -> Finding:
@@ -197,7 +189,7 @@ def error_counters(slave: Slave, count: int) -> Finding:
         return note(text, "invalid EtherCAT frames, or errors inside the slave", **values)
     if any(counters.forwarded):
         return note(text, "frames were corrupted before they reached it: see the other slaves", **values)
-    if any(counters.lost_links):
+    if text:
         why = "unplugged, or a neighbor was power-cycled; otherwise check the connectors"
         return note(text, why, **values)
     return ok("none", **values)
@@ -205,23 +197,23 @@ def error_counters(slave: Slave, count: int) -> Finding:
 
 def new_errors(before: Mapping[int, bytes], after: Mapping[int, bytes], count: int) -> Finding:
     """Errors counted during the measurement: registers by position, at its begin and its end."""
-    texts: list[str] = []
-    values: dict[str, Any] = {}
+    new: dict[int, ErrorCounters] = {}
     for position, now in after.items():
         # Fewer than before: a master was started meanwhile, which clears them.
         grown = bytes(max(0, n - o) for o, n in zip(before[position], now, strict=True))
-        new = ErrorCounters.parse(grown)
-        values[str(position)] = new._asdict()
-        texts += _port_errors(position, new, count)
-    if texts:
-        return bad("; ".join(texts), f"frames are being corrupted or links lost: {_CABLE}", new=values)
-    return ok("no new errors", new=values)
+        new[position] = ErrorCounters.parse(grown)
+    text = "; ".join(each for row in new.items() for each in _port_errors(*row, count))
+    return graded(
+        text or "no new errors",
+        (text, bad, f"frames are being corrupted or links lost: {_CABLE}"),
+        new={str(position): counters._asdict() for position, counters in new.items()},
+    )
 
 
 def _port_errors(position: int, counters: ErrorCounters, count: int) -> Iterator[str]:
     """Error counts of each port, with its cable. A counter saturates at 255."""
     for port in range(MOST_PORTS):
-        where = cable(position, port, count)
+        where = _cable(position, port, count)
         if damaged := max(counters.invalid[port], counters.physical[port]):
             yield f"{_many(damaged)} corrupted {where}"
         if forwarded := counters.forwarded[port]:
@@ -234,7 +226,7 @@ def _many(number: int) -> str:
     return f"{number} or more" if number == 0xFF else str(number)
 
 
-def cable(position: int, port: int, count: int) -> str:
+def _cable(position: int, port: int, count: int) -> str:
     """The cable at a port of a slave in a line of `count`."""
     if port == 0:
         return f"between {f'slave {position - 1}' if position else 'the interface'} and slave {position}"
@@ -247,7 +239,6 @@ _PERIOD_US: Final = 1250.0  # the sample period at the factory setting, 800 Hz
 _WAKE_NOTE_US: Final = 100
 _WAKE_WARNING_US: Final = 250
 _EXCHANGE_NOTE_US: Final = 250
-_MANY: Final = 0.001  # fraction of all cycles above which late or lost ones are `bad`
 _STEADIER: Final = "see 'A steadier cycle' in docs/operations.md"
 
 
@@ -259,131 +250,136 @@ def points(summary: Mapping[str, Any]) -> str:
 
 def scheduling(priority: int, *, real_time: bool) -> Finding:
     """Scheduling of the loop."""
-    if real_time:
-        return ok(f"SCHED_FIFO {priority}", real_time=True)
-    if not priority:
-        return note("ordinary scheduling, as requested", "other programs preempt it", real_time=False)
-    why = "real-time priority was not granted, so other programs preempt it: run with sudo, or as a service"
-    return note("ordinary scheduling", why, real_time=False)
+    return graded(
+        f"SCHED_FIFO {priority}" if real_time else "ordinary scheduling",
+        (not real_time and not priority, note, "as requested; other programs preempt it"),
+        (not real_time, note,
+         "real-time priority was not granted, so other programs preempt it: run with sudo, or as a service"),
+        real_time=real_time,
+    )  # fmt: skip
 
 
 def wake_finding(summary: Mapping[str, Any], late: int, count: int) -> Finding:
-    """The finding for a summary: `late` of `count` wake-ups were late by more than a sample period."""
+    """The finding for a summary: `late` of `count` wake-ups were late by more than a sample period.
+
+    It may be the cause of the verdict on the stream, and is not trouble itself.
+    """
     text = f"late by {points(summary)}"
-    values: dict[str, Any] = {**summary, "wake_ups": count, "later_than_a_period": late}
-    if late:
-        text += f"; {late} of {count} by more than a sample period"
-        why = f"each loses samples; other work, or a hypervisor, used the CPU: {_STEADIER}"
-        return (bad if late > _MANY * count else warning)(text, why, **values)
-    if summary["p99"] > _WAKE_WARNING_US:
-        return warning(text, f"increases the age of samples: {_STEADIER}", **values)
-    if summary["p99"] > _WAKE_NOTE_US:
-        why = "usual without a real-time kernel; occasionally increases the age of samples"
-        return note(text, f"{why}: {_STEADIER}", **values)
-    return ok(text, **values)
+    return graded(
+        f"{text}; {late} of {count} by more than a sample period" if late else text,
+        (late, warning, f"each loses samples; other work, or a hypervisor, used the CPU: {_STEADIER}"),
+        (summary["p99"] > _WAKE_WARNING_US, warning, f"increases the age of samples: {_STEADIER}"),
+        (summary["p99"] > _WAKE_NOTE_US, note,
+         f"usual without a real-time kernel; occasionally increases the age of samples: {_STEADIER}"),
+        **{**summary, "wake_ups": count, "later_than_a_period": late},
+    )  # fmt: skip
 
 
 def exchange_finding(when: str, summary: Mapping[str, Any], lost: int, count: int) -> Finding:
-    """The finding for a summary: `lost` of `count` exchanges did not come back."""
+    """The finding for a summary: `lost` of `count` exchanges did not come back. A cause, too."""
     text = f"{points(summary)}{when}"
-    values: dict[str, Any] = {**summary, "exchanges": count, "lost": lost}
-    if lost:
-        why = "each may cost a sample: check the cable; a busy virtual machine loses frames, too"
-        make = bad if lost > _MANY * count else warning
-        return make(f"{text}; {lost} frames lost of {count}", why, **values)
-    if summary["p50"] > SLOW_US:
-        why = f"slow network card or driver: {cost(summary['p50'])}; see coalescing, interrupts"
-        return warning(text, why, **values)
-    if summary["p99"] > _EXCHANGE_NOTE_US:
-        return note(text, "network card, driver or load: see coalescing, interrupts", **values)
-    return ok(text, **values)
+    return graded(
+        f"{text}; {lost} frames lost of {count}" if lost else text,
+        (lost, warning, "each may cost a sample: check the cable; a busy virtual machine loses frames, too"),
+        (summary["p50"] > SLOW_US, warning,
+         f"slow network card or driver: {cost(summary['p50'])}; see coalescing, interrupts"),
+        (summary["p99"] > _EXCHANGE_NOTE_US, note,
+         "network card, driver or load: see coalescing, interrupts"),
+        **{**summary, "exchanges": count, "lost": lost},
+    )  # fmt: skip
 
 
-def age_finding(what: str, summary: Mapping[str, Any], how: str) -> Finding:
-    """The finding for a summary of ages, by the limits of streams; `how` it was obtained."""
-    text, p99_us = f"{what}: {points(summary)}", summary["p99"]
-    if p99_us <= _PERIOD_US:
-        return ok(text, how, **summary)
-    limits = ((LIMITS.age_error, bad), (LIMITS.age_warn, warning), (0.0, note))
-    make = next(make for limit_s, make in limits if p99_us >= limit_s * 1e6)
-    return make(text, f"occasionally more than a sample period ({how})", **summary)
+def age_finding(what: str, summary: Mapping[str, Any]) -> Finding:
+    """The finding for a summary of ages, by the limits of streams."""
+    how, p99_s = "the server's estimate; a message to a client takes about 50 µs more", summary["p99"] * 1e-6
+    old = f"occasionally more than a sample period ({how})"
+    return graded(
+        f"{what}: {points(summary)}",
+        (p99_s >= LIMITS.age_error, bad, old),
+        (p99_s >= LIMITS.age_warn, warning, old),
+        (p99_s * 1e6 > _PERIOD_US, note, old),
+        why=how, **summary,
+    )  # fmt: skip
 
 
 _POSITION: Final = attrgetter("sensor")
 _FATES: Final = frozenset({Event.SENSOR_LOST, Event.SENSOR_BACK})
 _LOG: Final = "see the server's log (journalctl -u 'ethercat-server@*')"
+_COUNTS: Final = ("fresh", "repeated", "invalid", "lost_samples", "recoveries")
 
 
 class ServerView:
     """The stream and the `status` of a server over the measuring time."""
 
-    def __init__(self, sensors: Sensors, seconds: float, *, own: bool) -> None:
-        """Watch for `seconds`, then close `sensors`. `own`: its figures are those since its start."""
-        self._own = own
+    def __init__(self, sensors: Sensors, seconds: float) -> None:
+        """Watch for `seconds`, then close `sensors`. A private server's figures are those since its start."""
+        self._own, clock, private = sensors.private is not None, sensors.clock, sensors.private
+        self._events: list[dict[str, Any]] = []
         with contextlib.closing(sensors):
             rows: list[dict[str, Any]] = sensors.ask("describe")["sensors"]
             self.before: dict[str, Any] = sensors.ask("status")
-            start_ns = sensors.clock.monotonic_ns()
+            start_ns, end = clock.monotonic_ns(), Deadline(clock, seconds)
             self._observers = [StreamObserver(number(row["rate_hz"]) or 0.0, start_ns) for row in rows]
-
-            def take(frames: Sequence[DataMessage]) -> None:
-                now_ns = sensors.clock.monotonic_ns()
-                for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
-                    if position < len(self._observers):
-                        batch = list(of_one)
-                        self._observers[position].take(batch, now_ns)
-                        if sensors.same_machine:
-                            self._observers[position].note_age(batch[-1], now_ns)
-
-            self._events = sensors.listen(seconds, take) if seconds else []
-            self._end_ns = sensors.clock.monotonic_ns()
+            for frames, events in sensors.stream(fresh_only=False) if seconds else ():
+                self._take(frames, clock.monotonic_ns(), same_machine=sensors.client.session.same_machine)
+                self._events += events
+                if end.passed:
+                    sensors.ask("unsubscribe")
+                    break
+            self.real_time = private is not None and private.real_time
+            self._end_ns = clock.monotonic_ns()
             self.after: dict[str, Any] = sensors.ask("status")
             self.described: list[dict[str, Any]] = sensors.ask("describe")["sensors"]
         rows = [*self.described, *self.before["sensors"], *self.after["sensors"]]
         if not all(isinstance(row, dict) for row in rows):
             raise ServerError("the server's reply is not understood: install the same version of both")
-        self._when = "" if own else " in the last 10 s"
+        self._when = "" if self._own else " in the last 10 s"
+        self._summaries: dict[str, Any] = self.after if self._own else self.after["last_10s"]
+
+    def _take(self, frames: Sequence[DataMessage], now_ns: int, *, same_machine: bool) -> None:
+        for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
+            if position < len(self._observers):
+                batch = list(of_one)
+                self._observers[position].take(batch, now_ns)
+                if same_machine:
+                    self._observers[position].note_age(batch[-1], now_ns)
 
     def observation(self, position: int) -> Observation:
         """What was seen of a sensor's stream."""
-        described = self.described[position]
-        before, after = self.before["sensors"][position], self.after["sensors"][position]
+        described, after = self.described[position], self.after["sensors"][position]
         settings = described.get("settings")
         fates = [event["event"] for event in self._events if event.get("sensor") == position]
-        seen = self._observers[position].observation(self._end_ns)
-        return seen._replace(
-            locked=after["clock"]["mode"] == "locked",
-            recoveries=max(0, int(after["recoveries"]) - int(before["recoveries"])),
-            missed_deadlines=self.grown("missed_deadlines"),
-            is_lost=[fate for fate in fates if fate in _FATES][-1:] == [Event.SENSOR_LOST],
-            state=str(described["state"]),
-            emergency=emergency(after.get("emergency")),
-            settings=settings if isinstance(settings, dict) else {},
+        return (
+            self._observers[position]
+            .observation(self._end_ns)
+            ._replace(
+                locked=after["clock"]["mode"] == "locked",
+                recoveries=max(
+                    0, int(after["recoveries"]) - int(self.before["sensors"][position]["recoveries"])
+                ),
+                missed_deadlines=self._grown("missed_deadlines"),
+                is_lost=[fate for fate in fates if fate in _FATES][-1:] == [Event.SENSOR_LOST],
+                state=str(described["state"]),
+                emergency=emergency(after.get("emergency")),
+                settings=settings if isinstance(settings, dict) else {},
+            )
         )
 
-    def grown(self, name: str) -> int:
+    def _grown(self, name: str) -> int:
         """Increase of a counter."""
         return int(self.after[name]) - int(self.before[name])
-
-    @property
-    def _summaries(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.after if self._own else self.after["last_10s"]
-        return found
 
     def sensors(self) -> Iterator[Finding]:
         """Each sensor: the verdict on its stream."""
         for position, described in enumerate(self.described):
             before, after = self.before["sensors"][position], self.after["sensors"][position]
-            verdict = judge(self.observation(position))
-            serial, state, clock = described["serial"], described["state"], after["clock"]["mode"]
-            values: dict[str, Any] = {"sensor": position, "serial": serial, "state": state, "clock": clock}
-            values["verdict"] = verdict.level.key
-            names = ("fresh", "repeated", "invalid", "lost_samples", "recoveries")
-            values |= {name: after[name] for name in names}
-            values |= {f"new_{name}": int(after[name]) - int(before[name]) for name in names}
-            text = (
-                f"{described['name']}, serial {serial}, {state} at {described['rate_hz']} Hz, clock {clock}"
-            )
+            verdict, clock = judge(self.observation(position)), after["clock"]["mode"]
+            values: dict[str, Any] = {name: after[name] for name in _COUNTS}
+            values |= {f"new_{name}": int(after[name]) - int(before[name]) for name in _COUNTS}
+            values |= {key: described[key] for key in ("serial", "state")}
+            values |= {"sensor": position, "clock": clock, "verdict": verdict.level.key}
+            who = "{name}, serial {serial}, {state} at {rate_hz} Hz".format_map(described)
+            text = f"{who}, clock {clock}"
             if verdict.findings:
                 found = "; ".join(each.found for each in verdict.findings)
                 why = "; ".join(dict.fromkeys(each.remedy for each in verdict.findings))
@@ -395,16 +391,14 @@ class ServerView:
                 yield ok(f"{text}: {verdict.sentence[0].lower()}{verdict.sentence[1:]}", **values)
 
     def wake_ups(self) -> Finding:
-        """Its lateness, which may be the cause of the verdict on the stream, and is not trouble itself."""
-        missed, count = self.grown("missed_deadlines"), max(1, self.grown("cycles"))
-        found = wake_finding(self._summaries["wake_us"], missed, count)
-        return replace(found, level=min(found.level, Level.LOOK))
+        """Its lateness."""
+        late, count = self._grown("missed_deadlines"), max(1, self._grown("cycles"))
+        return wake_finding(self._summaries["wake_us"], late, count)
 
     def exchanges(self) -> Finding:
-        """How long its exchanges take, and how many are lost: a cause, too."""
-        lost, count = self.grown("lost_frames"), max(1, self.grown("cycles"))
-        found = exchange_finding(self._when, self._summaries["exchange_us"], lost, count)
-        return replace(found, level=min(found.level, Level.LOOK))
+        """How long its exchanges take, and how many are lost."""
+        lost, count = self._grown("lost_frames"), max(1, self._grown("cycles"))
+        return exchange_finding(self._when, self._summaries["exchange_us"], lost, count)
 
     def ages(self) -> Iterator[Finding]:
         """The age of samples when the server sends them."""
@@ -412,8 +406,7 @@ class ServerView:
         for position, summary in enumerate(recent):
             if not summary or not summary.get("max"):
                 raise CannotLookError("the server reports it once it follows the sensor's clock")
-            how = "the server's estimate; a message to a client takes about 50 µs more"
-            yield age_finding(f"sensor {position}, when sent{self._when}", summary, how)
+            yield age_finding(f"sensor {position}, when sent{self._when}", summary)
 
     def clients(self) -> Finding:
         """The clients, and those that are too slow."""
@@ -421,11 +414,12 @@ class ServerView:
         before = {row["peer"]: row["withheld"] for row in self.before["clients"]}
         slow = [str(row["peer"]) for row in rows if row["withheld"] > before.get(row["peer"], 0)]
         # The doctor itself is one of them.
-        text = f"{len(rows) - 1} beside the doctor"
-        if slow:
-            why = "it reads more slowly than the sensor samples, so the server withholds frames from it"
-            return note(f"{text}; too slow: {', '.join(slow)}", why, clients=rows)
-        return ok(f"{text}, none too slow", clients=rows)
+        return graded(
+            f"{len(rows) - 1} beside the doctor; too slow: {', '.join(slow) or 'none'}",
+            (slow, note,
+             "it reads more slowly than the sensor samples, so the server withholds frames from it"),
+            clients=rows,
+        )  # fmt: skip
 
     def examine(self, subject: str) -> Iterator[Finding]:
         """All checks."""
@@ -437,127 +431,108 @@ class ServerView:
             yield from examine(subject, "clients", self.clients)
 
 
-class Request(NamedTuple):
-    """Options of the measurement."""
-
-    seconds: float = 10.0
-    cpu: int | None = None
-    announce: Callable[[str], None] = lambda _: None  # called with a progress message
-
-
-def examine_bus(machine: Machine, request: Request) -> Iterator[Finding]:
-    """The bus itself, or the figures of its server; and the measurement."""
-    holder = find_holder(machine.ifname)
+def examine_bus(
+    machine: Machine, seconds: float = 10.0, announce: Callable[[str], None] = lambda _: None
+) -> Iterator[Finding]:
+    """The bus itself, or the figures of its server; and the measurement. `announce` is told the progress."""
+    holder, found = find_holder(machine.ifname), None
     if holder is not None and holder.address is not None:
-        yield from _through_server(holder, holder.address, request)
+        if seconds:
+            announce(f"watching the server for {seconds:g} s ...")
+        yield from _through_server(holder, holder.address, seconds)
         return
-    try:
-        _check_may_look(machine, holder)
-    except CannotLookError as error:
-        found = skipped(str(error))
-        if holder is not None and holder.pid is not None:
-            found = bad(str(error), "two masters disturb each other: stop it", f"sudo kill {holder.pid}")
-        yield replace(found, subject="bus", check="slaves")
-        yield _not_measured("the bus is not accessed")
-        return
-    yield from _on_bus(machine, request)
-
-
-def check_rights(machine: Machine) -> None:
-    """CannotLookError unless this process may open a bus."""
-    if missing := missing_to_open(machine):
-        raise CannotLookError(f"{' and '.join(missing)} missing; run with sudo")
-
-
-def _check_may_look(machine: Machine, holder: Holder | None) -> None:
-    """CannotLookError if the bus must not be accessed."""
     if holder is not None and holder.pid is not None:
-        raise CannotLookError(f"{holder} uses it as an EtherCAT master and serves no port")
-    if holder is not None:
-        raise CannotLookError("an EtherCAT master of another user has it: run with sudo to see which")
-    link = machine.link
-    check_rights(machine)
-    if link.loopback:
-        raise CannotLookError("it is the loopback interface")
-    if not machine.allow_ip:
-        try:
-            routes = machine.fact("routes")
-        except CannotLookError as error:
-            why = f"its IP configuration is unknown ({error}), so no frame is sent there"
-            raise CannotLookError(why) from None
-        if problem := network_trouble(machine.shown, routes):
-            raise CannotLookError(problem)
-    if link.master or link.upper:
-        raise CannotLookError("it is part of a bridge, bond or VLAN, so no frame is sent there")
-    if not link.up or not link.carrier:
-        raise CannotLookError("it is down" if not link.up else "it has no carrier")
+        text = f"{holder} uses it as an EtherCAT master and serves no port"
+        found = bad(text, "two masters disturb each other: stop it", f"sudo kill {holder.pid}")
+    elif holder is not None:
+        found = skipped("an EtherCAT master of another user has it: run with sudo to see which")
+    elif isinstance(unknown := machine.facts.get("link"), CannotLookError):
+        found = skipped(str(unknown))
+    if found is None:
+        yield from _on_bus(machine, seconds, announce)
+    else:
+        yield from _left_alone(found)
+
+
+def _left_alone(found: Finding) -> Iterator[Finding]:
+    yield replace(found, subject="bus", check="slaves")
+    yield _not_measured("the bus is not accessed")
 
 
 def _not_measured(why: str) -> Finding:
     return replace(skipped(why), subject="measurement", check="all")
 
 
-def _through_server(holder: Holder, address: Address, request: Request) -> Iterator[Finding]:
-    """What the server that uses the interface says."""
-    if request.seconds:
-        request.announce(f"watching the server for {request.seconds:g} s ...")
+def _watched(
+    subject: str, check: str, open_sensors: Callable[[], Sensors], seconds: float,
+    describe: Callable[[ServerView], Finding],
+) -> Iterator[Finding]:  # fmt: skip
+    """The checks of a server's figures; `describe` is the first one."""
     views: list[ServerView] = []
 
     def watch() -> Finding:
-        views.append(ServerView(Sensors.through(address), request.seconds, own=False))
+        views.append(ServerView(open_sensors(), seconds))
+        return describe(views[0])
+
+    yield from examine(subject, check, watch)
+    for view in views:
+        yield from view.examine(subject)
+
+
+def _through_server(holder: Holder, address: Address, seconds: float) -> Iterator[Finding]:
+    """What the server that uses the interface says."""
+
+    def describe(view: ServerView) -> Finding:
         why = "the bus is not accessed while it streams; these are the server's figures"
-        hours = float(views[0].after["uptime_s"]) / 3600
+        hours = float(view.after["uptime_s"]) / 3600
         return ok(f"{holder} serves it at {address}, up {hours:.1f} h", why, **address._asdict())
 
-    yield from examine("server", "server", watch)
-    for view in views:
-        yield from view.examine("server")
+    yield from _watched("server", "server", lambda: Sensors.through(address), seconds, describe)
 
 
-def _measured(machine: Machine, request: Request) -> Iterator[Finding]:
+def _measured(machine: Machine, seconds: float) -> Iterator[Finding]:
     """What a server measures here, with the sensors set as they are."""
-    request.announce(f"measuring for {request.seconds:g} s ...")
-    views: list[ServerView] = []
 
-    def watch() -> Finding:
-        sensors = Sensors.on_interface(
-            machine.ifname, allow_ip=machine.allow_ip, rt_priority=machine.rt_priority, cpu=request.cpu
+    def open_sensors() -> Sensors:
+        return Sensors.on_interface(
+            machine.ifname, allow_ip=machine.allow_ip, rt_priority=machine.rt_priority, cpu=machine.cpu
         )
-        views.append(ServerView(sensors, request.seconds, own=True))
-        return scheduling(machine.rt_priority, real_time=sensors.real_time)
 
-    yield from examine("measurement", "scheduling", watch)
-    for view in views:
-        yield from view.examine("measurement")
+    def describe(view: ServerView) -> Finding:
+        return scheduling(machine.rt_priority, real_time=view.real_time)
+
+    yield from _watched("measurement", "scheduling", open_sensors, seconds, describe)
 
 
-def _on_bus(machine: Machine, request: Request) -> Iterator[Finding]:
+def _on_bus(machine: Machine, seconds: float, announce: Callable[[str], None]) -> Iterator[Finding]:
     """The slaves, as they are; then what a server of the doctor's own measures, and the new errors."""
-    of_card = _card_counters(machine.ifname)
-    with promiscuity_kept(machine.ifname):
-        found: list[Slave] = []
-        try:
-            with open_bus(machine.ifname, allow_ip=machine.allow_ip) as bus:
-                count = yield from _slaves(machine, bus, found)
-        except ServerError as error:
-            yield replace(bad(str(error)), subject="bus", check="slaves")
-            return
-        if not request.seconds:
-            yield _not_measured("disabled by --seconds 0")
-            return
-        if not any(slave.looked.is_sensor for slave in found) or any(slave.left_alone for slave in found):
-            yield _not_measured("there is no sensor to measure with, or another master has the bus")
-            return
-        yield from _measured(machine, request)
+    of_card, found = _card_counters(machine.ifname), list[Slave]()
+    try:
+        with open_interface(machine.ifname, allow_ip=machine.allow_ip) as bus:
+            count = yield from _slaves(machine, bus, found)
+    except InterfaceError as error:  # the server would refuse it as well
+        yield from _left_alone(skipped(str(error)))
+        return
+    except ServerError as error:
+        yield replace(bad(str(error)), subject="bus", check="slaves")
+        return
+    if not seconds:
+        yield _not_measured("disabled by --seconds 0")
+        return
+    if not any(slave.looked.is_sensor for slave in found) or any(slave.left_alone for slave in found):
+        yield _not_measured("there is no sensor to measure with, or another master has the bus")
+        return
+    announce(f"measuring for {seconds:g} s ...")
+    yield from _measured(machine, seconds)
 
-        def meanwhile() -> Finding:
-            with open_bus(machine.ifname, allow_ip=machine.allow_ip) as bus:
-                after = {slave.looked.position: read_errors(bus, slave.looked.position) for slave in found}
-            return new_errors({slave.looked.position: slave.errors for slave in found}, after, count)
+    def meanwhile() -> Finding:
+        before = {slave.looked.position: slave.errors for slave in found}
+        with open_interface(machine.ifname, allow_ip=machine.allow_ip) as bus:
+            return new_errors(before, {position: _read_errors(bus, position) for position in before}, count)
 
-        now = _card_counters(machine.ifname)
-        yield from examine("measurement", "card meanwhile", rising, of_card, now)
-        yield from examine("measurement", "bus meanwhile", meanwhile)
+    now = _card_counters(machine.ifname)
+    yield from examine("measurement", "card meanwhile", rising, of_card, now)
+    yield from examine("measurement", "bus meanwhile", meanwhile)
 
 
 def _card_counters(ifname: str) -> Mapping[str, int]:
@@ -569,13 +544,13 @@ def _card_counters(ifname: str) -> Mapping[str, int]:
 
 def _slaves(machine: Machine, bus: Bus, found: list[Slave]) -> Generator[Finding, None, int]:
     """Those that answer, which are added to `found`; returns how many there are."""
-    count = count_slaves(bus)
+    count = max(0, *(bus.count_slaves(_PROBE_SIZE, _FIND_TIMEOUT_S) for _ in range(_FIND_ATTEMPTS)))
     yield from examine("bus", "slaves", answers, machine.shown, count)
     in_use = any(scan.look_at(bus, position).at_work for position in range(count))
     for position in range(count):
 
         def identify(position: int = position) -> Finding:
-            found.append(look_at_slave(bus, position, in_use=in_use))
+            found.append(Slave.look_at(bus, position, in_use=in_use))
             return identity(found[-1])
 
         yield from examine("bus", f"slave {position}", identify)

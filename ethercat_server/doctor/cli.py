@@ -11,13 +11,19 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
+from bota_ethercat.health.verdict import Level
 from bota_ethercat.program.completion import add_completion
+from bota_ethercat.text.untrusted import visible
 from ethercat_server import __version__
 from ethercat_server.daemon.options import SERVER_SETTINGS, VIRTUAL_INTERFACE
-from ethercat_server.doctor.report import EXIT_CODES, CannotLookError, Finding, Report, as_json, worst
+from ethercat_server.doctor.bus_checks import examine_bus
+from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.machine_checks import check_rights, examine_machine
+from ethercat_server.doctor.report import CannotLookError, Finding, Report, as_json, worst
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP, MAX_NAME_LENGTH
 from ethercat_server.process import command_line
+from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 
 _PROGRAM: Final = "ethercat-doctor"
 _EXIT_CODES: Final = "exit codes: 0 good or worth a look, 1 trouble, failed or stopped, 2 wrong arguments"
@@ -43,8 +49,8 @@ def build_parser() -> argparse.ArgumentParser:
     for name in ("rt_priority", "cpu"):
         setting = SERVER_SETTINGS[name]
         parser.add_argument(
-            setting.flag, dest=name, type=_whole, metavar=setting.metavar, default=setting.default,
-            help=f"measure like a server with this option: {setting.meaning}",
+            setting.flag, dest=name, type=setting.parse_argument, metavar=setting.metavar,
+            default=setting.default, help=f"measure like a server with this option: {setting.meaning}",
         )  # fmt: skip
     parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     parser.add_argument("--json", action="store_true", help="machine-readable output")
@@ -63,51 +69,47 @@ def _seconds(text: str) -> float:
 _seconds.__name__ = "number"
 
 
-def _whole(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, 0 or more")
-    return int(text)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the doctor; returns the exit code. argparse exits with 2."""
     command_line.begin(_PROGRAM)
     # Missing privileges are a finding.
     logging.getLogger("ethercat_server.process.realtime").setLevel(logging.ERROR)
     args = build_parser().parse_args(argv)
-    # KeyboardInterrupt in an import may be lost in Python's own code: load all before there can be one.
-    from ethercat_server.doctor import bus_checks  # noqa: F401, PLC0415
-
     return command_line.run(_PROGRAM, lambda: _run(args), as_json=args.json)
 
 
 def _run(args: argparse.Namespace) -> int:
-    _check(args)
+    if not 0 < len(os.fsencode(args.iface)) <= MAX_NAME_LENGTH or "/" in args.iface:
+        raise UsageError(
+            f"{args.iface!r} is not an interface name: it must have 1 to {MAX_NAME_LENGTH} characters; "
+            "'ethercat-sensor adapters' lists them"
+        )
+    last = (os.cpu_count() or 1) - 1
+    if args.cpu is not None and args.cpu > last:
+        raise UsageError(f"--cpu {args.cpu}: this machine has the processors 0 to {last}")
     header = {"interface": args.iface, "version": __version__, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
     header |= {"kernel": os.uname().release, "root": os.geteuid() == 0, "seconds": args.seconds}
-    findings: list[Finding] = []
     if args.json:
-        findings += _examined(args, lambda _: None)
+        findings = list(_examined(args, lambda _: None))
         print(as_json(header, findings))
     else:
-        report, who = Report(), "as root" if header["root"] else "not as root"
-        report.heading(f"{_PROGRAM} {__version__} on {args.iface}: Linux {header['kernel']}, {who}")
+        report, findings = Report(), []
+        who = "as root" if header["root"] else "not as root"
+        report.say(
+            visible(f"{_PROGRAM} {__version__} on {args.iface}: Linux {header['kernel']}, {who}") + "\n"
+        )
         for finding in _examined(args, report.wait):
             findings.append(finding)
             report.write(finding)
         report.summary(findings)
-    return EXIT_CODES[worst(findings)]
+    return command_line.FAILED if worst(findings) is Level.TROUBLE else 0
 
 
 def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iterator[Finding]:
     """What is found on this machine and the interface; on a virtual bus for `virtual`."""
-    from ethercat_server.doctor.bus_checks import Request, check_rights, examine_bus  # noqa: PLC0415
-    from ethercat_server.doctor.machine import Machine  # noqa: PLC0415
-    from ethercat_server.doctor.machine_checks import examine_machine  # noqa: PLC0415
-    from ethercat_server.virtual_sensor.virtual_bus import VirtualBus  # noqa: PLC0415
-
-    machine = Machine(args.iface, args.iface, rt_priority=args.rt_priority, allow_ip=args.allow_ip)
-    machine.timer_resolution_s = time.clock_getres(time.CLOCK_MONOTONIC)
+    machine = Machine(
+        args.iface, args.iface, rt_priority=args.rt_priority, cpu=args.cpu, allow_ip=args.allow_ip
+    )
     with contextlib.ExitStack() as cleanup:
         if args.iface == VIRTUAL_INTERFACE:
             try:
@@ -116,25 +118,7 @@ def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iter
             except (CannotLookError, ServerError) as error:
                 machine.facts["link"] = CannotLookError(f"there is no virtual bus: {error}")
         yield from examine_machine(machine)
-        yield from examine_bus(machine, Request(args.seconds, args.cpu, announce))
-
-
-def _check(args: argparse.Namespace) -> None:
-    """UsageError for impossible arguments."""
-    if not 0 < len(os.fsencode(args.iface)) <= MAX_NAME_LENGTH or "/" in args.iface:
-        raise UsageError(
-            f"{args.iface!r} is not an interface name: it must have 1 to {MAX_NAME_LENGTH} characters; "
-            "'ethercat-sensor adapters' lists them"
-        )
-    for name in ("rt_priority", "cpu"):
-        value, setting = getattr(args, name), SERVER_SETTINGS[name]
-        try:
-            setting.parse(str(value)) if value is not None else None
-        except ValueError as error:
-            raise UsageError(f"{setting.flag} {value}: it must be {error}") from None
-    last = (os.cpu_count() or 1) - 1
-    if args.cpu is not None and args.cpu > last:
-        raise UsageError(f"--cpu {args.cpu}: this machine has the processors 0 to {last}")
+        yield from examine_bus(machine, args.seconds, announce)
 
 
 if __name__ == "__main__":

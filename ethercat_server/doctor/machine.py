@@ -16,6 +16,7 @@ import re
 import shlex
 import socket
 import struct
+import time
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -88,9 +89,11 @@ class Machine:
     asked: str = ""  # the name on the command line if it differs: virtual
     facts: dict[str, Any] = field(default_factory=dict)  # those that are known, or why they are not
     root: Path = Path("/")
-    timer_resolution_s: float = 1e-9  # of CLOCK_MONOTONIC's timers
+    # Of CLOCK_MONOTONIC's timers.
+    timer_resolution_s: float = field(default_factory=lambda: time.clock_getres(time.CLOCK_MONOTONIC))
     release: str = field(default_factory=lambda: os.uname().release)
     rt_priority: int = 80  # the server's
+    cpu: int | None = None  # likewise
     allow_ip: bool = False  # whether an interface of the machine's network may be used
 
     @property
@@ -103,13 +106,13 @@ class Machine:
         if name not in self.facts:
             try:
                 self.facts[name] = FACTS[name](self.ifname)
-            except OSError as error:
-                text = NOT_SUPPORTED if error.errno == errno.EOPNOTSUPP else error.strerror or str(error)
-                self.facts[name] = CannotLookError(text)
             except Exception as error:  # noqa: BLE001 - pyroute2's errors share no base
-                kind = type(error).__name__
-                text = f"{kind}: {error}".replace("\0", "").strip()
-                self.facts[name] = CannotLookError(NOT_SUPPORTED if kind == "NotSupportedError" else text)
+                lacks = (
+                    "NotSupported" in type(error).__name__ or getattr(error, "errno", 0) == errno.EOPNOTSUPP
+                )
+                text = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+                text = NOT_SUPPORTED if lacks else text.replace("\0", "").strip()
+                self.facts[name] = CannotLookError(text)
         found = self.facts[name]
         if isinstance(found, CannotLookError):
             raise found
@@ -170,12 +173,6 @@ class Machine:
         except (OSError, zlib.error):
             text = self.text(f"/boot/config-{self.release}", "")
         return dict(re.findall(r"^CONFIG_(\w+)=(.*)$", text, re.MULTILINE))
-
-    @cached_property
-    def command_line(self) -> dict[str, str]:
-        """The kernel's command line; options without a value have an empty one."""
-        words = (word.partition("=") for word in self.text("/proc/cmdline", "").split())
-        return {name: value for name, _, value in words}
 
     @cached_property
     def processors(self) -> list[int]:

@@ -16,7 +16,7 @@ from bota_ethercat.health.verdict import Level
 from bota_ethercat.text.untrusted import visible
 from ethercat_server.errors import ServerError
 
-# As the doctor calls the levels.
+# As the doctor calls the levels, and their colors on a terminal.
 NAMES: Final = {
     Level.GOOD: "ok",
     Level.NOT_POSSIBLE: "skipped",
@@ -24,7 +24,7 @@ NAMES: Final = {
     Level.LOOK: "warning",
     Level.TROUBLE: "bad",
 }
-EXIT_CODES: Final = {Level.GOOD: 0, Level.NOT_POSSIBLE: 0, Level.NOTE: 0, Level.LOOK: 0, Level.TROUBLE: 1}
+_COLORS: Final = dict(zip(NAMES, ("\x1b[32m", "\x1b[2m", "\x1b[36m", "\x1b[33m", "\x1b[1;31m"), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,17 @@ ok = functools.partial(finding, Level.GOOD)  # nothing to fix
 note = functools.partial(finding, Level.NOTE)  # little effect, or only under load
 warning = functools.partial(finding, Level.LOOK)  # loses samples or increases their age
 bad = functools.partial(finding, Level.TROUBLE)  # sensors cannot be read, or not reliably
+
+# Whether it applies, and what is found then: the level's function above, the effect, commands.
+Limit = tuple[object, Callable[..., Finding], str, *tuple[str, ...]]
+
+
+def graded(found: str, *limits: Limit, why: str = "", **values: Any) -> Finding:
+    """The finding by the first of the `limits` that applies; `ok`, and `why`, if none does."""
+    for applies, make, effect, *commands in limits:
+        if applies:
+            return make(found, effect, *commands, **values)
+    return ok(found, why, **values)
 
 
 def skipped(why: str) -> Finding:
@@ -103,13 +114,6 @@ def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:
     return json.dumps(found, indent=2, ensure_ascii=False, default=str)
 
 
-_COLORS: Final = {
-    Level.GOOD: "\x1b[32m", Level.NOT_POSSIBLE: "\x1b[2m", Level.NOTE: "\x1b[36m", Level.LOOK: "\x1b[33m",
-    Level.TROUBLE: "\x1b[1;31m",
-}  # fmt: skip
-_END: Final = "\x1b[0m"
-_CLEAR_LINE: Final = "\x1b[K"
-_BOLD: Final = "\x1b[1m"
 _LEVEL_WIDTH: Final = max(map(len, NAMES.values()))
 _NAME_WIDTH: Final = 20
 _INDENT: Final = " " * (2 + _LEVEL_WIDTH + 2 + _NAME_WIDTH + 2)
@@ -129,16 +133,16 @@ class Report:
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stdout
         self._color = wants_color(self._stream, os.environ)
-        width = _USUAL_WIDTH
-        if self._stream.isatty():
-            width = shutil.get_terminal_size((_USUAL_WIDTH, 24)).columns
+        on_terminal = self._stream.isatty()
+        width = shutil.get_terminal_size((_USUAL_WIDTH, 24)).columns if on_terminal else _USUAL_WIDTH
         self._width = max(_LEAST_TEXT, width - len(_INDENT))
-        self._subject = ""
-        self._waiting = False
+        self._subject, self._waiting = "", False
 
-    def heading(self, text: str) -> None:
-        """The first line."""
-        self._say(visible(text) + "\n")
+    def say(self, text: str) -> None:
+        """One line, in place of what `wait` shows."""
+        self._stream.write("\x1b[K" * self._waiting + text + "\n")
+        self._stream.flush()
+        self._waiting = False
 
     def wait(self, text: str) -> None:
         """Show progress on a terminal, until the next line."""
@@ -150,22 +154,20 @@ class Report:
     def write(self, finding: Finding) -> None:
         """One finding, under its subject."""
         if finding.subject != self._subject:
-            self._say(("\n" if self._subject else "") + self._painted(finding.subject, _BOLD))
+            self.say(("\n" if self._subject else "") + self._painted(finding.subject, "\x1b[1m"))
             self._subject = finding.subject
-        first, *rest = self._lines(finding.found)
+        first, *rest = self._lines(finding.found) or [""]
         level = self._painted(NAMES[finding.level].ljust(_LEVEL_WIDTH), _COLORS[finding.level])
-        self._say(f"  {level}  {finding.check.ljust(_NAME_WIDTH)}  {first}")
-        for line in (*rest, *self._lines(finding.why)) if finding.why else rest:
-            self._say(_INDENT + line)
-        for command in finding.commands:
-            self._say(f"{_INDENT}$ {visible(command)}")
+        self.say(f"  {level}  {finding.check.ljust(_NAME_WIDTH)}  {first}")
+        for line in (*rest, *self._lines(finding.why), *(f"$ {visible(each)}" for each in finding.commands)):
+            self.say(_INDENT + line)
 
     def summary(self, findings: Sequence[Finding]) -> None:
         """The verdict, with what matters once more, for the rest may have scrolled away."""
         counts = {level: sum(f.level is level for f in findings) for level in reversed(NAMES)}
         text = ", ".join(f"{count} {_counted(level, count)}" for level, count in counts.items() if count)
         words = self._painted(verdict(findings).words.capitalize(), _COLORS[worst(findings)])
-        self._say(f"\n{words}: {text}")
+        self.say(f"\n{words}: {text}")
         matters = sorted((f for f in findings if f.level >= Level.LOOK), key=lambda f: -f.level)
         for each in matters[:_MOST_REPEATED]:
             name = NAMES[each.level].ljust(_LEVEL_WIDTH)
@@ -173,23 +175,16 @@ class Report:
                 f"  {name}  {each.subject}, {each.check}: {each.found}", self._width + len(_INDENT),
                 subsequent_indent=" " * (4 + _LEVEL_WIDTH), max_lines=2, placeholder=" ...",
             )  # fmt: skip
-            self._say("\n".join(map(visible, lines)))
+            self.say("\n".join(map(visible, lines)))
         if len(matters) > _MOST_REPEATED:
-            self._say(f"  and {len(matters) - _MOST_REPEATED} more above")
+            self.say(f"  and {len(matters) - _MOST_REPEATED} more above")
 
     def _lines(self, text: str) -> list[str]:
         found = textwrap.wrap(text, self._width, break_on_hyphens=False, break_long_words=False)
-        return [visible(line) for line in found] or [""]
+        return [visible(line) for line in found]
 
     def _painted(self, text: str, color: str) -> str:
-        return f"{color}{text}{_END}" if self._color else text
-
-    def _say(self, text: str) -> None:
-        if self._waiting:
-            self._stream.write(_CLEAR_LINE)
-            self._waiting = False
-        self._stream.write(text + "\n")
-        self._stream.flush()
+        return f"{color}{text}\x1b[0m" if self._color else text
 
 
 def _counted(level: Level, count: int) -> str:

@@ -1,6 +1,6 @@
-"""The seam between the server and an EtherCAT bus: what is needed of one, whatever answers on it.
+"""The interface between the server and an EtherCAT bus.
 
-Two backends have it: `soem.SoemBackend`, a network interface opened by pysoem, and
+Two backends implement it: `soem.SoemBackend`, a network interface opened by pysoem, and
 `simulation.backend.MemoryBackend`, in which the virtual sensor answers without sockets, processes or
 real time. pysoem scans and maps the sensors where it can, `mapping` in memory and where they share
 the wire. Everything above runs on any of these.
@@ -13,11 +13,11 @@ from typing import Protocol
 
 from ethercat_server.ethercat.clock import Clock
 
-CheckInterrupt = Callable[[], None]  # called while something takes long; may raise to give it up
+CheckInterrupt = Callable[[], None]  # called during long operations; may raise to abort them
 
 
 class Master(Protocol):
-    """A master of the backend's own, for a wire with nothing but sensors: it writes to every slave.
+    """The backend's own master, for a bus of sensors only: it writes to every slave.
 
     Errors are BusErrors, each one sentence. Used by one thread.
     """
@@ -36,11 +36,11 @@ class Backend(Protocol):
 
     @property
     def master(self) -> Master | None:
-        """None if it has none."""
+        """The backend's own master; None if it has none."""
 
     @property
     def clock(self) -> Clock:
-        """The time that passes on it."""
+        """The clock of this bus."""
 
     def open(self) -> None:
         """Open the wire. BusError if that fails."""
@@ -49,10 +49,10 @@ class Backend(Protocol):
         """Close the wire. May be called any number of times."""
 
     def check_present(self) -> None:
-        """InterfaceError if the network interface is gone for good."""
+        """InterfaceError if the network interface has been removed."""
 
     def why_silent(self) -> str:
-        """Why no frame comes back, as far as the interface knows, and what to do: part of a sentence."""
+        """The interface's part in frames not coming back, and what to do: part of a sentence."""
 
     def send(self, frame: bytes | bytearray, /) -> None:
         """Send an Ethernet frame; one that cannot be sent is lost."""

@@ -1,28 +1,35 @@
 """The EtherCAT bus: who is on it, from the scan to OP, and how its process data is laid out.
 
-Exchanges are `ProcessData`'s; single datagrams go between them (`Datagrams`).
+Exchanges are `ProcessData`'s; single datagrams go between them (`Datagrams`). pysoem configures every slave
+that it finds, so it is the master of a bus with sensors only. Beside other slaves only the sensors are
+written to: of the others is read which station and logical addresses they answer to: no sensor gets one.
 """
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, TypeVar
 
-from ethercat_server.ethercat import mapping
+from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, Master
-from ethercat_server.ethercat.datagrams import Datagrams
+from ethercat_server.ethercat.datagrams import Datagrams, repeat
 from ethercat_server.ethercat.exchange import DistributedClock, ProcessData, fit_a_frame, read_clock
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.slave.coe import Steps, finish
+from ethercat_server.ethercat.slave.coe import Emergencies, Steps, finish
 from ethercat_server.ethercat.slave.controller import SlaveController
-from ethercat_server.ethercat.slave.emergencies import Emergencies
 from ethercat_server.ethercat.slave.sii import Sii
 
+T = TypeVar("T")
 _MOST_EMERGENCIES: Final = 16
 _PAUSE_S: Final = 0.001
 _INIT_ATTEMPTS: Final = 5
 _DONE: Final = object()  # steps themselves yield None
+_FIRST_STATION: Final = 0x1001
+_LOGICAL_BYTES: Final = 0x10000  # of the logical address space for the sensors' process data
+# Kind of the sync manager, the object with its PDOs, kind of the FMMU.
+_ASSIGNMENTS: Final = (("outputs", 0x1C12, reg.FMMU_WRITE), ("inputs", 0x1C13, reg.FMMU_READ))
 
 
 class Bus(Datagrams):
@@ -31,7 +38,7 @@ class Bus(Datagrams):
     Attributes:
         positions: where the sensors are on the wire, by number.
         slaves: their slave controllers.
-        emergencies: what they report unasked.
+        emergencies: their CoE emergency messages.
         process_data: the exchange, once they are mapped.
     """
 
@@ -62,14 +69,15 @@ class Bus(Datagrams):
         """Number the sensors at these positions and take them to PREOP. `sii`: of every slave, theirs known.
 
         pysoem is the master where there are sensors only; other slaves are not written to. `again`: after a
-        failure, with the master that repeats what lost frames spoil.
+        failure, without pysoem, which does not repeat lost frames.
         """
-        self._soem = self.backend.master if len(positions) == len(sii) and not again else None
+        shared = len(positions) < len(sii)
+        self._soem = None if shared or again else self.backend.master
         self.positions, self._sii, self.slaves = list(positions), sii, []
         if self._soem is not None:
             self._soem.scan(positions, check_interrupt)
         else:
-            mapping.assign_stations(self, positions, self._others())
+            self.assign_stations(positions)
         self.stations = [
             int.from_bytes(self.read_surely_at(position, reg.STATION_ADDRESS, 2), "little")
             for position in positions
@@ -93,8 +101,9 @@ class Bus(Datagrams):
         if self._soem is not None:
             self._soem.map_process_data(check_interrupt)
         else:
-            logical = mapping.free_logical(self, self._others())
-            mapping.map_process_data(self.slaves, self._sensors_sii(), logical, check_interrupt)
+            logical = self._free_logical()
+            for slave, content in zip(self.slaves, self._sensors_sii(), strict=True):
+                logical = self.map(slave, content, logical, check_interrupt)
         return [slave.read_mapping() for slave in self.slaves]
 
     def enter_op(self, check_interrupt: CheckInterrupt) -> None:
@@ -127,12 +136,50 @@ class Bus(Datagrams):
     def close(self) -> None:
         """Take the sensors to INIT if they were scanned, and close the wire."""
         for number in range(len(self.stations)):
-            any(
-                self.write_register(number, reg.AL_CONTROL, AlState.INIT.request())
-                for _ in range(_INIT_ATTEMPTS)
-            )
+            repeat(_INIT_ATTEMPTS, self.write_register, number, reg.AL_CONTROL, AlState.INIT.request())
         self.stations = []
         self.backend.close()
+
+    def assign_stations(self, positions: Sequence[int]) -> None:
+        """Give the sensors at these positions station addresses that no slave answers to, nor by an alias."""
+        taken: set[int] = set()
+        for position in self._others():
+            taken.update(struct.unpack("<HH", self.read_surely_at(position, reg.STATION_ADDRESS, 4)))
+        for position in positions:
+            taken.update(struct.unpack("<H", self.read_surely_at(position, reg.STATION_ALIAS, 2)))
+        free = (station for station in range(_FIRST_STATION, 0xFFFF) if station not in taken)
+        for position, station in zip(positions, free, strict=False):
+            self.write_surely_at(position, reg.STATION_ADDRESS, station.to_bytes(2, "little"))
+
+    def map(self, slave: SlaveController, content: Sii, logical: int, check_interrupt: CheckInterrupt) -> int:
+        """Map a sensor's process data from a logical address on, as its PDO mapping says; returns its end."""
+        managers = units = b""
+        for kind, assignment, direction in _ASSIGNMENTS:
+            row = next((row for row in content["sync_managers"] if row["kind"] == kind), None)
+            size = row and self._run(slave.mapped_size(assignment, row["size"]), check_interrupt)
+            if not row or not size:
+                managers += bytes(reg.SYNC_MANAGER_SIZE)
+                continue
+            managers += reg.pack_sync_manager(row["start"], size, row["control"])
+            units += reg.FMMU_LAYOUT.pack(logical, size, 0, 7, row["start"], 0, direction, 1)
+            logical += size
+        slave.map(managers, units.ljust(len(_ASSIGNMENTS) * reg.FMMU_SIZE, b"\0"))
+        return logical
+
+    def _free_logical(self) -> int:
+        """The first logical address from which on no FMMU of the others is active."""
+        taken: list[tuple[int, int]] = []
+        for position in self._others():
+            count = self.read_surely_at(position, reg.FMMU_AND_SM_COUNT, 1)[0]
+            for at in range(min(count, reg.MOST_FMMUS)):
+                unit = self.read_surely_at(position, reg.FMMU + at * reg.FMMU_SIZE, reg.FMMU_SIZE)
+                start, length, *_, active = reg.FMMU_LAYOUT.unpack(unit)
+                if active & 1:
+                    taken.append((start, start + length))
+        for base in sorted([0, *(end for _, end in taken)]):
+            if all(end <= base or base + _LOGICAL_BYTES <= start for start, end in taken):
+                return base
+        raise BusError(f"the other devices on {self.ifname} map all logical addresses: power them off and on")
 
     def _others(self) -> list[int]:
         return [position for position in range(len(self._sii)) if position not in self.positions]
@@ -140,5 +187,5 @@ class Bus(Datagrams):
     def _sensors_sii(self) -> list[Sii]:
         return [content for at, content in enumerate(self._sii) if at in self.positions and content]
 
-    def _run(self, steps: Steps[None], check_interrupt: CheckInterrupt) -> None:
-        finish(steps, _PAUSE_S, self.clock, check_interrupt)
+    def _run(self, steps: Steps[T], check_interrupt: CheckInterrupt) -> T:
+        return finish(steps, _PAUSE_S, self.clock, check_interrupt)

@@ -1,4 +1,4 @@
-"""Time as everything above the bus sees it, so that a test can let it pass as it likes."""
+"""Clocks and waiting; tests replace them by simulated time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _READS: Final = 5
 
 
 class Clock(Protocol):
-    """CLOCK_MONOTONIC for what is measured, CLOCK_REALTIME for stamps, and waiting."""
+    """CLOCK_MONOTONIC for intervals, CLOCK_REALTIME for stamps, and waiting."""
 
     def monotonic_ns(self) -> int:
         """CLOCK_MONOTONIC, ns."""
@@ -18,7 +18,7 @@ class Clock(Protocol):
         """CLOCK_REALTIME, ns."""
 
     def sleep(self, seconds: float, /) -> None:
-        """Return `seconds` later, or a little after."""
+        """Return after `seconds` at the earliest."""
 
 
 class SystemClock:
@@ -44,7 +44,7 @@ class RealtimeOffset:
         self.ns = self._middle()
 
     def follow(self) -> None:
-        """To be called now and then: notice that CLOCK_REALTIME was set."""
+        """To be called regularly: notices that CLOCK_REALTIME was set."""
         least, most = self._bounds()
         if not least <= self.ns <= most:
             self.ns = self._middle()
@@ -59,7 +59,7 @@ class RealtimeOffset:
 
 
 class Deadline:
-    """An instant some `seconds` after now."""
+    """The instant `seconds` from now."""
 
     def __init__(self, clock: Clock, seconds: float) -> None:
         self._clock = clock

@@ -1,13 +1,14 @@
 """Single datagrams on the bus: registers of the slaves, by station address or position, and broadcast reads.
 
-Each is a frame of our own over the backend, matched with its answer by its index: a frame that comes too late
-is never taken for another one's answer.
+Each is a frame, matched with its answer by index, command and address: a late answer is not mistaken for that
+to another datagram.
 """
 
 from __future__ import annotations
 
 import struct
-from typing import Final, Protocol
+from collections.abc import Callable
+from typing import Final, ParamSpec, Protocol, TypeVar
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend
@@ -34,48 +35,56 @@ _LATE_FACTOR: Final = 2.0
 _SHORTEST_TIMEOUT_S: Final = 0.0003
 
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def repeat(attempts: int, do: Callable[P, T | None], *args: P.args, **kwargs: P.kwargs) -> T | None:
+    """What `do` returns, called again while its datagram is lost: while it returns nothing, or False."""
+    return next(filter(None, (do(*args, **kwargs) for _ in range(attempts))), None)
+
+
 class Registers(Protocol):
-    """How registers and mailboxes of slaves are reached: by number, as on a `Bus`, or `ByPosition`."""
+    """Access to registers and mailboxes of slaves: by sensor number, as on a `Bus`, or `ByPosition`."""
 
     @property
     def clock(self) -> Clock:
-        """The time that passes meanwhile."""
+        """The clock of the bus."""
 
     def read_register(self, number: int, address: int, size: int, /) -> bytes | None:
-        """None if the slave did not do it."""
+        """None if the slave did not execute it."""
 
     def write_register(self, number: int, address: int, data: bytes, /) -> bool:
-        """False if the slave did not do it."""
+        """False if the slave did not execute it."""
 
 
 class LateAnswers:
-    """The timeout of frames, of which `count` numbered from `first_index` on are told apart.
+    """The timeout of datagrams.
 
-    It grows while answers come late, so that a slow machine reads its sensors slowly, not never: an answer
-    that nobody waits for any more says how long a frame takes now.
+    It grows while answers are late, so that a slow machine reads its sensors slowly rather than not at all:
+    an answer that arrives after its timeout shows the present round trip.
     """
 
-    def __init__(self, clock: Clock, first_index: int, count: int) -> None:
+    def __init__(self, clock: Clock) -> None:
         self.timeout_s = 0.0  # the timeout at least; 0 on a bus that is in time
-        self._first_index = first_index
         self._monotonic_ns = clock.monotonic_ns
         # By index less the first: when a frame was sent that is not back; else 0.
-        self.pending_ns = [0] * count
+        self.pending_ns = [0] * _INDICES
 
     def note(self, answer: bytes) -> None:
-        """An answer, not the one that is waited for."""
-        index = answer[DATAGRAM_INDEX] - self._first_index if len(answer) > DATAGRAM_INDEX else -1
-        if 0 <= index < len(self.pending_ns) and self.pending_ns[index]:
-            self.timeout_s = min(max(self.timeout_s, _LATE_FACTOR * self._took_s(index)), _LONGEST_TIMEOUT_S)
+        """Take an answer that is not the one awaited."""
+        index = answer[DATAGRAM_INDEX] - FIRST_INDEX if len(answer) > DATAGRAM_INDEX else -1
+        if 0 <= index < _INDICES and self.pending_ns[index]:
+            self.timeout_s = min(max(self.timeout_s, self._least_s(index)), _LONGEST_TIMEOUT_S)
             self.pending_ns[index] = 0
 
     def in_time(self, index: int) -> None:
-        """The answer that is waited for: wait less from now on, if it came sooner."""
-        timeout_s = min(max(self.timeout_s / 2, _LATE_FACTOR * self._took_s(index)), _LONGEST_TIMEOUT_S)
+        """Take the awaited answer: the timeout falls if it was early."""
+        timeout_s = min(max(self.timeout_s / 2, self._least_s(index)), _LONGEST_TIMEOUT_S)
         self.timeout_s = timeout_s if timeout_s > _SHORTEST_TIMEOUT_S else 0.0
 
-    def _took_s(self, index: int) -> float:
-        return (self._monotonic_ns() - self.pending_ns[index]) * 1e-9
+    def _least_s(self, index: int) -> float:
+        return _LATE_FACTOR * (self._monotonic_ns() - self.pending_ns[index]) * 1e-9
 
 
 class Datagrams:
@@ -88,10 +97,10 @@ class Datagrams:
         self._send, self._receive = backend.send, backend.receive
         self._monotonic_ns = backend.clock.monotonic_ns
         self._index = 0
-        self._late = LateAnswers(backend.clock, FIRST_INDEX, _INDICES)
+        self._late = LateAnswers(backend.clock)
         self._pending_ns = self._late.pending_ns
-        # Returns the next frame before an instant in ns, None for none; the loop that exchanges process data
-        # puts its own here, and goes on meanwhile.
+        # Returns the next frame before an instant in ns, None if there is none. The acquisition loop replaces
+        # it by one that continues to exchange process data.
         self.next_frame = self.next_on_wire
         self.stations: list[int] = []  # configured station addresses of the sensors, by number
 
@@ -133,21 +142,19 @@ class Datagrams:
 
     def read_surely(self, number: int, address: int, size: int) -> bytes:
         """Read ESC registers of a sensor; BusError if it does not answer."""
-        for _ in range(_REGISTER_ATTEMPTS):
-            if (data := self.read_register(number, address, size)) is not None:
-                return data
+        if data := repeat(_REGISTER_ATTEMPTS, self.read_register, number, address, size):
+            return data
         raise BusError(f"sensor {number} does not answer: check cable and power")
 
     def read_surely_at(self, position: int, address: int, size: int) -> bytes:
         """Read ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
-        for _ in range(_REGISTER_ATTEMPTS):
-            if (data := self.read_at(position, address, size)) is not None:
-                return data
+        if data := repeat(_REGISTER_ATTEMPTS, self.read_at, position, address, size):
+            return data
         raise self._unanswered(position)
 
     def write_surely_at(self, position: int, address: int, data: bytes) -> None:
         """Write ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
-        if not any(self.write_at(position, address, data) for _ in range(_REGISTER_ATTEMPTS)):
+        if not repeat(_REGISTER_ATTEMPTS, self.write_at, position, address, data):
             raise self._unanswered(position)
 
     def _unanswered(self, position: int) -> BusError:
@@ -182,7 +189,7 @@ class Datagrams:
 
 
 class ByPosition:
-    """The registers of slaves that have no station address, in place of those of a `Bus`."""
+    """Registers of slaves by position, for those without a station address."""
 
     def __init__(self, bus: Datagrams) -> None:
         self.clock = bus.clock

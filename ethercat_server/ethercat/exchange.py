@@ -1,5 +1,5 @@
-"""The exchange of process data: frames of our own, several at a time, each matched by its index; which
-process data, and whose latched times, each of them carries, and where.
+"""The exchange of process data: the layout of its frames, which process data and latched times each carries,
+and the frames in flight, matched with their answers by index and tag.
 
 Distributed clocks, by ETG.1000.4 and the data sheets of slave controllers: the local time counts ns from
 power-on; the system time is that and an offset, less a delay, which masters that synchronize slaves have
@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from ethercat_server.errors import SetUpError
 from ethercat_server.ethercat.backend import Backend
-from ethercat_server.ethercat.datagrams import Datagrams
+from ethercat_server.ethercat.datagrams import Datagrams, repeat
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import (
     BYTE_NS,
@@ -37,7 +37,7 @@ _MOST_BEHIND_NS: Final = 1_000_000
 _WRAP: Final = 1 << 32
 _TIME_SIZE: Final = 4
 _SLACK_NS: Final = 10_000
-# One lost frame is no reason to do without event times; many would hold up the loop.
+# A single lost frame must not disable event times; more attempts would delay the loop.
 _ATTEMPTS: Final = 3
 
 # System time when the frame arrived, a working counter; local time of the event PDI buffer change, a working
@@ -71,12 +71,11 @@ def switch_latched(frame: bytearray, at: int, *, reads: bool) -> None:
 
 
 def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
-    """What another master has left in a sensor's controller; None if it does not answer.
+    """The clock of a sensor's controller as another master has set it; None if it does not answer.
 
     `at` is where frames read what is latched.
     """
-    tries = (bus.read_register(number, reg.DC_OFFSET, _U64_U32.size) for _ in range(_ATTEMPTS))
-    if (data := next(filter(None, tries), None)) is None:
+    if not (data := repeat(_ATTEMPTS, bus.read_register, number, reg.DC_OFFSET, _U64_U32.size)):
         return None
     offset, delay = _U64_U32.unpack(data)
     return DistributedClock((offset - delay) % _WRAP, _behind_ns(bus, number), at * BYTE_NS + _SLACK_NS)
@@ -96,13 +95,13 @@ def _behind_ns(bus: Datagrams, number: int) -> int:
     return max((time for time in times if time < _MOST_BEHIND_NS), default=0)
 
 
-# Each frame carries its number in a last datagram (NOP), which comes back as it was sent: by the index
-# alone one that comes back very late would be taken for a later one.
+# The last datagram of each frame (NOP) carries its number as a tag, which slaves do not change: by the index
+# alone a very late answer would be mistaken for that to a later frame.
 TAG_SIZE: Final = 4
 _AROUND_DATA: Final = DATAGRAM_HEADER + COUNTER_SIZE
 # Bytes of datagrams that fit one frame.
 _LONGEST: Final = 1498
-# What is sent where the inputs will be; no sensor says it, for its numbers would be NaN throughout.
+# Sent in place of the inputs. No sensor sends this: all its values would be NaN.
 _NEVER: Final = b"\xff"
 
 
@@ -126,7 +125,7 @@ class Inputs(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """One of an exchange, as it is sent but for its index and number."""
+    """One frame of an exchange, as sent except for index and tag."""
 
     content: bytearray
     inputs: list[Inputs]
@@ -143,17 +142,12 @@ def make_frames(areas: Sequence[Sequence[Area]], stations: Sequence[int | None],
     of the sensors whose latched times are read, None for others. SetUpError if the inputs of a sensor are not
     in one frame.
     """
-    spans = _spans(areas, stations, lrw=lrw)
-    carried: list[list[int]] = [[] for _ in spans]
-    for number, each in enumerate(areas):
-        first, last = _inputs(each)
-        which = next((n for n, (start, end) in enumerate(spans) if start <= first and last <= end), None)
-        if which is None:
+    frames = [_frame(*span, areas, stations, lrw=lrw) for span in _spans(areas, stations, lrw=lrw)]
+    carried = [each.number for frame in frames for each in frame.inputs]
+    for number in range(len(areas)):
+        if carried.count(number) != 1:
             raise SetUpError(f"the process data of sensor {number} lies among that of others: start again")
-        carried[which].append(number)
-    return [
-        _frame(span, numbers, areas, stations, lrw=lrw) for span, numbers in zip(spans, carried, strict=True)
-    ]
+    return frames
 
 
 def fit_a_frame(areas: Sequence[Area], *, lrw: bool) -> bool:
@@ -162,7 +156,7 @@ def fit_a_frame(areas: Sequence[Area], *, lrw: bool) -> bool:
 
 
 def _size(length: int, latching: int, *, lrw: bool) -> int:
-    """Bytes of the datagrams that exchange so much process data, and the latched times of so many."""
+    """Bytes of the datagrams for `length` bytes of process data and `latching` sensors' latched times."""
     exchanged = (1 if lrw else 2) * (_AROUND_DATA + length)
     return exchanged + latching * LATCHED_SIZE + _AROUND_DATA + TAG_SIZE
 
@@ -183,82 +177,77 @@ def _spans(
     return spans
 
 
-def _inputs(areas: Sequence[Area]) -> tuple[int, int]:
-    """Where the inputs of a sensor begin and end."""
-    inputs = [area for area in areas if area.kind == reg.FMMU_READ]
-    return min(area.start for area in inputs), max(area.end for area in inputs)
-
-
 def _frame(
-    span: tuple[int, int],
-    numbers: Sequence[int],
-    areas: Sequence[Sequence[Area]],
-    stations: Sequence[int | None],
-    *,
-    lrw: bool,
+    start: int, end: int, areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool
 ) -> Frame:
-    """The frame for the logical addresses of `span`, with the inputs of the sensors with these `numbers`."""
-    start, length = span[0], span[1] - span[0]
-    end = FIRST_DATA + length
-    written = 0 if lrw else end + _AROUND_DATA + length
-    commands = (Command.LRW,) if lrw else (Command.LRD, Command.LWR)
-    datagrams: list[tuple[int, int, int, bytes]] = [
-        (command, start & 0xFFFF, start >> 16, bytes(length)) for command in commands
-    ]
-    content = bytearray(length)
-    inputs: list[Inputs] = []
-    at = (written or end) + COUNTER_SIZE + DATAGRAM_HEADER
-    for number in numbers:
-        for area in areas[number]:
-            if area.kind == reg.FMMU_READ:
-                content[area.start - start : area.end - start] = _NEVER * (area.end - area.start)
-        first, last = (each - start for each in _inputs(areas[number]))
+    """The frame for the logical addresses from `start` to `end`, with the inputs that lie in them."""
+    length, commands = end - start, (Command.LRW,) if lrw else (Command.LRD, Command.LWR)
+    datagrams = [(int(command), start & 0xFFFF, start >> 16, bytes(length)) for command in commands]
+    read = FIRST_DATA + length
+    written = 0 if lrw else read + _AROUND_DATA + length
+    at = (written or read) + COUNTER_SIZE + DATAGRAM_HEADER
+    data, inputs, counters = bytearray(length), [], []
+    for number, each in enumerate(areas):
+        kinds = {area.kind for area in each if start <= area.start < end}
+        counters.append(2 * (reg.FMMU_WRITE in kinds) + (reg.FMMU_READ in kinds))
+        read_areas = [area for area in each if area.kind == reg.FMMU_READ]
+        first, last = (
+            min(area.start for area in read_areas) - start,
+            max(area.end for area in read_areas) - start,
+        )
+        if first < 0 or last > length:
+            continue
+        for area in read_areas:
+            data[area.start - start : area.end - start] = _NEVER * (area.end - area.start)
         station, latched = stations[number], 0
         if station is not None:
             latched, at = at, at + LATCHED_SIZE
             datagrams += latched_datagrams(station)
-        inputs.append(
-            Inputs(number, first + FIRST_DATA, last + FIRST_DATA, bytes(content[first:last]), latched)
-        )
-    made = build(*datagrams, (Command.NOP, 0, 0, bytes(TAG_SIZE))).ljust(SHORTEST_FRAME, b"\0")
-    made[FIRST_DATA:end] = content
-    counters = [_working_counter(each, span) for each in areas]
-    return Frame(made, inputs, end, written, at, counters)
-
-
-def _working_counter(areas: Sequence[Area], span: tuple[int, int]) -> int:
-    kinds = {area.kind for area in areas if span[0] <= area.start < span[1]}
-    return 2 * (reg.FMMU_WRITE in kinds) + (reg.FMMU_READ in kinds)
+        inputs.append(Inputs(number, FIRST_DATA + first, FIRST_DATA + last, bytes(data[first:last]), latched))
+    content = build(*datagrams, (Command.NOP, 0, 0, bytes(TAG_SIZE))).ljust(SHORTEST_FRAME, b"\0")
+    content[FIRST_DATA:read] = data
+    return Frame(content, inputs, read, written, at, counters)
 
 
 # Single datagrams and SOEM use the indices below.
 FIRST_INDEX: Final = 0x90
 _INDICES: Final = 0x100
-# Frames on the wire; a limit for a bus that does not answer.
+# Limit of frames in flight on a bus that does not answer.
 MOST_IN_FLIGHT = 100
-# A frame that is not back after this time counts as lost: its index is used again.
+# A frame counts as lost after this time, and its index is used again.
 _LOST_NS: Final = 100_000_000
-_TAG: Final = struct.Struct("<I")
-_NOTHING: Final = (0, 0, -1)
+_pack_tag_into, _unpack_tag_from = struct.Struct("<I").pack_into, struct.Struct("<I").unpack_from
+# By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 if there is none.
+_NOT_SENT: Final = (0, 0, -1)
 _IMPOSSIBLE: Final = 0xFFFF
 
 
 class Exchange(NamedTuple):
-    """One that is back. Times are CLOCK_MONOTONIC ns."""
+    """An exchange whose answer has arrived. Times are CLOCK_MONOTONIC ns."""
 
     sent_ns: int
     back_ns: int
     frame: bytes
-    wkc: int  # working counter; 0xFFFF if it cannot be
+    wkc: int  # working counter; 0xFFFF if it is impossible
     which: int  # number of the frame, of those that make up an exchange
 
 
-# An answer that was taken before.
+# An answer that has been taken before.
 DUPLICATE: Final = Exchange(0, 0, b"", 0, 0)
 
 
 class ProcessData:
-    """The frames of an exchange, and those that are on the wire."""
+    """The frames of an exchange, and those in flight.
+
+    Attributes:
+        inputs: by frame, the sensors whose inputs it carries.
+        wire_ns: by frame, what its bytes take on the wire.
+        counters: by sensor, what it adds to the working counter of each frame.
+        most_wkc: by frame, the highest working counter that there can be.
+        in_flight: frames that are not back, and not known to be lost.
+        duplicates: answers that came once more.
+        blocked_until_ns: until then nothing can be sent unless an answer arrives.
+    """
 
     def __init__(
         self,
@@ -270,101 +259,94 @@ class ProcessData:
     ) -> None:
         """See `make_frames`."""
         self._send, self._monotonic_ns = backend.send, backend.clock.monotonic_ns
-        frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
-        self._lrw, self._command = lrw, int(Command.LRW if lrw else Command.LRD)
-        self._frames = [frame.content for frame in frames]
-        # By frame: what its bytes take on the wire.
+        self._frames = frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
+        self._command = int(Command.LRW if lrw else Command.LRD) if frames else -1  # no frame has that
+        self.inputs = [frame.inputs for frame in frames]
         self.wire_ns = [len(frame.content) * BYTE_NS for frame in frames]
-        self._ends = [frame.end for frame in frames]
-        self._written = [frame.written for frame in frames]
-        self._tags = [frame.tag for frame in frames] or [0]
-        self.inputs = [frame.inputs for frame in frames]  # by frame: the sensors whose inputs it carries
-        # What each sensor adds to the working counter of each frame.
         self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
-        # The highest working counter of each frame that there can be.
         self.most_wkc = [sum(frame.counters) for frame in frames]
-        # By frame: the highest counters of LRD and LWR.
+        # The highest counters of LRD and LWR.
         self._most = [
             (sum(each & 1 for each in frame.counters), sum(each >> 1 for each in frame.counters))
             for frame in frames
         ]
-        self._index, self._number = FIRST_INDEX, 0
-        # By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 once it is lost.
-        self._sent = [_NOTHING] * _INDICES
-        self.in_flight = 0  # frames in flight: not back, and not known to be lost
+        self._tagged = [(frame.content, frame.tag) for frame in frames]
+        self._offsets = [(frame.tag, frame.end, frame.written) for frame in frames]
+        self._index, self._tag = FIRST_INDEX, 0
+        self._sent = [_NOT_SENT] * _INDICES
+        self.in_flight = 0
         self._lost = 0
-        self.duplicates = 0  # answers that came once more
-        self.blocked_until_ns = 0  # nothing can be sent before, as long as nothing comes back
+        self.duplicates = 0
+        self.blocked_until_ns = 0
 
     def read_latched(self, number: int, *, reads: bool) -> int | None:
         """Read what a sensor's controller latches, or no longer; where, or None if it latches nothing."""
-        for content, inputs in zip(self._frames, self.inputs, strict=True):
-            for each in inputs:
+        for frame in self._frames:
+            for each in frame.inputs:
                 if each.number == number and each.latched:
-                    switch_latched(content, each.latched, reads=reads)
+                    switch_latched(frame.content, each.latched, reads=reads)
                     return each.latched
         return None
 
     def send(self) -> int:
-        """Send an exchange, unless too many are on the wire. Returns when."""
-        for which, frame in enumerate(self._frames):
+        """Send an exchange unless too many frames are in flight. Returns the time."""
+        sent = self._sent
+        for which, (content, tag_at) in enumerate(self._tagged):
             index = self._index
-            if self.in_flight >= MOST_IN_FLIGHT or self._sent[index][0]:
+            if self.in_flight >= MOST_IN_FLIGHT or sent[index][0]:
                 now_ns = self._monotonic_ns()
                 self._forget(now_ns)
                 if self.in_flight >= MOST_IN_FLIGHT:
-                    self.blocked_until_ns = min(sent[0] for sent in self._sent if sent[0]) + _LOST_NS
+                    self.blocked_until_ns = min(row[0] for row in sent if row[0]) + _LOST_NS
                     return now_ns
-                while self._sent[index][0]:
-                    index = max(FIRST_INDEX, (index + 1) % _INDICES)
-            self._index = max(FIRST_INDEX, (index + 1) % _INDICES)
-            self._number = number = (self._number + 1) & 0xFFFFFFFF
-            frame[DATAGRAM_INDEX] = index
-            _TAG.pack_into(frame, self._tags[which], number)
+                while sent[index][0]:
+                    index = index + 1 & 0xFF or FIRST_INDEX
+            self._index = index + 1 & 0xFF or FIRST_INDEX
+            self._tag = tag = self._tag + 1 & 0xFFFFFFFF
+            content[DATAGRAM_INDEX] = index
+            _pack_tag_into(content, tag_at, tag)
             self.in_flight += 1
             now_ns = self._monotonic_ns()
-            self._send(frame)
-            self._sent[index] = now_ns, which, number
+            self._send(content)
+            sent[index] = now_ns, which, tag
         return now_ns
 
     def take(self, frame: bytes, back_ns: int) -> Exchange | None:
-        """Take a frame that has arrived; None if it is no answer that is awaited."""
+        """Take a frame that has arrived; None if it is not an awaited answer, DUPLICATE if taken before."""
         if len(frame) <= DATAGRAM_INDEX or frame[FRAME_HEADER] != self._command:
             return None
         index = frame[DATAGRAM_INDEX]
-        sent_ns, which, number = self._sent[index]
-        at = self._tags[which]
-        if len(frame) < at + _TAG.size or _TAG.unpack_from(frame, at)[0] != number:  # an older one
+        sent_ns, which, tag = self._sent[index]
+        tag_at, end, written = self._offsets[which]
+        if len(frame) < tag_at + TAG_SIZE or _unpack_tag_from(frame, tag_at)[0] != tag:  # an older one
             return None
         if not sent_ns:
             self.duplicates += 1
             return DUPLICATE
-        self._sent[index], self.blocked_until_ns = (0, which, number), 0
+        self._sent[index], self.blocked_until_ns = (0, which, tag), 0
         self.in_flight -= 1
-        end = self._ends[which]
         wkc = frame[end] | frame[end + 1] << 8
-        if not self._lrw:  # an LRW would have counted 2
-            end = self._written[which]
-            written = frame[end] | frame[end + 1] << 8
-            reads, writes = self._most[which]
-            wkc = wkc + 2 * written if wkc <= reads and written <= writes else _IMPOSSIBLE
+        if written:  # an LRW would have counted 2
+            writes = frame[written] | frame[written + 1] << 8
+            most_reads, most_writes = self._most[which]
+            wkc = wkc + 2 * writes if wkc <= most_reads and writes <= most_writes else _IMPOSSIBLE
         return Exchange(sent_ns, back_ns, frame, wkc, which)
 
     @property
     def sent(self) -> int:
-        """Exchanges that were sent."""
-        return self._number // max(1, len(self._frames))
+        """Number of exchanges sent."""
+        return self._tag // max(1, len(self._frames))
 
     @property
     def lost(self) -> int:
-        """Frames that did not come back."""
+        """Number of frames lost."""
         self._forget(self._monotonic_ns())
         return self._lost
 
     def _forget(self, now_ns: int) -> None:
-        """Give up the frames that have been away for too long."""
+        """Count frames as lost whose time has passed."""
         for index, (sent_ns, _, _) in enumerate(self._sent):
             if sent_ns and now_ns - sent_ns >= _LOST_NS:
-                self._sent[index] = _NOTHING
+                self._sent[index] = _NOT_SENT
                 self.in_flight -= 1
                 self._lost += 1

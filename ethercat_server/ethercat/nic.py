@@ -2,12 +2,9 @@
 one master, and the check of all that before the bus is opened. SOEM itself would say only that it failed,
 and open it beside another master.
 
-Asked by netlink (linux/rtnetlink.h), not of /sys, which shows the namespace it was mounted in. The packet
-sockets are found by inodes: those in /proc/net, and those of each process in /proc/PID/fd, where only root
-sees other users' descriptors. The lock is a byte of a file for each interface; the file is root's, or the
-service's, so that no other user can take it; the kernel knows which process has it, and releases it with
-the process. The root of a user namespace may not write it, and takes an abstract socket of its network
-namespace instead.
+Asked by netlink (linux/rtnetlink.h), not of /sys, which shows the namespace it was mounted in, and not by
+pyroute2, which would double the locked memory of the server. The packet sockets are found by inodes: those in
+/proc/net, and those of each process in /proc/PID/fd, where only root sees other users' descriptors.
 """
 
 from __future__ import annotations
@@ -18,7 +15,6 @@ import fcntl
 import ipaddress
 import os
 import socket
-import stat
 import struct
 import sys
 import time
@@ -27,8 +23,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from ethercat_server.errors import InterfaceError
-
-_ETHERCAT: Final = 0x88A4
+from ethercat_server.ethercat.wire import ETHERTYPE
 
 
 class Listener(NamedTuple):
@@ -53,12 +48,30 @@ def master_sockets(ifname: str) -> set[int]:
         index = socket.if_nametoindex(ifname)
     except OSError:
         return set()
-    return {row.inode for row in packet_sockets() if (row.protocol, row.ifindex) == (_ETHERCAT, index)}
+    return {row.inode for row in packet_sockets() if (row.protocol, row.ifindex) == (ETHERTYPE, index)}
 
 
 def packet_sockets(path: str | Path = "/proc/self/net/packet") -> list[Listener]:
     """The packet sockets of this network namespace, from the kernel's table of them."""
     return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in table(path)]
+
+
+_SIOCGSTAMPNS: Final = 0x80108907
+_TIMESPEC: Final = struct.Struct("=qq")
+
+
+def arrived_ns(fd: int) -> int:
+    """CLOCK_MONOTONIC when the packet that was received last from the socket `fd` had arrived.
+
+    0 if the kernel does not say, as at the first call, which has it stamp packets. The stamp is in
+    CLOCK_REALTIME: it is wrong if that was set in between.
+    """
+    try:
+        seconds, ns = _TIMESPEC.unpack(fcntl.ioctl(fd, _SIOCGSTAMPNS, bytes(_TIMESPEC.size)))
+    except OSError:
+        return 0
+    waited_ns = time.time_ns() - int(seconds * 1_000_000_000 + ns)
+    return time.monotonic_ns() - waited_ns  # if anything comes between the two clocks, it is too late
 
 
 def users_of(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Process]:
@@ -121,26 +134,12 @@ class Interface(NamedTuple):
     """An interface as it is now."""
 
     ifindex: int
-    flags: int
+    is_up: bool
+    is_loopback: bool
+    has_carrier: bool  # it is linked, and ready to send
     mtu: int
     master: int  # index of the bridge or bond that it is part of, 0 if none
-    carrier: bool  # what the driver says of the link
     address: bytes  # of the hardware
-
-    @property
-    def is_up(self) -> bool:
-        """Whether it is up."""
-        return bool(self.flags & _IFF_UP)
-
-    @property
-    def is_loopback(self) -> bool:
-        """Whether it is the loopback interface."""
-        return bool(self.flags & _IFF_LOOPBACK)
-
-    @property
-    def has_carrier(self) -> bool:
-        """Whether it is linked, and ready to send: the flag may follow the driver a second later."""
-        return self.carrier and bool(self.flags & _IFF_RUNNING)
 
 
 def look_up(ifname: str) -> Interface:
@@ -160,11 +159,19 @@ def look_up(ifname: str) -> Interface:
         int.from_bytes(found.get(name, b""), sys.byteorder)
         for name in (_IFLA_MTU, _IFLA_MASTER, _IFLA_CARRIER)
     )
-    return Interface(index, flags, mtu, master, bool(carrier), found.get(_IFLA_ADDRESS, b""))
+    return Interface(
+        index,
+        is_up=bool(flags & _IFF_UP),
+        is_loopback=bool(flags & _IFF_LOOPBACK),
+        has_carrier=bool(carrier and flags & _IFF_RUNNING),  # the flag may follow the driver a second later
+        mtu=mtu,
+        master=master,
+        address=found.get(_IFLA_ADDRESS, b""),
+    )
 
 
 def trouble(ifname: str) -> str | None:
-    """What keeps frames from passing over `ifname`, and what to do; None if it is not the interface."""
+    """What prevents frames from passing `ifname`, and what to do; None if nothing does."""
     found = look_up(ifname)
     if not found.is_up:
         return f"{ifname} is down: bring it up with 'sudo ip link set {ifname} up'"
@@ -184,7 +191,7 @@ def trouble(ifname: str) -> str | None:
 
 
 def why_silent(ifname: str) -> str:
-    """Why no frame comes back, as far as the interface knows, and what to do."""
+    """The interface's part in frames not coming back, and what to do."""
     try:
         return trouble(ifname) or CHECK_CABLE
     except InterfaceError as error:
@@ -210,7 +217,7 @@ class Routes(NamedTuple):
     addresses: tuple[str, ...] = ()  # with the length of their prefix; link-local ones are not among them
     link_local: tuple[str, ...] = ()  # those that every interface may give itself, without a network
     default: bool = False  # the machine's default route goes here
-    others: tuple[str, ...] = ()  # destinations of the routes that somebody made
+    others: tuple[str, ...] = ()  # destinations of the routes that the kernel did not make
     # Those of the addresses that a network gave for some time: DHCP, or an IPv6 router.
     leased: tuple[str, ...] = ()
 
@@ -221,39 +228,38 @@ class Routes(NamedTuple):
 
 def find_routes(ifname: str) -> Routes:
     """What is on `ifname` now; OSError if the kernel does not say."""
-    index, default = socket.if_nametoindex(ifname), False
-    addresses: list[str] = []
-    link_local: list[str] = []
-    leased: list[str] = []
-    others: list[str] = []
+    index = socket.if_nametoindex(ifname)
     try:
-        for (family, length, flags, scope, its), found in _ask(_GET_ADDRESS, _ADDRESS, 0, 0, 0, 0, 0):
-            if its == index and family in _FAMILIES:
-                raw = found.get(_IFA_LOCAL) or found[_IFA_ADDRESS]
-                there = link_local if scope == _LINK_SCOPE else addresses
-                there.append(f"{ipaddress.ip_address(raw)}/{length}")
-                if there is addresses and not flags & _IFA_F_PERMANENT:
-                    leased.append(addresses[-1])
-        for (family, length, _, _, table, made_by, *_), found in _ask(_GET_ROUTE, _ROUTE, *(0,) * 9):
-            goes = int.from_bytes(found.get(_RTA_OIF, b""), sys.byteorder)
-            if goes != index or table != _MAIN_TABLE or family not in _FAMILIES:
-                continue
-            default = default or not length
-            if length and made_by != _MADE_BY_KERNEL:
-                others.append(f"{ipaddress.ip_address(found[_RTA_DST])}/{length}")
+        addresses = [
+            (f"{ipaddress.ip_address(found.get(_IFA_LOCAL) or found[_IFA_ADDRESS])}/{length}", scope, flags)
+            for (family, length, flags, scope, its), found in _ask(_GET_ADDRESS, _ADDRESS, *(0,) * 5)
+            if its == index and family in _FAMILIES
+        ]
+        routes = [
+            (length and f"{ipaddress.ip_address(found[_RTA_DST])}/{length}", made_by)
+            for (family, length, _, _, table, made_by, *_), found in _ask(_GET_ROUTE, _ROUTE, *(0,) * 9)
+            if found.get(_RTA_OIF) == index.to_bytes(4, sys.byteorder)
+            if table == _MAIN_TABLE and family in _FAMILIES
+        ]
     except (LookupError, ValueError, struct.error) as error:
         raise OSError(f"unknown answer: {error}") from error
-    return Routes(tuple(addresses), tuple(sorted(link_local)), default, tuple(others), tuple(leased))
+    return Routes(
+        addresses=tuple(text for text, scope, _ in addresses if scope != _LINK_SCOPE),
+        link_local=tuple(sorted(text for text, scope, _ in addresses if scope == _LINK_SCOPE)),
+        default=any(not text for text, _ in routes),
+        others=tuple(text for text, made_by in routes if text and made_by != _MADE_BY_KERNEL),
+        leased=tuple(
+            text for text, scope, flags in addresses if scope != _LINK_SCOPE and not flags & _IFA_F_PERMANENT
+        ),
+    )
 
 
 def network_trouble(ifname: str, routes: Routes) -> str | None:
-    """Why no EtherCAT frame belongs on `ifname`, and what to do; None if it may be used."""
+    """Why `ifname` must not carry EtherCAT frames, and what to do; None if it may."""
     other = "name the one that the sensor is connected to ('ethercat-sensor adapters' lists them)"
-    anyway = f"{ALLOW_IP} uses it all the same"
+    anyway = f"{ALLOW_IP} overrides this"
     if routes.default:
-        return (
-            f"{ifname} has the machine's default route, so it is no interface for a sensor: {other}; {anyway}"
-        )
+        return f"{ifname} has the machine's default route, so it is not for a sensor: {other}; {anyway}"
     if routes.leased:
         return (
             f"{ifname} has the IP address {routes.leased[0]} by DHCP, so it is part of a network: {other}, "
@@ -296,82 +302,74 @@ def _attributes(data: bytes) -> dict[int, bytes]:
     return found
 
 
-DIRECTORY: Final = Path("/run/ethercat-server")  # RuntimeDirectory= of the service, which then owns it
-_FILE: Final = "lock"
-_NAME: Final = "\0ethercat-server/ifindex/{}"
-_INDEX_BITS: Final = 31
-_NAMESPACE: Final = 0xFFFFFFFF
-_FLOCK: Final = struct.Struct("@hhqqi0q")  # type, whence, start, length, process
+# RuntimeDirectory= of the service, which then owns it. Only root and the service can enter it, so that no
+# other user can take a lock.
+DIRECTORY: Final = Path("/run/ethercat-server")
+_FOLDER: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 @contextlib.contextmanager
 def locked(ifname: str, index: int) -> Iterator[None]:
     """Within it no other process has the lock of the interface `index`; InterfaceError if one has it.
 
-    For one interface at a time: closing the file releases all locks that this process has on it.
+    The lock is a folder's, one for each interface; the kernel releases it with the process. The root of a
+    user namespace may not make one, and takes an abstract socket of its network namespace instead.
     """
     try:
-        file = _open(DIRECTORY)
+        lock = _open_lock(f"{Path('/proc/self/ns/net').stat().st_ino}-{index}")
     except OSError:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
             try:
-                name.bind(_NAME.format(index))
+                name.bind(f"\0ethercat-server/ifindex/{index}")
             except OSError:
-                raise in_use(ifname) from None
+                raise _in_use(ifname) from None
             yield
         return
     try:
-        place = (Path("/proc/self/ns/net").stat().st_ino & _NAMESPACE) << _INDEX_BITS | index
         try:
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise in_use(ifname, _owner(file, place)) from None
+            raise _in_use(ifname, _owner(lock)) from None
         yield
     finally:
-        os.close(file)
+        os.close(lock)
 
 
-def in_use(ifname: str, process: int = 0) -> InterfaceError:
+def _open_lock(name: str) -> int:
+    """The folder that is the lock, open; OSError if it cannot be had, or other users could have it."""
+    with contextlib.suppress(FileExistsError):
+        DIRECTORY.mkdir(mode=0o700)
+    parent = os.open(DIRECTORY, _FOLDER)
+    try:
+        mode = os.fstat(parent).st_mode
+        if mode & 0o022:
+            raise PermissionError(f"{DIRECTORY} is writable for others")
+        if mode & 0o077:  # an older version made it
+            os.fchmod(parent, 0o700)
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(name, 0o755, dir_fd=parent)
+        return os.open(name, _FOLDER, dir_fd=parent)
+    finally:
+        os.close(parent)
+
+
+def _owner(lock: int) -> int:
+    """The process that has the lock; 0 if it is not visible."""
+    inode = f":{os.fstat(lock).st_ino}"
+    with contextlib.suppress(OSError):  # a service does not see them
+        for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
+            _, kind, _, _, process, file, *_ = line.split()
+            if kind == "FLOCK" and file.endswith(inode):
+                return int(process)
+    return 0
+
+
+def _in_use(ifname: str, process: int = 0) -> InterfaceError:
     """The error to be raised; `process` has the interface, 0 if that is not known."""
     who = "another EtherCAT master"
     if process > 0 and (name := _name_of(Path(f"/proc/{process}"))):
         who += f", process {process} ({name})"
     return InterfaceError(f"{ifname} is in use by {who}: stop that one first")
-
-
-def _open(directory: Path) -> int:
-    """The open lock file in `directory`; OSError if it cannot be had, or others could replace it."""
-    with contextlib.suppress(FileExistsError):
-        directory.mkdir(mode=0o755)
-    folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-    try:
-        owned = os.fstat(folder)
-        if owned.st_mode & 0o022:
-            raise PermissionError(f"{directory} is writable for others")
-        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
-        file = os.open(_FILE, flags, 0o600, dir_fd=folder)
-    finally:
-        os.close(folder)
-    try:
-        made = os.fstat(file)
-        if not stat.S_ISREG(made.st_mode) or made.st_nlink != 1:
-            raise PermissionError(f"{directory / _FILE} is not a file of its own")
-        if made.st_uid == os.geteuid() != owned.st_uid:
-            os.fchown(file, owned.st_uid, owned.st_gid)  # root made it first: the service needs it too
-    except OSError:
-        os.close(file)
-        raise
-    return file
-
-
-def _owner(file: int, place: int) -> int:
-    """The process that has the lock; 0 if there is none any more, or none that is visible."""
-    asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, place, 1, 0)
-    try:
-        kind, _, _, _, process = _FLOCK.unpack(fcntl.fcntl(file, fcntl.F_GETLK, asked))
-    except OSError:
-        return 0
-    return 0 if kind == fcntl.F_UNLCK else int(process)
 
 
 MAX_NAME_LENGTH: Final = 15  # Linux's limit; a longer name would overflow SOEM's buffer
@@ -391,7 +389,7 @@ def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
     # Of two that start at once neither has the bus open yet, so looking for that is not enough.
     with locked(ifname, index):
         if inodes := master_sockets(ifname):
-            raise in_use(ifname, next((process.pid for process in users_of(inodes)), 0))
+            raise _in_use(ifname, next((process.pid for process in users_of(inodes)), 0))
         _wait_usable(ifname)
         yield
 
@@ -399,7 +397,7 @@ def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
 def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
     if not 0 < len(ifname.encode()) <= MAX_NAME_LENGTH or "/" in ifname:
         raise InterfaceError(
-            f"{ifname!r} is no name of a network interface: it must have 1 to {MAX_NAME_LENGTH} characters; "
+            f"{ifname!r} is not an interface name: it must have 1 to {MAX_NAME_LENGTH} characters; "
             "'ip link' lists them"
         )
     found = look_up(ifname)
@@ -411,7 +409,7 @@ def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
         except OSError as error:
             raise InterfaceError(
                 f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "
-                "uses it all the same"
+                "overrides this check"
             ) from None
         if problem := network_trouble(ifname, routes):
             raise InterfaceError(problem)

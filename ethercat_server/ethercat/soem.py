@@ -1,31 +1,36 @@
 """The backend and the master on pysoem: socket, scan, mapping. The only file that knows pysoem.
 
 What pysoem raises is translated here, and its traps end here: the descriptor that a failed open leaks, the
-close that must happen once, the scan that may take minutes, the mapping's error ring.
+close that must happen once, the scan that may take minutes, the mapping's error ring. SOEM waits for single
+datagrams in jiffies, and exchanges one frame at a time; so the server's own frames use its AF_PACKET socket
+directly, with indices that SOEM does not use and discards.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import select
 import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import pysoem
 
 from ethercat_server.errors import BusError, SetUpError
+from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.nic import check_present, claimed, why_silent
-from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
-from ethercat_server.ethercat.slave.abort_codes import abort_meaning
+from ethercat_server.ethercat.slave.coe import abort_meaning
 
+_LONGEST_FRAME: Final = 1514
+_DONT_WAIT: Final = int(socket.MSG_DONTWAIT)
 _SCAN_TIMEOUT_S: Final = 15.0
-_IMAGE_BYTES: Final = 4096  # of pysoem's process image, whose end nothing checks
+_IMAGE_BYTES: Final = 4096  # of pysoem's process image, which pysoem does not check
 _PYSOEM_ERRORS: Final = (
     pysoem.SdoError,
     pysoem.Emergency,
@@ -35,7 +40,7 @@ _PYSOEM_ERRORS: Final = (
     pysoem.ConfigMapError,
     pysoem.NetworkInterfaceNotOpenError,
 )
-# What pysoem makes of entries of its error ring that it does not expect after a mapping.
+# How pysoem reports unexpected entries of its error ring after a mapping.
 _UNEXPECTED: Final = "unexpected error"
 
 
@@ -45,16 +50,13 @@ class SoemBackend:
     def __init__(self, ifname: str) -> None:
         self.ifname = ifname
         self.clock = SYSTEM_CLOCK
+        self.master: Master = self
         self._ifindex = 0
         self._master: Any = pysoem.Master()
         self._opened = False
         self._abandoned = False  # a thread that never ended still uses the socket: it must not be closed
-        self._socket: RawSocket
-
-    @property
-    def master(self) -> Master:
-        """See `Backend`."""
-        return self
+        self._fd: int  # SOEM's AF_PACKET socket, and a second handle to it
+        self._socket: socket.socket
 
     def open(self) -> None:
         """See `Backend`."""
@@ -69,38 +71,49 @@ class SoemBackend:
                 "check 'ip link' and the permissions"
             ) from None
         self._opened = True
-        self._socket = RawSocket((packet_sockets() - before).pop())
+        self._fd = (packet_sockets() - before).pop()
+        self._socket = socket.socket(fileno=os.dup(self._fd))
         try:
             self._ifindex = socket.if_nametoindex(self.ifname)
         except OSError:
             raise BusError(f"the interface {self.ifname} went away: connect it and start again") from None
         # Until SOEM had bound it to the interface, it received the EtherCAT frames of all others.
-        self._socket.discard()
+        while self.receive(0) is not None:
+            pass
 
     def send(self, frame: bytes | bytearray) -> None:
         """See `Backend`."""
-        self._socket.send(frame)
+        try:
+            self._socket.send(frame, _DONT_WAIT)
+        except OSError:  # the link is down: it is lost
+            return
 
     def receive(self, timeout_s: float) -> bytes | None:
         """See `Backend`."""
-        return self._socket.receive(timeout_s)
+        try:
+            # SO_RCVTIMEO is rounded up to jiffies, the time-out of `socket` to milliseconds; this is not.
+            if timeout_s <= 0 or select.select((self._fd,), (), (), timeout_s)[0]:
+                return self._socket.recv(_LONGEST_FRAME, _DONT_WAIT)
+        except OSError:  # there is none, or the link is down
+            return None
+        return None
 
     def arrived_ns(self) -> int:
         """See `Backend`."""
-        return self._socket.arrived_ns()
+        return nic.arrived_ns(self._fd)
 
     def check_present(self) -> None:
         """See `Backend`."""
-        check_present(self.ifname, self._ifindex)
+        nic.check_present(self.ifname, self._ifindex)
 
     def why_silent(self) -> str:
         """See `Backend`."""
-        return why_silent(self.ifname)
+        return nic.why_silent(self.ifname)
 
     def scan(self, positions: Sequence[int], check_interrupt: CheckInterrupt) -> None:
-        """See `Master`. SOEM takes every slave on the wire for its own."""
-        # SOEM tries every byte of the SII for long if a slave goes away meanwhile, two minutes in all, and no
-        # signal is noticed before it returns. So it runs in a thread, which can be left behind.
+        """See `Master`."""
+        # If a slave disappears during the scan, SOEM retries every byte of its SII, for two minutes, and no
+        # signal is noticed before it returns. So it runs in a thread, which can be abandoned.
         counts: list[int] = []
         thread = threading.Thread(
             target=lambda: counts.append(self._master.config_init(release_gil=True)), daemon=True
@@ -128,15 +141,12 @@ class SoemBackend:
     def map_process_data(self, check_interrupt: CheckInterrupt) -> None:
         """See `Master`. SOEM requests SAFEOP, too."""
         check_interrupt()
-        self._socket.set_blocking(True)
         try:
             mapped = self._master.config_map()
         except pysoem.ConfigMapError as error:
             raise self._unmapped(_texts(error.error_list)) from None
         except _PYSOEM_ERRORS as error:
             raise self._unmapped(_texts([error])) from None
-        finally:
-            self._socket.set_blocking(False)
         if mapped > _IMAGE_BYTES:
             raise self._unmapped(f"its slaves say that they have {mapped} bytes")
 
@@ -158,7 +168,7 @@ class SoemBackend:
 @contextlib.contextmanager
 def open_bus(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
     """The open bus on `ifname`; its sensors go to INIT at the end. Errors as `claimed`."""
-    with claimed(ifname, allow_ip=allow_ip):
+    with nic.claimed(ifname, allow_ip=allow_ip):
         backend = SoemBackend(ifname)
         with contextlib.closing(Bus(backend)) as bus:
             backend.open()
@@ -175,5 +185,16 @@ def _text(error: Any) -> str:
     if isinstance(error, pysoem.SdoError):
         return abort_meaning(error.abort_code & 0xFFFFFFFF)
     if str(error) == _UNEXPECTED:
-        return "an emergency, or another message that was not asked for, came meanwhile"
+        return "an emergency, or another message besides the answers, arrived"
     return str(getattr(error, "desc", None) or error).strip()
+
+
+def packet_sockets() -> set[int]:
+    """Descriptors of this process that are AF_PACKET sockets."""
+    targets = {f"socket:[{row.inode}]" for row in nic.packet_sockets()}
+    found = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # that of the listing itself
+            if str(descriptor.readlink()) in targets:
+                found.add(int(descriptor.name))
+    return found

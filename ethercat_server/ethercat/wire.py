@@ -19,13 +19,13 @@ DATAGRAM_HEADER: Final = 10
 COUNTER_SIZE: Final = 2
 TYPE_DATAGRAMS: Final = 1
 SOURCE_ADDRESS: Final = 6
-# The address that frames of this project come from, SOEM's too.
+# Source address of the frames of this project, and of SOEM.
 SOURCE: Final = b"\x01" * 6
 # Offset of the first datagram's index in a frame.
 DATAGRAM_INDEX: Final = FRAME_HEADER + 1
 # Offset of the first datagram's data.
 FIRST_DATA: Final = FRAME_HEADER + DATAGRAM_HEADER
-# What a byte takes at 100 Mbit/s.
+# Duration of a byte at 100 Mbit/s.
 BYTE_NS: Final = 80
 # Bytes on Ethernet, without the checksum.
 SHORTEST_FRAME: Final = 60
@@ -39,7 +39,7 @@ _U16 = struct.Struct("<H")
 
 
 class Command(IntEnum):
-    """What a datagram asks for."""
+    """Datagram commands."""
 
     NOP = 0
     APRD = 1
@@ -65,7 +65,7 @@ class Datagram(NamedTuple):
     """Where one datagram lies in its frame, and its header as it was received."""
 
     command: int
-    number: int  # the master's own; slaves leave it alone
+    number: int  # the index, which slaves do not change
     adp: int
     ado: int
     header: int  # offset of the first byte of the datagram in the frame
@@ -81,8 +81,7 @@ class Datagram(NamedTuple):
 def parse(frame: bytes | bytearray | memoryview, size: int) -> list[Datagram]:
     """The whole datagrams in the first `size` bytes of `frame`, in order.
 
-    Empty if it is no EtherCAT frame with datagrams. A datagram that does not fit ends the list: what is
-    before it stands, it and what is behind it is left alone.
+    Empty if it is not an EtherCAT frame with datagrams. A datagram that does not fit ends the list.
     """
     if size < FRAME_HEADER or frame[12:14] != _ETHERTYPE_BYTES:
         return []
@@ -143,9 +142,3 @@ def is_answer(frame: bytes, sent: bytes | bytearray, size: int) -> bool:
     asked = _DATAGRAM.unpack_from(sent, FRAME_HEADER)
     same_station = adp == asked[2] or command not in _BY_STATION
     return same_station and (command, index, ado, length & _LENGTH_MASK) == (*asked[:2], asked[3], size)
-
-
-def working_counter(frame: bytes | bytearray | memoryview, datagram: Datagram) -> int:
-    """The working counter of one datagram."""
-    value: int = _U16.unpack_from(frame, datagram.end)[0]
-    return value

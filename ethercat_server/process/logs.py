@@ -1,6 +1,6 @@
 """The log: one line per event on standard error, with priorities for journald, rate-limited.
 
-A thread writes it: a stopped terminal (Ctrl-S) or a pipe that nobody reads blocks nothing else.
+A thread writes it, so that a stopped terminal (Ctrl-S) or an unread pipe blocks nothing else.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _FLUSH_S: Final = 1.0  # longest time that the end of the process waits for what
 
 
 class QueuedHandler(logging.Handler):
-    """Writes lines to the descriptor `fd`. Whoever logs never waits for it."""
+    """Writes lines to the descriptor `fd`, without blocking the caller."""
 
     def __init__(self, fd: int) -> None:
         super().__init__()
@@ -77,7 +77,7 @@ class QueuedHandler(logging.Handler):
                 poller.register(self._fd, select.POLLOUT)
                 poller.poll()
             except OSError:
-                return  # nobody is there to read it
+                return  # its reader is gone
 
 
 _MOST_AT_ONCE: Final = 5

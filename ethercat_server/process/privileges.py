@@ -1,4 +1,4 @@
-"""Gives up root for good, once all that needs it is done: nothing that clients send is read as root."""
+"""Gives up root, once everything that needs it is done: no byte from a client is read as root."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class User(NamedTuple):
 
 
 def user_to_become(name: str | None) -> User | None:
-    """The user of this name or number; without one, who ran sudo. None to stay what this process is.
+    """The user of this name or number; without one, who ran sudo. None to remain as it is.
 
     UsageError if there is no such user, or this process is neither that user nor root.
     """
@@ -57,7 +57,7 @@ def _who_ran_sudo() -> User | None:
 def become(user: User) -> None:
     """Become `user`, with its groups and no capability, in all threads; ServerError if that is refused.
 
-    What is open, locked and scheduled stays so.
+    Open files, locked memory and scheduling are kept.
     """
     try:
         if user.name:

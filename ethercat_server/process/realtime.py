@@ -39,16 +39,17 @@ def prepare(priority: int, cpu: int | None, *, becomes_user: bool = False) -> No
             os.sched_setaffinity(0, {cpu})
         except OSError:
             refused.append(f"CPU {cpu}")
-    try:
-        if priority:
+    if priority:
+        try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except PermissionError:
-        refused.append(f"real-time priority {priority} (CAP_SYS_NICE)")
-        _fine_timer()
-    if not priority:
-        _fine_timer()
-    if priority and (missing := _lock_memory(becomes_user=becomes_user)):
-        refused.append(f"locked memory ({missing})")
+        except PermissionError:
+            refused.append(f"real-time priority {priority} (CAP_SYS_NICE)")
+        if missing := _lock_memory(becomes_user=becomes_user):
+            refused.append(f"locked memory ({missing})")
+    if os.sched_getscheduler(0) != os.SCHED_FIFO:
+        # By default an ordinary thread's sleep may end 50 µs late, a FIFO thread's not.
+        with contextlib.suppress(OSError):
+            Path("/proc/self/timerslack_ns").write_text(_TIMER_SLACK_NS, encoding="ascii")
     if refused:
         log.warning("not granted: %s; expect more jitter", ", ".join(refused))
     sys.setswitchinterval(_SWITCH_S)
@@ -73,11 +74,3 @@ def _lock_memory(*, becomes_user: bool) -> str | None:
         if becomes_user:  # without CAP_IPC_LOCK every allocation beyond the limit would fail
             return "CAP_SYS_RESOURCE"
     return None if ctypes.CDLL(None).mlockall(_MLOCK) == 0 else "CAP_IPC_LOCK"
-
-
-def _fine_timer() -> None:
-    """Timer slack of 1 µs: by default an ordinary thread's sleep may end 50 µs late, a FIFO thread's not."""
-    try:
-        Path("/proc/self/timerslack_ns").write_text(_TIMER_SLACK_NS, encoding="ascii")
-    except OSError:
-        log.debug("timer slack cannot be set")

@@ -1,8 +1,8 @@
-"""Looks at a bus: which slaves there are, which of them are sensors, whose the others are, who is at work.
+"""Which slaves are on a bus, which of them are sensors or operational, and whether a master is active.
 
-Looking disturbs nobody: frames of other masters are counted, registers and SIIs (EEPROMs) are read. Not the
-SII of a slave in SAFEOP, OP or BOOT, for reading takes writes to its controller; what is Bota's is then told
-from its sync managers.
+Nothing is disturbed: frames of other masters are counted, registers and SIIs (EEPROMs) are read. The SII of a
+slave in SAFEOP, OP or BOOT is not read, because that takes writes to its controller; a Bota sensor is then
+recognized by its sync managers.
 """
 
 from __future__ import annotations
@@ -26,14 +26,13 @@ from ethercat_server.ethercat.slave.sii import read_sii
 from ethercat_server.sensor.objects.dictionary import is_sensor
 
 _LISTEN_S: Final = 0.1
-# Frames in this time that are a master's cycle; fewer may be the last ones of a server that was killed.
+# As many frames in this time are a master's cycle; fewer may be the last ones of a server that was killed.
 _MASTER_FRAMES: Final = 3
 _TIMEOUT_S: Final = 0.02
 _ATTEMPTS: Final = 5
 _PROBE_BYTES: Final = 1
 _SII_PAUSE_S: Final = 0.0002  # between two questions whether an EEPROM has read a word: 1 to 3 ms
 _PAUSE_S: Final = 0.002
-_ACKNOWLEDGE: Final = 0x10
 # Start and length of a Bota sensor's sync managers 0 to 2, and start of the last one.
 _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
 _INPUTS: Final = 0x1180
@@ -58,7 +57,7 @@ class Slave(NamedTuple):
     status: AlStatus
     sii: sii.Sii | None  # None if it was not read
     problem: str = ""  # why its SII cannot be read
-    at_work: bool = False  # it is no Bota sensor and in SAFEOP, OP or BOOT
+    at_work: bool = False  # in SAFEOP, OP or BOOT, and not a Bota sensor
 
     @property
     def name(self) -> str:
@@ -90,8 +89,8 @@ class Slave(NamedTuple):
 def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False) -> list[Slave]:
     """All slaves, in their order on the wire, with their SIIs; NoSlaveError if there are none.
 
-    BusError if using the bus would stop somebody else's machine: if another master is sending, or a slave
-    that is not Bota's is in SAFEOP, OP or BOOT. With `force`, such slaves are taken to PREOP instead.
+    BusError if using the bus would stop another machine: if another master is sending, or a slave that is
+    not Bota's is in SAFEOP, OP or BOOT. With `force`, such slaves are taken to PREOP instead.
     """
     if not force and (count := bus.listen(_LISTEN_S)) >= _MASTER_FRAMES:
         raise BusError(
@@ -112,7 +111,7 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
     if at_work and not force:
         where = ", ".join(f"{slave.position} in {slave.status.state.name}" for slave in at_work)
         raise BusError(
-            f"{bus.ifname} has slaves at work that are no Bota sensors (position {where}): name the "
+            f"{bus.ifname} has slaves at work that are not Bota sensors (position {where}): name the "
             "interface that the sensor is connected to, or stop their master; --force takes them to PREOP"
         )
     found = []
@@ -155,7 +154,7 @@ def read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda
 
 
 class OtherSlaves:
-    """The slaves beside the sensors: left alone, looked at now and then for their presence."""
+    """The slaves beside the sensors: only their AL state is read, in turn."""
 
     def __init__(self, bus: Bus, slaves: Sequence[Slave]) -> None:
         self._bus = bus
@@ -190,10 +189,9 @@ def _has_sensors_managers(bus: Bus, position: int) -> bool:
 
 
 def _stopped(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:
-    """Take a slave that is not Bota's, and that is to be taken over, to PREOP."""
+    """Take a slave that is not Bota's to PREOP, as `force` permits."""
     position = slave.position
-    request = (AlState.PREOP | _ACKNOWLEDGE).to_bytes(2, "little")
-    bus.write_surely_at(position, reg.AL_CONTROL, request)
+    bus.write_surely_at(position, reg.AL_CONTROL, AlStatus(AlState.PREOP, error=True, code=0).acknowledge())
     deadline = Deadline(bus.clock, STATE_S[AlState.PREOP])
     while (now := look_at(bus, position)).at_work:
         check_interrupt()

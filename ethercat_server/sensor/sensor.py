@@ -1,4 +1,4 @@
-"""One sensor: who it is, what it is set to, and what it is doing."""
+"""One sensor: identity, settings, state."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MODEL_NAME: Final = re.compile(r"BFT-[A-Z]{4}-ECAT-M8")
 
 
 class Identity(NamedTuple):
-    """What the sensor says of itself over SDO."""
+    """The sensor's identity, read over SDO."""
 
     name: str
     serial: int
@@ -34,7 +34,7 @@ class Identity(NamedTuple):
 
 
 class Found(NamedTuple):
-    """A sensor that was found, or the foreign slave that was asked for."""
+    """A sensor that was found, or another slave."""
 
     number: int
     identity: Identity
@@ -50,14 +50,14 @@ class Found(NamedTuple):
 
 
 class SensorState(Enum):
-    """What a sensor is doing. It is in exactly one of these; `Sensor.enter` goes to another."""
+    """The state of a sensor; `Sensor.enter` changes it."""
 
     SETTING_UP = auto()
     STREAMING = auto()
     CHANGING = auto()  # out of OP to have its settings changed
     REVERTING = auto()  # the change failed: it gets its former settings back
     LOST = auto()
-    REFUSED = auto()  # another sensor is connected in its place
+    REFUSED = auto()  # another sensor is connected at its position
 
     @property
     def reported(self) -> str:
@@ -84,14 +84,14 @@ class Sensor:
     identity: Identity
     # The settings to be in force; written again when the sensor has lost them.
     wanted: dict[str, SettingValue]
-    asked: frozenset[str] = frozenset()  # those among them that a person asked for: these must exist
+    asked: frozenset[str] = frozenset()  # those among them that a user set: these must exist
     position: int = 0  # among all slaves on the wire, from 0
     pdo_size: int = 0
     rate_hz: int = 0
     state: SensorState = SensorState.SETTING_UP
     # The settings in force; `set_in_force` changes them.
     settings: dict[str, SettingValue] = field(default_factory=dict)
-    # What each of them means. Kept, so that telling it takes no time from the samples.
+    # What each of them means; computed once, not for each reply.
     meaning: dict[str, str] = field(default_factory=dict)
     # The delay of each channel by its filters; likewise.
     delay_ms: dict[str, float | None] = field(default_factory=dict)
@@ -109,7 +109,7 @@ class Sensor:
         return self.state is SensorState.STREAMING
 
     def settle(self, clock: Clock) -> None:
-        """It has entered OP, so its data is settling. The stream does not wait, what averages does."""
+        """It has entered OP, so its data is settling. Samples are streamed at once; averaging waits."""
         self.settled_at = Deadline(clock, max(SETTLING_S, SETTLING_SAMPLES * self.period_ns * 1e-9))
 
     @property
@@ -118,7 +118,7 @@ class Sensor:
         return self.streams and self.settled_at is not None and not self.settled_at.passed
 
     def enter(self, state: SensorState) -> None:
-        """Go to another state; AssertionError for a transition that cannot be."""
+        """Go to another state; AssertionError for an impossible transition."""
         assert state in _TRANSITIONS[self.state], f"{self.state.name} -> {state.name}"
         self.state = state
 
@@ -145,7 +145,7 @@ class Sensor:
         return list(offset) if offset is not None and all(map(math.isfinite, offset)) else None
 
     def in_force(self) -> dict[str, Any]:
-        """What replies and events say of a change."""
+        """The part of replies and events about a change."""
         return {
             "settings": dict(self.settings),
             "rate_hz": self.rate_hz,

@@ -1,4 +1,5 @@
-"""The steps that identify a sensor and set it up.
+"""The steps that identify a sensor, set it up, and change its settings while it streams, in OP or by way of
+PREOP; if that fails, the former settings are in force again afterwards.
 
 They are generators over an `Sdo` (see `ethercat.slave.coe`): the same code runs at start-up and, between two
 exchanges, when a sensor comes back.
@@ -11,9 +12,16 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor, sinc_length_of
+from bota_ethercat.settings import (
+    BASE_SAMPLING_RATE_HZ,
+    SETTINGS,
+    SettingValue,
+    check_combination,
+    rate_divisor,
+    sinc_length_of,
+)
 from bota_ethercat.text.untrusted import visible
-from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError
+from ethercat_server.errors import OBJECT_MISSING, BusError, CutOffError, SdoAbortError, extended
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.objects import dictionary
@@ -22,13 +30,20 @@ from ethercat_server.sensor.sensor import SETTLING_S, Identity, Sensor
 _LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]  # sinc_length
 _OFFSETS: Final = tuple((dictionary.FORCE_TORQUE_OFFSET, sub) for sub in range(1, 7))
 
+_SAVE_TIMEOUT_S: Final = 5.0
+
+# How the sentence of a change that failed goes on.
+IN_FORCE: Final = "; the former settings are in force"
+LATER: Final = "; it gets its former settings when it is back"
+_AGAIN: Final = "configure it again"
+
 NO_SETTINGS: Final[Mapping[str, SettingValue]] = {}
 
 log = logging.getLogger(__name__)
 
 
 def identify(sdo: Sdo, sii_name: str) -> Steps[Identity]:
-    """Ask the sensor who it is; what its firmware has no object for is left empty."""
+    """Read the sensor's identity; fields that its firmware has no object for are empty."""
     name = yield from _read_text(sdo, dictionary.DEVICE_NAME)
     hardware = yield from _read_text(sdo, dictionary.HARDWARE_VERSION)
     firmware = yield from _read_text(sdo, dictionary.FIRMWARE_VERSION)
@@ -42,18 +57,8 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     The sensor must be in PREOP. Afterwards `settings` and `rate_hz` are what is in force. BusError says which
     setting did not take.
     """
-    held: dict[str, str] = {}
-    written = False
-    for name in dictionary.SETTING_WRITE_ORDER:
-        if name not in sensor.wanted or name == _LAST:
-            continue
-        entry = dictionary.BY_SETTING[name]
-        found = yield from _read(sdo, entry.address)
-        if found != entry.encode_setting(sensor.wanted[name]):
-            yield from write_setting(sdo, sensor, name)
-            written = True
-            if found is not None:
-                held[name] = _setting_text(name, found)
+    written = yield from _write_differing(sdo, sensor, preop=True)
+    held = {name: _setting_text(name, found) for name, found in written.items() if found is not None}
     # The valid SINC range depends on the filters before it, and only the sampling rate shows what it is.
     # With CHOP, which may divide the rate, not even that shows it.
     right = (yield from _divisor(sdo, sensor)) == 1
@@ -72,21 +77,32 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
             sensor.number, ", ".join(texts),
             unset and f"; nobody set {unset}: --unset-settings keep leaves what the sensor has",
         )  # fmt: skip
-    yield from read_settings(sdo, sensor)
-    yield from _restore_offset(sdo, sensor)
-    sensor.change_interrupted = False
+    yield from _finish_set_up(sdo, sensor)
 
 
 def set_up_in_op(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    """After a change that was cut off in OP: write what is wanted, as far as OP takes it; see `set_up`."""
-    for name in dictionary.SETTING_WRITE_ORDER:
-        if name not in sensor.wanted or SETTINGS[name].preop_only:
-            continue
-        entry = dictionary.BY_SETTING[name]
-        if (yield from _read(sdo, entry.address)) != entry.encode_setting(sensor.wanted[name]):
-            yield from write_setting(sdo, sensor, name)
-    yield from _restore_offset(sdo, sensor)
+    """After a change that was interrupted in OP: write the wanted settings that OP permits; see `set_up`."""
+    yield from _write_differing(sdo, sensor, preop=False)
+    yield from _finish_set_up(sdo, sensor)
+
+
+def _write_differing(sdo: Sdo, sensor: Sensor, *, preop: bool) -> Steps[dict[str, bytes | None]]:
+    """Write what is wanted and not in force, but SINC; returns what was read of that."""
+    written = {}
+    for name in dictionary.SETTING_WRITE_ORDER[:-1]:
+        if name in sensor.wanted and (preop or not SETTINGS[name].preop_only):
+            entry = dictionary.BY_SETTING[name]
+            found = yield from _read(sdo, entry.address)
+            if found != entry.encode_setting(sensor.wanted[name]):
+                yield from write_setting(sdo, sensor, name)
+                written[name] = found
+    return written
+
+
+def _finish_set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     yield from read_settings(sdo, sensor)
+    if sensor.offset is not None and (yield from read_offset(sdo)) != sensor.offset:
+        yield from write_offset(sdo, sensor.offset)
     sensor.change_interrupted = False
 
 
@@ -112,10 +128,75 @@ def write_setting(sdo: Sdo, sensor: Sensor, name: str, value: SettingValue | Non
         )
 
 
+class Change:
+    """What the wanted `settings` would change of a sensor; SettingError if they contradict others."""
+
+    def __init__(self, sensor: Sensor, settings: Mapping[str, SettingValue]) -> None:
+        self.wanted = {**sensor.wanted, **settings}
+        check_combination(self.wanted)
+        changed = {name for name in settings if sensor.settings.get(name) != settings[name]}
+        # In the order in which they are to be written.
+        self.names = [name for name in dictionary.SETTING_WRITE_ORDER if name in changed]
+
+    @property
+    def needs_preop(self) -> bool:
+        """Whether the sensor takes one of them in PREOP only."""
+        return any(SETTINGS[name].preop_only for name in self.names)
+
+
+def apply_in_op(sdo: Sdo, sensor: Sensor, change: Change) -> Steps[None]:
+    """Write what has changed and verify it; BusError if it fails, which says that the former is in force."""
+    before, asked = sensor.wanted, sensor.asked
+    sensor.wanted, sensor.asked = change.wanted, asked | set(change.names)
+    written = []
+    try:
+        for name in change.names:
+            written.append(name)
+            yield from write_setting(sdo, sensor, name)
+        yield from read_settings(sdo, sensor)
+    except BusError as error:
+        sensor.wanted, sensor.asked, sensor.change_interrupted = before, asked, True
+        if isinstance(error, CutOffError):
+            raise extended(error, LATER) from None
+        try:
+            for name in written:
+                if name in sensor.settings:
+                    yield from write_setting(sdo, sensor, name, sensor.settings[name])
+        except BusError as worse:
+            raise extended(error, f"; restoring the former settings failed too: {worse}; {_AGAIN}") from None
+        sensor.change_interrupted = False
+        raise extended(error, IN_FORCE) from None
+
+
+def save(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+    """Have the sensor save its parameters to flash; BusError if it does not report success."""
+    command, status = dictionary.CONTROL_COMMAND, dictionary.CONTROL_STATUS
+    deadline = Deadline(sdo.clock, _SAVE_TIMEOUT_S)
+    try:
+        yield from sdo.write(*command, bytes((dictionary.SAVE_PARAMETERS,)))
+        while True:
+            answer = int.from_bytes((yield from sdo.read(*status)), "little")
+            if answer == 0:
+                return
+            if deadline.passed:
+                break
+            yield
+    except SdoAbortError as error:
+        raise extended(error, "; its settings are in force until its power goes, but not saved") from None
+    except BusError as error:  # lost, or without an answer
+        raise extended(
+            error, "; whether it saved all, some or none of its settings is not known: save again"
+        ) from None
+    raise BusError(
+        f"sensor {sensor.number} did not save its settings (status {answer}): they are in force until its "
+        "power goes; save again"
+    )
+
+
 def _setting_text(name: str, data: bytes) -> str:
     """For people: the setting in what was read of its object."""
     try:
-        return _text(dictionary.BY_SETTING[name].decode_setting(data, SETTINGS[name].is_bool))
+        return _text(dictionary.BY_SETTING[name].decode_setting(data))
     except ValueError:
         return f"0x{data.hex()}"
 
@@ -136,11 +217,6 @@ def read_offset(sdo: Sdo) -> Steps[tuple[float, ...]]:
                 f"the offset {entry.name} is {data.hex() or 'nothing'}, which is no {entry.type.name}"
             ) from None
     return tuple(found)
-
-
-def _restore_offset(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    if sensor.offset is not None and (yield from read_offset(sdo)) != sensor.offset:
-        yield from write_offset(sdo, sensor.offset)
 
 
 def pack_offset(offset: Sequence[float]) -> list[bytes]:
@@ -191,14 +267,14 @@ def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
 
 
 def read_settings(sdo: Sdo, sensor: Sensor) -> Steps[None]:
-    """Find out what is in force."""
+    """Read the settings in force."""
     held: dict[str, SettingValue] = {}
-    for name, setting in SETTINGS.items():
+    for name in SETTINGS:
         data = yield from _read(sdo, dictionary.BY_SETTING[name].address)
         if data is None:
             continue
         try:
-            held[name] = dictionary.BY_SETTING[name].decode_setting(data, setting.is_bool)
+            held[name] = dictionary.BY_SETTING[name].decode_setting(data)
         except ValueError as error:
             log.warning("sensor %d: %s", sensor.number, error)
     held["sinc_length"] = sensor.wanted["sinc_length"]
@@ -222,7 +298,7 @@ def read_in_force(sdo: Sdo, sensor: Sensor, asked: Mapping[str, SettingValue] = 
 
 
 def read_sinc(sdo: Sdo) -> Steps[tuple[int | None, int | None, bool]]:
-    """What tells the SINC length in force: what it reads back, the sampling rate, CHOP. None: unreadable."""
+    """SINC length as read back, sampling rate, CHOP: they show the length in force. None: unreadable."""
     length = yield from _read(sdo, dictionary.BY_SETTING[_LAST].address)
     rate = yield from _read(sdo, dictionary.SAMPLING_RATE)
     chop = yield from _read(sdo, dictionary.BY_SETTING["chop"].address)

@@ -2,13 +2,13 @@
 
 The sensor adds its offset to what it measures, so new = target - mean + current.
 
-An offset is taken back if an axis is then off target by more than STEADY and what noise explains: the load
+An offset is taken back if an axis is then off target by more than `steady` and what noise explains: the load
 moved. So is one that makes an axis worse: further from its target than before, by more than five standard
 errors of the difference of the two means. The standard error of a mean is the larger of two estimates: from
 single samples, and from the means of eight parts of its window, which covers noise that the sensor's filters
 have correlated.
 
-At rest is judged apart from `ft_compensation`, in raw units and by sums, which hold up no exchange.
+Rest is judged here, not as in `ft_compensation`: in raw units, and by sums, which delay no exchange.
 """
 
 from __future__ import annotations
@@ -28,18 +28,27 @@ from ethercat_server.sensor.sensor import SETTLING_SAMPLES, Sensor
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 
 LATER: Final = "; it gets its old offset when it is back"
-_NAMES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz", "Rx", "Ry", "Rz")
-_CHANNELS: Final = len(_NAMES)
 # Fields of the process data with force and torque, and with the angular rate.
 _LOAD: Final = slice(2, 8)
 _RATE: Final = slice(13, 16)
 LEAST_SAMPLES: Final = 20  # fewer would not show whether the sensor is stationary
-# Standard deviations (N, Nm, deg/s) of a stationary sensor, above Bota's own limits for a healthy one.
-_LIMITS: Final = (1.0,) * 3 + (0.05,) * 3 + (3.0,) * 3
-# N and Nm: what a mean may move within a window, and be off target after a tare, beyond noise.
-_STEADY: Final = (0.3,) * 3 + (0.01,) * 3
-_UNITS: Final = ("N",) * 3 + ("Nm",) * 3 + ("deg/s",) * 3
-# Of the mean angular rate: beyond it a robot is plainly moving. The residual tells what a slower turn costs.
+
+
+class _Channel(NamedTuple):
+    """A quantity of the process data, in its unit."""
+
+    name: str
+    unit: str
+    most: float  # standard deviation of a stationary sensor, above Bota's own limit for a healthy one
+    steady: float  # what a mean may move within a window, and be off target after a tare, beyond noise
+
+
+_CHANNELS: Final = (
+    *(_Channel(name, "N", 1.0, 0.3) for name in ("Fx", "Fy", "Fz")),
+    *(_Channel(name, "Nm", 0.05, 0.01) for name in ("Mx", "My", "Mz")),
+    *(_Channel(name, "deg/s", 3.0, math.inf) for name in ("Rx", "Ry", "Rz")),
+)
+# Limit of the mean angular rate: above it the robot is moving. The residual shows slower motion.
 _REST_TURN_DPS: Final = math.degrees(0.5)
 _BY_CHANCE: Final = 5.0  # standard errors by which two means must differ to differ significantly
 _PARTS: Final = 8  # parts of a window whose means give the standard error of the whole window's
@@ -70,7 +79,7 @@ def tare(
     """Steps of the action `tare`; returns what its reply carries. RequestError if the sensor is not at rest,
     or cannot hold the offset, or if an axis is off target afterwards or worse than before.
 
-    If it fails half-way the old offset is put back. `on_offset` hears of either at once.
+    If it fails after that, the old offset is written again. `on_offset` is called after each write.
     """
     _check_fits(target, "the key 'target'")
     samples = max(samples, LEAST_SAMPLES)
@@ -79,7 +88,7 @@ def tare(
     before = yield from _average(sdo.clock, sensor, stream, samples)
     _check_rest(sensor, before)
     old = yield from read_offset(sdo)
-    new = tuple(t - m + o for t, m, o in zip(target, before.mean[:6], old, strict=True))
+    new = tuple(t - found.mean + o for t, found, o in zip(target, before[:6], old, strict=True))
     _check_fits(new, "the offset that the key 'target' asks for")
     try:
         new = sensor.offset = yield from write_offset(sdo, new)
@@ -94,8 +103,8 @@ def tare(
     return {
         "old_offset": list(old),
         "new_offset": list(new),
-        "residual": [m - t for m, t in zip(after.mean[:6], target, strict=True)],
-        "deviation": before.deviation[:6],
+        "residual": [found.mean - t for found, t in zip(after[:6], target, strict=True)],
+        "deviation": [found.deviation for found in before[:6]],
     }
 
 
@@ -125,14 +134,14 @@ def _take_back(
     return extended(error, addition)
 
 
-class _Window(NamedTuple):
-    """Force, torque and angular rate (deg/s) over some samples."""
+class _Found(NamedTuple):
+    """One channel over some samples."""
 
-    mean: list[float]
-    deviation: list[float]
-    change: list[float]  # from the mean of the first half to that of the second
-    by_chance: list[float]  # what noise explains of that
-    error: list[float]  # standard error of the mean
+    mean: float
+    deviation: float
+    change: float  # from the mean of the first half to that of the second
+    by_chance: float  # what noise explains of that
+    error: float  # standard error of the mean
 
 
 class _Part:
@@ -140,8 +149,8 @@ class _Part:
 
     def __init__(self) -> None:
         self.taken = 0
-        self.sums = [0.0] * _CHANNELS
-        self.squares = [0.0] * _CHANNELS
+        self.sums = [0.0] * len(_CHANNELS)
+        self.squares = [0.0] * len(_CHANNELS)
 
     def add(self, row: Sequence[float]) -> None:
         self.taken += 1
@@ -150,15 +159,25 @@ class _Part:
             self.squares[channel] += value * value
 
 
-def _statistics(parts: Sequence[_Part]) -> list[tuple[float, float]]:
-    """Mean and variance of each channel."""
+def _moments(parts: Sequence[_Part], channel: int) -> tuple[float, float]:
+    """Mean and variance."""
     taken = sum(part.taken for part in parts)
-    means = [sum(part.sums[n] for part in parts) / taken for n in range(_CHANNELS)]
-    squares = [sum(part.squares[n] for part in parts) / taken for n in range(_CHANNELS)]
-    return [(mean, max(0.0, square - mean * mean)) for mean, square in zip(means, squares, strict=True)]
+    mean = sum(part.sums[channel] for part in parts) / taken
+    return mean, max(0.0, sum(part.squares[channel] for part in parts) / taken - mean * mean)
 
 
-def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[_Window]:
+def _found(parts: Sequence[_Part], channel: int, start: float) -> _Found:
+    """One channel of a window, in whose sums values are relative to `start`."""
+    samples, first = sum(part.taken for part in parts), parts[: _PARTS // 2]
+    mean, variance = _moments(parts, channel)
+    (one, noise), (other, more_noise) = _moments(first, channel), _moments(parts[_PARTS // 2 :], channel)
+    by_chance = _BY_CHANCE * math.sqrt((noise + more_noise) / sum(part.taken for part in first))
+    of_parts = statistics.stdev(_moments([part], channel)[0] for part in parts)
+    error = max(math.sqrt(variance / samples), of_parts / math.sqrt(_PARTS))
+    return _Found(start + mean, math.sqrt(variance), abs(other - one), by_chance, error)
+
+
+def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[list[_Found]]:
     """Over the next samples."""
     unpack = layout_for(sensor.pdo_size).struct.unpack
     deadline = _patience(clock, sensor, samples)
@@ -185,19 +204,7 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
         row = [value - start for value, start in zip(row, first, strict=True)]
         parts[_PARTS * taken // samples].add(row)
         taken += 1
-    found, halves = _statistics(parts), (parts[: _PARTS // 2], parts[_PARTS // 2 :])
-    change, by_chance = [], []
-    for (one, noise), (other, more_noise) in zip(*map(_statistics, halves), strict=True):
-        change.append(abs(other - one))
-        by_chance.append(_BY_CHANCE * math.sqrt((noise + more_noise) / sum(part.taken for part in halves[0])))
-    deviation = [math.sqrt(variance) for _, variance in found]
-    means = zip(*([mean for mean, _ in _statistics([part])] for part in parts), strict=True)
-    error = [
-        max(alone / math.sqrt(samples), statistics.stdev(each) / math.sqrt(_PARTS))
-        for alone, each in zip(deviation, means, strict=True)
-    ]
-    mean = [m + start for (m, _), start in zip(found, first, strict=True)]
-    return _Window(mean, deviation, change, by_chance, error)
+    return [_found(parts, channel, start) for channel, start in enumerate(first)]
 
 
 def _wait(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[None]:
@@ -213,46 +220,39 @@ def _patience(clock: Clock, sensor: Sensor, samples: int) -> Deadline:
     return Deadline(clock, 1.0 + _PATIENCE * samples * sensor.period_ns * 1e-9)
 
 
-def _check_rest(sensor: Sensor, found: _Window) -> None:
-    turn = math.hypot(*found.mean[6:])
+def _check_rest(sensor: Sensor, window: Sequence[_Found]) -> None:
+    turn = math.hypot(*(found.mean for found in window[6:]))
     if turn > _REST_TURN_DPS:
         raise _not_at_rest(sensor, f"it turns by {turn:.3g} deg/s (mean; at most {_REST_TURN_DPS:.3g})")
-    for name, deviation, limit, unit in zip(_NAMES, found.deviation, _LIMITS, _UNITS, strict=True):
-        if deviation > limit:
-            raise _not_at_rest(
-                sensor, f"{name} varies by {deviation:.3g} {unit} (standard deviation; at most {limit:g})"
-            )
-    changes = zip(_NAMES[:6], found.change[:6], found.by_chance[:6], _STEADY, _UNITS[:6], strict=True)
-    for name, change, by_chance, limit, unit in changes:
-        if change > limit + by_chance:
-            text = f"{name} changes by {change:.3g} {unit} (mean; at most {limit + by_chance:.3g})"
+    for (name, unit, most, steady), found in zip(_CHANNELS, window, strict=True):
+        if found.deviation > most:
+            text = f"{name} varies by {found.deviation:.3g} {unit} (standard deviation; at most {most:g})"
+            raise _not_at_rest(sensor, text)
+        if found.change > (most_change := steady + found.by_chance):
+            text = f"{name} changes by {found.change:.3g} {unit} (mean; at most {most_change:.3g})"
             raise _not_at_rest(sensor, text)
 
 
 def _check_better(
-    sensor: Sensor, before: _Window, after: _Window, samples: int, target: Sequence[float]
+    sensor: Sensor, before: Sequence[_Found], after: Sequence[_Found], samples: int, target: Sequence[float]
 ) -> None:
     """RequestError if an axis is off target or further from it than before, and noise does not explain it."""
     worst, text = 0.0, ""
-    for n, (name, wanted, limit) in enumerate(zip(_NAMES[:6], target, _STEADY, strict=True)):
-        was, now = before.mean[n] - wanted, after.mean[n] - wanted
-        allowed = _BY_CHANCE * math.hypot(before.error[n], after.error[n])
-        allowed += _ROUNDING * max(1.0, abs(wanted), abs(before.mean[n]))
+    for (name, unit, _, steady), old, new, wanted in zip(_CHANNELS, before, after, target, strict=False):
+        was, now = old.mean - wanted, new.mean - wanted
+        allowed = _BY_CHANCE * math.hypot(old.error, new.error)
+        allowed += _ROUNDING * max(1.0, abs(wanted), abs(old.mean))
         worse = abs(now) - abs(was) - allowed
         # Of single samples: a load that moves correlates the means of the parts.
-        alone = math.hypot(before.deviation[n], after.deviation[n]) / math.sqrt(samples)
-        off = abs(now) - limit - _BY_CHANCE * alone
-        excess = max(worse, off) / limit  # so that N and Nm compare
+        alone = math.hypot(old.deviation, new.deviation) / math.sqrt(samples)
+        off = abs(now) - steady - _BY_CHANCE * alone
+        excess = max(worse, off) / steady  # so that N and Nm compare
         if excess > worst:
-            did = (
-                f"the tare made sensor {sensor.number} worse"
-                if worse > 0
-                else f"the load of sensor {sensor.number} moved during the tare"
-            )
-            worst, text = (
-                excess,
-                f"{did}: {name} is {now:.3g} {_UNITS[n]} off target after it and was {was:.3g} before",
-            )
+            what = f"the load of sensor {sensor.number} moved during the tare"
+            if worse > 0:
+                what = f"the tare made sensor {sensor.number} worse"
+            worst = excess
+            text = f"{what}: {name} is {now:.3g} {unit} off target after it and was {was:.3g} before"
     if text:
         raise RequestError(ErrorCode.NOT_READY, f"{text}: keep its load still and tare again")
 

@@ -1,30 +1,17 @@
-"""One client's connection: its state, what it has sent so far, which DATA it wants. It never blocks.
-
-    READING <-> READY <-> ANSWERING          a client that may ask
-       |          |           |
-       v          |           |
-    HALF_CLOSED   |           |              it has closed its side and still receives its subscription
-       |          |           |
-       +----------+-----------+
-                  v
-       CLOSING -> LINGERING -> CLOSED        the server closes: sends what waits, then waits for the client
-           \\-> FLUSHING ------^              the client has closed its side: only what waits is sent
-
-From every state a connection that breaks goes to CLOSED at once.
-"""
+"""One client's connection: its state, what it has sent so far, which DATA it wants. It never blocks."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
 from bota_ethercat.errors import BadMessageError, RemoteProtocolError
 from bota_ethercat.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, encode_json
-from bota_ethercat.text.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import OutgoingFrame
+from ethercat_server.serving.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
 from ethercat_server.serving.transport import Stream
 
 MAX_REQUEST_LENGTH: Final = 4096
@@ -38,45 +25,24 @@ NO_SENSOR: Final = -1
 _IDLE_FRAME_NS: Final = 10_000_000
 _REPEATED: Final = int(DataFlag.REPEATED)
 _GAP: Final = int(DataFlag.GAP)
-# Timeout for the rest of a message whose first part has arrived.
-_UNFINISHED_NS: Final = 10_000_000_000
-# Timeout for a connection that is being closed.
-_LAST_REPLY_NS: Final = 1_000_000_000
+_UNFINISHED_NS: Final = 10_000_000_000  # timeout for the rest of a message whose first part has arrived
+_LAST_REPLY_NS: Final = 1_000_000_000  # timeout for a connection that is being closed
 
 
 class State(Enum):
-    """What a connection does now."""
+    """What a connection does now. It goes to a later one, or READY to READING and ANSWERING to READY."""
 
-    READING = "waits for the client's next request"
+    READING = "waits for the client's next request, if the client has not closed its side"
     READY = "has received bytes that may contain whole requests; reads no more until they are taken"
     ANSWERING = "its last request is not answered yet; what the client sent after it waits"
-    HALF_CLOSED = "the client has closed its side, but is subscribed"
     CLOSING = "sends what waits and discards what the client still sends"
-    FLUSHING = "sends what waits; the client has closed its side"
     LINGERING = "everything is sent and this side is closed; discards until the client has closed its own"
     CLOSED = "nothing is left but to close the socket"
 
     def __init__(self, _meaning: str) -> None:
         # Read for every connection in each turn: an attribute costs less than looking a member up in a set.
-        # Whether to wait for bytes of the client.
-        self.reads = self.name in {"READING", "CLOSING", "LINGERING"}
         # Whether no more requests are taken.
-        self.ending = self.name in {"CLOSING", "FLUSHING", "LINGERING", "CLOSED"}
-
-
-_ENDINGS: Final = frozenset({State.CLOSING, State.FLUSHING, State.CLOSED})
-
-# The states that may follow each.
-TRANSITIONS: Final[Mapping[State, frozenset[State]]] = {
-    State.READING: _ENDINGS | {State.READY, State.HALF_CLOSED},
-    State.READY: _ENDINGS | {State.READING, State.ANSWERING},
-    State.ANSWERING: _ENDINGS | {State.READY},
-    State.HALF_CLOSED: _ENDINGS - {State.CLOSING},
-    State.CLOSING: frozenset({State.FLUSHING, State.LINGERING, State.CLOSED}),
-    State.FLUSHING: frozenset({State.CLOSED}),
-    State.LINGERING: frozenset({State.CLOSED}),
-    State.CLOSED: frozenset(),
-}
+        self.ending = self.name in {"CLOSING", "LINGERING", "CLOSED"}
 
 
 class Limits(NamedTuple):
@@ -97,8 +63,6 @@ class Unreadable(NamedTuple):
 
 class Subscription:
     """Which DATA a client wants. Lists are by the sensor's number."""
-
-    __slots__ = ("chooses", "every", "fresh_only", "gap", "last_ns", "skipped", "wanted")
 
     def __init__(
         self, sensor_count: int, sensors: tuple[int, ...] | None, every: int, fresh_only: bool
@@ -195,7 +159,10 @@ class Outbox:
     def _refused(self, error: OSError) -> int:
         """The socket accepts nothing: not now, or never again."""
         if not isinstance(error, BlockingIOError):
-            self._break()
+            self.broken = True
+            self._writers.discard(self._fd)
+            self._queue.clear()
+            self._queued_data = self._queued_json_bytes = self._head_sent = 0
         return 0
 
     def _wait(self) -> None:
@@ -223,12 +190,6 @@ class Outbox:
             else:
                 self._queued_json_bytes -= len(message)
         self._writers.discard(self._fd)
-
-    def _break(self) -> None:
-        self.broken = True
-        self._writers.discard(self._fd)
-        self._queue.clear()
-        self._queued_data = self._queued_json_bytes = self._head_sent = 0
 
     def _drop_oldest_data(self) -> int:
         first = 1 if self._head_sent else 0  # a frame that is partly sent must go out whole
@@ -259,7 +220,7 @@ class Connection:
     """A client's stream and everything that belongs to it."""
 
     def __init__(
-        self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int], watched: Watched | None = None
+        self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int], watched: Watched
     ) -> None:
         """`uid` is the user who owns the other end, None if that is not known."""
         self.fd = stream.fileno()
@@ -269,12 +230,13 @@ class Connection:
         self.framed: FrameDecoder | None = None
         self.bare: BareJsonDecoder | None = None
         self.subscription: Subscription | None = None
-        self._watched = watched or Watched(set(), set())
+        self._watched = watched
         self._watched.readers.add(self.fd)
         self.outbox = Outbox(stream, monotonic_ns, self._watched.writers)
         self._stream = stream
         self._monotonic_ns = monotonic_ns
         self._heard_ns = monotonic_ns()
+        self._client_ended = False  # it has closed its side, and may still receive
         self._begun_ns = 0  # since when the rest of an unfinished message is awaited; 0 if there is none
         self._ending_ns = 0  # since when the connection is being closed
 
@@ -283,9 +245,12 @@ class Connection:
         return f"client {self.peer} (uid {'unknown' if self.uid is None else self.uid})"
 
     def _become(self, state: State) -> None:
-        assert state in TRANSITIONS[self.state], f"{self}: {self.state} -> {state}"
+        assert self.state is not State.CLOSED, f"{self}: closed -> {state.name}"
         self.state = state
-        (self._watched.readers.add if state.reads else self._watched.readers.discard)(self.fd)
+        if self._client_ended or state in (State.READY, State.ANSWERING, State.CLOSED):
+            self._watched.readers.discard(self.fd)
+        else:
+            self._watched.readers.add(self.fd)
 
     @property
     def is_idle(self) -> bool:
@@ -309,20 +274,23 @@ class Connection:
         except OSError:
             self.fail()
             return
-        if self.state.ending:
-            # Read and discarded, so that closing does not reset the connection before the last reply is read.
-            if not data:
-                self._become(State.FLUSHING if self.state is State.CLOSING else State.CLOSED)
-        elif data:
-            self._feed(data)
-            self._become(State.READY)
-        elif self.bare is not None and self.bare.pending:
+        if data:
+            # Once it is being closed what comes is discarded, so that this does not reset the connection
+            # before the last reply is read.
+            if not self.state.ending:
+                self._feed(data)
+                self._become(State.READY)
+        elif self.state is State.READING and self.bare is not None and self.bare.pending:
             self.bare.end_of_input()
             self._become(State.READY)
-        elif self.subscription is not None:
-            self._become(State.HALF_CLOSED)
         else:
-            self._end(State.FLUSHING)
+            self._client_ended = True
+            if self.state is State.LINGERING:
+                self._become(State.CLOSED)
+            elif self.state is State.CLOSING or self.subscription is not None:
+                self._become(self.state)
+            else:
+                self._end()
 
     def _feed(self, data: bytes) -> None:
         decoder = self.framed or self.bare
@@ -388,7 +356,7 @@ class Connection:
     def finish(self) -> None:
         """Accept no more requests and close once everything is sent."""
         if not self.state.ending:
-            self._end(State.FLUSHING if self.state is State.HALF_CLOSED else State.CLOSING)
+            self._end()
 
     def fail(self) -> None:
         """Close at once: the connection is broken, or the client is beyond a limit."""
@@ -402,10 +370,9 @@ class Connection:
         if too_long or self.outbox.broken:
             self.fail()
         elif self.state is State.CLOSING and not self.outbox.waiting:
-            self._stream.end_sending()
-            self._become(State.LINGERING)
-        elif self.state is State.FLUSHING and not self.outbox.waiting:
-            self._become(State.CLOSED)
+            if not self._client_ended:
+                self._stream.end_sending()
+            self._become(State.CLOSED if self._client_ended else State.LINGERING)
 
     def close(self) -> None:
         """Close the stream."""
@@ -413,8 +380,8 @@ class Connection:
             descriptors.discard(self.fd)
         self._stream.close()
 
-    def _end(self, state: State) -> None:
-        self._become(state)
+    def _end(self) -> None:
+        self._become(State.CLOSING)
         self.subscription = None
         self._ending_ns = self._monotonic_ns()
 
@@ -422,7 +389,7 @@ class Connection:
 
     def send_json(self, message: JsonObject) -> None:
         """Send a reply or an event in this connection's own form."""
-        if self.state is State.LINGERING or self.state is State.CLOSED:
+        if self.state in (State.LINGERING, State.CLOSED):
             return
         if self.outbox.full:
             self.fail()

@@ -23,16 +23,12 @@ from ethercat_server.serving.connection import Connection, Limits, State, Unread
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import Transport
 
-# Clients get at most a tenth of this thread's time, however much they ask.
-_PAUSE_RATIO: Final = 9
+_PAUSE_RATIO: Final = 9  # clients get at most a tenth of this thread's time, however much they ask
 # A pass that took long because this thread was not running must not silence all clients.
 _LONGEST_PAUSE_NS: Final = 20_000_000
-# No request is begun this shortly before a deadline; a usual one takes less.
-_REQUEST_NS: Final = 280_000
-# Clients accepted in one pass.
-_MAX_ACCEPTS: Final = 2
-# How often connections are checked for timeouts and closed.
-_SWEEP_NS: Final = 50_000_000
+_REQUEST_NS: Final = 280_000  # no request is begun this shortly before a deadline; a usual one takes less
+_MAX_ACCEPTS: Final = 2  # clients accepted in one pass
+_SWEEP_NS: Final = 50_000_000  # how often connections are checked for timeouts and closed
 _CLOSE_NS: Final = 1_000_000_000
 _CLOSE_TURN_NS: Final = 20_000_000
 
@@ -91,16 +87,14 @@ class Hub:
         """Serve the clients until the clock is at `until_ns`; once, without waiting, if that has passed."""
         watched, now_ns = self._watched, self._monotonic_ns()
         last_start_ns = until_ns - _REQUEST_NS
-        # Where there is never time for a request, one pass is made nevertheless.
+        # One pass is always made, also where there is never time for a request before a deadline.
         hurried = last_start_ns <= now_ns
         while hurried or now_ns < until_ns:
-            reads = self._pause_ends_ns <= now_ns and (hurried or now_ns < last_start_ns)
-            wake_ns = until_ns
-            if hurried or self._ready or now_ns < self._pause_ends_ns:
-                if reads:
-                    wake_ns = now_ns
-                elif now_ns < self._pause_ends_ns < until_ns:
-                    wake_ns = self._pause_ends_ns
+            reads, wake_ns = hurried or now_ns < last_start_ns, until_ns
+            if now_ns < self._pause_ends_ns:
+                reads, wake_ns = False, min(self._pause_ends_ns, until_ns)
+            elif hurried or (reads and self._ready):
+                wake_ns = now_ns
             wait_s = (wake_ns - now_ns) * 1e-9 if wake_ns > now_ns else 0.0
             ready = self._transport.wait(watched.readers if reads else (), watched.writers, wait_s)
             if ready[0] or ready[1] or (reads and self._ready):

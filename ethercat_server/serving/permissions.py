@@ -17,8 +17,7 @@ from ethercat_server.serving.connection import Connection
 MAX_CLIENTS: Final = 64
 # Clients among them that must be of users who may control, so that the others cannot use all of them up.
 RESERVED_FOR_CONTROL: Final = 16
-# Clients of one user who may not control.
-MAX_CLIENTS_PER_USER: Final = 16
+MAX_CLIENTS_PER_USER: Final = 16  # clients of one user who may not control
 # Clients of those users that must be the first of theirs: the bridge's is such a user.
 RESERVED_FOR_THE_FIRST: Final = 16
 

@@ -9,7 +9,6 @@ from bota_ethercat.control import ErrorCode, Event, Request, error_reply, event,
 from bota_ethercat.errors import RequestError, SettingError
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import SettingValue
-from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.jobs import Done, Jobs, refusal
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import SensorStream
@@ -17,10 +16,10 @@ from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.sii import read_sii
-from ethercat_server.sensor.configuration import Change, apply_in_op, save
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.access import bytes_to_write, entry_named, read, read_named, write
 from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.sensor.set_up import Change, apply_in_op, save
 from ethercat_server.sensor.tare import tare
 from ethercat_server.serving.connection import Connection
 from ethercat_server.serving.hub import Hub
@@ -28,8 +27,7 @@ from ethercat_server.serving.hub import Hub
 # Reads that may wait for one sensor: everyone may read, and changes must still get their turn.
 _MOST_READS: Final = 8
 
-# A sensor does one of these at a time.
-_CHANGES: Final = frozenset({"configure", "tare"})
+_CHANGES: Final = frozenset({"configure", "tare"})  # a sensor does one of these at a time
 
 
 class SensorActions:
@@ -79,12 +77,14 @@ class SensorActions:
             raise RequestError(ErrorCode.BAD_REQUEST, f"{problem} {choice} (available: {available})")
         return found[0]
 
-    def _start(self, connection: Connection, request: Request, steps: Steps[Mapping[str, Any]]) -> None:
-        self._jobs.start(request.values["sensor"], steps, self._answering(connection, request))
-
     def _answering(self, connection: Connection, request: Request) -> Done:
         def done(values: Mapping[str, Any], error: RequestError | None) -> None:
-            self._hub.answer(connection, _answer(request, values, error))
+            if error is None:
+                answer = reply(request, **values)
+            else:
+                message = {"action": request.action, **({"id": request.id} if request.has_id else {})}
+                answer = error_reply(message, error.code, str(error), **error.extra)
+            self._hub.answer(connection, answer)
 
         return done
 
@@ -93,14 +93,14 @@ class SensorActions:
         self._jobs.start(number, steps, done, changes=True)
 
     def _check_unchanging(self, number: int) -> None:
-        if self._jobs.is_changing(number) or self._recovery.is_changing(number):
+        if self._jobs.is_changing(number) or self._recovery.sensors[number].is_changing:
             raise RequestError(
                 ErrorCode.BUSY, f"sensor {number} is being configured or tared: try again when that is done"
             )
 
     def _sdo_read(self, connection: Connection, request: Request) -> None:
         values = request.values
-        sdo = self._recovery.sdo(values["sensor"])
+        sdo = self._recovery.sensors[values["sensor"]].sdo
         if (values["index"] is None) == (values["name"] is None):
             raise RequestError(
                 ErrorCode.BAD_REQUEST, "sdo_read needs either the key 'index' or the key 'name'"
@@ -138,7 +138,7 @@ class SensorActions:
                 ErrorCode.DENIED, "object 0x2000 is the factory calibration, which is never written"
             )
         sensor = self.sensors[values["sensor"]]
-        sdo = self._recovery.sdo(sensor.number)
+        sdo = self._recovery.sensors[sensor.number].sdo
         data = bytes_to_write(values)
 
         def steps() -> Steps[Mapping[str, Any]]:
@@ -150,12 +150,12 @@ class SensorActions:
                 self._announce_offset(sensor)
             return written
 
-        self._start(connection, request, steps())
+        self._jobs.start(sensor.number, steps(), self._answering(connection, request))
 
     def _tare(self, connection: Connection, request: Request) -> None:
         values = request.values
         sensor = self.sensors[values["sensor"]]
-        stream, sdo = self._streams[sensor.number], self._recovery.sdo(sensor.number)
+        stream, sdo = self._streams[sensor.number], self._recovery.sensors[sensor.number].sdo
         samples, target = values["samples"], values["target"]
         steps = tare(sdo, sensor, stream, samples, target, self._announce_offset)
         self._start_change(sensor.number, steps, self._answering(connection, request))
@@ -191,10 +191,10 @@ class SensorActions:
             except RequestError as refused:
                 done({}, refused)
 
-        self._recovery.reconfigure(number, change, changed)
+        self._recovery.sensors[number].reconfigure(change, changed)
 
     def _change_in_op(self, sensor: Sensor, change: Change, save_too: bool) -> Steps[Mapping[str, Any]]:
-        sdo = self._recovery.sdo(sensor.number)
+        sdo = self._recovery.sensors[sensor.number].sdo
         yield from apply_in_op(sdo, sensor, change)
         if change.names:
             self._announce_change(sensor)
@@ -208,14 +208,5 @@ class SensorActions:
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
         if save_too:
-            yield from save(self._recovery.sdo(sensor.number), sensor)
+            yield from save(self._recovery.sensors[sensor.number].sdo, sensor)
         return {"sensor": sensor.number, **sensor.in_force(), "saved": save_too}
-
-
-def _answer(request: Request, values: Mapping[str, Any], error: RequestError | None) -> JsonObject:
-    if error is None:
-        return reply(request, **values)
-    message: JsonObject = {"action": request.action}
-    if request.has_id:
-        message["id"] = request.id
-    return error_reply(message, error.code, str(error), **error.extra)

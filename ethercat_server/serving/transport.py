@@ -1,5 +1,5 @@
 """Clients over TCP, the hub's seam to the network: the listening sockets, the accepted ones, and which user
-is at the other end of each. `in_memory` stands in for it in tests.
+is at the other end of each. `simulation.transport` stands in for it in tests.
 
 Nothing here waits except `Transport.wait`. Errors are those of a non-blocking socket: BlockingIOError for
 what cannot be done yet, any other OSError for a connection that is broken. The user is asked of the kernel
@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import ipaddress
+import os
 import select
 import socket
 import struct
@@ -157,10 +158,6 @@ _BACKLOG: Final = 128
 _SEND_BUFFER: Final = 65536
 
 
-# On Windows the second would share a port with another program; here it takes one in TIME_WAIT.
-_EXCLUSIVE: Final = getattr(socket, "SO_EXCLUSIVEADDRUSE", socket.SO_REUSEADDR)
-
-
 class SocketStream:
     """An accepted TCP connection."""
 
@@ -169,7 +166,9 @@ class SocketStream:
         self.peer = "this process"
         if sock.family in (socket.AF_INET, socket.AF_INET6):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self.peer = _peer(sock)
+            self.peer = "unknown"
+            with contextlib.suppress(OSError):
+                self.peer = str(Address(*sock.getpeername()[:2]))
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         self._sock = sock
         self._diagnostics = diagnostics
@@ -230,13 +229,6 @@ class SocketTransport:
             self._diagnostics.close()
 
 
-def _peer(sock: socket.socket) -> str:
-    try:
-        return str(Address(*sock.getpeername()[:2]))
-    except OSError:
-        return "unknown"
-
-
 def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
     """A non-blocking listener for each address of `hosts`; ServerError says why it cannot be had.
 
@@ -246,19 +238,10 @@ def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
     for host in _distinct(hosts):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
-            listener = socket.socket(family, socket.SOCK_STREAM)
-        except OSError:
-            continue  # no IPv6 on this machine
-        listener.setsockopt(socket.SOL_SOCKET, _EXCLUSIVE, 1)
-        if family == socket.AF_INET6:  # IPv4 has a listener of its own
-            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        try:
-            listener.bind((host, port))
-            listener.listen(_BACKLOG)
+            listener = socket.create_server((host, port), family=family, backlog=_BACKLOG)
         except OSError as error:
-            listener.close()
-            if error.errno == errno.EADDRNOTAVAIL and listeners:
-                continue  # no address ::1 on this machine
+            if error.errno == errno.EAFNOSUPPORT or (error.errno == errno.EADDRNOTAVAIL and listeners):
+                continue  # no IPv6, or no address ::1, on this machine
             for other in listeners:
                 other.close()
             raise ServerError(f"port {port} on {host} {_reason(error)}") from None
@@ -273,7 +256,7 @@ def _reason(error: OSError) -> str:
         return "is in use by another program; stop that program or choose another port"
     if error.errno == errno.EADDRNOTAVAIL:
         return "cannot be used: no interface of this machine has this address; 'ip address' lists them"
-    return f"cannot be used: {error.strerror}; choose another"
+    return f"cannot be used: {os.strerror(error.errno or 0)}; choose another"
 
 
 def _distinct(hosts: Sequence[str]) -> list[str]:

@@ -1,1 +1,1 @@
-"""The bus in memory: virtual sensors on a simulated machine, in simulated time. No sockets, no processes."""
+"""Bus and clients in memory: virtual sensors on a simulated machine, in simulated time."""

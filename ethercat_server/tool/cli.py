@@ -12,7 +12,7 @@ from bota_ethercat.program.completion import OPTION, add_completion
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server import __version__
 from ethercat_server.process import command_line
-from ethercat_server.tool import bus, objects, settings, watch
+from ethercat_server.tool import bus, filters, objects, settings, watch
 from ethercat_server.tool.command import Command, say_json
 
 _PROGRAM: Final = "ethercat-sensor"
@@ -21,7 +21,9 @@ _EXIT_CODES: Final = (
 )
 
 COMMANDS: Final[Mapping[str, Command]] = {
-    command.name: command for module in (bus, watch, objects, settings) for command in module.COMMANDS
+    command.name: command
+    for module in (bus, watch, objects, settings, filters)
+    for command in module.COMMANDS
 }
 
 

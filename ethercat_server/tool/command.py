@@ -11,13 +11,14 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.program.server_choice import HELP
 from bota_ethercat.text.json_text import finite
-from ethercat_server.access.sensors import Sensors, find_server
+from ethercat_server.access.sensors import Sensors, choose, find_server
+from ethercat_server.errors import BusError
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.sensor.sensor import Found
 
 DONE: Final = 0
 CHANGES: Final = 3  # exit code of `plan` when there is something to change
-
+_FORCE: Final = "--force"
 
 Argument = Callable[[Any], object]  # adds it to a parser, or to a group of arguments
 
@@ -29,6 +30,17 @@ def argument(name: str, help_text: str, **options: Any) -> Argument:
     return lambda parser: parser.add_argument(name, help=help_text, **options)
 
 
+def one_of(*arguments: Argument) -> Argument:
+    """Of which one may be given."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        group = parser.add_mutually_exclusive_group()
+        for each in arguments:
+            each(group)
+
+    return add
+
+
 class Command(NamedTuple):
     """One subcommand."""
 
@@ -36,22 +48,16 @@ class Command(NamedTuple):
     summary: str
     arguments: Sequence[Argument]
     run: Callable[[argparse.Namespace], int]  # returns the exit code; raises ServerError
-    exclusive: Sequence[Argument] = ()  # of which one may be given
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add those of the command, and --json."""
         for add in self.arguments:
             add(parser)
-        if self.exclusive:
-            group = parser.add_mutually_exclusive_group()
-            for add in self.exclusive:
-                add(group)
-        parser.set_defaults(take_over=False)
         parser.add_argument("--json", action="store_true", help="machine-readable output")
 
 
-def sensor_arguments(*, all_if_none: bool = False, take_over: bool = True) -> tuple[Argument, ...]:
-    """IFACE or --server, and --sensor; `--force` to take over a bus in use, unless it has another meaning."""
+def sensor_arguments(*, all_if_none: bool = False, take_over: str = _FORCE) -> tuple[Argument, ...]:
+    """IFACE or --server, and --sensor; `take_over` is the option that takes over a bus in use."""
     iface = "interface the sensors are connected to ('virtual' for a virtual sensor); through the "
     force = "take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop"
     default = "all" if all_if_none else "the only one"
@@ -59,7 +65,8 @@ def sensor_arguments(*, all_if_none: bool = False, take_over: bool = True) -> tu
     return (
         argument("iface", f"{iface}server that uses it, if there is one", nargs="?", metavar="IFACE"),
         argument("--server", f"connect to this server, as without IFACE {HELP}", metavar="HOST:PORT"),
-        *((argument("--force", force, dest="take_over"),) if take_over else ()),
+        argument(take_over, force, dest="take_over"),
+        lambda parser: parser.set_defaults(take_over_option=take_over),
         argument(ALLOW_IP, ALLOW_IP_HELP),
         argument("--sensor", which, metavar="WHICH"),
     )
@@ -73,9 +80,25 @@ def sensors_of(args: argparse.Namespace) -> Iterator[Sensors]:
     """
     found = find_server(args.iface, args.server)
     if found is None:
-        found = Sensors.on_interface(args.iface, force=args.take_over, allow_ip=args.allow_ip)
+        try:
+            found = Sensors.on_interface(args.iface, force=args.take_over, allow_ip=args.allow_ip)
+        except BusError as error:  # which advises the option that most commands have
+            text = str(error).replace(f"; {_FORCE} ", f"; {args.take_over_option} ")
+            raise BusError(text) from None
     with contextlib.closing(found):
         yield found
+
+
+@contextlib.contextmanager
+def sensor_of(args: argparse.Namespace) -> Iterator[tuple[Sensors, Found]]:
+    """The same, and the one that is selected; UsageError if it is not unique."""
+    with sensors_of(args) as opened:
+        yield opened, choose(opened.sensors, args.sensor)
+
+
+def chosen(opened: Sensors, args: argparse.Namespace) -> list[Found]:
+    """The selected sensor, or all."""
+    return opened.sensors if args.sensor is None else [choose(opened.sensors, args.sensor)]
 
 
 def say(text: str) -> None:

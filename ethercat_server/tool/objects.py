@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import struct
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from bota_ethercat.pdo import INPUT_OBJECT
 from bota_ethercat.sensor.meaning import value_meaning
@@ -19,8 +19,13 @@ from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Sdo, Steps, finish
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION, ObjectEntry
-from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, find_objects, similar_names
+from ethercat_server.sensor.objects.dictionary import (
+    FACTORY_CALIBRATION,
+    KNOWN_OBJECTS,
+    ObjectEntry,
+    find_objects,
+    similar_names,
+)
 from ethercat_server.sensor.scan import look_safely
 from ethercat_server.sensor.sensor import Found, Identity
 from ethercat_server.sensor.set_up import read_sinc
@@ -28,6 +33,7 @@ from ethercat_server.tool.command import (
     DONE,
     Command,
     argument,
+    chosen,
     columns,
     say,
     say_json,
@@ -72,39 +78,19 @@ def _meaning(row: ObjectEntry, value: float | str) -> str:
     return row.allowed.get(int(value), "" if row.setting is None else "undefined value")
 
 
-class _Sensor(NamedTuple):
-    """The objects that could be read, and the error that ended reading."""
-
-    found: Found
-    objects: list[tuple[ObjectEntry, dict[str, Any]]]
-    error: BusError | None
-
-    def as_json(self) -> dict[str, Any]:
-        """Its JSON form."""
-        objects = [{**_row_as_json(row), **read} for row, read in self.objects]
-        error = {"error": str(self.error)} if self.error else {}
-        return {**self.found.as_json(), "objects": objects, **error}
-
-    def lines(self) -> list[str]:
-        """For people."""
-        table = [_HEAD, *(_line(row, read) for row, read in self.objects)]
-        objects = [columns(table, indent=2)] if self.objects else []
-        return [str(self.found), *objects, *([f"  {self.error}"] if self.error else [])]
-
-
-def _read_sensor(sdo: Sdo, found: Found, rows: Sequence[ObjectEntry]) -> _Sensor:
-    objects: list[tuple[ObjectEntry, dict[str, Any]]] = []
+def _read_objects(sdo: Sdo, found: Found, rows: Sequence[ObjectEntry]) -> dict[str, Any]:
+    """The objects of a sensor, ready for JSON, and the `error` that ended reading if one did."""
+    objects: list[dict[str, Any]] = []
     silent = 0
     for row in rows:
         try:
-            objects.append((row, finish(read_object(sdo, row))))
-            silent = 0
+            read, silent = finish(read_object(sdo, row)), 0
         except BusError as error:
-            silent += 1
+            read, silent = {"error": str(error)}, silent + 1
             if silent == _MOST_SILENT:
-                return _Sensor(found, objects, error)
-            objects.append((row, {"error": str(error)}))
-    return _Sensor(found, objects, None)
+                return {**found.as_json(), "objects": objects, **read}
+        objects.append({**_row_as_json(row), **read})
+    return {**found.as_json(), "objects": objects}
 
 
 def _open_slave(bus: Bus, wanted: str) -> tuple[Found, GuardedSdo]:
@@ -173,27 +159,27 @@ def _show(
             raise UsageError("a server reads the objects of sensors only: stop it to read those of a slave")
         used = f"the interface {args.iface}"
         with open_interface(args.iface, allow_ip=args.allow_ip) as bus:
-            found, sdo = _open_slave(bus, slave)
-            sensors = [_read_sensor(sdo, found, rows)]
+            only, sdo = _open_slave(bus, slave)
+            found, sensors = [only], [_read_objects(sdo, only, rows)]
     else:
         with sensors_of(args) as opened:
-            used, chosen = opened.used, opened.chosen(args.sensor)
+            used, found = opened.used, chosen(opened, args)
             if any(row.index == INPUT_OBJECT for row in rows):
-                opened.wait_settled([found.number for found in chosen])
-            sensors = [_read_sensor(opened.sdo(found.number), found, rows) for found in chosen]
-    errors = [sensor.error for sensor in sensors if sensor.error]
-    if len(errors) == len(sensors):
-        raise errors[0]
+                opened.wait_settled([each.number for each in found])
+            sensors = [_read_objects(opened.sdo(each.number), each, rows) for each in found]
+    failed = [sensor["error"] for sensor in sensors if "error" in sensor]
+    if len(failed) == len(sensors):
+        raise BusError(failed[0])
     if args.json:
-        say_json({"through": used, "sensors": [sensor.as_json() for sensor in sensors]})
-    else:
-        say("\n".join(line for sensor in sensors for line in sensor.lines()))
-    failed = [str(error) for error in errors]
-    for sensor in sensors if all_wanted else []:
-        rows_unread = [f"{row.name}: {read['error']}" for row, read in sensor.objects if "error" in read]
-        if rows_unread:
-            more = f"; and {len(rows_unread) - 1} more" if len(rows_unread) > 1 else ""
-            failed.append(f"sensor {sensor.found.number} gave no value of {rows_unread[0]}{more}")
+        say_json({"through": used, "sensors": sensors})
+    for each, sensor in zip(found, sensors, strict=True):
+        if not args.json:
+            table = [columns([_HEAD, *map(_line, sensor["objects"])], indent=2)] if sensor["objects"] else []
+            say("\n".join([str(each), *table, *(f"  {sensor[key]}" for key in ("error",) if key in sensor)]))
+        unread = [f"{row['name']}: {row['error']}" for row in sensor["objects"] if "error" in row]
+        if unread and all_wanted:
+            more = f"; and {len(unread) - 1} more" if len(unread) > 1 else ""
+            failed.append(f"sensor {each.number} gave no value of {unread[0]}{more}")
     for sentence in failed:
         note(sentence)
     return FAILED if failed else DONE
@@ -210,10 +196,10 @@ def _row_as_json(row: ObjectEntry) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _line(row: ObjectEntry, read: dict[str, Any]) -> tuple[str, ...]:
-    value = value_text(read["value"]) if "value" in read else "--"
-    where, access = f"0x{row.index:04X}:{row.subindex:<2}", row.access.value.removesuffix(" only")
-    return where, row.name, value, access, read.get("error") or read["meaning"]
+def _line(row: dict[str, Any]) -> tuple[str, ...]:
+    value = value_text(row["value"]) if "value" in row else "--"
+    where, access = f"{row['index']}:{row['subindex']:<2}", row["access"].removesuffix(" only")
+    return where, row["name"], value, access, row.get("error") or row["meaning"]
 
 
 _SENSORS: Final = sensor_arguments(all_if_none=True)

@@ -7,11 +7,10 @@ What cannot be done as a whole is taken back: the former settings and offsets ar
 from __future__ import annotations
 
 import argparse
-import contextlib
 import datetime
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -25,35 +24,37 @@ from bota_ethercat.text.json_text import finite
 from ethercat_server.access.sensors import Sensors, note
 from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignments, read_config
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
-from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
+from ethercat_server.ethercat.slave.coe import Sdo, finish
 from ethercat_server.process.signals import signals_held_back
-from ethercat_server.sensor.configuration import Change, save
 from ethercat_server.sensor.objects import dictionary
-from ethercat_server.sensor.objects.dictionary import OBJECTS, Access, ObjectEntry
-from ethercat_server.sensor.objects.search import BY_ADDRESS, KNOWN_OBJECTS
+from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, KNOWN_OBJECTS, OBJECTS, Access, ObjectEntry
 from ethercat_server.sensor.sensor import Found, Identity, Sensor
-from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
+from ethercat_server.sensor.set_up import Change, pack_offset, read_offset, save, write_offset
 from ethercat_server.tool.command import (
     CHANGES,
     DONE,
     Command,
     argument,
     columns,
+    one_of,
     report,
     sensor_arguments,
-    sensors_of,
+    sensor_of,
     value_text,
 )
 from ethercat_server.tool.objects import read_object
 
-_UNSAVED: Final = "in force until the sensor is powered off: use --save, or the command save, to keep it"
+_SAVED: Final = (
+    "saved to the sensor's flash; a server writes its own settings at start: set the same there, or "
+    "--unset-settings keep"
+)
+_UNSAVED: Final = "in force until the sensor is powered off: use the command save to keep it"
 _UNSAVED_IN_SERVER: Final = (
     "in force until the server is started again, also after the sensor was powered off: set the same in the "
     "server's configuration to keep it"
 )
-_SAVED: Final = (
-    "saved to the sensor's flash; a server writes its own settings at start: set the same there, or "
-    "--unset-settings keep"
+_TARE_IN_SERVER: Final = (
+    "in force while the server runs, then until the sensor is powered off: use the command save to keep it"
 )
 
 
@@ -94,20 +95,9 @@ def _change_lines(found: list[dict[str, Any]]) -> str:
     return columns(rows, indent=2)
 
 
-def _saving_lines(opened: Sensors, changed: bool, saved: bool) -> list[str]:
-    """How long a change lasts."""
-    unsaved = _UNSAVED_IN_SERVER if opened.restores else _UNSAVED
-    return [_SAVED] if saved else [unsaved] if changed else []
-
-
-def _verify(sensor: Sensor, settings: Mapping[str, SettingValue]) -> None:
-    """BusError unless `settings` are in force."""
-    for name, value in settings.items():
-        if (held := sensor.settings.get(name)) != value:
-            raise BusError(
-                f"sensor {sensor.number} reads back {name} = {value_text(held)} although it accepted "
-                f"{value_text(value)}: power it off and on, then try again"
-            )
+def _lasts(opened: Sensors, in_server: str = _UNSAVED_IN_SERVER) -> str:
+    """How long a change lasts that is not saved."""
+    return in_server if opened.private is None else _UNSAVED
 
 
 def _asked(args: argparse.Namespace) -> ServerOptions:
@@ -119,24 +109,22 @@ def _asked(args: argparse.Namespace) -> ServerOptions:
 
 
 def _look(
-    args: argparse.Namespace, opened: Sensors, options: ServerOptions
-) -> tuple[Found, dict[str, SettingValue], Sensor]:
-    """The chosen sensor, the settings requested for it, and those in force."""
-    found = opened.choose(args.sensor)
+    opened: Sensors, found: Found, args: argparse.Namespace, options: ServerOptions
+) -> tuple[dict[str, SettingValue], Sensor, list[dict[str, Any]]]:
+    """The settings requested for a sensor, those in force, and the changes."""
     options.check_sensors({sensor.number: sensor.identity for sensor in opened.sensors})
     asked = options.asked_settings(found.number, found.identity.name, found.identity.serial)
     if not asked:
         raise UsageError(f"{args.config} has no settings for {found}: correct its tables, or use --set")
-    return found, asked, opened.in_force(found, asked)
+    sensor = opened.in_force(found, asked)
+    return asked, sensor, _changes(sensor, asked)
 
 
 def _plan(args: argparse.Namespace) -> int:
-    asked = _asked(args)
-    with sensors_of(args) as opened:
-        found, settings, sensor = _look(args, opened, asked)
-    changed = _changes(sensor, settings)
-    now = meaning(sensor.settings, sensor.rate_hz)
-    changes = {row["name"]: row["then"] for row in changed}
+    options = _asked(args)
+    with sensor_of(args) as (opened, found):
+        _, sensor, changed = _look(opened, found, args, options)
+    now, changes = meaning(sensor.settings, sensor.rate_hz), {row["name"]: row["then"] for row in changed}
     rate_hz = None if changes.keys() & {"sinc_length", "chop"} else sensor.rate_hz
     then = meaning({**sensor.settings, **changes}, rate_hz)
     lines = [_change_lines(changed)]
@@ -150,21 +138,22 @@ def _plan(args: argparse.Namespace) -> int:
 
 
 def _apply(args: argparse.Namespace) -> int:
-    asked = _asked(args)
-    with sensors_of(args) as opened:
-        found, settings, before = _look(args, opened, asked)
-        changed = _changes(before, settings)
+    options = _asked(args)
+    with sensor_of(args) as (opened, found):
+        settings, after, changed = _look(opened, found, args, options)
         if changed or args.save:
             opened.configure(found.number, settings, args.save)
-        after = opened.in_force(found, settings) if changed else before
-    _verify(after, settings)
+        if changed:
+            after = opened.in_force(found, settings)
     in_force = meaning(after.settings, after.rate_hz)
     values = {
         "changes": changed, "saved": args.save, "settings": after.settings, "rate_hz": after.rate_hz,
         "meaning": in_force.as_json(),
     }  # fmt: skip
     lines = [_change_lines(changed), "in force:\n  " + "\n  ".join(in_force.lines())]
-    report(args.json, opened, found, values, *lines, *_saving_lines(opened, bool(changed), args.save))
+    if changed or args.save:
+        lines.append(_SAVED if args.save else _lasts(opened))
+    report(args.json, opened, found, values, *lines)
     return DONE
 
 
@@ -175,8 +164,7 @@ def _save_now(opened: Sensors, found: Found) -> None:
 
 
 def _save(args: argparse.Namespace) -> int:
-    with sensors_of(args) as opened:
-        found = opened.choose(args.sensor)
+    with sensor_of(args) as (opened, found):
         _save_now(opened, found)
     report(args.json, opened, found, {"saved": True}, f"  {_SAVED}")
     return DONE
@@ -185,10 +173,6 @@ def _save(args: argparse.Namespace) -> int:
 # -- tare
 
 _AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-_TARE_UNSAVED: Final = _UNSAVED.replace("--save, or the command save,", "the command save")
-_TARE_UNSAVED_IN_SERVER: Final = (
-    "in force while the server runs, then until the sensor is powered off: use the command save to keep it"
-)
 
 
 def _tare(args: argparse.Namespace) -> int:
@@ -201,8 +185,7 @@ def _tare(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise UsageError(f"--target: {error}") from None
     keys = ["old_offset", "new_offset"]
-    with sensors_of(args) as opened:
-        found = opened.choose(args.sensor)
+    with sensor_of(args) as (opened, found):
         if args.undo or args.clear:
             tared: Mapping[str, Sequence[float]] = _taken_back(opened, found, undo=args.undo)
         else:
@@ -215,8 +198,8 @@ def _tare(args: argparse.Namespace) -> int:
     rows: list[tuple[str, ...]] = [("", *(key.replace("_", " ") for key in keys), "")]
     for n, axis in enumerate(_AXES):
         rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
-    lasts = _TARE_UNSAVED_IN_SERVER if opened.restores else _TARE_UNSAVED
-    report(args.json, opened, found, {key: tared[key] for key in keys}, columns(rows, indent=2), lasts)
+    lines = columns(rows, indent=2), _lasts(opened, _TARE_IN_SERVER)
+    report(args.json, opened, found, {key: tared[key] for key in keys}, *lines)
     return DONE
 
 
@@ -251,8 +234,6 @@ _CONFIGURATION: Final = range(0x8000, 0x8011)
 RESTORABLE: Final[tuple[ObjectEntry, ...]] = tuple(
     row for row in OBJECTS if row.access is not Access.RO and row.index in _CONFIGURATION and not row.setting
 )
-# Not `--force`, which is for the file: replacing one must not stop a machine.
-_TAKE_OVER: Final = "--take-over"
 
 Address = tuple[int, int]
 
@@ -296,31 +277,17 @@ def read_snapshot(path: Path) -> Snapshot:
     return Snapshot(identity, settings, wanted)
 
 
-@contextlib.contextmanager
-def _opened(args: argparse.Namespace) -> Iterator[Sensors]:
-    """As `sensors_of`; an error advises the option that these commands have."""
-    try:
-        with sensors_of(args) as opened:
-            yield opened
-    except BusError as error:
-        if "; --force " not in str(error):
-            raise
-        raise BusError(str(error).replace("; --force ", f"; {_TAKE_OVER} ")) from None
-
-
 def _snapshot(args: argparse.Namespace) -> int:
-    with NewFile(args.file, force=args.force) as file, _opened(args) as opened:
-        found = opened.choose(args.sensor)
+    with NewFile(args.file, force=args.force) as file, sensor_of(args) as (opened, found):
         sensor, sdo = opened.in_force(found), opened.sdo(found.number)
         read = [(row, finish(read_object(sdo, row))) for row in KNOWN_OBJECTS]
+        who = found.identity._asdict()
         content = {
             "format": _FORMAT,
             "version": _VERSION,
             "taken": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            "model": found.identity.name,
-            "serial": found.identity.serial,
-            "hardware": found.identity.hardware,
-            "firmware": found.identity.firmware,
+            "model": who.pop("name"),
+            **who,
             "settings": sensor.settings,
             "objects": [_as_json(row.address, values) for row, values in read],
         }
@@ -339,20 +306,23 @@ def _as_json(address: Address, values: dict[str, Any]) -> dict[str, Any]:
 
 def _restore(args: argparse.Namespace) -> int:
     snapshot = read_snapshot(args.file)
-    with _opened(args) as opened:
-        found = opened.choose(args.sensor)
+    with sensor_of(args) as (opened, found):
         _check_whose(found.identity, snapshot.identity, args)
-        sensor = opened.in_force(found, snapshot.settings)
-        lacking = sorted(snapshot.settings.keys() - sensor.settings.keys())
-        settings = {name: value for name, value in snapshot.settings.items() if name not in lacking}
-        changed = _changes(sensor, settings)
-        differing, unreadable = finish(_differing(opened.sdo(found.number), snapshot))
+        sensor, sdo = opened.in_force(found, snapshot.settings), opened.sdo(found.number)
+        settings = {name: value for name, value in snapshot.settings.items() if name in sensor.settings}
+        missing = sorted(snapshot.settings.keys() - settings.keys())
+        changed, differing = _changes(sensor, settings), dict[Address, tuple[bytes, bytes]]()
+        for address, wanted in snapshot.objects.items():
+            try:
+                if (held := finish(sdo.read(*address))) != wanted:
+                    differing[address] = held, wanted
+            except SdoAbortError:
+                missing.append(f"0x{address[0]:04X}:{address[1]}")
         if changed or differing:
             with signals_held_back():
                 _put_back(opened, found, sensor, settings, differing)
         if args.save:
             _save_now(opened, found)
-    missing = [*lacking, *(f"0x{index:04X}:{sub}" for index, sub in unreadable)]
     lines = [_change_lines(changed)] if changed else []
     if differing:
         lines.append(columns([_object_line(address, *pair) for address, pair in differing.items()], indent=2))
@@ -360,11 +330,12 @@ def _restore(args: argparse.Namespace) -> int:
         lines.append(f"  skipped, this sensor does not have them: {', '.join(missing)}")
     if not changed and not differing:
         lines.append("  nothing to restore: the sensor already matches the file")
+    if changed or differing or args.save:
+        lines.append(_SAVED if args.save else _lasts(opened))
     written = [
         _as_json(address, {"now": old.hex(), "then": new.hex()}) for address, (old, new) in differing.items()
     ]
     values = {"changes": changed, "objects": written, "left_alone": missing, "saved": args.save}
-    lines += _saving_lines(opened, bool(changed or differing), args.save)
     report(args.json, opened, found, values, *lines)
     return DONE
 
@@ -376,22 +347,6 @@ def _check_whose(sensor: Identity, file: Identity, args: argparse.Namespace) -> 
         )
     if sensor.firmware != file.firmware:
         note(f"{args.file} was taken with firmware {file.firmware}, the sensor now has {sensor.firmware}")
-
-
-def _differing(
-    sdo: Sdo, snapshot: Snapshot
-) -> Steps[tuple[dict[Address, tuple[bytes, bytes]], list[Address]]]:
-    """Present and saved value of the objects that differ; the objects that the sensor does not have."""
-    differing, unreadable = {}, []
-    for address, wanted in snapshot.objects.items():
-        try:
-            held = yield from sdo.read(*address)
-        except SdoAbortError:
-            unreadable.append(address)
-            continue
-        if held != wanted:
-            differing[address] = held, wanted
-    return differing, unreadable
 
 
 def _put_back(
@@ -407,14 +362,13 @@ def _put_back(
         opened.configure(found.number, settings, save=False)
     written = []
     try:
-        _verify(opened.in_force(found, settings), settings)
         for address, (_, wanted) in objects.items():
             written.append(address)
-            finish(_write(sdo, address, wanted))
+            _write(sdo, address, wanted)
     except BusError as error:
         try:
             for address in written:
-                finish(_write(sdo, address, objects[address][0]))
+                _write(sdo, address, objects[address][0])
             opened.configure(found.number, before, save=False)
         except BusError as again:
             raise BusError(
@@ -423,10 +377,9 @@ def _put_back(
         raise BusError(f"{error}; the former settings are in force") from None
 
 
-def _write(sdo: Sdo, address: Address, data: bytes) -> Steps[None]:
-    yield from sdo.write(*address, data)
-    held = yield from sdo.read(*address)
-    if held != data:
+def _write(sdo: Sdo, address: Address, data: bytes) -> None:
+    finish(sdo.write(*address, data))
+    if (held := finish(sdo.read(*address))) != data:
         raise BusError(
             f"object 0x{address[0]:04X}:{address[1]} reads back {held.hex()} after writing {data.hex()}"
         )
@@ -448,10 +401,10 @@ _SETTINGS: Final = (
     argument("--config", "settings from [sensor] or [sensor.0] of a file", type=Path, metavar="FILE.toml"),
 )
 _SAVE: Final = argument("--save", "store it in the sensor's flash")
+# Here `--force` is for the file: replacing one must not stop a machine.
 _FILE: Final = (
-    *sensor_arguments(take_over=False),
+    *sensor_arguments(take_over="--take-over"),
     argument("file", "JSON file", type=Path, metavar="FILE"),
-    argument(_TAKE_OVER, "take over a bus in use, as --force elsewhere"),
 )
 _SAMPLES: Final = f"number of samples to average, 1 to {MAX_TARE_SAMPLES} (default %(default)s)"
 _DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
@@ -468,12 +421,12 @@ COMMANDS: Final = (
             *_SENSOR,
             argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
             argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=_AXES),
+            one_of(
+                argument("--undo", "restore the offset of before the last tare"),
+                argument("--clear", "set the offset to zero"),
+            ),
         ),
         _tare,
-        exclusive=(
-            argument("--undo", "restore the offset of before the last tare"),
-            argument("--clear", "set the offset to zero"),
-        ),
     ),
     Command(
         "snapshot", "write all readable objects to a file",

@@ -5,23 +5,27 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping
 from typing import Any, Final
 
+from bota_ethercat.accounting import NOT_NEW, FrameKind, StreamAccounting, StreamCounts
+from bota_ethercat.control import Event
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.judge import Observation, judge
 from bota_ethercat.health.verdict import LIMITS
-from bota_ethercat.pdo import Sample, SampleDecoder
+from bota_ethercat.pdo import Sample
 from bota_ethercat.sensor.warnings_register import explain
-from ethercat_server.access.sensors import note
-from ethercat_server.errors import UsageError
-from ethercat_server.ethercat.clock import Clock, Deadline
+from bota_ethercat.text.json_text import JsonObject
+from ethercat_server.access.sensors import Sensors, note
+from ethercat_server.errors import ServerError, UsageError
+from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.process.command_line import FAILED
-from ethercat_server.sensor.sensor import Found
 from ethercat_server.tool.command import (
     DONE,
     Command,
     argument,
+    chosen,
     columns,
     say,
     say_json,
@@ -36,76 +40,78 @@ _VECTORS: Final = (
     ("force", "F", "N", 3), ("torque", "M", "Nm", 4), ("acceleration", "A", "m/s²", 3),
     ("angular_rate", "R", "rad/s", 4),
 )  # fmt: skip
+_FOREVER_S: Final = 1e9
 _LEAST_INTERVALS: Final = 10  # for a rate
+# What is told of a watched sensor, unless the event has a message of its own.
+_TOLD: Final[Mapping[str, str]] = {
+    Event.SENSOR_LOST: "sensor {sensor} is lost",
+    Event.SENSOR_BACK: "sensor {sensor} is back after {lost_s} s",
+    Event.EMERGENCY: "sensor {sensor} reports an emergency",
+    Event.RECONFIGURED: "the settings of sensor {sensor} have changed",
+}
 
 
 class Block:
     """Statistics of a block of samples of one sensor: mean, standard deviation, rate, warnings, losses.
 
     Attributes:
-        samples, invalid, repeated: since the first block.
+        counts: of this block.
+        total: what `finish` counted of the blocks before.
     """
 
     def __init__(self) -> None:
-        self.samples = self.invalid = self.repeated = 0
-        self._decoders: dict[int, SampleDecoder] = {}
-        self._last_ns: int | None = None
+        self.total = Counter[str]()
+        self._accounting, self._gap = StreamAccounting(), 0
         self._begin()
 
     def _begin(self) -> None:
-        self._before = self.samples, self.invalid, self.repeated
-        self._gaps = self._warnings = 0
-        self._first_ns = self._last_ns
-        self._origin: list[float] = []  # what the sums are relative to, so that they stay exact
-        self._sums, self._squares = [0.0] * 12, [0.0] * 12
+        self.counts = self._accounting.counts = StreamCounts()
+        self._first_ns, self._intervals, self._warnings = self._accounting.new_ns, 0, 0
+        self._means, self._squares = [0.0] * 12, [0.0] * 12  # the squares are of the deviations, summed up
         self._newest: Sample | None = None
 
-    def __bool__(self) -> bool:
-        """Whether it has any frames."""
-        return self._before != (self.samples, self.invalid, self.repeated)
+    @property
+    def samples(self) -> int:
+        """All so far."""
+        return self.total["samples"] + self.counts.new
 
-    def take(self, frame: DataMessage) -> None:
-        """Add a frame."""
-        self._gaps += bool(frame.flags & DataFlag.GAP)
-        if frame.flags & DataFlag.INVALID:
-            self.invalid += 1
-        elif frame.flags & DataFlag.REPEATED:
-            self.repeated += 1
-            self._newest = self._newest or self._decode(frame)  # a stuck sensor has nothing newer
-        else:
-            self.samples += 1
-            sample = self._newest = self._decode(frame)
+    def take(self, frame: DataMessage, sample: Sample, *, settled: bool) -> None:
+        """Add a frame and what it holds; a sample that has not settled is left out, its GAP is the next's."""
+        self._gap |= frame.flags & DataFlag.GAP
+        if not settled and not frame.flags & NOT_NEW:
+            return
+        kind = self._accounting.take(frame.sequence, frame.monotonic_ns, frame.flags | self._gap)
+        self._gap = 0
+        # A stuck sensor has nothing newer than what it repeats.
+        if kind is FrameKind.NEW or (kind is FrameKind.REPEATED and self._newest is None):
+            self._newest = sample
+        if kind is FrameKind.NEW:
             self._warnings |= sample.warnings
-            self._origin = self._origin or sample.array
-            for n, (value, origin) in enumerate(zip(sample.array, self._origin, strict=True)):
-                self._sums[n] += value - origin
-                self._squares[n] += (value - origin) ** 2
-            self._last_ns = frame.monotonic_ns
-            if self._first_ns is None:
+            for n, value in enumerate(sample.array):  # Welford's algorithm
+                before = value - self._means[n]
+                self._means[n] += before / self.counts.new
+                self._squares[n] += before * (value - self._means[n])
+            if self._first_ns < 0:
                 self._first_ns = frame.monotonic_ns
+            else:
+                self._intervals += 1
 
-    def _decode(self, frame: DataMessage) -> Sample:
-        size = len(frame.process_data)
-        return self._decoders.setdefault(size, SampleDecoder(size)).decode(frame.process_data)
-
-    def finish(self) -> dict[str, Any]:
-        """The statistics in SI units, ready for JSON; what comes then is the next block."""
-        samples, invalid, repeated = self._before
-        count = self.samples - samples
+    def finish(self) -> dict[str, Any] | None:
+        """The statistics in SI units, ready for JSON, None without frames; then begin the next block."""
+        counts, span_ns = self.counts, self._accounting.new_ns - self._first_ns
+        if not counts.frames:
+            return None
         found: dict[str, Any] = {
-            "samples": count,
-            "rate_hz": self._rate_hz(count if samples else count - 1),
-            "invalid": self.invalid - invalid,
-            "repeated": self.repeated - repeated,
-            "gaps": self._gaps,
+            "samples": counts.new,
+            "rate_hz": self._intervals * 1e9 / span_ns if self._intervals >= _LEAST_INTERVALS else None,
+            "invalid": counts.invalid,
+            "repeated": counts.repeated,
+            "gaps": counts.gaps,
         }
+        self.total.update(samples=counts.new, invalid=counts.invalid, repeated=counts.repeated)
         if self._newest is not None:
-            origin, count = self._origin or self._newest.array, max(1, count)
-            means = [s / count for s in self._sums]
-            deviations = [
-                math.sqrt(max(0.0, q / count - m * m)) for q, m in zip(self._squares, means, strict=True)
-            ]
-            means = [m + o for m, o in zip(means, origin, strict=True)]
+            means = self._means if counts.new else self._newest.array
+            deviations = [math.sqrt(squares / max(1, counts.new)) for squares in self._squares]
             at = {name: slice(3 * n, 3 * n + 3) for n, (name, *_) in enumerate(_VECTORS)}
             found |= {name: means[where] for name, where in at.items()}
             found["deviation"] = {name: deviations[where] for name, where in at.items()}
@@ -118,54 +124,59 @@ class Block:
         self._begin()
         return found
 
-    def _rate_hz(self, intervals: int) -> float | None:
-        if self._first_ns is None or self._last_ns is None or intervals < _LEAST_INTERVALS:
-            return None
-        return intervals * 1e9 / (self._last_ns - self._first_ns)
-
 
 class _Watch:
     """Collects frames and shows them."""
 
-    def __init__(self, sensors: Sequence[Found], args: argparse.Namespace, clock: Clock) -> None:
-        self.on_terminal = sys.stdout.isatty() and not args.json
-        usual = _TERMINAL_INTERVAL_S if self.on_terminal else _LINE_INTERVAL_S
-        self._interval_s = args.interval or usual
-        self._sensors = {sensor.number: sensor for sensor in sensors}
+    def __init__(self, opened: Sensors, args: argparse.Namespace) -> None:
+        self._opened, self._args = opened, args
+        self._sensors = {sensor.number: sensor for sensor in chosen(opened, args)}
         self._blocks = {number: Block() for number in self._sensors}
-        self._samples, self._seconds, self._json = args.samples, args.seconds, args.json
-        self._clock = clock
-        self._began_ns = 0
-        self._end: Deadline | None = None
-        self._show: Deadline | None = None
-        self._height = 0
+        self._on_terminal = sys.stdout.isatty() and not args.json
+        usual = _TERMINAL_INTERVAL_S if self._on_terminal else _LINE_INTERVAL_S
+        self._interval_s = args.interval or usual
+        self._began_ns, self._height = opened.clock.monotonic_ns(), 0
 
-    def take(self, frame: DataMessage) -> bool:
-        """Add a frame; returns whether to continue."""
-        block = self._blocks[frame.sensor]
-        if self._samples is None or block.samples < self._samples:
-            block.take(frame)
-        return self._samples is None or min(each.samples for each in self._blocks.values()) < self._samples
+    def run(self) -> None:
+        """Until it is over, or KeyboardInterrupt."""
+        if not self._args.json and not self._on_terminal:
+            say("\n".join(f"{sensor} (mean of each block)" for sensor in self._sensors.values()))
+        opened, most = self._opened, self._args.samples or math.inf
+        opened.wait_settled(self._sensors)
+        self._began_ns = opened.clock.monotonic_ns()
+        end, show = (Deadline(opened.clock, s) for s in (self._args.seconds or _FOREVER_S, self._interval_s))
+        awaited = set[int]()
+        for frames, events in opened.stream(sensors=list(self._sensors)):
+            settling = {event["sensor"] for event in events if self._tell(event)}
+            for frame in frames:
+                block = self._blocks[frame.sensor]
+                if block.samples < most:
+                    settled = frame.sensor not in awaited | settling
+                    block.take(frame, opened.client.decode(frame), settled=settled)
+            if end.passed or all(block.samples >= most for block in self._blocks.values()):
+                return
+            opened.wait_settled(settling)
+            awaited = settling  # their samples that came meanwhile are in the next batch
+            if show.passed:
+                show = Deadline(opened.clock, self._interval_s)
+                self.show()
 
-    def idle(self) -> bool:
-        """Show what is due; returns whether to continue."""
-        if self._show is None:  # it begins: the sensors have settled
-            self._began_ns = self._clock.monotonic_ns()
-            self._show = Deadline(self._clock, self._interval_s)
-            self._end = Deadline(self._clock, self._seconds) if self._seconds else None
-        if self._end is not None and self._end.passed:
+    def _tell(self, event: JsonObject) -> bool:
+        """Say what happened to a watched sensor; whether its data has to settle."""
+        kind, number = event["event"], event.get("sensor")
+        if kind == Event.SHUTTING_DOWN:
+            raise ServerError(f"{self._opened.used} is shutting down")
+        if kind not in _TOLD or number not in self._sensors:
             return False
-        if self._show.passed:
-            self._show = Deadline(self._clock, self._interval_s)
-            self.show()
-        return True
+        note(str(event.get("message") or _TOLD[kind].format_map({"lost_s": None, **event})))
+        return kind in (Event.SENSOR_BACK, Event.RECONFIGURED)
 
     def show(self) -> None:
         """Show all blocks and start new ones."""
-        found = {number: block.finish() for number, block in self._blocks.items() if block}
-        if not self.on_terminal:
+        found = {number: row for number, block in self._blocks.items() if (row := block.finish())}
+        if not self._on_terminal:
             for number, row in found.items():
-                if self._json:
+                if self._args.json:
                     say_json({**self._sensors[number].as_json(), **row}, indent=None)
                 else:
                     say(f"sensor {number}  {_line(row)}")
@@ -176,20 +187,20 @@ class _Watch:
             self._height = text.count("\n") + 1
             say(text)
 
-    def summary(self) -> str:
-        """Number of samples per sensor."""
-        return ", ".join(f"sensor {number}: {each.samples} samples" for number, each in self._blocks.items())
-
-    def problems(self) -> list[str]:
-        """A sentence for each sensor that sent nothing."""
-        if self._show is None:  # it ended before it began
-            return []
-        silent_s = (self._clock.monotonic_ns() - self._began_ns) * 1e-9
-        seen = {
-            number: Observation(invalid=each.invalid, repeated=each.repeated, silent_s=silent_s)
-            for number, each in self._blocks.items() if not each.samples and silent_s > LIMITS.stale_after
-        }  # fmt: skip
-        return [f"sensor {number}: {judge(each).sentence}" for number, each in seen.items()]
+    def finish(self) -> int:
+        """Say how many samples there were, and which sensor sent none; the exit code."""
+        if not self._args.json:
+            say(
+                ", ".join(f"sensor {number}: {each.samples} samples" for number, each in self._blocks.items())
+            )
+        silent_s = (self._opened.clock.monotonic_ns() - self._began_ns) * 1e-9
+        silent = {number: each.total for number, each in self._blocks.items() if not each.samples}
+        if silent_s <= LIMITS.stale_after or not silent:
+            return DONE
+        for number, total in silent.items():
+            seen = Observation(invalid=total["invalid"], repeated=total["repeated"], silent_s=silent_s)
+            note(f"sensor {number}: {judge(seen).sentence}")
+        return FAILED
 
 
 def _counts(row: dict[str, Any]) -> str:
@@ -237,22 +248,14 @@ def _watch(args: argparse.Namespace) -> int:
     if args.samples is not None and args.samples < 1:
         raise UsageError(f"--samples {args.samples}: it must be 1 or more")
     with sensors_of(args) as opened:
-        sensors = opened.chosen(args.sensor)
-        watch = _Watch(sensors, args, opened.clock)
-        if not args.json and not watch.on_terminal:
-            say("\n".join(f"{sensor} (mean of each block)" for sensor in sensors))
+        watch = _Watch(opened, args)
         try:
-            opened.watch([sensor.number for sensor in sensors], watch.take, watch.idle)
+            watch.run()
         except KeyboardInterrupt:
             pass  # the normal end
         finally:
             watch.show()
-        if not args.json:
-            say(watch.summary())
-        problems = watch.problems()
-    for problem in problems:
-        note(problem)
-    return FAILED if problems else DONE
+        return watch.finish()
 
 
 _LENGTH: Final = f"length of a block (default {_LINE_INTERVAL_S:g}, on a terminal {_TERMINAL_INTERVAL_S:g})"

@@ -67,6 +67,7 @@ class Application:
         coe = CoeServer(self, SdoInformation(objects, device).answer)
         managers = self.esc.sync_managers
         self.mailbox = Mailbox(managers[0], managers[1], coe.answer, device.protocols)
+        self._outputs = [(entry.address, entry.type.size) for entry in device.output_entries]
         self._fed = 0  # when the process data watchdog was last triggered; 0 = not running
         self._show_state()
 
@@ -87,9 +88,9 @@ class Application:
     def take_outputs(self, data: bytes) -> None:
         """The master wrote the outputs, in OP."""
         at = 0
-        for entry in self.device.output_entries:
-            self.objects.values[entry.address] = data[at : at + entry.type.size]
-            at += entry.type.size
+        for address, size in self._outputs:
+            self.objects.values[address] = data[at : at + size]
+            at += size
 
     def prepare(self, expected: int) -> None:
         """Compute what a frame at the time `expected` will read, while there is time."""

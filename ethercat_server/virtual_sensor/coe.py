@@ -10,10 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from ethercat_server.ethercat.slave.abort_codes import AbortCode, abort_meaning
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry
-from ethercat_server.sensor.objects.search import TITLES
+from ethercat_server.ethercat.slave.coe import AbortCode, abort_meaning
+from ethercat_server.sensor.objects.dictionary import TITLES, Access, ObjectEntry
 from ethercat_server.virtual_sensor.device import Device
 from ethercat_server.virtual_sensor.mailbox import INVALID_HEADER, TOO_SHORT, MailboxError
 

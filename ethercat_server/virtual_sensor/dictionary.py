@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from bota_ethercat.pdo import INPUT_OBJECT, LAYOUTS
-from bota_ethercat.settings import SETTINGS, SettingValue, sampling_rate_hz
-from ethercat_server.ethercat.slave.abort_codes import AbortCode
+from bota_ethercat.settings import SettingValue, sampling_rate_hz
 from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.coe import AbortCode
 from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects import dictionary as table
 from ethercat_server.virtual_sensor.coe import Address, ObjectTable, SdoAbortError
@@ -160,10 +160,7 @@ class Dictionary(ObjectTable):
 
     def settings(self) -> dict[str, SettingValue]:
         """Every setting in force."""
-        return {
-            name: row.decode_setting(self.values[row.address], SETTINGS[name].is_bool)
-            for name, row in table.BY_SETTING.items()
-        }
+        return {name: row.decode_setting(self.values[row.address]) for name, row in table.BY_SETTING.items()}
 
     def offsets(self, index: int) -> tuple[float, ...]:
         """The six offsets of an offset object."""

@@ -159,8 +159,8 @@ class EventTimes:
             self.update(now)
             self._since = now if wanted else None
 
-    def update(self, now: int) -> None:
-        """Latch what has happened up to now."""
+    def update(self, now: int, *, starts: bool = True) -> None:
+        """Latch the ends of writes up to now, and their starts."""
         newest_at, since = self._newest_at, self._since
         if since is None or newest_at is None or self.none:
             return
@@ -172,12 +172,11 @@ class EventTimes:
                 self._any_shown = True
                 shown = end - self._write_ns if self.shows_start else end
                 self._show(reg.DC_PDI_CHANGE_EVENT, shown, number)
-        number = newest_at(now + self._write_ns)
-        if number != self._begun:
-            self._begun = number
-            start = self._end(number) - self._write_ns
+        if starts and (begun := newest_at(now + self._write_ns)) != self._begun:
+            self._begun = begun
+            start = self._end(begun) - self._write_ns
             if start >= since:
-                self._show(reg.DC_PDI_START_EVENT, start, number)
+                self._show(reg.DC_PDI_START_EVENT, start, begun)
 
     def _end(self, number: int) -> int:
         end = self._end_of(number)

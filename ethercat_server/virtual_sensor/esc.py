@@ -17,7 +17,8 @@ from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, Distributed
 
 _U16, _AL_STATUS = struct.Struct("<H"), struct.Struct("<HHH")
 _REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
-_DC_SYSTEM_TIME, _DC_RECEIVE_TIME, _DC_ECAT_EVENT = reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME, reg.DC_ECAT_EVENT
+_DC_SYSTEM_TIME, _DC_RECEIVE_TIME = reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME
+_DC_ECAT_EVENT, _DC_CHANGE_EVENT = reg.DC_ECAT_EVENT, reg.DC_PDI_CHANGE_EVENT
 _LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613  # DL status: ports 0 and 1 have a link, or only port 0
 
 
@@ -146,7 +147,8 @@ class SyncManager:
 
     def access(self, offset: int, length: int) -> bool:
         """The master accesses the buffer; False if it may not now."""
-        if self.locked or (self.mailbox and self.full == self.master_writes):
+        inside = offset >= 0 and offset + length <= self.length
+        if not inside or self.locked or (self.mailbox and self.full == self.master_writes):
             return False
         may = self.open or offset == 0
         self.open = may and offset + length < self.length
@@ -257,6 +259,7 @@ class Esc:
         # What each logical command copies, by address and length; emptied when an FMMU changes.
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
         self.has_lrw = True
+        self.station = self.event_mask = 0  # as the registers have them
         self.into_ns = 0  # from the start of a datagram until the bytes that are being copied pass
         self.record: Callable[[int, bytes], None] | None = None  # gets all that a master writes, and where
         self._events = 0
@@ -308,62 +311,37 @@ class Esc:
         length = len(current)
         end = address + length
         if end <= _REGISTERS_END:
-            return self._read_registers(address, end) if length else None
+            return self.read_registers(address, end) if length else None
         for manager in self.sync_managers:
             if manager.active and manager.start == address and manager.length == length:
                 return self._read_manager(manager, 0, length)
-        result, any_read = bytearray(current), False
-        part: bytes | bytearray | None
-        for start, stop, owner in self._regions(address, end):
-            if owner is not None:
-                part = self._read_manager(owner, start - owner.start, stop - start)
-            elif start < _REGISTERS_END:
-                part = self._read_registers(start, stop)
-            else:
-                part = self.memory[start:stop]
-            if part is not None:
-                result[start - address : stop - address] = part
-                any_read = True
-        return result if any_read else None
+        if address < _REGISTERS_END:  # it ends in the memory, which is not read
+            return self.read_registers(address, _REGISTERS_END) + current[_REGISTERS_END - address :]
+        owner = self._owner(address, end)
+        if owner is not None:
+            return self._read_manager(owner, address - owner.start, length)
+        part = self.memory[address:end]
+        return part + current[len(part) :] if part else None
 
     def write(self, address: int, data: bytes) -> bool:
         """Write `data` as a master does; False if it may write none of it."""
         if self.record is not None:
             self.record(address, data)
-        end, any_written = address + len(data), False
+        end = address + len(data)
         for manager in self.sync_managers:
             if manager.active and manager.start == address and manager.end == end:
                 return self._write_manager(manager, 0, data)
-        for start, stop, owner in self._regions(address, end):
-            part = data[start - address : stop - address]
-            if owner is not None:
-                any_written |= self._write_manager(owner, start - owner.start, part)
-            elif start < _REGISTERS_END:
-                any_written |= self._write_registers(start, part)
-            else:
-                self.memory[start:stop] = part
-                any_written = True
-        return any_written
+        if address < _REGISTERS_END:
+            return self._write_registers(address, data[: _REGISTERS_END - address])
+        owner = self._owner(address, end)
+        if owner is not None:
+            return self._write_manager(owner, address - owner.start, data)
+        self.memory[address:end] = data[: reg.MEMORY_END - address]
+        return address < reg.MEMORY_END and bool(data)
 
-    def _regions(self, start: int, end: int) -> list[tuple[int, int, SyncManager | None]]:
-        """Split an access into registers, what each active sync manager guards, and free memory."""
-        end = min(end, reg.MEMORY_END)
-        regions: list[tuple[int, int, SyncManager | None]] = []
-        if start < _REGISTERS_END:
-            regions.append((start, min(end, _REGISTERS_END), None))
-            start = _REGISTERS_END
-        if start < end:
-            for manager in sorted((m for m in self.sync_managers if m.active), key=lambda m: m.start):
-                if manager.end <= start or manager.start >= end:
-                    continue
-                if manager.start > start:
-                    regions.append((start, manager.start, None))
-                    start = manager.start
-                stop = min(manager.end, end)
-                regions.append((start, stop, manager))
-                start = stop
-            regions.append((start, end, None))
-        return [region for region in regions if region[0] < region[1]]
+    def _owner(self, start: int, end: int) -> SyncManager | None:
+        """The first active sync manager that guards any of this memory."""
+        return next((m for m in self.sync_managers if m.active and m.start < end and start < m.end), None)
 
     def _read_manager(self, manager: SyncManager, offset: int, length: int) -> bytes | None:
         if manager.master_writes or not manager.access(offset, length):
@@ -394,12 +372,14 @@ class Esc:
         elif manager.master_writes:
             self._pdi.outputs(manager.content())
 
-    def _read_registers(self, start: int, end: int) -> bytes | bytearray:
-        if end > _DC_SYSTEM_TIME and start < _DC_END and self.clock.present:
+    def read_registers(self, start: int, end: int) -> bytes | bytearray:
+        """Registers `start` to `end`, as a master reads them."""
+        clock = self.clock
+        if end > _DC_SYSTEM_TIME and start < _DC_END and clock.present:
             if start < _DC_RECEIVE_TIME:
-                self.clock.show_system_time()
+                clock.show_system_time()
             if end > _DC_ECAT_EVENT:
-                self.clock.events.update(self._pdi.clock() + self.clock.way_ns)
+                clock.events.update(self._pdi.clock() + clock.way_ns, starts=start < _DC_CHANGE_EVENT)
         if start > _DC_RECEIVE_TIMES:
             return self.memory[start:end]
         if start <= reg.EVENT_REQUEST + 1 and end > reg.EVENT_REQUEST:
@@ -435,6 +415,10 @@ class Esc:
         def touched(first: int, length: int) -> bool:
             return start < first + length and end > first
 
+        if touched(reg.STATION_ADDRESS, 2):
+            (self.station,) = _U16.unpack_from(self.memory, reg.STATION_ADDRESS)
+        if touched(reg.EVENT_MASK, 2):
+            (self.event_mask,) = _U16.unpack_from(self.memory, reg.EVENT_MASK)
         if touched(reg.SII_CONTROL, 2):
             self.sii.command()
         if touched(reg.FMMU, reg.FMMU_COUNT * reg.FMMU_SIZE):
@@ -463,14 +447,12 @@ _LOGICAL = frozenset({Command.LRD, Command.LWR, Command.LRW})
 _READS = frozenset({Command.APRD, Command.FPRD, Command.BRD})
 _WRITES = frozenset({Command.APWR, Command.FPWR, Command.BWR})
 _BROADCAST = frozenset({Command.BRD, Command.BWR, Command.BRW})
-_ONE_BY_STATION = frozenset({Command.FPRD, Command.FPWR, Command.FPRW})
 _READ_MULTIPLE_WRITE = frozenset({Command.ARMW, Command.FRMW})
 # Their position is, by every slave.
 _COUNTED_UP = _BROADCAST | {Command.APRD, Command.APWR, Command.APRW, Command.ARMW}
 _KNOWN = frozenset(Command) - {Command.NOP}
 _PLANS_KEPT: Final = 64
 _FPRD: Final = int(Command.FPRD)
-_STATION_ADDRESS, _EVENT_MASK = reg.STATION_ADDRESS, reg.EVENT_MASK
 
 
 def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> None:
@@ -478,30 +460,20 @@ def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> N
 
     Those that it is not meant for only show their events, if they have a mask for them.
     """
-    command, at = datagram.command, datagram.header + 2
-    if command in _ONE_BY_STATION:
-        low = frame[at]  # which suffices to pass nearly all others
-        for esc in escs:
-            memory = esc.memory
-            if memory[_EVENT_MASK] or memory[_EVENT_MASK + 1]:
-                execute(esc, frame, datagram)
-            elif memory[_STATION_ADDRESS] == low and memory[_STATION_ADDRESS + 1] == frame[at + 1]:
-                if command == _FPRD:
-                    _read(esc, frame, datagram)
-                else:
-                    execute(esc, frame, datagram)
-    else:
+    command, _, station, address, _, start, length = datagram
+    end = address + length
+    if command != _FPRD or end > _REGISTERS_END or not length:
         for esc in escs:
             execute(esc, frame, datagram)
-
-
-def _read(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
-    """Process an FPRD for this slave, which shows no events: the same as `execute`, in less time."""
-    start, end = datagram.data, datagram.end
-    read = esc.read(datagram.ado, frame[start:end])
-    if read is not None:
-        frame[start:end] = read
-        _U16.pack_into(frame, end, (_U16.unpack_from(frame, end)[0] + 1) & 0xFFFF)
+        return
+    # Masters read the times of a sensor's clock with every frame: the same as `execute`, in less time.
+    for esc in escs:
+        if esc.event_mask:
+            execute(esc, frame, datagram)
+        elif esc.station == station:
+            counter = start + length
+            frame[start:counter] = esc.read_registers(address, end)
+            _U16.pack_into(frame, counter, (_U16.unpack_from(frame, counter)[0] + 1) & 0xFFFF)
 
 
 def execute(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
@@ -510,8 +482,7 @@ def execute(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
     if command not in _KNOWN:
         return
     counted = (_logical if command in _LOGICAL else _physical)(esc, frame, datagram)
-    mask = _U16.unpack_from(esc.memory, _EVENT_MASK)[0]
-    if mask and (events := esc.events & mask):
+    if esc.event_mask and (events := esc.events & esc.event_mask):
         at = datagram.data - 2
         _U16.pack_into(frame, at, _U16.unpack_from(frame, at)[0] | events)
     if counted:
@@ -526,7 +497,7 @@ def _physical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
         _U16.pack_into(frame, datagram.header + 2, (position_or_station + 1) & 0xFFFF)
         meant = command in _BROADCAST or position_or_station == 0
     else:
-        meant = position_or_station == _U16.unpack_from(esc.memory, _STATION_ADDRESS)[0]
+        meant = position_or_station == esc.station
     reads, writes = command not in _WRITES, command not in _READS
     if command in _READ_MULTIPLE_WRITE:
         reads, writes = meant, not meant

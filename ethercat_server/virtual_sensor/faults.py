@@ -61,11 +61,6 @@ class Call:
             raise UsageError("the sensor has no power: use `power on` first")
         return self.sensor.life
 
-    def _later(self, words: Sequence[str]) -> Callable[[], None]:
-        """Parses another command for the same slave, which is executed at the end of the frame then."""
-        action = _parse(self.bus, words, self.slave)
-        return lambda: self.bus.due.append(action)
-
     def _port(self, port: int) -> int:
         if port == 1 and self.slave is self.bus.slaves[-1]:
             raise UsageError("port 1 of the last slave is not connected")
@@ -86,10 +81,8 @@ class Call:
         self.bus.power(self.sensor, True)
 
     def _on_write(self, index: int, subindex: int, *command: str) -> None:
-        self.sensor.on_write[index, subindex] = self._later(command)
-
-    def _on_request(self, *command: str) -> None:
-        self.firmware.mailbox.on_request = self._later(command)
+        action = _parse(self.bus, command, self.slave)  # for the same slave, at the end of the frame
+        self.sensor.on_write[index, subindex] = lambda: self.bus.due.append(action)
 
     def _saving(self, seconds: float, result: int = 0) -> None:
         self.sensor.flash.seconds, self.sensor.flash.result = seconds, result
@@ -182,9 +175,6 @@ COMMANDS: Final[tuple[Command, ...]] = (
             lambda c, n: setattr(c.application.mailbox, "mute", n), (_COUNT,)),
     Command("emergency CODE [REGISTER [HEX]] [@N]", "send a CoE emergency before all that the mailbox holds",
             Call._emergency, (_WORD, _BYTE, _hex)),
-    Command("on-request COMMAND ...",
-            "execute a command after the next mailbox request, before its answer is read",
-            Call._on_request, (str,)),
     Command("sii error|busy|ok [@N]", "result of reading the EEPROM",
             lambda c, result: c.application.esc.sii.fail(SiiInterface.FAULTS[result]),
             (_one_of("result", tuple(SiiInterface.FAULTS)),)),

@@ -1,7 +1,8 @@
 """Slaves of other vendors on the virtual bus, and chains as other masters leave them.
 
-Vendor, product code and process data of the Beckhoff slaves are public; the drive is nobody's. It follows the
-CiA 402 drive profile (IEC 61800-7-201), its motor the target velocity at once.
+Vendor, product code and process data of the Beckhoff slaves are public; the drive is nobody's. It has the
+objects of the CiA 402 drive profile (IEC 61800-7-201), but is enabled and disabled in one step, and its motor
+follows the target velocity at once.
 """
 
 from __future__ import annotations
@@ -80,8 +81,8 @@ def _objects_of(device: Device) -> ObjectTable:
 
 
 _ENABLE: Final = 0x000F  # controlword in normal operation
-_SWITCH_ON, _VOLTAGE, _NO_QUICK_STOP, _ENABLE_OPERATION, _FAULT_RESET = 0x01, 0x02, 0x04, 0x08, 0x80
-_VOLTAGE_ENABLED, _REMOTE = 0x0010, 0x0200
+_FAULT_RESET: Final = 0x80
+_REMOTE: Final = 0x0200
 _COMMUNICATION_LOST: Final = 0x8130
 
 
@@ -89,15 +90,12 @@ class DriveState(IntEnum):
     """States, as bits of the statusword."""
 
     SWITCH_ON_DISABLED = 0x0040
-    READY_TO_SWITCH_ON = 0x0021
-    SWITCHED_ON = 0x0023
-    OPERATION_ENABLED = 0x0027
-    QUICK_STOP_ACTIVE = 0x0007
+    OPERATION_ENABLED = 0x0037
     FAULT = 0x0008
 
 
 class Drive(Application):
-    """A servo drive: its state machine and position."""
+    """A servo drive: its state and position."""
 
     def __init__(self, clock: Callable[[], int], eeprom_ms: float) -> None:
         self.drive_state = DriveState.SWITCH_ON_DISABLED
@@ -114,49 +112,44 @@ class Drive(Application):
     def take_outputs(self, data: bytes) -> None:
         """See `Application`."""
         super().take_outputs(data)
-        self._obey_objects()
+        self._obey()
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
         """See `Application`."""
         super().write(index, subindex, data)
-        self._obey_objects()
+        self._obey()
 
-    def _obey_objects(self) -> None:
-        word, velocity = (int(self.objects.number(row.address)) for row in (_CONTROLWORD, _VELOCITY))
-        self._command(word, velocity)
-
-    def _command(self, controlword: int, velocity: int) -> None:
+    def _obey(self) -> None:
         self._move()
+        controlword, self._velocity = (int(self.objects.number(o.address)) for o in (_CONTROLWORD, _VELOCITY))
         reset = controlword & ~self._controlword & _FAULT_RESET
-        self._controlword, self._velocity = controlword, velocity
-        if self.drive_state is not DriveState.FAULT:
-            self.drive_state = self._next(controlword)
-        elif reset:
-            self.drive_state, self._error = DriveState.SWITCH_ON_DISABLED, 0
+        self._controlword = controlword
+        if reset:
+            self._error = 0
+        if reset or self.drive_state is not DriveState.FAULT:
+            enabled = controlword & _ENABLE == _ENABLE
+            self.drive_state = DriveState.OPERATION_ENABLED if enabled else DriveState.SWITCH_ON_DISABLED
 
     def state_changed(self) -> None:
         """The motor stops when process data ends, with an error if the master did not say so."""
         if self.state is AlState.OP:
             return
         self._move()
-        energized = self.drive_state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
-        if self.error and energized:
+        if self.error and self.drive_state is DriveState.OPERATION_ENABLED:
             self.drive_state, self._error = DriveState.FAULT, _COMMUNICATION_LOST
         elif self.drive_state is not DriveState.FAULT:
             self.drive_state = DriveState.SWITCH_ON_DISABLED
 
     def work(self) -> None:
         """Be at work in OP: the other master has enabled it, and it turns."""
-        for controlword in (_ENABLE & ~_SWITCH_ON, _ENABLE, _ENABLE):
-            self._command(controlword, _VELOCITY_AT_WORK)
+        self.take_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
 
     def read(self, index: int, subindex: int) -> bytes:
         """See `Application`; some objects the drive itself changes."""
         self._move()
-        powered = self.drive_state not in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
         live = {
             _ERROR_CODE.address: self._error,
-            _STATUSWORD.address: self.drive_state | _REMOTE | (_VOLTAGE_ENABLED if powered else 0),
+            _STATUSWORD.address: self.drive_state | _REMOTE,
             _POSITION.address: (round(self._position) + 2**31) % 2**32 - 2**31,
         }
         value = live.get((index, subindex))
@@ -169,22 +162,6 @@ class Drive(Application):
         if self.drive_state is DriveState.OPERATION_ENABLED:
             self._position += self._velocity * (now - self._since) * 1e-9
         self._since = now
-
-    def _next(self, word: int) -> DriveState:
-        state = self.drive_state
-        if not word & _VOLTAGE:
-            return DriveState.SWITCH_ON_DISABLED
-        if state in (DriveState.SWITCH_ON_DISABLED, DriveState.QUICK_STOP_ACTIVE):
-            ready = state is DriveState.SWITCH_ON_DISABLED and word & _NO_QUICK_STOP and not word & _SWITCH_ON
-            return DriveState.READY_TO_SWITCH_ON if ready else state
-        if not word & _NO_QUICK_STOP:
-            stops = state is DriveState.OPERATION_ENABLED
-            return DriveState.QUICK_STOP_ACTIVE if stops else DriveState.SWITCH_ON_DISABLED
-        if not word & _SWITCH_ON:
-            return DriveState.READY_TO_SWITCH_ON
-        if word & _ENABLE_OPERATION and state is not DriveState.READY_TO_SWITCH_ON:
-            return DriveState.OPERATION_ENABLED
-        return DriveState.SWITCHED_ON
 
 
 _WRITES_REMEMBERED: Final = 1000

@@ -19,8 +19,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final, Self, TextIO
 
-from ethercat_server.ethercat.nic import look_up
-from ethercat_server.ethercat.raw_socket import arrived_ns
+from ethercat_server.ethercat.nic import arrived_ns, look_up
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, QuitCommand, obey
@@ -272,8 +271,11 @@ class _Answers:
                 if bus.process(buffer, size, middle - size * BYTE_NS // 2):
                     half_ns = (time.monotonic_ns() - now) / 2
                     status, control, kind = _AUXDATA.unpack(messages[0][2])
-                    tag = struct.pack("!HH", kind, control) if status & _VLAN_VALID else b""
-                    raw.sendmsg((view[:_ADDRESSES], tag, view[_ADDRESSES:size]))
+                    if status & _VLAN_VALID:
+                        tag = struct.pack("!HH", kind, control)
+                        raw.sendmsg((view[:_ADDRESSES], tag, view[_ADDRESSES:size]))
+                    else:
+                        raw.send(view[:size])
                     self._half_ns *= 1 + _STEP if half_ns > self._half_ns else 1 - _STEP / _QUICK
             except BlockingIOError:
                 bus.prepare()

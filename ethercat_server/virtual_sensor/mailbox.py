@@ -55,7 +55,6 @@ class Mailbox:
         self._last_reply = b""
         self._last_counter = self._counter = 0
         self.mute = 0  # number of the next requests to drop: a fault
-        self.on_request: Callable[[], None] | None = None  # called once, after the next request
 
     def reset(self) -> None:
         """The mailbox was switched off or on."""
@@ -70,8 +69,7 @@ class Mailbox:
         """
         if self._read.full:
             return
-        requested = not self._replies and self._written.full
-        if requested:
+        if not self._replies and self._written.full:
             message = self._written.content()
             self._written.full = False
             self._request(message)
@@ -81,9 +79,6 @@ class Mailbox:
             self._counter = self._counter % 7 + 1
             self._last_reply = HEADER.pack(len(body), address, 0, kind | self._counter << 4) + body
             self._read.load(self._last_reply)
-        if requested and (action := self.on_request) is not None:
-            self.on_request = None
-            action()
 
     def raise_emergency(self, code: int, register: int, data: bytes) -> None:
         """Put a CoE emergency before all that the master has not read yet; the mailbox must be on."""

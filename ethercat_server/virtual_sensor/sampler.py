@@ -216,9 +216,9 @@ class Sampler:
         sinc_length = self._dictionary.sinc_in_effect
         if sinc_length != self.clock.sinc_length:
             self.clock.change(self._now(), sinc_length=sinc_length)
-        if isinstance(self._signal, Scene):
-            self._signal.set_sinc_length(sinc_length)
         settings = self._dictionary.settings()
+        if isinstance(self._signal, Scene):
+            self._signal.set_filters(sinc_length, settings)
         self._offset, self._acceleration_offset, self._angular_rate_offset = (
             self._dictionary.offsets(index) for index in (0x8000, 0x8001, 0x8002)
         )

@@ -7,12 +7,16 @@ Frames: the sensor's, with z out of the tool side; the world's, with z up. An at
 from __future__ import annotations
 
 import math
+import operator
 import random
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
+from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+from ethercat_server.virtual_sensor.filters import UNFILTERED, ImuFilterProfile, LoadFilter
 
 Vector = tuple[float, float, float]
 
@@ -61,12 +65,6 @@ def _clock(number: int, instant: int) -> Iterable[float]:
 FORMULAS: Final = {
     "clock": Formula(_clock, exact=True),
     "ramp": Formula(lambda k, _: (((k + 100 * i) % 1024) / 64 - 8 for i in range(6))),
-    "sine": Formula(
-        lambda k, _: (
-            amplitude * math.sin(math.tau * (k % 1000 / 1000 + i / 6))
-            for i, amplitude in enumerate((10.0, 20.0, 30.0, 1.0, 2.0, 3.0))
-        )
-    ),
     "constant": Formula(lambda *_: CONSTANT),
     # The sample number in the temperature: steps of 2**-18 °C, from 32 to 48 °C, are exact in REAL32.
     "rest": Formula(lambda *_: CONSTANT, lambda k: 32 + k % 2**22 / 2**18),
@@ -205,6 +203,7 @@ _SHAKE = ((0.15, 1.7), (0.10, 2.3), (0.20, 1.1))
 # own test allows at 51, and a little under half of it at 1024.
 _REFERENCE_SINC = 51
 _NOISE = (*((0.3, 0.62),) * 3, (0.007, 0.78), (0.007, 0.78), (0.0025, 0.78))
+_FILTERS: Final = ("fir", "acceleration_filter", "angular_rate_filter")
 _ACCELERATION_NOISE = 0.002  # g
 _ANGULAR_RATE_NOISE = 0.04  # °/s
 
@@ -231,44 +230,72 @@ class Scene:
     exact = False
 
     def __init__(self, seed: int, noise: bool, motion: Motion = sway) -> None:
+        """Measured without filters, until there are some."""
         self._motion = motion
         self._gauss = random.Random(seed).gauss
         self._noise = noise
+        self._settings: tuple[SettingValue, ...] = ()  # of the filters
+        self._load_filter: LoadFilter | None = None
+        self._acceleration_filter = self._rate_filter = UNFILTERED
         self.set_sinc_length(_REFERENCE_SINC)
 
     def set_sinc_length(self, sinc_length: int) -> None:
-        """A longer filter makes force (N) and torque (Nm) quieter: their standard deviations."""
+        """A longer filter makes force (N) and torque (Nm) quieter: their standard deviations with FIR off."""
         ratio = sinc_length / _REFERENCE_SINC
         self.deviations = tuple(deviation * ratio**-power for deviation, power in _NOISE)
 
-    def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
-        """See `Formula`."""
-        attitude, rates = self._motion(seconds)
+    def set_filters(self, sinc_length: int, settings: Mapping[str, SettingValue]) -> None:
+        """Measure through these filters; `sinc_length` is that in effect."""
+        wanted = sinc_length, *(settings[name] for name in _FILTERS)
+        if wanted == self._settings:
+            return
+        self._settings = wanted
+        self.set_sinc_length(sinc_length)
+        fir, acceleration, rate = wanted[1:]
+        period_s = sinc_length / BASE_SAMPLING_RATE_HZ
+        self._load_filter = LoadFilter(self.load, self._load_noise, period_s, fir=bool(fir))
+        self._acceleration_filter = ImuFilterProfile(ACCELERATION_FILTERS[acceleration])
+        self._rate_filter = ImuFilterProfile(ANGULAR_RATE_FILTERS[rate])
+
+    def specific_force(self, seconds: float) -> Vector:
+        """m/s²."""
         ax = ay = az = 0.0
-        contact = (0.0, 0.0, 0.0)
         if self._motion is sway:
             ax, ay, az = (a * math.sin(w * seconds) for a, w in _SHAKE)
-            contact = contact_force(seconds)
-        fx, fy, fz = to_sensor(attitude, (ax, ay, az + STANDARD_GRAVITY))
+        return to_sensor(self._motion(seconds)[0], (ax, ay, az + STANDARD_GRAVITY))
+
+    def load(self, seconds: float) -> tuple[float, ...]:
+        """Force (N) and torque (Nm) of tool and contact."""
+        fx, fy, fz = self.specific_force(seconds)
         weight = (-TOOL_MASS * fx, -TOOL_MASS * fy, -TOOL_MASS * fz)
-        torque, contact_torque = cross(TOOL_CENTRE, weight), cross(CONTACT_POINT, contact)
-        wx, wy, wz = angular_rate(attitude, rates)
-        values = [
-            *(w + c for w, c in zip(weight, contact, strict=True)),
-            *(w + c for w, c in zip(torque, contact_torque, strict=True)),
-            fx / STANDARD_GRAVITY, fy / STANDARD_GRAVITY, fz / STANDARD_GRAVITY,
-            math.degrees(wx), math.degrees(wy), math.degrees(wz),
-        ]  # fmt: skip
+        load = (*weight, *cross(TOOL_CENTRE, weight))
+        if self._motion is not sway or not any(contact := contact_force(seconds)):
+            return load
+        return tuple(map(operator.add, load, (*contact, *cross(CONTACT_POINT, contact))))
+
+    def rate(self, seconds: float) -> Vector:
+        """Angular rate, rad/s."""
+        return angular_rate(*self._motion(seconds))
+
+    def _load_noise(self) -> list[float]:
+        return [self._gauss(0.0, deviation) if self._noise else 0.0 for deviation in self.deviations]
+
+    def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
+        """See `Formula`."""
+        if self._load_filter is None:
+            load = tuple(map(operator.add, self.load(seconds), self._load_noise()))
+        else:
+            load = self._load_filter.at(number, seconds)
+        force = self._acceleration_filter.at(self.specific_force, seconds)
+        rate = self._rate_filter.at(self.rate, seconds)
+        values = [*load, *(a / STANDARD_GRAVITY for a in force), *map(math.degrees, rate)]
         if self._noise:
-            gauss = self._gauss
-            for axis, deviation in enumerate(self.deviations):
-                values[axis] += gauss(0.0, deviation)
             for axis in range(6, 9):
-                values[axis] += gauss(0.0, _ACCELERATION_NOISE)
-                values[axis + 3] += gauss(0.0, _ANGULAR_RATE_NOISE)
+                values[axis] += self._gauss(0.0, _ACCELERATION_NOISE)
+                values[axis + 3] += self._gauss(0.0, _ANGULAR_RATE_NOISE)
         # The temperature drifts by 2 °C about 35 °C in ten minutes.
         temperature = 35.0 + 2.0 * math.sin(math.tau * seconds / 600.0)
-        return reading_of(values, temperature, quaternion(attitude))
+        return reading_of(values, temperature, quaternion(self._motion(seconds)[0]))
 
 
 def reading_of(values: Sequence[float], temperature: float, orientation: tuple[float, ...]) -> Reading:

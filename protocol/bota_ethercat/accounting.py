@@ -1,24 +1,7 @@
 """One accounting of a stream: what each DATA frame is, and what is missing before it. No sockets, no clock.
 
-The words, as docs/protocol.md has them. The first four are kinds of frames, each frame is of one; the C++
-header counts the same, and tests/protocol/golden/accounting.json holds both to it.
-
-new: neither REPEATED nor INVALID: one new, valid sample
-repeated: REPEATED without INVALID: the sensor has nothing new
-invalid: INVALID: the working counter was short
-old: `sequence` and `monotonic_ns` are both no higher than those of the frame before: a duplicate, or out of
-    order. It changes no other count
-restarts: `sequence` is no higher but `monotonic_ns` is: the server's numbering began again. What is missing
-    before this frame is unknown
-gaps: frames with GAP
-withheld: sequence numbers missing before a frame with GAP, except `every` - 1 of them: the client did not
-    read in time. Under `fresh_only` REPEATED frames skipped in the same gap are included; without
-    `fresh_only` no GAP is needed
-lost: samples that the sensor produced and the server never had, so they have no number: at least one for a
-    GAP with nothing withheld, and, where the sensor's rate is known, as many as fit between this frame and
-    the last new one. GAP is also set when the server cannot rule a loss out; `lost_samples` in `status` says
-    how many there were
-skipped: other missing sequence numbers: the subscription left them out (`every`, `fresh_only`)
+docs/protocol.md defines the words; the C++ header counts the same, and tests/protocol/golden/accounting.json
+holds both to it.
 """
 
 from __future__ import annotations
@@ -29,8 +12,8 @@ from typing import Final
 
 from bota_ethercat.framing import DataFlag
 
+# Either of these flags says that a frame brings no new sample.
 NOT_NEW: Final = int(DataFlag.REPEATED | DataFlag.INVALID)
-"""Either of these flags says that a frame brings no new sample."""
 _INVALID: Final = int(DataFlag.INVALID)
 _GAP: Final = int(DataFlag.GAP)
 
@@ -46,17 +29,17 @@ class FrameKind(Enum):
 
 @dataclass(slots=True)
 class StreamCounts:
-    """Counts of one sensor's frames and samples; the module's docstring defines each."""
+    """Counts of one sensor's frames and samples."""
 
-    new: int = 0
-    repeated: int = 0
-    invalid: int = 0
-    old: int = 0
-    restarts: int = 0
-    gaps: int = 0
-    withheld: int = 0
-    lost: int = 0
-    skipped: int = 0
+    new: int = 0  # frames with one new, valid sample
+    repeated: int = 0  # frames: the sensor has nothing new
+    invalid: int = 0  # frames: the working counter was short
+    old: int = 0  # duplicates, and frames out of order; they change no other count
+    restarts: int = 0  # the server's numbering began again
+    gaps: int = 0  # frames with GAP
+    withheld: int = 0  # sequence numbers of frames that this client did not read in time
+    lost: int = 0  # samples that the server never had, so they have no number
+    skipped: int = 0  # sequence numbers that the subscription left out
 
     @property
     def frames(self) -> int:
@@ -79,10 +62,8 @@ class StreamAccounting:
     ) -> None:
         """`every` and `fresh_only` as subscribed; `counts` to add to, by default new ones."""
         self.counts: StreamCounts = StreamCounts() if counts is None else counts
-        self.rate_hz = 0.0
-        """The sensor's sampling rate; 0 if it is unknown."""
-        self.new_ns = -1
-        """`monotonic_ns` of the newest new frame; -1: none since the subscription began."""
+        self.rate_hz = 0.0  # the sensor's sampling rate; 0 if it is unknown
+        self.new_ns = -1  # `monotonic_ns` of the newest new frame; -1: none since the subscription began
         self._every = every
         self._fresh_only = fresh_only
         self.begin()

@@ -29,13 +29,12 @@ class Address(NamedTuple):
             host, port = "", text
         elif not colon or text.endswith("]"):
             host, port = text, str(DEFAULT_PORT)
-        bracketed = host.startswith("[") and host.endswith("]")
-        if ":" in host and not bracketed:
+        if ":" in host and not (host.startswith("[") and host.endswith("]")):
             raise ValueError(f"{text!r}: write an IPv6 address in brackets, for example [::1]:{DEFAULT_PORT}")
-        if port.isdecimal() and port.isascii() and not 1 <= int(port) <= 65535:
-            raise ValueError(f"{text!r}: {port} is no port: it must be from 1 to 65535")
         if not port.isdecimal() or not port.isascii():
             raise ValueError(f"{text!r}: it must be HOST:PORT, for example {DEFAULT_HOST}:{DEFAULT_PORT}")
+        if not 1 <= int(port) <= 65535:
+            raise ValueError(f"{text!r}: {port} is no port: it must be from 1 to 65535")
         return cls(host.strip("[]") or DEFAULT_HOST, int(port))
 
     def __str__(self) -> str:
@@ -47,8 +46,8 @@ class Address(NamedTuple):
 def boot_id() -> str | None:
     """The name of this process's CLOCK_MONOTONIC, `boot_id` in messages; None if it cannot be known.
 
-    The kernel's boot id: whoever has the same has the same clock. In a time namespace that shifts the clock
-    the offset follows, in s and ns.
+    The kernel's boot id: processes with the same one have the same clock. In a time namespace that shifts
+    the clock the offset follows, in s and ns.
     """
     try:
         text = _BOOT_ID.read_text()

@@ -1,4 +1,4 @@
-"""ROS 2 messages of fixed layout serialized as CDR, without ROS: what the node publishes and recordings have.
+"""ROS 2 messages of fixed layout serialized as CDR, without ROS: what the node publishes.
 
 ROS's own conversion takes longer than handing the message to the middleware does.
 """

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 from collections.abc import Callable, Mapping
 from enum import StrEnum
@@ -48,8 +49,8 @@ class Event(StrEnum):
     SHUTTING_DOWN = "shutting_down"
 
 
+# Returns the checked value; raises SettingError, or ValueError whose text is what is allowed.
 Check = Callable[[object], Any]
-"""Returns the checked value; raises SettingError, or ValueError whose text is what is allowed."""
 
 
 class Parameter(NamedTuple):
@@ -220,33 +221,27 @@ def parse_request(message: JsonObject) -> Request:
 
     RequestError carries `bad_request`, naming the key that is wrong, or `unknown_action`.
     """
-    name = message.get("action")
-    if name is None:
-        raise RequestError(ErrorCode.BAD_REQUEST, "the key 'action' is missing: say what to do")
+    name, bad = message.get("action"), functools.partial(RequestError, ErrorCode.BAD_REQUEST)
     if not isinstance(name, str):
-        raise RequestError(ErrorCode.BAD_REQUEST, "the key 'action' must be a string")
+        wrong = "is missing: say what to do" if name is None else "must be a string"
+        raise bad(f"the key 'action' {wrong}")
     action = ACTIONS.get(name)
     if action is None:
         known = ", ".join(ACTIONS)
         raise RequestError(ErrorCode.UNKNOWN_ACTION, f"no action {_short(name)}: the actions are {known}")
-    for key in message:
-        if key not in action.parameters and key not in {"action", "id"}:
-            known = ", ".join(("id", *action.parameters))
-            text = f"{name} takes no key {_short(key)}: it takes {known}"
-            raise RequestError(ErrorCode.BAD_REQUEST, text)
+    known_keys = ("id", *action.parameters)
+    if unknown := [key for key in message if key not in ("action", *known_keys)]:
+        raise bad(f"{name} takes no key {_short(unknown[0])}: it takes {', '.join(known_keys)}")
     values: dict[str, Any] = {}
     for key, parameter in action.parameters.items():
-        if key not in message:
-            if parameter.required:
-                raise RequestError(ErrorCode.BAD_REQUEST, f"{name} needs the key {key!r}")
-            values[key] = parameter.default
-            continue
+        if parameter.required and key not in message:
+            raise bad(f"{name} needs the key {key!r}")
         try:
-            values[key] = parameter.check(message[key])
+            values[key] = parameter.check(message[key]) if key in message else parameter.default
         except ValueError as error:
-            raise RequestError(ErrorCode.BAD_REQUEST, f"the key {key!r} must be {error}") from None
+            raise bad(f"the key {key!r} must be {error}") from None
         except SettingError as error:
-            raise RequestError(ErrorCode.BAD_REQUEST, f"the key {key!r} is refused: {error}") from None
+            raise bad(f"the key {key!r} is refused: {error}") from None
     return Request(name, message.get("id"), "id" in message, values)
 
 

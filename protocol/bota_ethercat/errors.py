@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from bota_ethercat.text.untrusted import printable
@@ -18,11 +18,6 @@ class FileError(ProtocolError):
 
 class PdoSizeError(ProtocolError):
     """Process data of a size that no known sensor has."""
-
-    def __init__(self, size: int, known: Sequence[int]) -> None:
-        choices = " or ".join(str(n) for n in known)
-        super().__init__(f"process data of {size} bytes: a Bota Gen-0 sensor maps {choices}")
-        self.size = size
 
 
 class RemoteProtocolError(ProtocolError):

@@ -49,17 +49,14 @@ class DataMessage(NamedTuple):
 
 _LENGTH: Final = struct.Struct(">I")
 _PREFIX: Final = struct.Struct(">IB")
-_DATA_HEADER: Final = struct.Struct(">QQQBBH")
 _DATA_MESSAGE: Final = struct.Struct(">IBQQQBBH")
+_DATA_OVERHEAD: Final = _DATA_MESSAGE.size - _LENGTH.size  # what `length` counts beside the process data
 _DATA: Final = int(MessageType.DATA)
 _TYPE_SIZE: Final = 1
-_BODY_OFFSET: Final = _PREFIX.size
+# Offset of the flags byte in an encoded DATA message.
 DATA_FLAGS_OFFSET: Final = _PREFIX.size + struct.calcsize(">QQQB")
-"""Offset of the flags byte in an encoded DATA message."""
-_LENGTH_SIZE: Final = _LENGTH.size
 _UNPACK_DATA: Final = {
-    _TYPE_SIZE + _DATA_HEADER.size + size: struct.Struct(f">{_PREFIX.size}xQQQBBH{size}s").unpack_from
-    for size in LAYOUTS
+    _DATA_OVERHEAD + size: struct.Struct(f">{_PREFIX.size}xQQQBBH{size}s").unpack_from for size in LAYOUTS
 }
 """The fields of a whole DATA message, by its length."""
 _DATA_LENGTHS: Final = frozenset(_UNPACK_DATA)
@@ -70,7 +67,7 @@ def encode_data(
     sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, process_data: bytes
 ) -> bytes:
     """A whole DATA message, ready to send. struct.error if a number does not fit its field."""
-    length = _TYPE_SIZE + _DATA_HEADER.size + len(process_data)
+    length = _DATA_OVERHEAD + len(process_data)
     head = _DATA_MESSAGE.pack(length, _DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
     return head + process_data
 
@@ -145,17 +142,16 @@ class FrameDecoder:
             if length not in _DATA_LENGTHS:
                 self._break(f"DATA message of length {length}: it must be one of {sorted(_DATA_LENGTHS)}")
         elif kind != MessageType.JSON:
-            self._break(f"message type {kind}: this side understands {self._types_text()}")
+            known = "1 (DATA) and 2 (JSON)" if self._accept_data else "2 (JSON)"
+            self._break(f"message type {kind}: this side understands {known}")
         elif length > self._max_json_length + _TYPE_SIZE:
             self._break(f"JSON message of length {length}: it must be at most {self._max_json_length + 1}")
         if available < _LENGTH.size + length:
             return None
-        body = self._start + _BODY_OFFSET
-        end = self._start + _LENGTH.size + length
-        self._start = end
+        start, self._start = self._start, self._start + _LENGTH.size + length
         if kind == MessageType.DATA:
-            return DataMessage._make(_UNPACK_DATA[length](self._buffer, body - _BODY_OFFSET))
-        return parse_json_object(bytes(self._buffer[body:end]))
+            return DataMessage._make(_UNPACK_DATA[length](self._buffer, start))
+        return parse_json_object(bytes(self._buffer[start + _PREFIX.size : self._start]))
 
     def __iter__(self) -> Iterator[DataMessage | JsonObject]:
         """The whole messages received so far."""
@@ -169,9 +165,10 @@ class FrameDecoder:
         """
         buffer, start, end = self._buffer, self._start, self._end
         if self._accept_data and self._broken is None:
-            while end - start >= _BODY_OFFSET:
+            prefix_size, length_size = _PREFIX.size, _LENGTH.size
+            while end - start >= prefix_size:
                 length, kind = _PREFIX.unpack_from(buffer, start)
-                unpack, after = _UNPACK_DATA.get(length), start + _LENGTH_SIZE + length
+                unpack, after = _UNPACK_DATA.get(length), start + length_size + length
                 if kind != _DATA or unpack is None or after > end:
                     break
                 into.append(DataMessage._make(unpack(buffer, start)))
@@ -181,9 +178,6 @@ class FrameDecoder:
         message = self.next_message()
         assert not isinstance(message, DataMessage)  # a whole one was taken above
         return message
-
-    def _types_text(self) -> str:
-        return "1 (DATA) and 2 (JSON)" if self._accept_data else "2 (JSON)"
 
     def _break(self, reason: str) -> NoReturn:
         self._broken = reason

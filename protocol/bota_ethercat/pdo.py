@@ -120,10 +120,10 @@ LAYOUTS: Final[dict[int, PdoLayout]] = {
 
 def layout_for(size: int) -> PdoLayout:
     """Return the layout of `size` bytes of process data; PdoSizeError if there is none."""
-    try:
-        return LAYOUTS[size]
-    except KeyError:
-        raise PdoSizeError(size, tuple(LAYOUTS)) from None
+    if size not in LAYOUTS:
+        known = " or ".join(map(str, LAYOUTS))
+        raise PdoSizeError(f"process data of {size} bytes: a Bota Gen-0 sensor maps {known}")
+    return LAYOUTS[size]
 
 
 def is_finite(process_data: bytes) -> bool:

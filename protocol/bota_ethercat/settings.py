@@ -21,8 +21,8 @@ class Setting(NamedTuple):
     """One setting. `choices` are its allowed values, None for bool."""
 
     name: str
+    # What the server writes at start-up unless configured otherwise; None = not written.
     default: SettingValue | None
-    """What the server writes at start-up unless configured otherwise; None = not written."""
     choices: range | tuple[int, ...] | None
     meaning: str
     preop_only: bool  # can be written in PREOP only
@@ -89,18 +89,14 @@ SETTINGS: Final[Mapping[str, Setting]] = {
 
 BASE_SAMPLING_RATE_HZ: Final = 51200  # the ADC's rate: sampling rate = 51200 / SINC length
 
+# By how much CHOP may divide the sampling rate; no source says whether it does, so object 0x8011 decides.
 _MOST_DIVIDED: Final = 8
-"""By how much CHOP may divide the sampling rate; no source says whether it does, so object 0x8011 decides."""
-
-PUBLISHED_RATES_HZ: Final[Mapping[int, int]] = {
-    length: row.rate_hz for length, row in FORCE_TORQUE_FILTERS.items()
-}
-"""Rate in object 0x8011 by SINC length, for the lengths of the manual (51 is rounded down, 205 up)."""
 
 
 def sampling_rate_hz(sinc_length: int) -> int:
     """The rate in whole Hz that object 0x8011 gives for a SINC length."""
-    return PUBLISHED_RATES_HZ.get(sinc_length, round(BASE_SAMPLING_RATE_HZ / sinc_length))
+    row = FORCE_TORQUE_FILTERS.get(sinc_length)  # 51 is rounded down, 205 up
+    return round(BASE_SAMPLING_RATE_HZ / sinc_length) if row is None else row.rate_hz
 
 
 def rate_divisor(sinc_length: int, rate_hz: int, chop: SettingValue | None = False) -> int | None:
@@ -132,21 +128,17 @@ def sinc_length_of(
     for length in (read, asked):
         if length is not None and length in allowed and rate_divisor(length, rate_hz, chop):
             return length
-    published = [length for length, published in PUBLISHED_RATES_HZ.items() if published == rate_hz]
-    return published[0] if published else min(round(BASE_SAMPLING_RATE_HZ / rate_hz), allowed[-1])
+    published = (length for length, row in FORCE_TORQUE_FILTERS.items() if row.rate_hz == rate_hz)
+    return next(published, min(round(BASE_SAMPLING_RATE_HZ / rate_hz), allowed[-1]))
 
 
 def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:
     """Return `values` if every name exists and every value is allowed; else raise SettingError."""
-    checked: dict[str, SettingValue] = {}
-    for name, value in values.items():
-        setting = SETTINGS.get(name)
-        if setting is None:
-            raise SettingError(
-                f"no setting {name!r}: the settings are {', '.join(SETTINGS)}{did_you_mean(name, SETTINGS)}"
-            )
-        checked[name] = setting.check(value)
-    return checked
+    for name in values:
+        if name not in SETTINGS:
+            known = f"the settings are {', '.join(SETTINGS)}{did_you_mean(name, SETTINGS)}"
+            raise SettingError(f"no setting {name!r}: {known}")
+    return {name: SETTINGS[name].check(value) for name, value in values.items()}
 
 
 def known_settings(values: object) -> dict[str, SettingValue]:

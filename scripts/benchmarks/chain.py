@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import shutil
 import signal
-import socket
-import struct
 import subprocess
 import sys
 import tempfile
@@ -23,6 +20,7 @@ import numpy as np
 
 from bota_ethercat.client import Client
 from bota_ethercat.errors import ProtocolError
+from ethercat_server.access.private_server import change_flags
 from ethercat_server.errors import ServerError
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 from scripts.benchmarks import statistics
@@ -177,10 +175,10 @@ class Chain(contextlib.ExitStack):
         )  # fmt: skip
         return self.connect(self.setup.sensors)
 
-    def master(self, *c_program: object) -> None:
-        """Start what stands in place of the server, on its CPU: the C program, or the polling loop."""
-        path, bus = self.directory / "master", self.bus()
-        how = (path, bus, self.setup.rate_hz, *c_program)
+    def master(self, c_program: Path) -> None:
+        """Start the C program in place of the server, on its CPU."""
+        path, setup = self.directory / "master", self.setup
+        how = (path, self.bus(), setup.rate_hz, c_program, setup.priority)
         child = self.python("server", f"{PROCESSES}.masters", *how, result=path)
         os.sched_setaffinity(child.pid, own_cpus()[1:])
 
@@ -230,27 +228,18 @@ class Chain(contextlib.ExitStack):
         end = time.monotonic() + seconds
         self.wait(lambda: time.monotonic() > end, seconds=seconds + 5)
 
-    def measure(self, recorder: Child, memory: list[tuple[float, float]] | None = None) -> Turn:
-        """Wait for a recording to be complete and end everything; what was recorded, and what it took.
-
-        `memory` gets the server's with the time, s and bytes.
-        """
+    def measure(self, recorder: Child) -> Turn:
+        """Wait for a recording to be complete and end everything; what was recorded, and what it took."""
         path, seconds = recorder.result, self.setup.seconds
         self.wait(began(path).exists, "nothing was received")
-        watched, machine, start = self._watched.copy(), cpu_of_machine(), time.monotonic()
+        watched, start = self._watched.copy(), time.monotonic()
         before_s = {name: used_s(pid) for name, pid in watched.items()}
 
-        def is_over() -> bool:
-            if memory is not None:
-                memory.append((time.monotonic(), rss(watched["server"])))
-            return time.monotonic() > start + seconds - 0.1 or path.exists()
-
-        self.wait(is_over, seconds=seconds + 5)
+        self.wait(lambda: time.monotonic() > start + seconds - 0.1 or path.exists(), seconds=seconds + 5)
         percent = 100 / (time.monotonic() - start)
         usage: Figures = {
             "cpu_percent": {n: round((used_s(pid) - before_s[n]) * percent, 1) for n, pid in watched.items()},
             "rss_mb": {name: round(rss(pid) / 1e6, 1) for name, pid in watched.items()},
-            "stolen_percent": stolen_percent(machine),
         }
         self.wait(path.exists, "the recording did not end")
         if self._link:
@@ -292,25 +281,9 @@ def own_cpus() -> tuple[int, int]:
     return cpus[0], cpus[-1]
 
 
-def cpu_of_machine() -> tuple[float, float]:
-    """Ticks of all CPUs that a hypervisor has given to others, and all that have passed."""
-    ticks = [int(word) for word in Path("/proc/stat").read_text(encoding="ascii").split()[1:9]]
-    return float(ticks[7]), float(sum(ticks))
-
-
-def stolen_percent(before: tuple[float, float]) -> float:
-    """What a hypervisor took of all CPUs since then."""
-    stolen, passed = (now - then for now, then in zip(cpu_of_machine(), before, strict=True))
-    return round(100 * stolen / passed, 1) if passed else 0.0
-
-
 def loopback_up() -> None:
     """Set the new namespace's loopback interface up, as `ip link set lo up` does."""
-    siocgifflags, siocsifflags, iff_up = 0x8913, 0x8914, 1
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
-        answer = fcntl.ioctl(any_socket, siocgifflags, struct.pack("16sh14x", b"lo", 0))
-        (flags,) = struct.unpack_from("h", answer, 16)
-        fcntl.ioctl(any_socket, siocsifflags, struct.pack("16sh14x", b"lo", flags | iff_up))
+    change_flags("lo", on=1)  # IFF_UP
 
 
 def stoppable(run: Callable[[], int], program: str, sentence: str, code: int) -> int:

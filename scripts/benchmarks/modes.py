@@ -1,9 +1,9 @@
 """What `scripts/benchmark` measures: a table of modes, each but the comparison an option.
 
-The comparison is of this project with a bare C program, Bota's driver and the polling design, on virtual
-sensors. This project and the C program alternate in short turns, so that the machine's noise meets both.
-Bota's closed Python driver (package bota-driver) is no dependency of the project: scripts/benchmark installs
-it into .venv-vendor before the program enters its network namespace.
+The comparison is of this project with a bare C program and Bota's driver, on virtual sensors. This project
+and the C program alternate in short turns, so that the machine's noise meets both. Bota's closed Python
+driver (package bota-driver) is no dependency of the project: scripts/benchmark installs it into .venv-vendor
+before the program enters its network namespace.
 """
 
 from __future__ import annotations
@@ -24,13 +24,12 @@ from scripts.benchmarks.statistics import Arrivals, Floats
 
 REAL_TIME: Final = 40  # of the client, or of node and subscriber: the default of the node's `rt_priority`
 _MOST_TURNS: Final = 3
-_SETTLED: Final = 0.1  # the memory of this first part of a soak does not count: caches still fill
 _NONE: Final = "-"
 VENDOR: Final = Path(__file__).parents[2] / ".venv-vendor"
 # What the ROS packages in .venv set is not for another environment's Python.
 _WITHOUT_ROS: Final = ("env", "-u", "LD_LIBRARY_PATH", "-u", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
 THIS, C_CLIENT, BARE_C, BY_C = "this", "this, C client", "bare C", "this / C"
-DRIVER, POLLING, ROS = "Bota's driver", "polling", "this, ROS"
+DRIVER, ROS = "Bota's driver", "this, ROS"
 RATIOS: Final = {
     "age_p50": ("age_us", "p50"),
     "age_p99": ("age_us", "p99"),
@@ -52,11 +51,8 @@ def _start(name: str, chain: Chain) -> Child:
             "server", *_WITHOUT_ROS, VENDOR / "bin" / "python", "-m", f"{PROCESSES}.vendor_driver", file,
             WARM_UP_S, setup.seconds, chain.bus(), setup.sinc, setup.rate_hz, setup.priority, result=file,
         )  # fmt: skip
-    if name == POLLING:
-        chain.master()
-        return chain.recorder("polling", setup.rate_hz)
     if name == BARE_C:
-        chain.master(yardstick, setup.priority)
+        chain.master(yardstick)
     else:
         chain.server()
     if name == ROS:
@@ -84,7 +80,7 @@ def first_ages(arrivals: Arrivals) -> Floats:
 
 
 def compare(setup: Setup, with_driver: bool) -> list[Figures]:
-    """A row for each program; `ages` are all of its ages, in ns."""
+    """A row for each program."""
     missing: dict[str, str] = {}
     alternating = [THIS, C_CLIENT, BARE_C]
     try:
@@ -95,16 +91,16 @@ def compare(setup: Setup, with_driver: bool) -> list[Figures]:
     short = replace(setup, seconds=setup.seconds / count)
     rounds = [{name: turn(short, name) for name in alternating} for _ in range(count)]
     taken = {name: together([each[name] for each in rounds]) for name in alternating}
-    one = setup.sensors == 1  # the others know one sensor only
-    if with_driver and one:
+    if with_driver and setup.sensors == 1:  # it knows one sensor only
         if [*VENDOR.glob("has-bota-driver*")]:
             taken[DRIVER] = turn(setup, DRIVER)
         else:
             missing[DRIVER] = "bota-driver could not be installed by scripts/benchmark"
-    taken |= {name: turn(setup, name) for name, wanted in ((POLLING, one), (ROS, setup.ros)) if wanted}
+    if setup.ros:
+        taken[ROS] = turn(setup, ROS)
     rows: list[Figures] = []
-    for name, (figures, ages) in taken.items():
-        rows.append({"program": name, **figures, "ages": ages})
+    for name, (figures, _) in taken.items():
+        rows.append({"program": name, **figures})
         if name == BARE_C:
             rows.append({"program": BY_C, "ratio": ratios(*([e[n] for e in rounds] for n in (THIS, BARE_C)))})
     rows += [{"program": name, "missing": why} for name, why in missing.items()]
@@ -145,7 +141,7 @@ def answer(rows: Sequence[Figures]) -> str:
     def age(name: str) -> str:
         return f"{ages[name]['p50']:,.0f} µs (p99 {ages[name]['p99']:,.0f})"
 
-    others = {BARE_C: "A bare C program", DRIVER: "Bota's driver", POLLING: "polling at a fixed rate"}
+    others = {BARE_C: "A bare C program", DRIVER: "Bota's driver"}
     beside = "; ".join(f"{text}: {age(name)}" for name, text in others.items() if name in ages)
     return f"**Your controller gets a sample {age(THIS)} after it was measured.** {beside}."
 
@@ -166,23 +162,6 @@ def load(setup: Setup, loops: int) -> list[Figures]:
             about = {"rate_hz": setup.rate_hz, "loops": loops, "chain": f"{client}, {how}"}
             rows.append({**about, **figures})
     return rows
-
-
-def soak(setup: Setup, minutes: float) -> list[Figures]:
-    """One row: does the server lose samples for long, and does its memory grow?"""
-    memory: list[tuple[float, float]] = []
-    with Chain(replace(setup, seconds=minutes * 60), f"the server, for {minutes:g} minutes") as chain:
-        chain.server()
-        figures, _ = chain.measure(chain.recorder("tcp"), memory)
-    slope = round(slope_kb_per_hour(*np.array(memory).T), 1) + 0.0
-    about = {"seconds": minutes * 60, "rate_hz": setup.rate_hz, "sensors": setup.sensors}
-    return [{**about, **figures, "rss_slope_kb_per_hour": slope}]
-
-
-def slope_kb_per_hour(seconds: Floats, rss: Floats) -> float:
-    """How fast memory grows: a straight line through it, once settled."""
-    settled = seconds >= seconds[0] + _SETTLED * (seconds[-1] - seconds[0])
-    return float(np.polyfit(seconds[settled] - seconds[0], rss[settled], 1)[0]) * 3600 / 1000
 
 
 def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
@@ -261,20 +240,5 @@ MODES: Final = {
             "files": lambda row: f"{row['files']:.0f}",
             "system calls": lambda row: f"{row['system_calls']:.0f} / {row['mean_system_calls']:.1f}",
         },
-    ),
-    "soak": Mode(
-        "only the server: losses, memory",
-        soak,
-        {
-            "soak": lambda row: f"{row['seconds']:.0f} s, {row['rate_hz']} Hz, {row['sensors']}",
-            "lost (in stalls)": _losses,
-            "of": lambda row: str(row["made"]),
-            "repeated": lambda row: str(row["repeated"]),
-            "age, µs": lambda row: _points(row, "age_us"),
-            "CPU, %": lambda row: f"{row['cpu_percent']['server']}",
-            "memory, MB": lambda row: f"{row['rss_mb']['server']}",
-            "grows by, kB/h": lambda row: f"{row['rss_slope_kb_per_hour']}",
-        },
-        argument={"type": float, "metavar": "MINUTES"},
     ),
 }

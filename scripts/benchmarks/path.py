@@ -20,8 +20,8 @@ from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.in_memory import InMemoryStream, InMemoryTransport
 from ethercat_server.simulation.backend import MemoryBackend
+from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
 from ethercat_server.virtual_sensor.options import SensorOptions
 from scripts.benchmarks.chain import Figures
 
@@ -32,11 +32,11 @@ CLIENTS: Final = (1, 4)
 CLOCKS: Final = {"with a distributed clock": "", "without": "none"}
 _ROOT: Final = Path(__file__).parents[2]
 _COUNTED: Final = (f"{_ROOT}/ethercat_server/", f"{_ROOT}/protocol/")
-_NOT_COUNTED: Final = ("/simulation/", "/virtual_sensor/", "in_memory.py")
+_NOT_COUNTED: Final = ("/simulation/", "/virtual_sensor/")
 # What each of these is in a server that has a network interface, and TCP.
 _SYSTEM_CALLS: Final = {
     (MemoryBackend, "send"): 1,
-    (MemoryBackend, "receive"): 2,  # poll and recv, of which a look in vain needs the first only
+    (MemoryBackend, "receive"): 2,  # select and recv, of which a look needs the second only
     (MemoryBackend, "arrived_ns"): 1,
     (InMemoryTransport, "wait"): 1,
     (InMemoryStream, "send"): 1,
@@ -96,7 +96,7 @@ class _Tracer:
 
 
 def count(dc: str, clients: int, seconds: float = SECONDS) -> dict[str, float]:
-    """Figures of a new sample of one sensor, whose controller's clock is `dc` (`--dc`), with so many clients.
+    """Figures of a new sample of one sensor, whose controller's clock is `dc` (`--dc`), by clients.
 
     Most are like the median; the mean is what they cost.
     """

@@ -27,13 +27,10 @@ from scripts.benchmarks.chain import (
     Figures,
     ScriptError,
     Setup,
-    cpu_of_machine,
     loopback_up,
-    stolen_percent,
     stoppable,
 )
 from scripts.benchmarks.modes import MODES, Mode, answer
-from scripts.benchmarks.plot import draw
 from scripts.benchmarks.records import may_be_real_time
 
 MOST_CPUS: Final = 4  # CPUs used: each of them runs a canary
@@ -63,12 +60,8 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
     wanted = {options.mode: options.argument}
     if options.page:
         wanted = {**_ON_PAGE, **wanted}
-    began, machine = time.monotonic(), cpu_of_machine()
+    began = time.monotonic()
     results = {name: measure(name, argument, options) for name, argument in wanted.items()}
-    ages: dict[tuple[int, int], dict[str, Any]] = {}
-    for row in results.get("comparison", ()):
-        if "ages" in row:
-            ages.setdefault((row["rate_hz"], row["sensors"]), {})[row["program"]] = row.pop("ages")
     for name, rows in results.items():
         console.print(table(MODES[name], rows))
     content = {
@@ -77,21 +70,16 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
         "cpus_used": len(os.sched_getaffinity(0)),
         "python": platform.python_version(),
         "idle_states": idle_states,
-        "stolen_percent": stolen_percent(machine),
         "rt_priority": options.rt_priority,
         **results,
     }
     options.json.parent.mkdir(parents=True, exist_ok=True)
     options.json.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     written = [options.json]
-    if ages and find_spec("matplotlib") is not None:
-        written.append((options.page or options.json).with_suffix(".png"))
-        draw(ages, written[-1])
     if options.page:
         renew(options.page, content)
         written.append(options.page)
-    took = f"{time.monotonic() - began:.0f} s, of which a hypervisor took {content['stolen_percent']} %"
-    print(f"{took}; written: {', '.join(map(str, written))}")
+    print(f"{time.monotonic() - began:.0f} s; written: {', '.join(map(str, written))}")
 
 
 def measure(name: str, argument: Any, options: argparse.Namespace) -> list[Figures]:
@@ -144,8 +132,7 @@ def renew(path: Path, content: Mapping[str, Any]) -> None:
     where = (
         f"All figures on this page but those with another date are of one run: {content['date'][:10]}, "
         f"{content['cpus_used']} CPUs, Linux {content['kernel'].split('-')[0]}, Python {content['python']}, "
-        f"{'with' if content['idle_states'] else 'without'} idle states. "
-        f"A hypervisor took {content['stolen_percent']} % of the time meanwhile."
+        f"{'with' if content['idle_states'] else 'without'} idle states."
     )
 
     def measured(match: re.Match[str]) -> str:
@@ -162,12 +149,12 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """The command line; argparse exits with 2 for what is wrong with it."""
     parser = argparse.ArgumentParser(
         prog="scripts/benchmark",
-        description="Measure this project beside a bare C program and a polling design.",
+        description="Measure this project beside a bare C program.",
     )
     parser.add_argument("--quick", action="store_true", help="one configuration only, in half a minute")
     parser.add_argument("--seconds", type=number(0.5, 3600), help="how long each chain is measured (6)")
     parser.add_argument("--json", type=Path, default="benchmark-results/benchmark.json", metavar="FILE",
-                        help="where the figures go, and beside it the plot (%(default)s)")  # fmt: skip
+                        help="where the figures go (%(default)s)")  # fmt: skip
     parser.add_argument("--page", type=Path, metavar="FILE.md",
                         help="measure all that this page has (docs/benchmark.md), and renew it")  # fmt: skip
     parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver, too")

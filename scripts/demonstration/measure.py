@@ -15,16 +15,15 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bota_ethercat.accounting import FrameKind, StreamAccounting
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample, SampleDecoder
-from scripts.benchmarks.statistics import Ints, in_stops
 
 _REMEMBERED: Final = 8192  # samples: some seconds' worth
 FULL_RATE: Final = 0.95  # fewer messages than this part of the samples: something could not keep up
 _LEAST_RATE: Final = 0.6  # fewer than this part, and something is wrong
-NO_STOPS: Final[Ints] = np.empty((0, 2), dtype=np.int64)
 
 _decoder = functools.cache(SampleDecoder)
 
@@ -36,9 +35,6 @@ class Summary(NamedTuple):
     rate_hz: float
     lost: int  # samples that came from the server, but not on the topic
     lost_before: int  # samples that were lost, or withheld from the client, before that
-    lost_in_stops: int  # of both: those made while the machine stopped
-    stops: int
-    longest_stop_ms: float
     repeated: int
     age_ms: Sequence[float]  # of messages at the subscriber: median, 99th percentile
     tcp_age_ms: Sequence[float]
@@ -62,8 +58,6 @@ class Measurement:
         # Messages, those of a sample that an earlier one had, those that equal no sample.
         self.messages = self.repeated = self._not_finite = self._unknown = 0
         self.age_ns = 0  # of the newest message on its arrival
-        self._passed_ns = 0  # samples up to this instant have come from the server, if not withheld
-        self._missing_ns: list[float] = []  # when the missing samples were made
         # Of each sample that came from the server: when it was made, and its age then.
         self._made_ns, self._tcp_ages_ns = array("q"), array("q")
         self._known: dict[tuple[float, ...], int] = {}  # by its values: its index there
@@ -72,11 +66,7 @@ class Measurement:
 
     def take_frame(self, frame: DataMessage, now_ns: int) -> None:
         """A frame came from the server."""
-        before = self._stream.counts.missing
-        kind = self._stream.take(frame.sequence, frame.monotonic_ns, frame.flags)
-        if missing := self._stream.counts.missing - before:
-            self._missing_ns += np.linspace(self._passed_ns, frame.monotonic_ns, missing + 2)[1:-1].tolist()
-        if kind is not FrameKind.NEW:
+        if self._stream.take(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
             return
         self.latest = _decoder(len(frame.process_data)).decode(frame.process_data)
         values = tuple(self.latest.array)
@@ -84,8 +74,7 @@ class Measurement:
         self._known[values] = len(self._made_ns)
         if len(self._known) > _REMEMBERED:
             del self._known[next(iter(self._known))]
-        self._passed_ns = frame.monotonic_ns
-        self._made_ns.append(self._passed_ns)
+        self._made_ns.append(frame.monotonic_ns)
         self._tcp_ages_ns.append(now_ns - frame.monotonic_ns)
         self._look_up()
 
@@ -104,7 +93,7 @@ class Measurement:
                 self._indices.append(index)
                 self._arrived_ns.append(arrived_ns)
                 self.age_ns = arrived_ns - self._made_ns[index]
-            elif self._passed_ns <= arrived_ns:
+            elif not self._made_ns or self._made_ns[-1] <= arrived_ns:
                 return  # its sample may still come
             elif self.began:  # before the first match the two streams need not overlap
                 self.messages += 1
@@ -127,22 +116,17 @@ class Measurement:
         found = self._indices
         return found[-1] - found[0] + 1 - len(found) + self.repeated if found else 0
 
-    def summary(self, stops: Ints = NO_STOPS) -> Summary:
-        """The figures so far; `stops` of the machine, (n, 2), begin and end in CLOCK_MONOTONIC ns."""
+    def summary(self) -> Summary:
+        """The figures so far."""
         index, made, arrived = (
             np.array(a, np.int64) for a in (self._indices, self._made_ns, self._arrived_ns)
         )
-        lost = np.setdiff1d(np.arange(*index[[0, -1]]), index) if self.began else index
-        missing_ns = np.array([*self._missing_ns, *made[lost]])
         seconds = np.ptp(arrived) / 1e9 if self.began else 0.0
         return Summary(
             messages=self.messages,
             rate_hz=(len(index) - 1) / seconds if seconds else 0.0,
-            lost=len(lost),
+            lost=self.lost,
             lost_before=self.lost_before,
-            lost_in_stops=in_stops(missing_ns, 1e9 / self.rate_hz, stops),
-            stops=len(stops),
-            longest_stop_ms=float(np.max(np.diff(stops), initial=0)) / 1e6,
             repeated=self.repeated,
             age_ms=_median_and_p99_ms(arrived - made[index]),
             tcp_age_ms=_median_and_p99_ms(self._tcp_ages_ns),
@@ -152,28 +136,10 @@ class Measurement:
         )
 
 
-def _median_and_p99_ms(ages_ns: Ints | array[int]) -> list[float]:
-    points: list[float] = (
-        np.percentile(ages_ns if len(ages_ns) else [0], (50, 99), method="higher") / 1e6
-    ).tolist()
-    return points
-
-
-def explanation(summary: Summary) -> str | None:
-    """Why samples are missing, in words; None if none are."""
-    missing = summary.lost + summary.lost_before
-    if not missing:
-        return None
-    if not summary.stops:
-        return (
-            f"{missing} samples are missing, although this machine never stopped: clients could not keep up."
-        )
-    times = f"{summary.stops} times" if summary.stops > 1 else "once"
-    return (
-        f"{missing} samples are missing, {summary.lost_in_stops} of them made while this machine itself "
-        f"stopped, which it did {times}, for up to {summary.longest_stop_ms:.1f} ms: other programs or "
-        "a hypervisor had its processors. 'A steadier cycle' in docs/operations.md helps."
-    )
+def _median_and_p99_ms(ages_ns: ArrayLike) -> list[float]:
+    ages = np.asarray(ages_ns)
+    points = np.percentile(ages if ages.size else [0], (50, 99), method="higher")
+    return [float(point) / 1e6 for point in points]
 
 
 def verdict(summary: Summary, nominal_hz: float) -> str | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
+import shutil
 import subprocess
 import time
 import urllib.request
@@ -12,10 +13,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
+import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from tests.clients.chromium import PROGRAM
 from tests.server.running import PATIENCE_S, wait_until
+
+_NAMES: Final = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+_PROGRAM: Final = next((found for name in _NAMES if (found := shutil.which(name))), None)
+needs_chromium = pytest.mark.skipif(_PROGRAM is None, reason="no Chromium here: apt install chromium")
 
 _OPTIONS: Final = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars",
@@ -55,7 +60,10 @@ class Page:
             self.complaints.append(json.dumps(parameters["entry"]))
 
     def open(self, address: str) -> None:
+        self.complaints.clear()
         self.ask("Page.navigate", url=address)
+        start = json.dumps(address.partition("#")[0])
+        self.wait_for(f"location.href.startsWith({start}) && document.readyState === 'complete'")
 
     def value(self, expression: str) -> Any:
         """Of a JavaScript expression, as JSON has it."""
@@ -85,14 +93,18 @@ class Page:
     def screenshot(self, picture: Path) -> None:
         picture.write_bytes(base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"]))
 
+    def printed(self) -> bytes:
+        """The page as PDF."""
+        return base64.b64decode(self.ask("Page.printToPDF")["data"])
+
 
 @contextlib.contextmanager
 def browser(scratch: Path) -> Iterator[Page]:
     """A page in a new browser, which ends with the block; its profile is in `scratch`."""
-    assert PROGRAM is not None
+    assert _PROGRAM is not None
     profile = scratch / "chromium"
     process = subprocess.Popen(
-        [PROGRAM, *_OPTIONS, f"--user-data-dir={profile}", "about:blank"],
+        [_PROGRAM, *_OPTIONS, f"--user-data-dir={profile}", "about:blank"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )

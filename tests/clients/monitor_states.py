@@ -109,7 +109,8 @@ def fed(model: Model, sensors: int, frames: Mapping[int, Values] | None = None) 
 
 def settled(state: State) -> State:
     """Without what depends on the time of day."""
-    return replace(state, server=replace(state.server, since_clock="12:00:00"))
+    message = state.message and state.message._replace(text=f"12:00:00{state.message.text[8:]}")
+    return replace(state, server=replace(state.server, since_clock="12:00:00"), message=message)
 
 
 @functools.cache

@@ -1,26 +1,32 @@
-"""The pictures in docs/ that a browser draws, each able to tell whether it is still of that page.
+"""The pictures in docs/ of monitor and report, each able to tell whether it is still of what it shows.
 
     python -m tests.clients.pictures report.png web.png
 
-makes them again, or one of them; it needs Chromium. A picture carries a digest of the page that it shows,
-for a report without what another version of Matplotlib may draw otherwise.
+makes those of the terminal again, and those named, or both; they need Chromium. A picture carries a digest of
+the page that it shows, for a report without what another version of Matplotlib may draw otherwise.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import re
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from PIL import Image, PngImagePlugin
+from rich.console import Console
+from rich.text import Text
 
+from bota_clients.monitor.model import State
+from bota_clients.monitor.screen import Look
+from bota_clients.monitor.screen import render as render_screen
 from bota_clients.monitor.web.server import read_page
 from bota_clients.report.checks import Examination
 from bota_clients.report.page import render
-from tests.clients import chromium
 from tests.clients import monitor_states as made
 from tests.clients.devtools import browser
 from tests.clients.monitor_states import RATE_HZ, frame, now
@@ -66,11 +72,13 @@ def report_digest(page: str) -> str:
 
 
 def draw_report(name: str, scratch: Path) -> None:
-    page = report_page()
-    source, drawn = scratch / "report.html", scratch / "drawn.png"
-    source.write_text(page, encoding="utf-8")
-    said = chromium.screenshot(source, drawn, 960, 3480)
-    _keep(drawn, name, report_digest(page), 160, said)
+    text, source = report_page(), scratch / "report.html"
+    source.write_text(text, encoding="utf-8")
+    with browser(scratch) as page:
+        page.size(960, 3480)
+        page.open(source.as_uri())
+        page.screenshot(scratch / "drawn.png")
+        _keep(scratch / "drawn.png", name, report_digest(text), 160, page.complaints)
 
 
 def web_digest() -> str:
@@ -108,7 +116,30 @@ def draw_web(name: str, scratch: Path) -> None:
         _keep(scratch / "drawn.png", name, web_digest(), 200, page.complaints)
 
 
+def svg(state: State, look: Look, width: int, height: int) -> str:
+    console = Console(
+        width=width, height=height, record=True, file=io.StringIO(), force_terminal=True,
+        color_system="truecolor", legacy_windows=False, _environ={},
+    )  # fmt: skip
+    head, body, foot = render_screen(state, look, width)
+    room = height - len(head) - len(foot)
+    for row in [*head, *body[:room], *[Text()] * (room - len(body)), *foot]:
+        console.print(row, soft_wrap=True)
+    return console.export_svg(title="ethercat-monitor", unique_id="monitor")
+
+
+def captures() -> Mapping[str, str]:
+    """The terminal's view: name of the file to what it holds."""
+    return {
+        "monitor.svg": svg(made.healthy(), Look(recording="REC 42 s"), 80, 24),
+        "monitor-warnings.svg": svg(made.troubled(), Look(), 80, 24),
+        "monitor-gone.svg": svg(made.gone(), Look(), 60, 15),
+    }
+
+
 if __name__ == "__main__":
+    for file, drawing in captures().items():
+        (DOCS / file).write_text(drawing)
     for each in sys.argv[1:] or ["report.png", "web.png"]:
         with tempfile.TemporaryDirectory() as folder:
             (draw_web if each == "web.png" else draw_report)(each, Path(folder))

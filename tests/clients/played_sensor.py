@@ -39,7 +39,7 @@ class PlayedSensor:
         self.protocol = 1
         self.refusal: JsonObject | None = None
         self.streams: list[socket.socket] = []
-        self.asked: list[str] = []
+        self.asked: list[JsonObject] = []
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
         self._thread = threading.Thread(target=self._serve, name="played sensor")
@@ -60,8 +60,10 @@ class PlayedSensor:
                 return
             decoder.feed(data)
         assert isinstance(message, dict)
-        self.asked.append(str(message["action"]))
+        self.asked.append(message)
         reply = {"reply": message["action"], "ok": True, "protocol": self.protocol, "sensors": [self.sensor]}
+        if message["action"] == "tare":
+            reply |= dict.fromkeys(("old_offset", "new_offset", "residual", "deviation"), [0] * 6)
         if self.refusal:
             reply = {"reply": message["action"], "ok": False, "error": self.refusal}
         connection.sendall(encode_json(reply))

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import subprocess
-import time
 from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
 
 from bota_ethercat.address import Address
-from bota_ethercat.client import connect
-from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.cpp_programs import (
     SOURCES,
-    Driver,
     Reading,
     assert_no_faults,
     build,
-    check,
     driver,
     needs_gxx,
     patient,
@@ -33,9 +27,6 @@ pytestmark = [needs_gxx, patient]
 
 PATIENT = {"max_age_ms": 60_000}
 """For what must not depend on how busy this machine is."""
-STRICT_AGE = {"max_age_ms": 300}
-SLOW = 512
-"""SINC length for 100 Hz, where the rate does not matter."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -50,37 +41,7 @@ def shared() -> Iterator[ServedSimulation]:
         yield running
 
 
-def new_again(running: Driver, after: Reading) -> Reading:
-    """The first fresh reading with a sample that was made after this one."""
-    return running.until(
-        lambda r: r["fresh"] and r["monotonic_ns"] > after["monotonic_ns"], "samples after the trouble"
-    )
-
-
 # -- trouble, with servers of their own
-
-
-def test_a_server_killed_and_started_again() -> None:
-    with contextlib.ExitStack() as ends:
-        first = ends.enter_context(served(sinc_length=SLOW))
-        running = ends.enter_context(driver(first.port, reconnect_every_ms=50, **STRICT_AGE))
-        running.connect()
-        before = running.until(lambda r: r["fresh"], "samples")
-        first.kill()
-        gone = running.until(lambda r: r["condition"] == "disconnected", "the loss of the connection")
-        assert gone["has_sample"]
-        # As long as there is no server the last sample only grows older.
-        for _ in range(20):
-            reading = running.latest()
-            assert not reading["is_new"]
-            assert not reading["fresh"]
-            assert reading["age_ns"] >= gone["age_ns"]
-            assert reading["monotonic_ns"] == gone["monotonic_ns"]
-        ends.enter_context(served(port=first.port, sinc_length=SLOW))
-        back = new_again(running, before)
-        assert back["connection"] == 2
-        assert running.info()["link"] == "up"
-        assert running.do("next", 60_000)["is_new"]
 
 
 def test_a_client_that_did_not_read_is_told_what_it_missed() -> None:
@@ -121,27 +82,6 @@ def count(reading: Reading, total: dict[str, int | bool]) -> None:
     total["gap"] = total["gap"] or reading["gap"]
 
 
-def test_a_stuck_sensor_and_one_that_is_lost() -> None:
-    with served(sinc_length=SLOW) as server, driver(server.port, **STRICT_AGE) as running:
-        running.connect()
-        running.until(lambda r: r["fresh"], "samples")
-        server.command("stick")
-        stuck = running.until(lambda r: r["condition"] == "repeated", "repeated samples")
-        assert stuck["flags"] & DataFlag.REPEATED
-        assert not running.latest()["is_new"]
-        server.command("unstick")
-        before = new_again(running, stuck)
-        server.command("power off")
-        lost = running.until(lambda r: r["condition"] == "sensor_lost", "the loss of the sensor")
-        assert lost["flags"] & DataFlag.INVALID
-        assert not lost["fresh"]
-        assert "sensor 0 is lost" in running.info()["error"]
-        server.command("power on")
-        after = new_again(running, lost)
-        assert after["connection"] == 1
-        assert after["sequence"] > before["sequence"]
-
-
 # -- a healthy server
 
 
@@ -171,66 +111,6 @@ def test_every_sample_in_order_and_the_same_as_in_python(shared: ServedSimulatio
         told = running.info()
         assert (told["passed_over"], told["allocated"]) == (0, 0)
         assert told["names"] == ["BFT-SENS-ECAT-M8"]
-
-
-@pytest.mark.parametrize(("count", "hz"), [(500, 1000), (20, 50)])
-def test_latest_in_a_loop_faster_and_slower_than_the_sensor(
-    shared: ServedSimulation, count: int, hz: int
-) -> None:
-    """Every sample is either seen once as new, or passed over; the age is never told too small."""
-    with driver(shared.port, **STRICT_AGE) as running:
-        running.connect()
-        last = running.do("next", 60_000)
-        new = passed_over = 0
-        for _ in range(count):
-            time.sleep(1 / hz)
-            before_ns = time.monotonic_ns()
-            reading = running.latest()
-            check(reading)
-            assert reading["age_ns"] >= before_ns - reading["monotonic_ns"]
-            assert not reading["withheld"] or reading["gap"]
-            assert reading["is_new"] == (reading["monotonic_ns"] > last["monotonic_ns"])
-            new, passed_over, last = new + reading["is_new"], passed_over + reading["passed_over"], reading
-        told = running.info()
-        assert new + passed_over + 1 == told["samples"]
-        assert (new > 0, hz >= 1000 or passed_over > 0, told["allocated"]) == (True, True, 0)
-
-
-def test_one_frame_in_ten(shared: ServedSimulation) -> None:
-    with driver(shared.port, every=10, **PATIENT) as running:
-        running.connect()
-        readings = [running.do("next", 60_000) for _ in range(10)]
-        for one, later in pairwise(readings):
-            assert later["sequence"] - one["sequence"] == 10 + later["withheld"]
-
-
-def test_a_server_that_is_stopped_and_goes_on(shared: ServedSimulation) -> None:
-    with driver(shared.port, **STRICT_AGE) as running:
-        running.connect()
-        before = running.until(lambda r: r["fresh"], "samples")
-        with shared.stopped():
-            silent = running.until(lambda r: r["condition"] == "silent", "silence")
-            assert not silent["fresh"]
-            assert silent["age_ns"] > STRICT_AGE["max_age_ms"] * 1e6
-            waited = running.do("next", 50)
-            assert (waited["is_new"], waited["fresh"]) == (False, False)
-        after = new_again(running, silent)
-        assert after["connection"] == 1, "a stopped server is not gone: its connection is kept"
-        assert after["monotonic_ns"] > before["monotonic_ns"]
-
-
-def test_a_server_of_another_machine_at_an_address_of_this_one(
-    shared: ServedSimulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As at this end of an SSH tunnel: C++ and Python count ages from the arrival."""
-    monkeypatch.setattr("ethercat_server.serving.actions.boot_id", lambda: "another machine's")
-    with served(sinc_length=SLOW) as far:
-        for server, is_far in ((far, True), (shared, False)):
-            with driver(server.port, **PATIENT) as running, connect(server.port) as client:
-                running.connect()
-                reading = running.do("next", 60_000)
-                assert (reading["fresh"], reading["age_is_lower_bound"]) == (True, is_far)
-                assert client.session.same_machine is not is_far
 
 
 # -- requests

@@ -40,9 +40,11 @@ class Stage:
 
     def shown(self) -> str:
         self.app.draw()
-        view = self.app.query_one("View")
+        views = self.app.query("View")
         return "\n".join(
-            "".join(segment.text for segment in view.render_line(y)) for y in range(view.size.height)
+            "".join(segment.text for segment in view.render_line(y))
+            for view in views
+            for y in range(view.size.height)
         )
 
     async def press(self, *keys: str) -> str:
@@ -66,8 +68,8 @@ def test_tare_asks_first_and_only_y_does_it() -> None:
     async def scene(stage: Stage) -> None:
         assert "Tare sensor 0? y: yes, u: undo the last tare, c: clear it, any" in await stage.press("t")
         assert "Not tared" in await stage.press("enter")
-        assert "Sensor 1  BFT-ROKS" in await stage.press("n")
-        assert "Sensor 0  BFT-SENS" in await stage.press("n")
+        assert "Sensor 1  OP  BFT-ROKS" in await stage.press("n")
+        assert "Sensor 0  OP  BFT-SENS" in await stage.press("n")
         assert "Tare sensor 1?" in await stage.press("n", "t")
         await stage.press("y")
         wait_until(lambda: "Sensor 1 was not tared: " in stage.shown(), "a word")
@@ -79,13 +81,15 @@ def test_tare_asks_first_and_only_y_does_it() -> None:
     play(scene)
 
 
-def test_w_shows_all_warnings_and_any_other_key_leads_back() -> None:
+def test_what_does_not_fit_is_scrolled_to() -> None:
     async def scene(stage: Stage) -> None:
-        stage.model.take([made.frame(6400, {"warnings": 0x7FFFFFFF})], stage.now_s)
-        for page in (1, 2, 3, 1):
-            assert f"page {page} of 3" in await stage.press("w")
-        assert "Stream" in await stage.press("t")
-        assert "Tare sensor" not in stage.shown()
+        assert "Clients" not in stage.shown()
+        await stage.press("end")
+        await stage.pilot.pause()
+        text = stage.shown()
+        assert "Clients" in text
+        assert "localhost:12001" in text.splitlines()[0]
+        assert "quit" in text.splitlines()[-1]
 
     play(scene)
 
@@ -142,16 +146,17 @@ def test_another_size_is_drawn_anew_and_then_only_rows_that_changed(monkeypatch:
         await stage.pilot.resize_terminal(60, 15)
         await stage.pilot.pause()
         rows = stage.shown().splitlines()
-        assert [len(row) for row in rows] == [60] * 15
-        drawn: list[Any] = []
-        monkeypatch.setattr(
-            stage.app.query_one("View"), "refresh", lambda *regions, **_: drawn.extend(regions)
-        )
+        assert len(rows) == 15
+        assert {len(row) for row in rows} == {60}
+        drawn: list[tuple[str | None, int]] = []
+        for view in stage.app.query("View"):
+            monkeypatch.setattr(view, "refresh", lambda *_, view=view, **__: drawn.append((view.id, -1)))
+            monkeypatch.setattr(view, "refresh_lines", lambda y, view=view: drawn.append((view.id, y)))
         stage.app.draw()
         assert not drawn
         stage.model.say("something new")
         stage.app.draw()
-        assert [region.y for region in drawn] == [13]
+        assert drawn == [("foot", 0)]
 
     play(scene)
 

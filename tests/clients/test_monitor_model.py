@@ -57,13 +57,12 @@ def texts(sensor: SensorState) -> list[str]:
     return [alert.text for alert in sensor.alerts]
 
 
-def test_a_peak_of_one_sample_is_held_and_in_the_trace(model: Model) -> None:
+def test_a_peak_of_one_sample_is_held(model: Model) -> None:
     spike = frame(20, {**REST, "force.x": 55.0, "torque.z": -3.0})
     sensor = take(model, *run(0, 20), spike, *run(21, 20))
     assert sensor.sample is not None
     assert sensor.sample.force == (0.0, 0.0, -8.0)
     assert peaks(sensor) == [(0, 55), (0, 0), (-8, -8), (0, 0), (0, 0), (-3, 0)]
-    assert sensor.traces[0][-1] == (0.0, 55.0)
 
 
 def test_repeated_and_invalid_frames_are_counted_and_bring_no_values(model: Model) -> None:
@@ -134,7 +133,7 @@ def test_a_replay_is_told_from_a_server(model: Model) -> None:
     model.described({**description(), "replay": {"files": ["run.mcap", "b.mcap"]}}, now(0))
     state = model.state(now(0))
     assert state.server.replay == "run.mcap and 1 more"
-    assert "REPLAY run.mcap and 1 more" in render(state, Look(), 80, 24)[0].plain
+    assert "REPLAY run.mcap and 1 more" in render(state, Look(), 80).head[0].plain
 
 
 def test_a_warning_of_one_sample_is_present_for_a_while_and_then_follows_present_ones(

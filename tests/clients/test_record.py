@@ -5,31 +5,26 @@ It is a process where it is stopped or killed from outside, which nothing else c
 
 from __future__ import annotations
 
-import contextlib
+import errno
 import itertools
 import os
 import queue
-import random
 import signal
 import socket
-import subprocess
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 
-import psutil
 import pytest
 from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
 from bota_clients.errors import DiskError
 from bota_clients.record import cli, recorder
-from bota_clients.record.program import Progress
 from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch, Parts, Source, Tally
 from bota_clients.recording.file_format import FORMAT_VERSION, frame_topic
 from bota_clients.recording.reader import Description, open_recording
-from bota_clients.recording.writer import DiskFile
 from bota_ethercat.address import Address
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -38,7 +33,7 @@ from tests.clients.recordings import frame, record
 from tests.clients.running import Recorder, RecorderProcess, Replay, frames_in, signalled
 from tests.ended import run_here
 from tests.served_simulation import served
-from tests.server.running import PATIENCE_S, free_port, needs_bus, server, wait_until
+from tests.server.running import PATIENCE_S, free_port, wait_until
 
 SECOND = 800
 """Frames of one sensor in a second."""
@@ -177,28 +172,24 @@ def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.
 
 
 @pytest.mark.parametrize(
-    ("frames", "words", "sentence"),
+    ("frames", "sentence"),
     [
-        ([frame(1), frame(2), frame(1, 1)], "nothing lost", ""),
+        ([frame(1), frame(2), frame(1, 1)], "nothing was lost"),
         (
             [frame(1), frame(2, 0, DataFlag.GAP), frame(3, 0, DataFlag.GAP), frame(1, 1)],
-            "2+0 gaps",
-            "sensor 0: 2 times samples were or may have been lost on the bus (GAP)",
+            "2 frames of sensor 0 after a GAP: samples were or may have been lost on the bus",
         ),
         (
             [frame(1), frame(5, 0, DataFlag.GAP), frame(1, 1, DataFlag.INVALID)],
-            "3 lost, 0+1 invalid",
             "3 frames of sensor 0 not read in time, 1 frame of sensor 1 invalid",
         ),
     ],
 )
-def test_the_line_says_nothing_lost_only_if_the_end_would(
-    frames: list[DataMessage], words: str, sentence: str
-) -> None:
+def test_what_was_lost_is_said(frames: list[DataMessage], sentence: str) -> None:
     tally = Tally()
     for each in frames:
-        tally.count(each)
-    assert (tally.brief(), ", ".join(tally.losses())) == (words, sentence)
+        tally.take(each)
+    assert tally.losses() == sentence
 
 
 def test_a_moment_without_running_and_the_end_of_its_input(out: Path) -> None:
@@ -293,49 +284,36 @@ def test_of_a_file_that_is_removed_nothing_is_said_to_be_there(out: Path) -> Non
     assert (removed.saved, removed.tally.dropped) == (0, 11)
 
 
-TWENTY = pytest.param(20, marks=[pytest.mark.long, pytest.mark.timeout(600)])
-
-
-@pytest.mark.parametrize("times", [1, TWENTY])
-def test_killed_it_leaves_what_was_there(times: int, endless: Replay, out: Path) -> None:
-    source = random.Random(4)
-    for _ in range(times):
-        frames = source.randrange(200, 5000) if times > 1 else 500
-        recorder = RecorderProcess(out, endless.port, "--force")
-        try:
-            recorder.wait_for("Ctrl-C ends it")
-            wait_until(lambda: frames_in(out) > frames, "frames")  # noqa: B023
-            before = frames_in(out)
-            recorder.signal(signal.SIGKILL)
-            recorder.wait()
-        finally:
-            recorder.close()
-        left = read(out)
-        assert len(left) >= before
-        assert is_whole(left)
-        assert {item.sensor for item in left} == {0, 1}
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    folder = tmp_path / "small"
-    folder.mkdir()
-    made = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=48k", "tmpfs", folder],
-        check=False,
-        capture_output=True,
-        text=True,
-    )
-    if made.returncode:
-        pytest.skip(f"no small disk here ({made.stderr.strip()}): run as root with CAP_SYS_ADMIN")
+def test_killed_it_leaves_what_was_there(endless: Replay, out: Path) -> None:
+    recorder = RecorderProcess(out, endless.port, "--force")
     try:
-        yield folder
+        recorder.wait_for("Ctrl-C ends it")
+        wait_until(lambda: frames_in(out) > 500, "frames")
+        before = frames_in(out)
+        recorder.signal(signal.SIGKILL)
+        recorder.wait()
     finally:
-        subprocess.run(["umount", folder], check=True)
+        recorder.close()
+    left = read(out)
+    assert len(left) >= before
+    assert is_whole(left)
+    assert {item.sensor for item in left} == {0, 1}
 
 
-def test_a_full_disk_ends_it_with_what_was_written_whole(endless: Replay, small_disk: Path) -> None:
-    out = small_disk / "out.mcap"
+def test_a_full_disk_ends_it_with_what_was_written_whole(
+    endless: Replay, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, room = os.write, 48_000
+
+    def full(fd: int, data: bytes) -> int:
+        nonlocal room
+        if not room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        count = min(room, len(data))
+        room -= count
+        return int(real(fd, data[:count]))
+
+    monkeypatch.setattr(os, "write", full)
     code, said = run(out, endless.port, "--seconds", "30")
     assert code == 1
     assert "No space left on device; what was written before is intact" in said
@@ -414,30 +392,6 @@ def test_a_row_that_is_being_written_is_not_replaced(tmp_path: Path) -> None:
     assert [path.exists() for path in first.made] == [True, False]
 
 
-def test_what_the_disk_does_not_take_is_taken_off_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    disk = DiskFile(tmp_path / "a", overwrite=False)
-    disk.write(b"first")
-    disk.flush()
-    real, room = os.write, 3
-
-    def full(fd: int, data: bytes) -> int:
-        nonlocal room
-        if not room:
-            raise OSError(28, "No space left on device")
-        count, room = min(room, len(data)), 0
-        return int(real(fd, data[:count]))
-
-    disk.write(b"second")
-    monkeypatch.setattr("os.write", full)
-    with pytest.raises(DiskError, match="No space left"):
-        disk.flush()
-    monkeypatch.undo()
-    disk.close()
-    assert (tmp_path / "a").read_bytes() == b"first"
-
-
 def test_nothing_is_overwritten_unasked_or_by_two(endless: Replay, out: Path) -> None:
     out.write_text("precious")
     code, said = run(out, endless.port, "--seconds", "0.3")
@@ -498,7 +452,6 @@ def test_what_cannot_be_done_is_said(
 )
 def test_a_recording_for_a_time(text: str, seconds: float) -> None:
     assert cli.parse_options(["x.mcap", "--for", text]).seconds == seconds
-    assert f" of {seconds:g} s" == Progress("x", seconds)._of or seconds != 30
 
 
 def test_it_waits_for_a_server_if_it_is_told_to_until_it_is_stopped(
@@ -535,38 +488,10 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
         assert is_whole(list(opened.frames()))
 
 
-@pytest.mark.long
-@pytest.mark.bus
-@needs_bus
-@pytest.mark.timeout(300)
-def test_two_sensors_at_1600_hz_for_a_minute(out: Path) -> None:
-    """Nothing lost between server and file, for part of the server's CPU."""
-    seconds = 60
-    with server("virtual", "--virtual", "--sensors 2", "--set", "sinc_length=32") as running:
-        recorder = RecorderProcess(out, running.port, "--seconds", str(seconds))
-        used = psutil.Process(recorder.process.pid)
-        serves = psutil.Process(running.process.pid)
-        spent, began = 0.0, sum(serves.cpu_times()[:2])
-        try:
-            while recorder.process.poll() is None:
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    spent = max(spent, sum(used.cpu_times()[:2]))
-                time.sleep(0.1)
-            served_s = sum(serves.cpu_times()[:2]) - began
-            assert recorder.wait() == 0
-            said = recorder.said()
-        finally:
-            recorder.close()
-    print(f"{100 * spent / seconds:.1f} % of a core, server {100 * served_s / seconds:.1f} %; {said}")
-    frames = read(out)
-    assert "not read in time" not in said
-    assert "could not be written" not in said
-    assert is_whole(frames)
-    assert len(frames) > 0.95 * 2 * 1600 * seconds
-    assert spent < 0.4 * served_s
-    with Reader(out) as bag:  # another library's
+def test_other_libraries_read_it(source: Path) -> None:
+    with Reader(source) as bag:
         counts = {connection.topic: connection.msgcount for connection in bag.connections}
-    assert counts[frame_topic(0)] + counts[frame_topic(1)] == len(frames)
-    with out.open("rb") as file:
+    assert counts[frame_topic(0)] + counts[frame_topic(1)] == SECOND
+    with source.open("rb") as file:
         messages = NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False)
         assert sum(1 for _ in messages) == sum(counts.values())

@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 import signal
 import socket
-import subprocess
-import sys
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -224,11 +222,10 @@ def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
     sensors.describe(Description(0, reply))
     assert not sensors.sensors[0].describe()["settling"]
     for flags in (0, 0, 0, DataFlag.REPEATED, DataFlag.INVALID, DataFlag.INVALID | DataFlag.REPEATED):
-        sensors.count(frame(0, flags=flags), due_ns=1, now_ns=20_000_001)
+        sensors.count(frame(0, flags=flags))
     status = sensors.status()
     counts = [status["sensors"][0][name] for name in ("fresh", "repeated", "invalid")]
-    assert (counts, status["cycles"], status["missed_deadlines"]) == ([3, 1, 2], 6, 6)
-    assert status["wake_us"] == dict.fromkeys(("p50", "p99", "p999", "max"), 20_000.0)
+    assert (counts, status["cycles"]) == ([3, 1, 2], 6)
 
 
 # -- when a frame goes out, under which number and stamps
@@ -289,23 +286,15 @@ def test_a_frame_before_its_turn_is_not_held_back_and_holds_none_back() -> None:
 def test_again_numbers_go_on_and_there_is_one_period_between() -> None:
     clock = Clock()
     line = timeline(clock=clock)
-    for number in range(10, 13):
+    for number in (10, 11, 14):
         last = line.due(frame(number))
     clock.passed_ns = 2 * PERIOD_NS
     line.begin_again()
     first = line.due(frame(10))
-    assert first.frame.sequence == last.frame.sequence + 1 == 13
-    assert first.at_ns - last.at_ns == PERIOD_NS
-    assert first.frame.stamp_ns - last.frame.stamp_ns == PERIOD_NS
-    assert line.due(frame(12)).frame.sequence == 15
-
-
-def test_a_jump_of_the_numbers_is_kept_when_it_begins_again() -> None:
-    line = timeline()
-    line.due(frame(10))
-    line.due(frame(15))
-    line.begin_again()
-    assert [line.due(frame(n)).frame.sequence for n in (10, 15)] == [16, 21]
+    assert first.frame.sequence == last.frame.sequence + 1 == 15
+    assert first.at_ns - last.at_ns == 3 * PERIOD_NS
+    assert first.frame.stamp_ns - last.frame.stamp_ns == 3 * PERIOD_NS
+    assert line.due(frame(12)).frame.sequence == 17
 
 
 def test_across_a_restart_of_the_machine_the_pause_is_that_of_the_stamps() -> None:
@@ -338,7 +327,7 @@ def test_numbers_and_times_stay_in_their_fields() -> None:
         (2, ("x.mcap", "99999"), "99999 is no port: it must be from 1 to 65535"),
         (2, ("x.mcap", "--speed", "0"), "it must be a number"),
         (2, ("x.mcap", "--speed", "nan"), "it must be a number"),
-        (2, ("x.mcap", "--host", "nowhere"), "an IP address of this machine"),
+        (2, ("x.mcap", "--server", "nowhere:1"), "does not appear to be an IPv4 or IPv6 address"),
         (1, ("/no/x.mcap",), "No such file"),
         (1, (__file__,), "is not an MCAP file"),
     ],
@@ -372,9 +361,3 @@ def test_a_damaged_recording_ends_it_with_a_sentence(path: Path) -> None:
         list(client.frames())
         assert served.wait() == 1
         assert "is damaged at byte" in served.said()
-
-
-def test_it_needs_no_bus() -> None:
-    code = "import sys; from bota_clients import replay, record; import bota_clients.replay.program, "
-    code += "bota_clients.record.program; sys.exit('pysoem' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -33,7 +33,7 @@ def names(table: str, file: str) -> list[str]:
     """The strings that begin the rows of a table in C++."""
     text = (INCLUDE / file).read_text()
     rows = text[text.index(table) :].split("\n};", 1)[0]
-    return re.findall(r'^    \{"(\w+)"' if "Row" in table else r'"([\w.]+)"', rows, re.MULTILINE)
+    return re.findall(r'^    \{"([\w.]+)"' if "Row" in table else r'"([\w.]+)"', rows, re.MULTILINE)
 
 
 PARAMETERS = names("Row kRows[] = {", "parameters.hpp")
@@ -43,7 +43,8 @@ SIGNALS = names("kSignals = {", "sensor_loop.hpp")
 def test_the_page_has_every_parameter_and_no_other() -> None:
     table = PAGE.split("| Parameter |", 1)[1].split("\n\n", 1)[0]
     assert (
-        re.findall(r"`(\w+)`", "\n".join(row.split("|")[1] for row in table.splitlines()[2:])) == PARAMETERS
+        re.findall(r"`([\w.]+)`", "\n".join(row.split("|")[1] for row in table.splitlines()[2:]))
+        == PARAMETERS
     )
 
 
@@ -66,7 +67,7 @@ def test_the_macro_lists_what_is_asked_for(tmp_path: Path) -> None:
     macro = PACKAGE / "urdf" / "bota_force_torque_sensor.ros2_control.xacro"
     description = tmp_path / "robot.xacro"
     for flag in ("false", "true"):
-        flags = " ".join(f'{name}="{flag}"' for name in ("imu", "orientation", "temperature"))
+        flags = " ".join(f'{name}="{flag}"' for name in ("imu", "orientation", "temperature", "compensated"))
         description.write_text(
             '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
             f'<xacro:include filename="{macro}"/>'
@@ -75,11 +76,13 @@ def test_the_macro_lists_what_is_asked_for(tmp_path: Path) -> None:
             "</xacro:bota_force_torque_sensor></robot>"
         )
         robot = ElementTree.fromstring(xacro.process_file(str(description)).toxml())
-        listed = [str(each.get("name")) for each in robot.iter("state_interface")]
+        sensors = {str(each.get("name")): each.findall("state_interface") for each in robot.iter("sensor")}
+        assert list(sensors) == ["wrist", "wrist_compensated"][: 1 + (flag == "true")]
+        listed = [str(each.get("name")) for each in sensors["wrist"]]
+        listed += [f"compensated.{each.get('name')}" for each in sensors.get("wrist_compensated", ())]
         assert len(set(listed)) == len(listed)
         assert set(listed) == set(SIGNALS if flag == "true" else [*SIGNALS[:6], "age", "condition"])
         assert [(p.get("name"), p.text) for p in robot.iter("param")] == [("port", "12002")]
-        assert [s.get("name") for s in robot.iter("sensor")] == ["wrist"]
 
 
 def test_the_controllers_are_those_of_the_arm() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import random
 import select
 import subprocess
 import time
@@ -13,9 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
+from bota_clients.identify.cli import main as identify
 from bota_ethercat.control import Event, event
-from bota_ethercat.framing import DataFlag
+from bota_ethercat.framing import DataFlag, encode_data
+from bota_ethercat.pdo import STANDARD_GRAVITY, encode
 from tests.clients.cpp_programs import (
     ROOT,
     SANITIZED,
@@ -27,6 +31,9 @@ from tests.clients.cpp_programs import (
     patient,
 )
 from tests.clients.played_sensor import PlayedSensor, described, frame, played
+from tests.clients.recordings import record
+from tests.clients.test_identify import posed
+from tests.ended import run_here
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port, wait_until
 
@@ -134,11 +141,9 @@ def wrench(seen: Seen) -> Any:
         ("on_stale", "use", 'the parameter on_stale is "use"; allowed: error, nan or hold'),
         ("on_saturated", "NaN", "allowed: error, nan, hold or use"),
         ("on_activate_tare", "yes", "allowed: true or false"),
-        (
-            "max_agee",
-            "1",
-            'there is no parameter "max_agee" (did you mean "max_age"?); there are: host, port,',
-        ),
+        ("tool_center_of_gravity", "1,2", "allowed: three numbers (m)"),
+        ("bias", "1,2,3,4,5,6,7", "allowed: six numbers (N, Nm)"),
+        ("accelerometer.scale", "1,1,0", "allowed: three numbers, about 1"),
         ("quality", "1", 'there is no parameter "quality"; there are: host'),
     ],
 )
@@ -212,6 +217,84 @@ def test_no_time_limit(running: Loop) -> None:
         assert (seen["good"], wrench(seen), seen["age"]) == (True, None, math.inf)
 
 
+# -- the tool
+
+
+TOOL = {
+    "tool_mass": 1.25,
+    "tool_center_of_gravity": "[0.01,-0.02,0.08]",
+    "accelerometer.offset": "0.3,-0.2,0.1",
+    "accelerometer.scale": "1.01,0.99,1.002",
+}
+# mm from the mounting face, of the drawings in Bota's URDFs: wrench origin, IMU.
+HEIGHTS = {
+    "SENS": (35, 9.3), "ROKS": (32, 9.8), "ROKA": (32, 9.8), "MEDS": (32, 9.8), "MEDA": (32, 9.8),
+    "LAXS": (44.5, 11.95), "MEGS": (59, 13.4), "NONE": (0, 0),
+}  # fmt: skip
+# By ft_compensation for `TOOL` on a SENS, of the samples of `moving`: specific force, alignment, compensator.
+LOADS = json.loads((Path(__file__).parent / "golden_loads.json").read_text())
+
+
+def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
+    """Times, acceleration, angular rate: with lost samples, a long gap, a NaN, a clock that stood still."""
+    random_ = random.Random(7)
+    time_s = 1000.0
+    for number in range(60):
+        time_s += {28: 5, 36: 6, 44: 200, 45: 0}.get(number, 1) / rate_hz * random_.uniform(0.98, 1.02)
+        swing = [math.sin((3 + axis) * time_s + axis) for axis in range(6)]
+        values = [*(9 * each for each in swing[:3]), *(2 * each for each in swing[3:])]
+        yield time_s, tuple(math.nan if number == 50 and axis == 4 else v for axis, v in enumerate(values))
+
+
+def loads(running: Loop, model: str, lag_s: float, fir: bool, rate_hz: float, *samples: Any) -> Any:
+    """What the tool of `new` loads a sensor of this model with in each sample."""
+    running.begin("tool", f"BFT-{model}-ECAT-M8", lag_s, int(fir), rate_hz, len(samples))
+    for time_s, values in samples:
+        running.begin(repr(time_s), *map(repr, values))
+    return running.answer()
+
+
+@pytest.mark.parametrize("row", LOADS, ids=lambda row: f"{row['rate_hz']} Hz, FIR {row['fir']}")
+def test_the_load_of_the_tool_is_that_of_the_golden_table(running: Loop, row: dict[str, Any]) -> None:
+    assert running.new(**TOOL) == ""
+    found = loads(running, "SENS", row["lag_s"], row["fir"], row["rate_hz"], *moving(row["rate_hz"]))
+    for number, (load, expected) in enumerate(zip(found, row["loads"], strict=True)):
+        assert (load is None) == (expected is None), number
+        assert load is None or load == pytest.approx(expected, abs=1e-9), number
+
+
+@pytest.mark.parametrize(("model", "heights"), HEIGHTS.items())
+def test_the_imu_is_where_the_model_has_it(running: Loop, model: str, heights: tuple[float, float]) -> None:
+    running.new(tool_mass=2)
+    force = loads(running, model, 0, False, 800, (1.0, (0.0, 0.0, 9.0, 3.0, 0.0, 0.0)))[2]
+    origin, imu_at = heights
+    assert force == pytest.approx(-2 * (9.0 - 3.0**2 * (origin - imu_at) / 1000))
+
+
+def test_the_compensated_wrench_is_without_bias_and_tool(running: Loop) -> None:
+    running.new(bias="1,0,0,0,0,0", **TOOL)
+    seen = running.do("take", FRESH, 1000, 1, 1, 5.0)
+    assert (wrench(seen), seen["compensated.force.x"]) == (5.0, 3.75)
+    assert running.do("take", LATE, 1100, 101, 1, 9.0)["compensated.force.x"] is None
+
+
+def test_the_payload_from_the_file_of_an_identification(running: Loop, tmp_path: Path) -> None:
+    recording, path = tmp_path / "poses.mcap", tmp_path / "tool.yaml"
+    record(recording, posed())
+    assert run_here(identify, recording, "--yaml", path).code == 0
+    (parameters,) = yaml.safe_load(path.read_text()).values()
+    given = {name: parameters["ros__parameters"][name] for name in TOOL}
+    found = []
+    for asked in ({"payload_file": path}, {k: str(v).replace(" ", "") for k, v in given.items()}):
+        assert running.new(**asked) == ""
+        found.append(loads(running, "SENS", 0, False, 800, (1.0, (0.1, 0.2, 9.8, 0.0, 0.0, 0.0))))
+    assert found[0] == pytest.approx(found[1])
+    assert found[0][2] == pytest.approx(-given["tool_mass"] * 9.8, rel=0.05)
+    path.write_text("/**:\n  ros__parameters:\n    tool_mass: heavy\n")
+    for file in (path, tmp_path / "none.yaml"):
+        assert "allowed: a file that ethercat-identify --yaml" in running.new(payload_file=file)
+
+
 # -- which sensors are refused
 
 
@@ -227,9 +310,11 @@ def test_no_time_limit(running: Loop) -> None:
             "has a sample every 0.006667 s: raise max_age (0.01 s) to at least 0.01333",
         ),
         ("imu", {}, {"imu_active": 0}, "has its IMU switched off"),
-        ("orientation", {}, {}, "does not map its orientation (61 bytes of process data)"),
-        ("orientation", {}, {"pdo_size": 77}, "does not estimate its orientation"),
-        ("", {}, {"imu_active": 0, "rate_hz": None}, ""),
+        ("orientation", {}, {"orientation_estimation": True}, "does not send its orientation (77 bytes"),
+        ("orientation", {}, {"pdo_size": 77}, "does not send its orientation"),
+        ("", {"tool_mass": 1}, {"imu_active": 0}, "has its IMU switched off"),
+        ("", {"tool_mass": 1}, {"inertia_compensation": True}, "subtracts gravity and inertia itself"),
+        ("", {}, {"imu_active": 0, "rate_hz": None, "inertia_compensation": True}, ""),
         ("orientation", {}, {"pdo_size": 77, "orientation_estimation": True}, ""),
     ],
 )
@@ -348,6 +433,44 @@ def test_settings_that_changed_are_checked(running: Loop, server: PlayedSensor) 
     loop.logged("has another coordinate_system than when configured")
     server.send(frame(8))
     loop.until(UNCHECKED)
+
+
+def test_a_tare_in_any_pose_is_right_in_every_pose(running: Loop, server: PlayedSensor) -> None:
+    """The sensor's offset becomes what makes it read the load of the tool, which is then subtracted."""
+    loop = running.opened(server.port, bias="9,0,0,0,0,0", tool_mass=2, tool_center_of_gravity="0,0,0.1")
+    loop.begin("tare")
+    sequence = 0
+    while not loop.has_answered():
+        server.send(frame(sequence := sequence + 1, acceleration__y=0.5))
+    assert loop.answer()["ok"]
+    (asked,) = (message for message in server.asked if message["action"] == "tare")
+    half = STANDARD_GRAVITY  # the weight of half of 2 kg
+    assert asked["target"] == pytest.approx([0, -half, 0, 0.1 * half, 0, 0])
+    loop.logged("info: tared to the load of the tool in this pose: right in every pose")
+    load: dict[str, Any] = {"force.y": -half, "force.z": -half, "torque.x": 0.1 * half}
+    server.send(frame(100_000, acceleration__y=0.5, acceleration__z=0.5, **{"force.x": 0.0, **load}))
+    wait_until(lambda: loop.read()["force.z"] is not None and loop.read()["force.z"] < -1, "that sample")
+    seen = loop.read()
+    assert [seen[f"compensated.{name}"] for name in ("force.x", *load)] == pytest.approx([0] * 4, abs=1e-5)
+
+
+def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> None:
+    """Two sample periods: the newest force is that of the acceleration two samples before."""
+    with played(rate_hz=100, delay_ms={"force_torque": 25.0, "acceleration": 5.0}) as server:
+        loop = running.opened(server.port, tool_mass=1)
+        begin_ns = time.monotonic_ns() - 50_000_000
+        for number in range(1, 5):
+            data = encode(61, {"acceleration.z": number, "force.x": number})
+            server.send(encode_data(number, 5, begin_ns + number * 10_000_000, 0, 0, 3, data))
+        wait_until(lambda: wrench(loop.read()) == 4, "the last sample")
+        assert loop.read()["compensated.force.z"] == pytest.approx(2 * STANDARD_GRAVITY)
+        loop.do("stop")
+
+
+def test_without_a_payload_the_log_says_what_zero_is(running: Loop, server: PlayedSensor) -> None:
+    loop = running.opened(server.port)
+    assert loop.do("tare")["ok"]
+    loop.logged("info: tared to zero in this pose, the weight of a tool included")
 
 
 def test_a_tare_that_is_refused(running: Loop, server: PlayedSensor) -> None:

@@ -116,8 +116,8 @@ def test_the_variable_comes_before_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"\xff\xfe\x00", "is not a text file"),
-        (b"server = ", "is not valid TOML"),
+        (b"\xff\xfe\x00", "is not TOML in UTF-8"),
+        (b"server = ", "is not TOML in UTF-8"),
         (b"server = 1", "takes one key"),
         (b'sever = "x"', "takes one key"),
         (b'server = "x:y"', "it must be HOST:PORT"),

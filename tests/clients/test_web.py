@@ -182,8 +182,8 @@ def test_each_page_gets_the_sensor_that_it_shows(web: Harness) -> None:
     other = web.join()
     web.take(other, sensor=1)
     states = web.states()
-    assert states[web.page]["sensor"]["identity"].startswith("Sensor 0  one")
-    assert states[other]["sensor"]["identity"].startswith("Sensor 1  two")
+    assert states[web.page]["sensor"]["identity"].startswith("Sensor 0  OP  one")
+    assert states[other]["sensor"]["identity"].startswith("Sensor 1  OP  two")
     web.model.take([frame(k, sensor=s) for k in range(40) for s in (0, 1)], START_S + 0.05)
     sent = {page: [each["points"] for each in batches] for page, batches in web.points(START_S + 1).items()}
     assert sent == {web.page: [0], other: [1]}
@@ -398,7 +398,7 @@ def test_a_page_says_what_the_monitor_says() -> None:
         "settings"
     ]
     assert dict(sensor["stream"])["Temperature"] == "34.6 °C"
-    assert found["message"] == {"text": "Sensor 0 is not tared: it is not at rest", "bad": True}
+    assert found["message"] == {"text": "12:00:00 Sensor 0 is not tared: it is not at rest", "bad": True}
     assert (sensor["units"], sensor["imu_off"]) == (["N", "Nm"], False)
     raw = replace(state, settings={"calibration_matrix": False, "imu_active": 0})
     counts = json.loads(state_text(replace(made.troubled(), sensors=(raw,)), 0, 8))["sensor"]

@@ -56,18 +56,13 @@ def message(stream: ClientConnection, key: str) -> dict[str, Any]:
 def test_the_page_is_served_on_both_loopback_addresses_and_nothing_is_kept(web: Web, host: str) -> None:
     if host == "::1" and not has_ipv6():
         pytest.skip("no IPv6 here")
-    for path, name, status in (
-        ("/", "localhost", 200), ("/app.js", "localhost", 200), ("/none", "localhost", 404),
-        ("/", "evil.example", 403),
-    ):  # fmt: skip
+    for name, status in (("localhost", 200), ("evil.example", 403)):
         asking = http.client.HTTPConnection(host, web.port, timeout=PATIENCE_S)
-        asking.request("GET", path, headers={"Host": name})
+        asking.request("GET", "/", headers={"Host": name})
         answer = asking.getresponse()
         assert answer.status == status
         assert dict(answer.getheaders()).items() >= HEADERS.items()
-        body = answer.read()
-        assert len(body) == int(answer.headers["Content-Length"])
-        assert body.startswith(b"The page is for this machine only") is (status == 403)
+        assert answer.read().startswith(b"The page is for this machine only") is (status == 403)
         assert web.hub.token not in str(answer.headers)
         asking.close()
 

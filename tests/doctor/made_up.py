@@ -25,22 +25,14 @@ FACTS: Facts = {
     "offloads": {"generic-receive-offload": False, "tcp-segmentation-offload": False},
     "EEE": (False, False),
 }
-LIMITS = """Limit                     Soft Limit           Hard Limit           Units
-Max locked memory         8388608              8388608              bytes
-Max realtime priority     0                    0
-"""
 Files = Mapping[str, str | bytes | None]
 GOOD: Files = {
     "/proc/version": "Linux version 6.12.0-rt-amd64 (x@y) #1 SMP PREEMPT_RT Debian",
     "/proc/cmdline": "quiet isolcpus=3",
-    "/proc/config.gz": gzip.compress(
-        b"CONFIG_HZ=1000\nCONFIG_PREEMPT_RT=y\n# CONFIG_RT_GROUP_SCHED is not set\n"
-    ),
+    "/proc/config.gz": gzip.compress(b"CONFIG_HZ=1000\nCONFIG_PREEMPT_RT=y\n"),
     "/proc/sys/kernel/sched_rt_runtime_us": "950000\n",
     "/proc/sys/kernel/sched_rt_period_us": "1000000\n",
     "/proc/self/status": "Name:\tpython\nCapEff:\t000001ffffffffff\n",
-    "/proc/self/limits": LIMITS,
-    "/proc/self/net/packet": "sk RefCnt Type Proto Iface R Rmem User Inode\n",
     "/proc/cpuinfo": "flags\t\t: fpu vme de\n",
     "/proc/interrupts": " 0: 9 IO-APIC timer\n 130: 1 2 IR-PCI-MSI-0000:00:1f.6 0-edge ens5\n 131: 7 xhci\n",
     "/proc/irq/130/smp_affinity_list": "0-3\n",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bota_ethercat.health.verdict import Level
-from ethercat_server.doctor.bus_checks import Request, examine_bus
+from ethercat_server.doctor.bus_checks import examine_bus
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.report import NAMES, Finding, worst
 from tests import rights
@@ -82,7 +82,7 @@ def examined(
     """The doctor's examination of `bus` on a machine that is good but for `files` and `facts`."""
     subject = machine(root, files, facts)
     subject.ifname = bus.near
-    found = BusFindings(examine_bus(subject, Request(seconds, announce=announce)))
+    found = BusFindings(examine_bus(subject, seconds, announce))
     assert not [finding for finding in found if "error in ethercat-doctor" in finding.found]
     return found
 

@@ -141,7 +141,6 @@ def summary(p99_us: float, p50_us: float = 20.0, max_us: float | None = None) ->
         (150, 0, 1000, NOTE),
         (400, 0, 1000, LOOK),
         (20, 1, 2001, LOOK),
-        (20, 10, 1000, BAD),
     ],
 )
 def test_late_wake_ups_matter_by_what_they_cost(p99_us: float, late: int, count: int, level: Level) -> None:
@@ -151,7 +150,7 @@ def test_late_wake_ups_matter_by_what_they_cost(p99_us: float, late: int, count:
 
 @pytest.mark.parametrize(
     ("p50_us", "p99_us", "lost", "level"),
-    [(80, 80, 0, FINE), (80, 300, 0, NOTE), (80, 80, 1, LOOK), (80, 80, 200, BAD), (860, 860, 0, LOOK)],
+    [(80, 80, 0, FINE), (80, 300, 0, NOTE), (80, 80, 1, LOOK), (860, 860, 0, LOOK)],
 )
 def test_exchanges_matter_by_losses_and_time(p50_us: float, p99_us: float, lost: int, level: Level) -> None:
     found = bus_checks.exchange_finding("", summary(p99_us, p50_us), lost, 2000)
@@ -162,7 +161,7 @@ def test_exchanges_matter_by_losses_and_time(p50_us: float, p99_us: float, lost:
 
 @pytest.mark.parametrize(("p99_us", "level"), [(900, FINE), (1300, NOTE), (11_000, LOOK), (110_000, BAD)])
 def test_old_samples_are_judged_as_those_of_a_stream(p99_us: float, level: Level) -> None:
-    assert bus_checks.age_finding("when sent", summary(p99_us), "").level is level
+    assert bus_checks.age_finding("when sent", summary(p99_us)).level is level
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.machine import Machine
 from tests import rights
 from tests.doctor.running import ATTEMPTS, MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
@@ -25,7 +24,6 @@ from tests.server.running import (
     Veth,
     VirtualSensor,
     needs_bus,
-    server,
     virtual_sensor,
     wait_until,
 )
@@ -61,29 +59,12 @@ def test_the_whole_doctor(bench: Bench) -> None:
     interface, others = ended.findings("interface"), ended.findings("other software")
     assert interface["link"]["values"]["kind"] == "veth"
     assert interface["driver"]["values"]["driver"] == "veth"
-    assert interface["coalescing"]["level"] == "ok"
+    assert interface["coalescing"]["level"] == "skipped", "the driver has none"
     assert others["addresses"]["level"] in {"ok", "note"}, "nothing but a link-local address"
-    assert others["listeners"]["level"] in {"ok", "warning"}
     for position in range(2):
         now = sensor.stats(position)
         assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
     assert not promiscuous(veth), "SOEM leaves it so"
-
-
-def test_a_terminal_gets_colour_and_is_told_what_takes_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether its output is a terminal is the kernel's to say."""
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("NO_COLOR", "")
-    ours, its = os.openpty()
-    with open(its, "w") as terminal, contextlib.redirect_stdout(terminal):  # noqa: PTH123
-        main(["virtual", "--seconds", "0.05", "--rt-priority", "0"])
-    shown = b""
-    with contextlib.suppress(OSError):  # EIO: the other end is closed
-        while part := os.read(ours, 65536):
-            shown += part
-    os.close(ours)
-    assert b"\x1b[32mok" in shown
-    assert b"measuring for 0.05 s ..." in shown
 
 
 @pytest.mark.parametrize(
@@ -112,15 +93,6 @@ def test_the_kernel_says_what_an_interface_is_used_for(
         link, routes = found.link, found.fact("routes")
         assert (link.kind, link.up, link.carrier, bool(link.master)) == ("veth", up, carrier, master)
         assert (routes.addresses, routes.default) == (addresses, False)
-
-
-def test_another_master_is_not_disturbed(bench: Bench) -> None:
-    """Which process has a socket is known to the kernel alone."""
-    veth, sensor = bench
-    found = doctor_here(veth.far, *LOOK).findings("bus")["slaves"]
-    assert found["level"] == "bad"
-    assert f"process {sensor.process.pid}" in found["found"]
-    assert found["commands"] == [f"sudo kill {sensor.process.pid}"]
 
 
 def is_running(pid: str) -> bool:
@@ -177,9 +149,7 @@ def test_without_rights_it_says_what_it_skipped(bench: Bench) -> None:
     before = sensor.command("stats")
     ended = doctor_of_nobody(veth.near, "--json", "--seconds", "0.02")
     assert not ended.json["root"]
-    assert ended.findings("bus")["slaves"]["found"] == (
-        "not checked: CAP_NET_RAW and CAP_NET_ADMIN missing; run with sudo"
-    )
+    assert "CAP_NET_ADMIN and CAP_NET_RAW missing; run with sudo" in ended.findings("bus")["slaves"]["found"]
     assert ended.findings("rights")["capabilities"]["level"] == "note"
     assert ended.findings("measurement")["all"]["level"] == "skipped"
     assert ended.findings("interface")["driver"]["values"]["driver"] == "veth", "this needs no rights"
@@ -211,15 +181,3 @@ def test_virtual_brings_a_bus_of_its_own_and_takes_it_away() -> None:
     assert "ecat" not in str([row["commands"] for row in ended.json["findings"]]), (
         "what is gone needs no mending"
     )
-
-
-def test_the_server_that_holds_the_interface_is_asked(bench: Bench) -> None:
-    """Its process and port come from the kernel's tables, its replies over a real socket."""
-    veth, _ = bench
-    with server(veth.near, "--rt-priority", "0", "--set", "sinc_length=512") as running:
-        ended = doctor_here(veth.near, *QUICK)
-    found = ended.findings("server")
-    assert f"process {running.process.pid}" in found["server"]["found"]
-    assert found["server"]["values"]["port"] == running.port
-    assert not ended.findings("bus")
-    assert not ended.findings("measurement"), "its loop is the measurement"

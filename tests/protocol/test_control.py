@@ -32,11 +32,6 @@ def test_subscribe_takes_what_the_contract_names() -> None:
     assert parse_request(message).values == {"sensors": (0, 2), "every": 4, "fresh_only": False}
 
 
-@pytest.mark.parametrize("action", ["describe", "subscribe", "unsubscribe", "status", "shutdown"])
-def test_the_actions_are_there(action: str) -> None:
-    assert parse_request({"action": action}).action == action
-
-
 def test_only_what_changes_something_needs_authority() -> None:
     free = {"describe", "subscribe", "unsubscribe", "status", "sdo_read", "sii_read"}
     assert {name for name, action in ACTIONS.items() if not action.controls} <= free

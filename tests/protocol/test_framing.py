@@ -10,10 +10,8 @@ import json
 import os
 import random
 import struct
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import pytest
@@ -31,8 +29,8 @@ from bota_ethercat.framing import (
     encode_data,
     encode_json,
 )
-from bota_ethercat.text.bare_json import BareJsonDecoder, encode_bare_json
 from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject, parse_json_object
+from ethercat_server.serving.bare_json import BareJsonDecoder, encode_bare_json
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, in_chunks, mutate
 
 SEED: Final = int(os.environ.get("FUZZ_SEED", "20261121"))
@@ -115,13 +113,6 @@ def test_messages_on_the_wire_are_as_the_contract_says() -> None:
     assert wire[DATA_FLAGS_OFFSET] == DataFlag.GAP
     assert len(encode_data(*WITH_ORIENTATION)) == MAX_DATA_MESSAGE_SIZE == 110
     assert encode_json({"action": "shutdown"}) == b'\x00\x00\x00\x16\x02{"action":"shutdown"}'
-
-
-def test_bytes_that_follow_wait() -> None:
-    decoder = FrameDecoder()
-    decoder.feed(encode_json(JSON) + b"\x00\x00\x00")
-    assert list(decoder) == [JSON]
-    assert decoder.pending == 3
 
 
 def test_reading_into_the_decoders_own_buffer() -> None:
@@ -290,19 +281,6 @@ def test_a_bare_line_may_be_as_long_as_allowed_and_longer_is_final() -> None:
         assert decoder.pending == 0
 
 
-simple_objects = st.dictionaries(
-    st.text(), st.text() | st.integers() | st.lists(st.text(), max_size=3), max_size=4
-)
-
-
-@given(st.lists(simple_objects, max_size=5), st.integers(1, 50), st.booleans())
-def test_bare_round_trip_in_any_pieces(messages: list[Any], size: int, newline: bool) -> None:
-    lines = [encode_bare_json(message) for message in messages]
-    stream = b"".join(lines if newline else map(bytes.rstrip, lines))
-    chunks = [stream[at : at + size] for at in range(0, len(stream), size)]
-    assert outcomes(BareJsonDecoder(), chunks) == messages
-
-
 # -- any bytes: found by hypothesis
 
 
@@ -390,46 +368,3 @@ def test_a_broken_decoder_keeps_nothing_it_is_still_given(make: Callable[[], Dec
         decoder.feed(bytes(10_000))
     assert decoder.pending == 0
     assert len(decoder._buffer) <= BUFFER
-
-
-# -- many, fast
-
-
-def resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def storm(count: int, seed: int) -> None:
-    """Streams of valid, hostile and mutated messages, `count` in all; memory stays what it was."""
-    rng, done, resident = random.Random(seed), 0, 0.0
-    sides = (client_side, FRAMED), (server_side, FRAMED[:-2]), (bare_side, BARE)
-    while done < count:
-        make, good = rng.choice(sides)
-        valid = b"".join(rng.choices(good, k=rng.randint(0, 4)))
-        rest = []
-        for _ in range(rng.randint(1, 6)):
-            piece = rng.choice(good)
-            if rng.random() < 0.05:
-                piece = rng.choice(HOSTILE_TEXTS)
-                piece = piece if good is BARE else framed(piece)
-            rest.append(mutate(rng, piece, good) if rng.random() < 0.6 and piece else piece)
-        spoilt = b"".join(rest)
-        check(make, valid, spoilt, in_chunks(rng, valid + spoilt))
-        if done < count // 4 <= done + len(rest):
-            resident = resident_mb()
-        done += len(rest)
-    assert resident_mb() - resident < 4, f"memory grew from {resident} MB"
-
-
-def test_a_storm_of_mutations() -> None:
-    storm(2_000, SEED)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(900)
-def test_a_million_mutations() -> None:
-    print(f"FUZZ_SEED={SEED}")
-    began = time.monotonic()
-    storm(1_000_000, SEED)
-    print(f"{time.monotonic() - began:.0f} s")

@@ -2,47 +2,34 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-import bota_ethercat.accounting
 from bota_ethercat.accounting import StreamAccounting, StreamCounts
-from bota_ethercat.errors import BadMessageError, RemoteProtocolError
-from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data
+from bota_ethercat.client import Client
+from bota_ethercat.framing import DataMessage, encode_data
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
+from bota_ethercat.text.json_text import JsonObject
 from tests.golden_vectors import (
     ACCOUNTED,
+    BEGIN_NS,
     BROKEN,
+    CHANNELS,
     DATA,
     JSON,
+    READ,
     STREAMS,
     AccountedStream,
-    Outcome,
+    ReadStream,
     Vector,
     expected,
+    outcomes,
     same_sample,
 )
-
-
-def outcomes(chunks: Sequence[bytes]) -> list[Outcome]:
-    decoder, found = FrameDecoder(), list[Outcome]()
-    for chunk in chunks:
-        decoder.feed(chunk)
-        while True:
-            try:
-                message = decoder.next_message()
-            except BadMessageError:
-                found.append("refused")
-                continue
-            except RemoteProtocolError:
-                return [*found, "broken"]
-            if message is None:
-                break
-            found.append(message)
-    return found
+from tests.protocol.scripted_channel import MemoryServer, ScriptedChannel
 
 
 def test_each_alone() -> None:
@@ -95,9 +82,57 @@ def test_accounting() -> None:
         assert accounting.counts == StreamCounts(**stream.counts), stream.name
 
 
-def test_the_words_are_those_of_the_documentation() -> None:
+class PythonPlayer:
+    """See `Player`: the Python client."""
+
+    def __init__(self, stream: ReadStream) -> None:
+        self.server = MemoryServer()
+        self.server.now_ns = BEGIN_NS - 10**10
+        self.max_age_s = stream.max_age_ms * 1e-3
+        self.client = Client(
+            1, every=stream.every, sensors=stream.sensors, channel=ScriptedChannel(self.server)
+        )
+        self.counts: dict[int, StreamCounts] = {}
+
+    def now(self, now_ns: int) -> None:
+        assert now_ns >= self.server.now_ns
+        self.server.now_ns = now_ns
+
+    def connect(self, description: JsonObject) -> None:
+        self.end()
+        while self.client.session.connected:
+            self.client.poll()
+        self.server.listens, self.server.description = True, description
+        self.client.connect()
+
+    def send(self, message: bytes) -> None:
+        self.server.send_raw(message)
+
+    def end(self) -> None:
+        """Nobody takes a connection until the next is told to be made."""
+        self.server.listens = False
+        self.server.drop()
+
+    def read(self, sensor: int) -> dict[str, object]:
+        reading = self.client.latest(sensor, max_age_s=self.max_age_s)
+        before = self.counts.get(sensor, StreamCounts())
+        counts = self.counts[sensor] = replace(self.client.session.state(sensor).accounting.counts)
+        return {
+            **reading._asdict(),
+            "condition": reading.condition.name.lower(),
+            "sequence": reading.frame and reading.frame.sequence,
+            "age_ns": None if math.isinf(reading.age_s) else round(reading.age_s * 1e9),
+            "measured_ns": [reading.measured_ns(channel) for channel in CHANNELS],
+            "withheld": counts.withheld - before.withheld,
+            "lost": counts.lost - before.lost,
+        }
+
+
+@pytest.mark.parametrize("stream", READ, ids=lambda stream: stream.name)
+def test_readings(stream: ReadStream) -> None:
+    stream.play(PythonPlayer(stream))
+
+
+def test_every_count_is_documented() -> None:
     page = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
-    words = re.findall(r"^(\w+): (.*(?:\n    .*)*)", bota_ethercat.accounting.__doc__ or "", re.MULTILINE)
-    assert {word for word, _ in words} == set(StreamCounts.__slots__)
-    for word, meaning in words:
-        assert f"| `{word}` | {' '.join(meaning.split())} |" in page, word
+    assert all(f"| `{count}` |" in page for count in StreamCounts.__slots__)

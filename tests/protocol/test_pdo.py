@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bota_ethercat.errors import PdoSizeError
-from bota_ethercat.pdo import LAYOUTS, PDO_FIELDS, ImuUnits, SampleDecoder, encode, layout_for
+from bota_ethercat.pdo import LAYOUTS, PDO_FIELDS, SampleDecoder, encode, layout_for
 
 # Name, offset, struct code, sub-index.
 TABLE = [
@@ -61,33 +61,6 @@ def test_every_field_lies_where_the_table_says(size: int) -> None:
     for number, (name, offset, code, _) in enumerate((r for r in TABLE if r[1] < size), 1):
         assert struct.unpack_from("<" + code, data, offset) == (number,), name
         assert layout_for(size).fields[layout_for(size).index(name)].name == name
-
-
-def test_decoded_in_si_units() -> None:
-    sample = SampleDecoder(77).decode(numbered(77))
-    assert (sample.status, sample.warnings) == (1, 2)
-    assert list(sample.force) == [3, 4, 5]
-    assert list(sample.torque) == [6, 7, 8]
-    assert sample.acceleration == pytest.approx([10 * 9.80665, 11 * 9.80665, 12 * 9.80665])
-    assert sample.angular_rate == pytest.approx([math.radians(v) for v in (14, 15, 16)])
-    assert sample.temperature == 18
-    assert list(sample.orientation or ()) == [19, 20, 21, 22]
-    saturated = (sample.force_torque_saturated, sample.acceleration_saturated, sample.angular_rate_saturated)
-    assert saturated == (9, 13, 17)
-    assert sample.array == [
-        *sample.force, *sample.torque, *sample.acceleration, *sample.angular_rate
-    ]  # fmt: skip
-
-
-def test_a_sensor_that_sends_si_is_taken_at_its_word() -> None:
-    sample = SampleDecoder(61, ImuUnits.SI).decode(numbered(61))
-    assert list(sample.acceleration) == [10, 11, 12]
-    assert list(sample.angular_rate) == [14, 15, 16]
-
-
-def test_no_orientation_without_an_estimate() -> None:
-    assert SampleDecoder(61).decode(numbered(61)).orientation is None
-    assert SampleDecoder(77).decode(bytes(77)).orientation is None
 
 
 def test_decodes_in_the_middle_of_a_buffer() -> None:

@@ -15,6 +15,7 @@ from bota_ethercat.sensor.response import (
     fir_gain,
     fir_taps,
     force_torque_response,
+    noise_bandwidth,
     sinc_gain,
 )
 from bota_ethercat.settings import start_up_defaults
@@ -32,6 +33,16 @@ def test_the_stop_band_is_that_of_the_same_converter_elsewhere() -> None:
     """Beckhoff's IP3102: 64.5 dB from 43008 / 307200 of the rate on."""
     worst = max(sinc_gain(share / 1000) * fir_gain(share / 1000) for share in range(140, 1000))
     assert 20 * math.log10(worst) < -64.5
+
+
+def test_the_noise_that_passes() -> None:
+    """In closed form: the integral of sinc to the sixth power, and the energy of the impulse response."""
+    assert noise_bandwidth(False) == pytest.approx(11 / 40, rel=1e-4)
+    spline = {0: 11 / 20, 1: 13 / 60, 2: 1 / 120}  # of the sinc filter with itself, some periods later
+    energy = sum(
+        a * b * spline.get(abs(i - k), 0) for i, a in enumerate(fir_taps()) for k, b in enumerate(fir_taps())
+    )
+    assert noise_bandwidth(True) == pytest.approx(energy / 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("fir", [False, True])

@@ -25,8 +25,7 @@ from bota_ethercat.text.json_text import JsonObject
 from tests.rights import socket_of
 
 Test = TypeVar("Test", bound=Callable[..., None])
-OLD = int(DataFlag.REPEATED | DataFlag.INVALID)
-"""Flags of frames that carry no new sample."""
+OLD = int(DataFlag.REPEATED | DataFlag.INVALID)  # flags of frames that carry no new sample
 START_TIMEOUT_S = 40.0
 PATIENCE_S = 30.0
 
@@ -226,14 +225,21 @@ class Server(Program):
 
 
 @contextlib.contextmanager
-def server(ifname: str, *arguments: str, port: int = 0, under: Sequence[str] = ()) -> Iterator[Server]:
-    running = _streaming(ifname, *arguments, port=port, under=under)
+def server(
+    ifname: str,
+    *arguments: str,
+    port: int = 0,
+    under: Sequence[str] = (),
+    python: str | Path = sys.executable,
+) -> Iterator[Server]:
+    running = _streaming(ifname, *arguments, port=port, under=under, python=python)
     try:
         yield running
     finally:
         running.close()
 
 
+# What it says at start where a busy machine lets the virtual sensor's process wait for too long.
 _STARVED = (
     "no EtherCAT slave answers",
     "stopped answering",
@@ -247,7 +253,6 @@ _STARVED = (
     "does not go to",  # after a lost frame of SOEM's set-up
     "maps process data of",  # as much of it as SOEM could read in its time
 )
-"""What it says at start where a busy machine lets the virtual sensor's process wait for too long."""
 ATTEMPTS = 5
 
 
@@ -256,10 +261,10 @@ def starved(said: str) -> bool:
     return any(words in said for words in _STARVED)
 
 
-def _streaming(ifname: str, *arguments: str, port: int, under: Sequence[str]) -> Server:
+def _streaming(ifname: str, *arguments: str, port: int, under: Sequence[str], python: str | Path) -> Server:
     """A server that streams; started again where the sensor was starved."""
     for attempt in range(ATTEMPTS):
-        running = Server(ifname, *arguments, port=port, under=under)
+        running = Server(ifname, *arguments, port=port, under=under, python=python)
         try:
             return running.wait_streaming()
         except BaseException:
@@ -362,8 +367,7 @@ class FramedClient:
     ) -> None:
         self.send_all, self.wait = send_all, wait
         self.frames: list[DataMessage] = []
-        self.events: list[JsonObject] = []
-        """Those that `wait_event` has not returned."""
+        self.events: list[JsonObject] = []  # those that `wait_event` has not returned
         self.replies: list[JsonObject] = []
         self._decoder = FrameDecoder()
         self._id = 0

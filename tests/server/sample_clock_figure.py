@@ -22,8 +22,7 @@ ROUND_TRIPS_NS: Final = [40e3 * 10 ** (each / 10) for each in range(21)]
 STOP_S: Final = 0.5
 STOP_LENGTH_S: Final = 0.7
 _END_S: Final = 2.0
-_STEPS: Final = 200
-"""Points in a second."""
+_STEPS: Final = 200  # points in a second
 
 
 class Phase(NamedTuple):

@@ -206,7 +206,7 @@ def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() 
 
 
 def test_a_late_answer_makes_datagrams_wait_longer_but_never_long() -> None:
-    late, pending = LateAnswers(clock := SimulatedClock(Machine()), 0x80, 16), 0x80 + 3
+    late, pending = LateAnswers(clock := SimulatedClock(Machine())), 0x80 + 3
     for stall_s in (0.01, 10.0):
         late.pending_ns[3] = clock.now_ns
         clock.sleep(stall_s)

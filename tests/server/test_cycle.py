@@ -11,7 +11,7 @@ import pytest
 
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.acquisition import health
-from ethercat_server.acquisition.histogram import Distribution, RecentDistribution
+from ethercat_server.acquisition.exchange_timing import RecentDistribution
 from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.simulation.machine import REALTIME_START_NS, START_NS, Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -271,11 +271,11 @@ def of_each(running: Simulation) -> dict[int, list[DataMessage]]:
     return by_sensor
 
 
+# SINC length (64: 800 Hz), round trip in ms, jitter in µs.
 CARDS = [
     (64, 0.86, 0), (64, 2.0, 0), (64, 3.0, 0), (64, 2.8, 400),
     (32, 0.44, 0), (32, 0.86, 0), (32, 2.0, 0), (32, 1.8, 400),
 ]  # fmt: skip
-"""SINC length (64: 800 Hz), round trip in ms, jitter in µs."""
 
 
 @pytest.mark.parametrize(("sinc_length", "milliseconds", "jitter_us"), CARDS)
@@ -378,49 +378,41 @@ def test_process_data_in_two_frames_is_as_complete(sinc_length: int) -> None:
 
 
 def test_percentiles_are_exact_to_a_few_percent() -> None:
-    noise = random.Random(0)
+    noise, recent = random.Random(0), RecentDistribution()
+    assert recent.summaries_us()[0] == {"p50": 0, "p99": 0, "p999": 0, "max": 0}
     values = sorted(int(10 ** noise.uniform(0, 10)) for _ in range(50_000))
-    distribution = Distribution()
     for value in values:
-        distribution.record(value)
-    fractions = (0.01, 0.5, 0.9, 0.99, 0.999)
-    for fraction, found in zip(fractions, distribution.percentiles_ns(fractions), strict=True):
-        exact = values[int(fraction * (len(values) - 1))]
-        assert exact <= found * 1.001
-        assert found <= exact * 1.05 + 1
+        recent.record(value)
+    summary, _ = recent.summaries_us()
+    for name, fraction in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999), ("max", 1)):
+        exact_us = values[int(fraction * (len(values) - 1))] / 1000
+        assert exact_us <= summary[name] * 1.001
+        assert summary[name] <= exact_us * 1.05
+    for extreme in (10**15, -5):
+        recent.record(extreme)
+    assert recent.summaries_us()[0]["max"] == pytest.approx(10**12)
 
 
-def test_extremes() -> None:
-    distribution = Distribution()
-    assert distribution.percentiles_ns((0.5,)) == [0]
-    distribution.record(-5)
-    distribution.record(10**15)
-    assert distribution.percentiles_ns((0.5,)) == [0]
-    assert distribution.summary_us()["max"] == pytest.approx(10**12)
-    assert distribution.count() == 2
-
-
-def test_recent_forgets_after_ten_rolls_but_everything_does_not() -> None:
+def test_negative_durations_count_as_zero() -> None:
     recent = RecentDistribution()
+    for duration in (-5, -5e9, 7):
+        recent.record(duration)
+    assert recent.summaries_us()[0] == {"p50": 0, "p99": 0.007, "p999": 0.007, "max": 0.007}
+
+
+def test_recent_forgets_after_ten_rolls_and_reading_takes_no_longer_with_time() -> None:
+    noise, recent = random.Random(1), RecentDistribution()
     recent.record(5_000_000)
     for _ in range(9):
         recent.roll()
-        recent.record(1_000)
+        for _ in range(300):
+            recent.record(noise.gammavariate(4, 20_000))
     assert recent.summaries_us()[1]["max"] == 5000
     recent.roll()
-    recent.record(2_000)
     everything, last = recent.summaries_us()
-    assert last["max"] == 2
-    assert last["p50"] == pytest.approx(1, rel=0.05)
-    assert everything["max"] == 5000
-
-
-def test_reading_a_distribution_takes_no_longer_with_time() -> None:
-    """It happens between two exchanges: what fills is the buckets that there are."""
-    noise, recent = random.Random(1), RecentDistribution()
-    for _ in range(60):
-        for _ in range(300):
-            recent.record(int(noise.gammavariate(4, 20_000)))
+    assert last["p50"] == pytest.approx(73, rel=0.1)
+    assert last["max"] < everything["max"] == 5000
+    for _ in range(50):
         recent.roll()
-    assert len(recent._before._counts) < 300
-    assert len(recent._slots) == 10
+    assert len(recent.slots) == 10
+    assert len(recent.before.counts) < 300

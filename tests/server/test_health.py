@@ -11,14 +11,13 @@ import pytest
 
 from bota_ethercat.pdo import LAYOUTS, encode
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.ethercat.slave.emergencies import Emergency
+from ethercat_server.ethercat.slave.coe import Emergency
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import Simulation, check_frames, life_of
 
-SLOW = {"sinc_length": 512}
-"""The fewer samples, the faster it is simulated."""
+SLOW = {"sinc_length": 512}  # the fewer samples, the faster it is simulated
 
 
 @pytest.fixture

@@ -28,15 +28,14 @@ from ethercat_server.serving.connection import (
     Subscription,
 )
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.in_memory import InMemoryStream, InMemoryTransport, ManualClock
+from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.server.running import OLD
-from tests.simulation import Client, Simulation, check_frames, life_of, reading
+from tests.simulation import Client, ManualClock, Simulation, check_frames, life_of, reading
 
 DESCRIBE = encode_json({"action": "describe"})
 ANSWER = {"reply": "describe", "ok": True}
-TURN_NS = 1_250_000
-"""Time between two deadlines: the acquisition loop's at 800 Hz."""
+TURN_NS = 1_250_000  # time between two deadlines: the acquisition loop's at 800 Hz
 
 
 def decoded(data: bytes | bytearray) -> list[Any]:
@@ -333,12 +332,9 @@ def test_subscription_filters(served: Served) -> None:
     served.publish(0, DataFlag.REPEATED, now_ns + 9_999_999)
     served.publish(0, DataFlag.REPEATED, now_ns + 10_000_000)
     assert served.sequences(default) == [10]
-
-
-def test_a_client_that_has_had_nothing_sees_a_silent_sensor_at_once(served: Served) -> None:
-    client = served.subscribe()
-    served.publish(flags=DataFlag.REPEATED, now_ns=1)
-    assert served.sequences(client) == [0]
+    newcomer = served.subscribe()
+    served.publish(0, DataFlag.REPEATED, now_ns)
+    assert served.sequences(newcomer) == [11], "it has had nothing yet"
 
 
 def test_gap_is_kept_for_a_client_that_skips_the_frame_that_had_it(served: Served) -> None:
@@ -367,7 +363,7 @@ def test_who_does_not_read_loses_the_oldest_whole_frames_and_is_told(served: Ser
             received_quick += served.read(quick)
     received += slow.recv_all()
     got = decoded(received)
-    assert outbox.withheld > 1000
+    assert outbox.withheld > len(made[0]) + len(made[1]) - MAX_QUEUED_DATA - 200, "the queue is bounded"
     assert len(got) == len(made[0]) + len(made[1]) - outbox.withheld == outbox.sent
     assert quick_outbox.withheld == 0
     for sensor in (0, 1):
@@ -377,17 +373,11 @@ def test_who_does_not_read_loses_the_oldest_whole_frames_and_is_told(served: Ser
             assert bool(after.flags & DataFlag.GAP) == (skipped > 0)
 
 
-def test_queue_is_bounded(served: Served) -> None:
-    served.subscribe()
-    served.publish(count=20_000)
-    assert len(served.only.outbox._queue) <= MAX_QUEUED_DATA
-
-
 def test_a_subscriber_that_half_closes_continues_to_receive(served: Served) -> None:
     client = served.subscribe()
     client.end_sending()
     served.serve(0.2)
-    assert served.only.state is State.HALF_CLOSED
+    assert served.only.state is State.READING
     served.publish()
     assert served.sequences(client) == [0]
     client.close()
@@ -399,32 +389,19 @@ def test_a_subscriber_that_half_closes_continues_to_receive(served: Served) -> N
 # -- how many, and for how long
 
 
-def test_too_many_clients_are_refused(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(permissions, "MAX_CLIENTS", 2)
-    first, second, third = served.connect(), served.connect(), served.connect()
-    assert served.is_closed(third)
-    for client in (first, second):
-        client.send(DESCRIBE)
-        assert served.read(client) == [ANSWER]
-
-
-def test_other_users_cannot_use_up_all_connections(served: Served) -> None:
-    for uid in range(100, 100 + permissions.MAX_CLIENTS):
-        served.connect(uid)
-    assert len(served.connections) == permissions.MAX_CLIENTS - permissions.RESERVED_FOR_CONTROL
-    served.hub.permissions.control_uids = frozenset({7})
-    for _ in range(permissions.RESERVED_FOR_CONTROL + 3):
-        served.connect(7)
-    assert len(served.connections) == permissions.MAX_CLIENTS
-
-
 @pytest.mark.parametrize("uid", [4711, None])
-def test_one_user_cannot_use_up_the_connections_of_others(served: Served, uid: int | None) -> None:
+def test_no_user_can_use_up_the_connections_of_others(served: Served, uid: int | None) -> None:
     for _ in range(permissions.MAX_CLIENTS_PER_USER + 5):
         served.connect(uid)
     assert len(served.connections) == permissions.MAX_CLIENTS_PER_USER
-    served.connect(4712)
-    assert len(served.connections) == permissions.MAX_CLIENTS_PER_USER + 1
+    for other in range(100, 100 + permissions.MAX_CLIENTS):
+        served.connect(other)
+    assert len(served.connections) == permissions.MAX_CLIENTS - permissions.RESERVED_FOR_CONTROL
+    served.hub.permissions.control_uids = frozenset({7})
+    for _ in range(permissions.RESERVED_FOR_CONTROL + 3):
+        last = served.connect(7)
+    assert len(served.connections) == permissions.MAX_CLIENTS
+    assert served.is_closed(last)
 
 
 def test_those_who_have_most_cannot_keep_out_who_has_none(served: Served) -> None:
@@ -562,14 +539,6 @@ def test_close_sends_what_waits_and_is_bounded(served: Served) -> None:
     assert stalled.other.closed
 
 
-def test_close_is_quick_if_all_clients_read(served: Served) -> None:
-    served.subscribe().end_sending()
-    served.serve()
-    began_ns = served.clock.now_ns
-    served.hub.close()
-    assert served.clock.now_ns - began_ns < 0.1e9
-
-
 # -- fairness
 
 
@@ -684,12 +653,6 @@ def test_unsubscribe_stops_the_frames() -> None:
     assert not client.frames
 
 
-def test_a_subscription_to_one_sensor_in_n_frames() -> None:
-    frames = Simulation(CLOCK, SensorOptions(serial=2)).subscribe(sensors=[1], every=4).collect(100)
-    assert {frame.sensor for frame in frames} == {1}
-    assert {after.sequence - before.sequence for before, after in pairwise(frames)} == {4}
-
-
 def test_others_may_read_and_not_control() -> None:
     client = Simulation(CLOCK).connect(4711)
     for action, keys in (
@@ -725,8 +688,7 @@ def test_shutdown_ends_the_loop_and_takes_the_sensor_to_init() -> None:
 # -- eight clients at 800 Hz, half of them troublesome
 
 ALL_FOR_S = 2.0
-SMALL_BUFFER = 4096
-"""Bytes on their way to a client that reads slowly; a kernel holds more."""
+SMALL_BUFFER = 4096  # bytes on their way to a client that reads slowly; a kernel holds more
 
 
 class Troublesome:

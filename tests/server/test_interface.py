@@ -9,7 +9,6 @@ import contextlib
 import os
 import signal
 import socket
-import stat
 import subprocess
 import sys
 import time
@@ -22,11 +21,11 @@ from ethercat_server.daemon.server import serve
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.nic import Routes, claimed, look_up, network_trouble, why_silent
-from ethercat_server.ethercat.raw_socket import RawSocket, packet_sockets
+from ethercat_server.ethercat.soem import SoemBackend, packet_sockets
 from ethercat_server.process.signals import Signals
 from tests import rights
 from tests.doctor.running import doctor_here
-from tests.rights import NO_OTHER_USER, NOBODY, as_user, needs_another_user
+from tests.rights import NOBODY, as_user, needs_another_user
 from tests.server.running import Veth, needs_bus, wait_until
 from tests.tool.running import tool_here
 
@@ -233,51 +232,48 @@ def test_the_process_that_has_the_interface_is_named_until_it_ends_in_any_way(ve
 
 
 @needs_another_user
-def test_another_user_takes_neither_the_lock_nor_its_file(
+def test_another_user_can_neither_take_the_lock_nor_stop_others_from_it(
     veth: Veth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As it could an abstract socket."""
+    """As it could with an abstract socket."""
     directory = rights.temporary() / "ethercat-server"
     monkeypatch.setattr(nic, "DIRECTORY", directory)
     with claimed(veth.near):
-        pass
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as taken:
+        (lock,) = directory.iterdir()
         with as_user(NOBODY.pw_uid):
-            taken.bind(f"\0bota-ethercat-bridge/ifindex/{socket.if_nametoindex(veth.near)}")
-            for mode in (os.O_RDONLY, os.O_RDWR):
+            for place in (directory, lock):
                 with pytest.raises(PermissionError):
-                    os.open(directory / "lock", mode)
+                    os.open(place, os.O_RDONLY)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as taken:
+        taken.bind(f"\0ethercat-server/ifindex/{socket.if_nametoindex(veth.near)}")
         with claimed(veth.near):
             pass
 
 
-def test_what_root_made_first_is_the_services_too(veth: Veth, directory: Path) -> None:
-    directory.mkdir(mode=0o755)
-    if os.geteuid() == 0 and NO_OTHER_USER is None:
-        os.chown(directory, NOBODY.pw_uid, NOBODY.pw_gid)
-    with claimed(veth.near):
-        found = (directory / "lock").stat()
-    assert stat.S_IMODE(found.st_mode) == 0o600
-    assert found.st_uid == directory.stat().st_uid
+@needs_another_user
+def test_the_lock_that_root_made_is_the_services_too(veth: Veth, monkeypatch: pytest.MonkeyPatch) -> None:
+    directory = rights.temporary() / "ethercat-server"
+    monkeypatch.setattr(nic, "DIRECTORY", directory)
+    directory.mkdir(mode=0o700)
+    os.chown(directory, NOBODY.pw_uid, NOBODY.pw_gid)
+    which = veth.near, socket.if_nametoindex(veth.near)
+    with nic.locked(*which), as_user(NOBODY.pw_uid), pytest.raises(InterfaceError, match="in use"):
+        nic.locked(*which).__enter__()
+    with as_user(NOBODY.pw_uid), nic.locked(*which), pytest.raises(InterfaceError, match="in use"):
+        nic.locked(*which).__enter__()
 
 
-@pytest.mark.parametrize("trap", ["link", "hard link", "fifo", "writable"])
-def test_a_file_that_may_be_anothers_is_not_touched(veth: Veth, directory: Path, trap: str) -> None:
-    directory.mkdir(mode=0o755)
-    victim, place = directory.parent / "victim", directory / "lock"
-    victim.write_text("as it was")
-    before = victim.stat()
+@pytest.mark.parametrize("trap", ["link", "fifo", "writable"])
+def test_a_lock_that_may_be_anothers_is_not_used(veth: Veth, directory: Path, trap: str) -> None:
+    directory.mkdir(mode=0o700)
     if trap == "link":
-        place.symlink_to(victim)
-    elif trap == "hard link":
-        place.hardlink_to(victim)
+        (directory / "lock").symlink_to(directory.parent)
     elif trap == "fifo":
-        os.mkfifo(place)
+        os.mkfifo(directory / "lock")
     else:
         directory.chmod(0o777)
     with claimed(veth.near), pytest.raises(OSError):  # noqa: PT011 - any
-        nic._open(nic.DIRECTORY)
-    assert (victim.stat().st_uid, victim.stat().st_mode) == (before.st_uid, before.st_mode)
+        nic._open_lock("lock")
 
 
 def test_without_run_it_is_a_name_in_the_namespace(veth: Veth, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -292,67 +288,56 @@ def test_without_run_it_is_a_name_in_the_namespace(veth: Veth, monkeypatch: pyte
 
 FRAME = (b"\xff" * 6 + b"\x01" * 6 + b"\x88\xa4" + b"\x0e\x10").ljust(60, b"\0")
 LONG_S = 20.0
-
-
-def open_packet(ifname: str) -> socket.socket:
-    sock = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
-    sock.bind((ifname, 0x88A4))
-    sock.settimeout(LONG_S)
-    return sock
+Ends = tuple[SoemBackend, socket.socket]
 
 
 @pytest.fixture
-def ends(veth: Veth) -> Iterator[tuple[RawSocket, socket.socket]]:
+def ends(veth: Veth) -> Iterator[Ends]:
+    before = packet_sockets()
     with (
-        open_packet(veth.near) as near,
-        open_packet(veth.far) as far,
-        contextlib.closing(RawSocket(near.fileno())) as raw,
+        contextlib.closing(SoemBackend(veth.near)) as near,
+        socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0) as far,
     ):
-        yield raw, far
+        far.bind((veth.far, 0x88A4))
+        far.settimeout(LONG_S)
+        near.open()
+        assert len(packet_sockets() - before) == 3, "both, and a second handle"
+        yield near, far
+    assert packet_sockets() == before
 
 
-def test_frames_go_both_ways_and_none_is_none(ends: tuple[RawSocket, socket.socket]) -> None:
-    raw, far = ends
-    assert raw.receive(0) is None
-    raw.send(FRAME)
+def test_frames_go_both_ways_and_none_is_none(ends: Ends) -> None:
+    near, far = ends
+    assert near.receive(0) is None
+    near.send(FRAME)
     assert far.recv(2048) == FRAME
-    far.send(FRAME)
-    assert raw.receive(LONG_S) == FRAME
-    far.send(FRAME)
-    far.send(FRAME)
-    assert raw.receive(LONG_S) == FRAME
-    raw.discard()
-    assert raw.receive(0) is None
+    for _ in range(2):
+        far.send(FRAME)
+    assert [near.receive(LONG_S), near.receive(0), near.receive(0)] == [FRAME, FRAME, None]
 
 
-def test_the_kernel_says_when_a_frame_had_arrived(ends: tuple[RawSocket, socket.socket]) -> None:
-    raw, far = ends
-    raw.arrived_ns()  # from now on
+def test_the_kernel_says_when_a_frame_had_arrived(ends: Ends) -> None:
+    near, far = ends
+    near.arrived_ns()  # from now on
     right = False
     for _ in range(50):  # it is late if this process stops while it reads two clocks
         before = time.monotonic_ns()
         far.send(FRAME)
         after = time.monotonic_ns()
         time.sleep(0.002)  # in which it lies there
-        assert raw.receive(LONG_S) == FRAME
-        assert raw.arrived_ns() > before
-        right |= raw.arrived_ns() < after
+        assert near.receive(LONG_S) == FRAME
+        assert near.arrived_ns() > before
+        right |= near.arrived_ns() < after
     assert right
 
 
-def test_waiting_leaves_the_processor_to_others(ends: tuple[RawSocket, socket.socket]) -> None:
+def test_waiting_leaves_the_processor_to_others(ends: Ends) -> None:
     before = time.thread_time()
     assert ends[0].receive(0.3) is None
     assert time.thread_time() - before < 0.15
 
 
-def test_packet_sockets_are_found_among_the_descriptors(veth: Veth) -> None:
-    with open_packet(veth.near) as packet, socket.socket() as other:
-        assert packet.fileno() in packet_sockets()
-        assert other.fileno() not in packet_sockets()
-
-
-def test_a_link_that_is_down_loses_frames(veth: Veth, ends: tuple[RawSocket, socket.socket]) -> None:
+def test_a_link_that_is_down_loses_frames(veth: Veth, ends: Ends) -> None:
     """The last one: it stays down."""
     veth.ip("link", "set", veth.near, "down")
     ends[0].send(FRAME)

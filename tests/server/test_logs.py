@@ -8,6 +8,7 @@ import logging
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,7 +25,7 @@ from ethercat_server.process.logs import (
     Repetitions,
     goes_to_journal,
 )
-from tests.server.running import ATTEMPTS, PATIENCE_S, Client, free_port, on_a_bus, wait_until
+from tests.server.running import ATTEMPTS, Server, on_a_bus
 
 
 def record(message: str, *arguments: object, level: int = logging.WARNING) -> logging.LogRecord:
@@ -162,36 +163,22 @@ def test_without_standard_error_nothing_is_written_anywhere(tmp_path: Path) -> N
     assert other.read_text() == ""
 
 
-def connected(process: subprocess.Popen[bytes], port: int) -> Client | None:
-    """A client of the server, once it streams; None if it ended."""
-    clients: list[Client] = []
-
-    def streams() -> bool:
-        with contextlib.suppress(ConnectionFailedError):
-            clients.append(Client(port))
-        return bool(clients) or process.poll() is not None
-
-    wait_until(streams, "the server")
-    return clients[0] if clients else None
-
-
 @on_a_bus
 def test_the_server_streams_and_ends_while_nobody_reads_its_log(pipe: Pipe) -> None:
     """What blocks is the kernel's pipe, so it is a real server; it used to stop at its first line."""
+    into_pipe = ("sh", "-c", f'exec "$@" 2>/proc/{os.getpid()}/fd/{pipe.writing}', "sh")
     for _ in range(ATTEMPTS):  # on a busy machine the sensor may be starved
-        port = free_port()
-        command = [sys.executable, "-m", "ethercat_server.daemon.cli", "virtual", str(port)]
-        process = subprocess.Popen(command, stderr=pipe.writing, start_new_session=True)
-        try:
-            if (client := connected(process, port)) is None:
-                continue
-            with client:
-                assert client.ask("subscribe")["ok"]
-                client.fresh(100)
-                assert client.ask("shutdown")["ok"]
-            assert process.wait(PATIENCE_S) == 0
-            return
-        finally:
-            process.kill()
-            process.wait()
+        with contextlib.closing(Server("virtual", under=into_pipe)) as running:
+            while running.process.poll() is None:
+                try:
+                    client = running.connect()
+                except ConnectionFailedError:
+                    time.sleep(0.02)
+                    continue
+                with client:
+                    assert client.ask("subscribe")["ok"]
+                    client.fresh(100)
+                    assert client.ask("shutdown")["ok"]
+                assert running.wait() == 0
+                return
     pytest.fail("it did not start")

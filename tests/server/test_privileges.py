@@ -13,7 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -26,6 +26,7 @@ from ethercat_server.errors import ServerError, StopRequestedError, UsageError
 from ethercat_server.process import privileges, realtime
 from ethercat_server.process.privileges import User, user_to_become
 from ethercat_server.process.signals import Signals
+from tests import rights
 from tests.rights import IPC_LOCK, NOBODY, SYS_NICE, needs_another_user, without
 from tests.server.running import (
     Server,
@@ -37,6 +38,7 @@ from tests.server.running import (
     virtual_sensor,
     wait_until,
 )
+from tests.systemd.test_installation import CAPABILITIES, SERVER_UNIT, values
 
 BY_SUDO = ("env", f"SUDO_UID={NOBODY.pw_uid}", f"SUDO_GID={NOBODY.pw_gid}")
 """As if nobody had started it with sudo."""
@@ -287,6 +289,62 @@ def test_what_cannot_be_given_up_is_an_error(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(os, "initgroups", refuse)
     with pytest.raises(ServerError, match="cannot become user nobody: Operation not permitted"):
         privileges.become(User(NOBODY.pw_uid, NOBODY.pw_gid, pwd.getpwuid(NOBODY.pw_uid).pw_name))
+
+
+# -- as its unit starts it: another user with four capabilities, or with one of them missing
+
+
+@pytest.fixture(scope="module")
+def spare() -> Iterator[Veth]:
+    """With a sensor, and no server yet."""
+    with virtual_sensor() as (veth, _):
+        yield veth
+
+
+def confined(capabilities: Iterable[str]) -> dict[str, Any]:
+    """For `server`, which then has no more than these; skips where it cannot be started like this at all."""
+
+    def become(capabilities: Iterable[str]) -> list[str]:
+        given = ",".join(["-all", *(f"+{name.removeprefix('CAP_').lower()}" for name in capabilities)])
+        return [
+            "prlimit", "--memlock=65536", "--rtprio=0",
+            "setpriv", f"--reuid={NOBODY.pw_uid}", f"--regid={NOBODY.pw_gid}", "--clear-groups",
+            "--no-new-privs", f"--inh-caps={given}", f"--ambient-caps={given}", f"--bounding-set={given}",
+        ]  # fmt: skip
+
+    rights.need(*become(CAPABILITIES))
+    return {"under": [*rights.readable(), *become(capabilities)], "python": rights.PYTHON}
+
+
+@on_a_bus
+def test_the_units_capabilities_are_enough_for_everything(spare: Veth) -> None:
+    (ambient,) = values(SERVER_UNIT, "AmbientCapabilities")
+    expected = sum(1 << getattr(rights, name.removeprefix("CAP_")) for name in ambient.split())
+    with server(spare.near, **confined(ambient.split())) as found:
+        process = rows_of(found.process.pid)
+        assert process["Uid"].split() == [str(NOBODY.pw_uid)] * 4
+        for kind in ("CapEff", "CapPrm", "CapBnd", "CapAmb"):
+            assert int(process[kind], 16) == expected, kind
+        assert process["NoNewPrivs"] == "1"
+        assert os.sched_getscheduler(found.process.pid) == os.SCHED_FIFO
+        assert int(process["VmLck"].split()[0]) > 0
+        assert "not granted" not in found.said()
+        with found.connect() as client:
+            assert client.ask("subscribe")["ok"]
+            client.fresh(10)
+            found.signal(signal.SIGTERM)
+            client.receive_all()
+            assert client.events[-1]["event"] == "shutting_down"
+        assert found.wait() == 0
+
+
+@on_a_bus
+@pytest.mark.parametrize("missing", ["CAP_NET_RAW", "CAP_NET_ADMIN"])
+def test_without_the_rights_to_the_interface_it_ends(spare: Veth, missing: str) -> None:
+    given = confined(name for name in CAPABILITIES if name != missing)
+    with contextlib.closing(Server(spare.near, **given)) as found:
+        assert found.wait() == 1
+        assert f"{missing} missing" in found.said()
 
 
 # -- what is asked of the kernel is granted where allowed, and said in one line where not

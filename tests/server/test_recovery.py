@@ -236,7 +236,7 @@ def test_one_that_dies_while_another_is_out_and_counted_is_lost_too() -> None:
     simulation, client = chain_of_two()
     simulation.sensors[0].change_interrupted = True  # so that it is asked for its settings, in vain
     simulation.command("mute-mailbox 100000 @0")
-    simulation.recovery._lose(0, "its settings are to be put right")
+    simulation.recovery.sensors[0].lose("its settings are to be put right")
     simulation.run(0.1)
     simulation.command("power off @1")
     simulation.run(0.3)

@@ -22,8 +22,7 @@ QUIET = Machine()
 SETTLED_S = 2.0
 SEEDS = range(1, 4)
 LONG = pytest.mark.long
-MOST_FAULTS = 5
-"""In 100 runs of the sweep."""
+MOST_FAULTS = 5  # in 100 runs of the sweep
 
 
 def simulate(

@@ -67,7 +67,7 @@ def test_systemd_is_told_ready_and_a_status_that_changes(server: Administered, m
     server.listener.wait_event("sensor_lost")
     server.service.every_second()
     assert "STATUS=streaming 0 of 1 sensors, lost: 0; 3 clients" in manager.told
-    server.notifier.stopping()
+    server.notifier.send("STOPPING=1")
     assert manager.told[-1] == "STOPPING=1"
 
 
@@ -88,7 +88,7 @@ def test_without_systemd_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setenv("WATCHDOG_USEC", "600000")
     monkeypatch.setenv("WATCHDOG_PID", "1")
     notifier = Notifier()
-    notifier.ready()
+    notifier.send("READY=1")
     notifier.feed()
     assert notifier.feed_every_ns > 10**15, "the watchdog is another process's"
 

@@ -73,7 +73,7 @@ def test_a_controller_without_it_is_polled_as_before(dc: str, caplog: pytest.Log
 
 
 def sent(running: Simulation) -> list[Datagram]:
-    content = bytes(running.bus.process_data._frames[0])
+    content = bytes(running.bus.process_data._frames[0].content)
     return parse(content, len(content))
 
 

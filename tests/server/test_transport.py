@@ -17,9 +17,10 @@ from typing import Any
 import pytest
 
 from ethercat_server.errors import ServerError, UsageError
-from ethercat_server.serving.in_memory import InMemoryTransport, ManualClock
 from ethercat_server.serving.transport import SocketTransport, Stream, Transport
+from ethercat_server.simulation.transport import InMemoryTransport
 from tests.server.running import free_port
+from tests.simulation import ManualClock
 
 PATIENCE_S = 20.0
 

@@ -17,7 +17,7 @@ import pytest
 
 from tests import rights
 from tests.server.running import Client, Veth, free_port, needs_bus, virtual_sensor, wait_until
-from tests.systemd.staging import SERVER_UNIT
+from tests.systemd.test_installation import SERVER_UNIT
 
 pytestmark = [
     pytest.mark.bus,

@@ -7,8 +7,8 @@ from collections.abc import Collection
 
 import pytest
 
-from ethercat_server.ethercat.slave.abort_codes import AbortCode
 from ethercat_server.ethercat.slave.al import AlState
+from ethercat_server.ethercat.slave.coe import AbortCode
 from ethercat_server.virtual_sensor import application, device, dictionary
 from ethercat_server.virtual_sensor.coe import SdoAbortError
 from ethercat_server.virtual_sensor.device import Device

@@ -21,9 +21,8 @@ from tests.tool.running import told, tool_here
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
+def bench() -> Iterator[SimulatedBus]:
     """Two sensors behind whatever is opened."""
-    monkeypatch.setattr(find, "promiscuity_kept", lambda _: contextlib.nullcontext())
     with simulated_bus("--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--serial", "10,20") as bus:
         yield bus
 
@@ -98,7 +97,7 @@ def test_other_interfaces_without_a_sensor_are_told_apart(
         rows = found(monkeypatch, *(Adapter(name) for name in (*buses, "denied")))
     assert rows["empty"]["found"] == "no EtherCAT slave answers"
     assert rows["foreign"]["found"] == "another EtherCAT slave"
-    assert "has slaves at work that are no Bota sensors (position 1 in OP)" in str(rows["at_work"]["found"])
+    assert "has slaves at work that are not Bota sensors (position 1 in OP)" in str(rows["at_work"]["found"])
     assert registers(at_work) == before
     assert "run with sudo" in str(rows["denied"]["found"])
     assert [name for name, row in rows.items() if row["sensors"]] == ["ens5"]

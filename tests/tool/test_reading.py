@@ -13,9 +13,8 @@ import pytest
 
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import DATAGRAM_HEADER, FRAME_HEADER, Command
-from ethercat_server.sensor.objects.search import KNOWN_OBJECTS, NOTE_NAMES
+from ethercat_server.sensor.objects.dictionary import KNOWN_OBJECTS, NOTE_NAMES
 from ethercat_server.simulation.backend import MemoryBackend
-from ethercat_server.tool.cli import COMMANDS
 from tests.simulation import SimulatedBus, SimulatedServer, registers, simulated_bus, simulated_server
 from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign, no_mailbox
 from tests.tool.running import complaints, one_sentence, refused, told, tool_here
@@ -93,14 +92,6 @@ def test_objects_that_cannot_be_read_have_a_line_with_the_reason(
     assert any("Sampling rate" in line and "800" in line for line in lines)
     alone = tool_here("read", near, "0x8010:4", code=1)
     assert "this firmware does not have it" in alone.out + alone.err
-
-
-@pytest.mark.parametrize(("size", "missing"), [("61", 5), ("77", 1)])
-def test_the_full_dump_has_a_line_for_every_object(size: str, missing: int) -> None:
-    with simulated_bus("--pdo", size) as bus:
-        lines = tool_here("objects", bus.near).out.splitlines()
-    assert len(lines) == 2 + len(KNOWN_OBJECTS)
-    assert sum("this firmware does not have it" in line for line in lines) == missing
 
 
 def test_a_foreign_slave_is_no_sensor_to_anybody(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,41 +197,34 @@ def test_a_bus_that_is_silent_is_one_sentence(bench: SimulatedBus) -> None:
         assert "no EtherCAT slave answers on " in refused(command, bench.near)
 
 
-FURTHER: dict[str, list[object]] = {
-    "read": ["sampling rate"], "snapshot": ["new"], "restore": ["old"],
-    "plan": ["--set", "chop=on"], "apply": ["--set", "chop=on"],
-}  # fmt: skip
-"""Arguments of commands on a bus of others."""
 SII_ACCESS = set(range(reg.SII_OWNER, reg.SII_OWNER + 8))
 """Registers that are written to read an SII; its owner gets it back."""
 
 
-@pytest.fixture
-def old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A snapshot in the current directory."""
+@pytest.mark.parametrize("command", [("watch",), ("snapshot", "new"), ("apply", "--set", "chop=on")])
+def test_a_bus_without_a_sensor_is_not_touched(
+    command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    with simulated_bus() as bus:
-        tool_here("snapshot", bus.near, "old")
-
-
-@pytest.mark.usefixtures("old")
-@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("adapters", "find", "eeprom")])
-def test_a_bus_without_a_sensor_is_not_touched_by(command: str) -> None:
     with simulated_bus("--chain", "EK1100,DRIVE:PREOP") as bus:
         before, sent = [state(each) for each in registers(bus.backend)], writes(bus.backend)
-        assert "no Bota Gen-0 sensor" in refused(command, bus.near, *FURTHER.get(command, []))
+        assert "no Bota Gen-0 sensor" in refused(command[0], bus.near, *command[1:])
         assert [state(each) for each in registers(bus.backend)] == before
         assert {address for _, address in sent} <= SII_ACCESS
 
 
-@pytest.mark.usefixtures("old")
-@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("adapters", "find")])
-def test_a_drive_at_work_is_not_touched_by(command: str) -> None:
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [(("eeprom",), "--force"), (("tare",), "--force"), (("snapshot", "new"), "--take-over")],
+)
+def test_a_drive_at_work_is_not_touched(
+    command: tuple[str, ...], option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with simulated_bus("--chain", "BOTA:OP,DRIVE:OP") as bus:
         before = registers(bus.backend)
-        said = refused(command, bus.near, *FURTHER.get(command, []))
-        assert "has slaves at work that are no Bota sensors (position 1 in OP)" in said
-        option = "--take-over" if command in {"snapshot", "restore"} else "--force"
+        said = refused(command[0], bus.near, *command[1:])
+        assert "has slaves at work that are not Bota sensors (position 1 in OP)" in said
         assert f"; {option} takes them to PREOP" in said
         assert registers(bus.backend) == before
         assert bus.stats_of_foreign(1)["write_count"] == 0

@@ -64,13 +64,6 @@ def test_find_looks_where_it_may(bench: Bench, monkeypatch: pytest.MonkeyPatch) 
     assert "PROMISC" not in veth.ip("link", "show", veth.near)
 
 
-def test_a_master_that_is_no_server_is_named(bench: Bench) -> None:
-    """Which process has a socket is known to the kernel alone."""
-    veth, sensor = bench
-    said = refused("objects", veth.far)
-    assert f"{veth.far} is in use by process {sensor.process.pid}" in said
-
-
 def test_a_whole_command_on_the_interface(bench: Bench) -> None:
     """pysoem's SDO transfers and its way to PREOP, standard output that is a pipe, settings that stay."""
     veth, sensor = bench
@@ -81,12 +74,6 @@ def test_a_whole_command_on_the_interface(bench: Bench) -> None:
     assert {row[0] for row in sensor.written(1)} == {"0x8006"}
     assert sensor.written(0) == []
     assert sensor.stats()["al_state"] == "INIT"
-
-
-def test_the_eeproms_of_a_chain(bench: Bench) -> None:
-    """Each slave's own name, though pysoem gives the second one the first one's."""
-    found = tool("eeprom", bench[0].near, "--json").json["slaves"]
-    assert [row["name"] for row in found] == ["BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8"]
 
 
 def test_watch_ends_with_ctrl_c_and_leaves_the_bus(bench: Bench) -> None:

@@ -55,7 +55,8 @@ class RawMaster:
         assert len(frame) == size
         assert frame[6] & 2
         return [
-            (bytes(frame[d.data : d.end]), wire.working_counter(frame, d)) for d in wire.parse(frame, size)
+            (bytes(frame[d.data : d.end]), int.from_bytes(frame[d.end : d.end + 2], "little"))
+            for d in wire.parse(frame, size)
         ]
 
     def one(self, command: int, adp: int, ado: int, data: bytes) -> tuple[bytes, int]:

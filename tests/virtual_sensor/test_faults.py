@@ -284,16 +284,6 @@ def test_another_signal_begins_with_the_next_sample_and_outlasts_a_power_cycle()
         master.go(OP)
 
 
-def test_ppm_keeps_the_phase() -> None:
-    master = RawMaster(SensorOptions(signal="clock")).go(OP)
-    master.wait(100 * PERIOD)
-    before = clock_of(master)
-    do(master, "ppm 50000")
-    assert clock_of(master) == before
-    master.wait(1000 * PERIOD)
-    assert clock_of(master) - before in (1049, 1050, 1051)
-
-
 def test_stats_tell_what_was_written() -> None:
     master = RawMaster().go(OP)
     master.download(0x2000, 1, bytes(4))

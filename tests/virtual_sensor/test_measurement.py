@@ -1,13 +1,18 @@
 """Samples: the clock, the formulas, the scene's physics, and what settings do to them."""
 
-import itertools
+import cmath
 import math
+import statistics
 import struct
+from collections.abc import Mapping
 
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, SampleDecoder, encode
+from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS, ImuFilter
+from bota_ethercat.sensor.response import fir_taps, force_torque_response
 from bota_ethercat.sensor.warnings_register import WarningFlag
+from bota_ethercat.settings import SettingValue, start_up_defaults
 from ethercat_server.virtual_sensor import signals
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sampler import SampleClock
@@ -66,17 +71,6 @@ def test_the_newest_sample_is_what_a_frame_carries() -> None:
         previous = number
 
 
-def test_polling_at_the_nominal_rate_sees_the_beat_of_two_clocks() -> None:
-    master = RawMaster(SensorOptions(signal="clock", ppm=300.0)).go(OP)
-    seen = []
-    for _ in range(8000):
-        master.wait(PERIOD - 1000)
-        seen.append(decode_clock(load(master.inputs())).number)
-    steps = {b - a for a, b in itertools.pairwise(seen)}
-    assert steps == {1, 2}
-    assert seen[-1] - seen[0] - 7999 in (2, 3), "300 ppm of 8000"
-
-
 def test_the_same_sample_is_the_same_bytes_also_if_computed_ahead() -> None:
     plain, ahead = (RawMaster(SensorOptions(noise=False)).go(OP) for _ in range(2))
     before = b""
@@ -93,8 +87,7 @@ def test_the_same_sample_is_the_same_bytes_also_if_computed_ahead() -> None:
 
 
 def test_formulas() -> None:
-    amplitudes = (10.0, 20.0, 30.0, 1.0, 2.0, 3.0)
-    for signal in ("ramp", "sine", "rest"):
+    for signal in ("ramp", "rest"):
         master = RawMaster(SensorOptions(signal=signal)).go(OP)
         for _ in range(30):
             master.wait(37 * PERIOD)
@@ -102,7 +95,6 @@ def test_formulas() -> None:
             sample = RAW.decode(master.inputs())
             expected = {
                 "ramp": [((k + 100 * i) % 1024) / 64 - 8 for i in range(6)],
-                "sine": [a * math.sin(2 * math.pi * (k / 1000 + i / 6)) for i, a in enumerate(amplitudes)],
                 "rest": CONSTANT,
             }[signal]
             assert (*sample.force, *sample.torque) == pytest.approx(expected, abs=1e-4)
@@ -173,6 +165,112 @@ def test_the_gyroscope_integrates_to_the_attitude(motion: signals.Motion, begin:
     wanted = source.reading(0, 0, begin + 20_000 * step).orientation
     sign = math.copysign(1.0, sum(a * b for a, b in zip(q, wanted, strict=True)))
     assert q == pytest.approx([sign * part for part in wanted], abs=1e-5)
+
+
+def filtered(motion: signals.Motion, sinc: int, **changed: SettingValue) -> signals.Scene:
+    source = quiet(motion)
+    source.set_filters(sinc, start_up_defaults() | changed)
+    return source
+
+
+def response_to(
+    hz: float, channel: int, step_s: float, count: int, sinc: int, **changed: SettingValue
+) -> complex:
+    """What a channel makes of a sine, by so many samples in whole periods: magnitude, and phase.
+
+    The sensor pitches by 0.01 rad; force along x, acceleration along x, and angular rate about y follow.
+    """
+    omega = math.tau * hz
+
+    def pitching(t: float) -> tuple[signals.Vector, signals.Vector]:
+        return (0.0, 0.01 * math.sin(omega * t), 0.0), (0.0, 0.01 * omega * math.cos(omega * t), 0.0)
+
+    source, plain = filtered(pitching, sinc, **changed), quiet(pitching)
+    sums = [0j, 0j]
+    for number in range(count):
+        seconds = 20.0 + number * step_s
+        for which, each in enumerate((source, plain)):
+            reading = each.reading(number, 0, seconds)
+            value = (*reading.force_torque, *reading.acceleration, *reading.angular_rate)[channel]
+            sums[which] += value * cmath.exp(-1j * omega * seconds)
+    return sums[0] / sums[1]
+
+
+@pytest.mark.parametrize("fir", [False, True])
+@pytest.mark.parametrize("sinc", [32, 64, 512])
+def test_a_sine_of_force_is_late_by_the_filters_delay(sinc: int, fir: bool) -> None:
+    rate = 51200 / sinc
+    response = force_torque_response({"sinc_length": sinc, "fir": fir})
+    # The last but one is about the cut-off frequency with FIR off.
+    for cycles in (2, 8, 16, 105, 150):
+        hz = cycles * rate / 400
+        found = response_to(hz, 0, 1 / rate, 400, sinc, fir=fir)
+        assert abs(found) == pytest.approx(response.gain(hz), abs=2e-3)
+        if abs(found) > 0.1:
+            assert response.delay_s is not None
+            turned = found * cmath.exp(1j * math.tau * hz * response.delay_s)
+            assert abs(math.degrees(cmath.phase(turned))) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("channel", "setting", "rows"),
+    [(6, "acceleration_filter", ACCELERATION_FILTERS), (10, "angular_rate_filter", ANGULAR_RATE_FILTERS)],
+)
+def test_a_sine_of_motion_is_late_by_the_profiles_delay(
+    channel: int, setting: str, rows: Mapping[int, ImuFilter]
+) -> None:
+    for profile, row in rows.items():
+        for share in (0.02, 0.2, 1.0):  # of the bandwidth
+            hz = share * row.bandwidth_hz
+            rest_s = row.delay_ms * 1e-3 - 1 / (math.tau * row.bandwidth_hz)
+            expected = cmath.exp(-1j * math.tau * hz * rest_s) / (1 + 1j * share)
+            found = response_to(hz, channel, 1 / (8 * hz), 8, 64, **{setting: profile})
+            assert abs(found - expected) < 0.03 * share, (profile, share)
+
+
+@pytest.mark.parametrize("fir", [False, True])
+@pytest.mark.parametrize("sinc", [32, 64, 512])
+def test_a_step_of_force_settles_as_the_filters_do(sinc: int, fir: bool) -> None:
+    period, turned = sinc / 51200, 0.1
+
+    def stepping(t: float) -> tuple[signals.Vector, signals.Vector]:
+        return (0.0, turned if t >= 100 * period else 0.0, 0.0), (0.0, 0.0, 0.0)
+
+    def sinc_step(x: float) -> float:
+        """Of three moving averages over a period: a sum of cubes."""
+        return sum(c * max(0.0, x - k) ** 3 for k, c in enumerate((1, -3, 3, -1))) / 6
+
+    source = filtered(stepping, sinc, fir=fir)
+    whole = signals.TOOL_MASS * STANDARD_GRAVITY * math.sin(turned)
+    before = 0.0
+    for number in range(95, 130):
+        share = source.reading(number, 0, number * period).force_torque[0] / whole
+        taps = fir_taps() if fir else (1.0,)
+        expected = sum(tap * sinc_step(number - k - 100) for k, tap in enumerate(taps))
+        assert share == pytest.approx(expected, abs=0.01)
+        assert share >= before - 1e-9
+        before = share
+    assert share == pytest.approx(1)
+
+
+def test_what_is_not_read_does_not_change_what_is() -> None:
+    """The filters look at samples that no master has read."""
+    every, one = (filtered(sway, 64, fir=True) for _ in range(2))
+    read = [every.reading(number, 0, number / 800).force_torque for number in range(60)]
+    assert one.reading(59, 0, 59 / 800).force_torque == pytest.approx(read[59])
+
+
+def test_with_fir_on_there_is_less_noise() -> None:
+    deviations = []
+    for fir in (False, True):
+        noisy = signals.Scene(1, noise=True, motion=lambda _: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+        noisy.set_filters(64, start_up_defaults() | {"fir": fir})
+        forces = [noisy.reading(number, 0, number / 800).force_torque[0] for number in range(2000)]
+        deviations.append(statistics.pstdev(forces))
+    assert deviations[0] == pytest.approx(noisy.deviations[0], rel=0.1)
+    assert deviations[1] == pytest.approx(
+        deviations[0] * sum(tap * tap for tap in fir_taps()) ** 0.5, rel=0.2
+    )
 
 
 def test_poses_are_held_still_with_each_axis_up_and_down() -> None:
@@ -266,12 +364,3 @@ def test_imu_off_calibration_off_orientation_on() -> None:
     assert sample.orientation
     assert sample.force[2] == pytest.approx(calibrated.force[2] * 10_000, rel=1e-2)
     assert sample.force[2].is_integer()
-
-
-def test_sinc_changes_the_rate() -> None:
-    master = RawMaster(SensorOptions(signal="clock")).go(PREOP)
-    master.download(0x8006, 1, struct.pack("<H", 128))
-    master.go(OP)
-    first = decode_clock(load(master.inputs())).number
-    master.wait(1_000_000_000)
-    assert decode_clock(load(master.inputs())).number - first in (400, 401)

@@ -134,6 +134,8 @@ def test_a_buffer_is_read_and_written_from_its_first_byte_on() -> None:
     assert master.one(Command.APRD, 0, 0x1180, bytes(20))[1] == 1
     assert middle() == 1, "it goes on"
     assert middle() == 0, "it was handed back with its last byte"
+    for start, size in ((0x117F, 62), (0x1180, 62)):
+        assert master.one(Command.APRD, 0, start, bytes(size))[1] == 0, "not all of it is the buffer's"
     drive = RawMaster(ForeignOptions("DRIVE", state=AlState.SAFEOP))
     at = drive.read16(0x0810)
     assert [drive.write(at + n, bytes(size)) for n, size in ((1, 5), (0, 1), (1, 5), (1, 5))] == [0, 1, 1, 0]

@@ -8,7 +8,7 @@ from bota_ethercat.pdo import LAYOUTS
 from bota_ethercat.settings import SETTINGS, sampling_rate_hz
 from ethercat_server.sensor.objects.dictionary import BY_SETTING, OBJECTS, Access, ObjectEntry, ObjectType
 from ethercat_server.virtual_sensor.application import Application
-from ethercat_server.virtual_sensor.coe import CoeServer, ObjectTable, SdoInformation
+from ethercat_server.virtual_sensor.coe import CoeServer, ObjectTable
 from ethercat_server.virtual_sensor.dictionary import sensor_entries
 from ethercat_server.virtual_sensor.foreign import KINDS
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -151,17 +151,6 @@ def test_uploads_are_segmented_when_the_mailbox_is_small(room: int) -> None:
     assert data == value
 
 
-def test_sampling_rate_follows_sinc_and_the_length_does_not_read_back() -> None:
-    """As with real sensors."""
-    master = RawMaster().go(PREOP)
-    for length, rate in ((32, 1600), (51, 1003), (64, 800), (128, 400), (205, 250), (341, 150), (512, 100)):
-        master.download(0x8006, 1, struct.pack("<H", length))
-        assert master.upload(0x8011, 0) == struct.pack("<H", rate)
-        assert master.upload(0x8006, 1) == struct.pack("<H", round(307_200 / rate))
-    master.download(0x8006, 3, b"\1")  # FAST before FIR, as the server writes them
-    master.download(0x8006, 2, b"\0")
-
-
 def test_save_outlives_a_power_cut_and_nothing_else_does() -> None:
     master = RawMaster().go(PREOP)
     master.download(0x8006, 1, struct.pack("<H", 128))
@@ -196,17 +185,6 @@ def test_object_lists() -> None:
         assert (len(one) - 6) // 2 == counts[kind]
     [error] = master.information(1, struct.pack("<H", 9))
     assert error[0] == 7
-
-
-def test_a_list_longer_than_the_mailbox_comes_in_fragments() -> None:
-    life = RawMaster().bus.sensors[0].life
-    assert life is not None
-    information = SdoInformation(life.dictionary, life.device)
-    fragments = information.answer(struct.pack("<BBHH", 1, 0, 0, 1), 24)
-    assert len(fragments) > 2
-    assert all(len(fragment) <= 24 for fragment in fragments)
-    assert struct.unpack_from("<H", fragments[0], 2)[0] == len(fragments) - 1
-    assert (fragments[0][0], fragments[-1][0]) == (0x82, 0x02)
 
 
 def test_descriptions() -> None:

@@ -52,9 +52,9 @@ def chain_with_events() -> list[Esc]:
     escs = [slave.life.esc for slave in master.bus.slaves if slave.life]
     masks = (0, reg.EVENT_DL_STATUS, 0, 0, 0x0100)
     for esc, station, mask in zip(escs, (0, 0x1001, 0x1002, 0x1001, 0x2001), masks, strict=True):
-        struct.pack_into("<H", esc.memory, reg.STATION_ADDRESS, station)
+        esc.write(reg.STATION_ADDRESS, struct.pack("<H", station))
         esc._events = mask
-        struct.pack_into("<H", esc.memory, reg.EVENT_MASK, mask)
+        esc.write(reg.EVENT_MASK, struct.pack("<H", mask))
     return escs
 
 

@@ -6,6 +6,7 @@ Ten times a second the state is rendered as rows of text, and only rows that cha
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,13 +15,13 @@ from typing import ClassVar, Final
 from rich.text import Text
 from textual import events
 from textual.app import App, ComposeResult
-from textual.geometry import Region
+from textual.geometry import Size
+from textual.scroll_view import ScrollView
 from textual.strip import Strip
-from textual.widget import Widget
 
 from bota_clients.monitor.model import Model, State, clock_text
 from bota_clients.monitor.recorder import Recorder
-from bota_clients.monitor.screen import Look, render
+from bota_clients.monitor.screen import Look, Screen, render
 from bota_clients.monitor.tare import start_tare
 from bota_clients.numbers import duration
 from bota_clients.program import call_on
@@ -30,25 +31,26 @@ REFRESH_S: Final = 0.1
 _ANSWERS: Final = {"y": "tare", "u": "undo", "c": "clear"}  # to the question whether to tare
 
 
-class View(Widget):
+class View(ScrollView, can_focus=True):
     """Rows of text, of which only those that change are drawn."""
 
-    can_focus = False
-
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, id: str) -> None:  # noqa: A002 - as Textual has it
+        super().__init__(id=id)
         self._rows: list[Text] = []
 
     def show(self, rows: list[Text]) -> None:
         """Show these rows."""
         before, self._rows = self._rows, rows
         if len(rows) != len(before):
+            self.virtual_size = Size(0, len(rows))
             self.refresh()
-        elif changed := [y for y, row in enumerate(rows) if row != before[y]]:
-            self.refresh(*(Region(0, y, self.size.width, 1) for y in changed))
+        for y, (old, new) in enumerate(zip(before, rows, strict=False)):
+            if new != old:
+                self.refresh_lines(y)
 
     def render_line(self, y: int) -> Strip:
-        """One row, for Textual."""
+        """One row of what is seen, for Textual."""
+        y += self.scroll_offset.y
         row = self._rows[y] if y < len(self._rows) else Text()
         return Strip(row.render(self.app.console)).adjust_cell_length(self.size.width)
 
@@ -57,7 +59,11 @@ class Monitor(App[None]):
     """Connects keys, model and view. The caller closes `recorder` once the terminal is restored."""
 
     TITLE = "ethercat-monitor"
-    CSS = "Screen, View { background: ansi_default; color: ansi_default; width: 100%; height: 100%; }"
+    CSS = """
+        Screen, View { background: ansi_default; color: ansi_default; scrollbar-size-vertical: 1; }
+        #head { height: 1; }
+        #body { height: 1fr; }
+    """
     ENABLE_COMMAND_PALETTE = False
     BINDINGS: ClassVar = [("ctrl+z", "suspend_process", "suspend")]
 
@@ -66,31 +72,32 @@ class Monitor(App[None]):
         model: Model,
         address: Address,
         *,
-        ascii_only: bool = False,
         seconds: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`seconds`: exit after this time."""
         # The terminal's own background; Textual obeys NO_COLOR.
         super().__init__(ansi_color=True)
+        self.animation_level = "none"
         self._model = model
         self._address = address
         self._clock = clock
-        self._look = Look(ascii=ascii_only)
-        self._view = View()
+        self._look = Look()
+        self._views = [View(id=name) for name in Screen._fields]
         self._seconds = seconds
         self.recorder = Recorder(address)
         self._state: State | None = None
         self._to_tare = 0  # the position that the question is about
 
     def compose(self) -> ComposeResult:
-        """The only widget."""
-        yield self._view
+        """What stays, and between them what scrolls."""
+        yield from self._views
 
     def on_mount(self) -> None:
         """Start the timers and the signal handlers."""
         call_on(asyncio.get_running_loop(), self.exit, "SIGTERM", "SIGHUP")
-        self.app_resume_signal.subscribe(self, lambda _: self._view.refresh())
+        self.app_resume_signal.subscribe(self, lambda _: self.refresh(layout=True))
+        self._views[1].focus()
         self.set_interval(REFRESH_S, self.draw)
         if self._seconds is not None:
             self.set_timer(self._seconds, self.exit)
@@ -101,15 +108,22 @@ class Monitor(App[None]):
 
     def draw(self) -> None:
         """Show the current state, or that of the time of the pause."""
+        if not self.is_headless and not os.isatty(0):
+            self.exit()  # the terminal was closed: Textual would block once 30 writes had failed
+            return
         now_s = self._clock()
         if ended := self.recorder.ended():
-            self._say(*ended)
+            self._model.say(*ended)
         state = self._model.state(now_s)
         if self._look.paused and self._state is not None:
             state = replace(self._state, message=state.message)
         self._state = state
         recording = f"REC {duration(now_s - self.recorder.since_s)}" if self.recorder.running else ""
-        self._view.show(render(state, replace(self._look, recording=recording), *self._view.size))
+        width = self._views[1].scrollable_content_region.width
+        screen = render(state, replace(self._look, recording=recording), width)
+        self._views[2].styles.height = len(screen.foot)
+        for view, rows in zip(self._views, screen, strict=True):
+            view.show(rows)
 
     def action_help_quit(self) -> None:
         """Ctrl-C quits, instead of Textual's hint at another key."""
@@ -122,11 +136,11 @@ class Monitor(App[None]):
         event.stop()
         look, key = self._look, (event.character or "").lower()
         if event.key == "ctrl+l":
-            self._view.refresh()
+            self.refresh(layout=True)
         elif look.question:
             self._answer(key)
-        elif look.help or (look.warnings and key != "w"):
-            self._look = replace(look, help=False, warnings=0)
+        elif look.help:
+            self._look = replace(look, help=False)
         elif key == "t":
             self._ask_tare()
         elif key == "r":
@@ -135,24 +149,19 @@ class Monitor(App[None]):
             self._look = replace(look, paused="" if look.paused else clock_text())
         elif key == "0":
             self._model.reset()
-            self._say("Peaks and past warnings are reset")
+            self._model.say("Peaks and past warnings are reset")
         elif key == "n":
             self._next()
-        elif key == "w":
-            self._look = replace(look, warnings=look.warnings + 1)
         elif key in {"?", "h"}:
             self._look = replace(look, help=True)
         elif key == "q":
             self.exit()
         self.draw()
 
-    def _say(self, text: str, bad: bool = False) -> None:
-        self._model.say(f"{clock_text()} {text}", bad)
-
     def _ask_tare(self) -> None:
         state = self._state
         if state is None or not state.sensors or not state.server.connected:
-            self._say("No sensor to tare: not connected to the server", True)
+            self._model.say("No sensor to tare: not connected to the server", True)
             return
         self._to_tare = state.sensors[self._look.selected % len(state.sensors)].position
         answers = "y: yes, u: undo the last tare, c: clear it, any other key: no"
@@ -161,20 +170,20 @@ class Monitor(App[None]):
     def _answer(self, key: str) -> None:
         self._look = replace(self._look, question="")
         if key in _ANSWERS:
-            start_tare(self._address, self._to_tare, self._say, _ANSWERS[key])
+            start_tare(self._address, self._to_tare, self._model.say, _ANSWERS[key])
         else:
-            self._say("Not tared")
+            self._model.say("Not tared")
 
     def _record(self) -> None:
         if self.recorder.running:
             self.recorder.stop()
-            self._say("Stopping the recording")
+            self._model.say("Stopping the recording")
         else:
-            self._say(*self.recorder.start(self._clock()))
+            self._model.say(*self.recorder.start(self._clock()))
 
     def _next(self) -> None:
         count = len(self._state.sensors) if self._state else 0
         if count < 2:
-            self._say("There is only one sensor" if count else "There is no sensor")
+            self._model.say("There is only one sensor" if count else "There is no sensor")
         else:
             self._look = replace(self._look, selected=(self._look.selected + 1) % count)

@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import argparse
 import errno
+import itertools
+import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from bota_clients.arguments import add_imu_units, add_server, address, parser, seconds, server_of
 from bota_clients.monitor.model import Model, clock_text
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.web.hub import is_loopback
-from bota_clients.monitor.words import can_show, json_line, to_ascii, trouble, verdict
+from bota_clients.monitor.words import json_line, trouble, verdict
 from bota_clients.program import discard_output, interrupt_on_signals, not_installed
 from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.health.verdict import Level
@@ -37,7 +39,6 @@ class Options(argparse.Namespace):
     json: bool
     seconds: float | None
     imu_units: ImuUnits
-    ascii: bool
     web: Address | None
 
 
@@ -71,7 +72,6 @@ def parse(argv: Sequence[str] | None) -> Options:
     add("--json", action="store_true", help="print one JSON object per second; with --once, just one")
     add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
     add_imu_units(made)
-    add("--ascii", action="store_true", help="use ASCII characters only")
     add(
         "--web", type=_loopback, nargs="?", const=DEFAULT_WEB, metavar="PORT",
         help=f"show it in a browser instead, on this port of this machine (default {DEFAULT_WEB.port})",
@@ -109,7 +109,6 @@ def run(options: Options) -> int:
     else:
         import bota_clients.monitor.screen  # noqa: F401, PLC0415
     interrupt_on_signals()  # the live view replaces the handler of SIGTERM
-    options.ascii = options.ascii or not can_show(sys.stdout.encoding)
     model = Model(str(options.address), options.imu_units)
     reader = Reader(options.address, model)
     reader.start()
@@ -137,14 +136,14 @@ def _once(options: Options, model: Model, *, answered: bool) -> int:
         sys.stderr.write(f"ethercat-monitor: {reason}, or give its HOST:PORT\n")
         return 1
     if not options.json:
-        _say(*table(state), ascii_only=options.ascii)
+        _say(*table(state))
     return 1 if verdict(state)[0] is Level.TROUBLE else 0
 
 
 def _live(options: Options, model: Model) -> int:
     from bota_clients.monitor.app import Monitor  # noqa: PLC0415
 
-    app = Monitor(model, options.address, ascii_only=options.ascii, seconds=options.seconds)
+    app = Monitor(model, options.address, seconds=options.seconds)
     try:
         app.run(mouse=False)
         if app.recorder.running:
@@ -161,34 +160,23 @@ def _each_second(options: Options, model: Model) -> int:
     from bota_clients.monitor.screen import line  # noqa: PLC0415
 
     was_wrong = False
-    for _ in ticks(options.seconds):
+    for _ in itertools.count() if options.seconds is None else range(math.ceil(options.seconds)):
+        time.sleep(_PERIOD_S)
         state, now = model.state(time.monotonic()), clock_text()
         wrong = trouble(state.server)
         if options.json:
             _say(json_line(state, time.time()))
             model.reset()  # peaks and warnings of the next line are those of its own second
         elif wrong is None:
-            _say(*(line(sensor, now) for sensor in state.sensors), ascii_only=options.ascii)
+            _say(*(line(sensor, now) for sensor in state.sensors))
         elif not was_wrong:
-            _say(f"{now}  server {wrong}", ascii_only=options.ascii)
+            _say(f"{now}  server {wrong}")
         was_wrong = wrong is not None
     return 0
 
 
-def ticks(limit_s: float | None) -> Iterator[None]:
-    """Once a second, until the limit; whoever is late does not hurry afterwards."""
-    start_s = due_s = time.monotonic()
-    while True:
-        due_s = max(due_s + _PERIOD_S, time.monotonic())
-        if limit_s is not None and due_s > start_s + limit_s + 0.5 * _PERIOD_S:
-            return
-        time.sleep(max(0.0, due_s - time.monotonic()))
-        yield
-
-
-def _say(*lines: str, ascii_only: bool = False) -> None:
-    text = "".join(f"{line}\n" for line in lines)
-    sys.stdout.write(to_ascii(text) if ascii_only else text)
+def _say(*lines: str) -> None:
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
     sys.stdout.flush()
 
 

@@ -22,14 +22,13 @@ from bota_ethercat.health.judge import Observation, emergency, judge, saturated_
 from bota_ethercat.health.observer import COMMON, StreamObserver
 from bota_ethercat.health.verdict import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
+from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import SETTINGS, SettingValue
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import number, rows, text, whole
 
 AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 SILENT_S: Final = LIMITS.stale_after  # a server normally sends a frame per sample period
-TRACE_STEP_S: Final = 0.25
-TRACE_STEPS: Final = 80
 _WRENCH: Final = tuple(COMMON.index(f.name) for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
 _WINDOW_NS: Final = 5 * 10**9  # of rate, jitter and age
 _JUDGED_NS: Final = 10**9  # of a verdict
@@ -101,7 +100,6 @@ class SensorState:
     sample: Sample | None = None
     old_s: float | None = None  # age of its values if they are stale
     peaks: tuple[Range, ...] | None = None  # of the six axes since the reset; every sample counts
-    traces: tuple[tuple[Range | None, ...], ...] = ((),) * len(AXES)  # a range per step, oldest first
     saturated: frozenset[str] = frozenset()
     verdict: Verdict = NOTHING_WRONG  # on the last second
     alerts: tuple[Alert, ...] = ()  # present ones first, then the latest
@@ -129,6 +127,11 @@ class SensorState:
     def imu_off(self) -> bool:
         """Whether the IMU is off."""
         return self.settings.get("imu_active") == 0
+
+    @property
+    def delay_ms(self) -> dict[str, float | None]:
+        """Of the filters in effect, by channel; as `describe` has it, also where a recording has not."""
+        return delays_ms(self.settings, self.nominal_hz)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,7 +183,6 @@ class _Sensor:
         self._status: JsonObject = {}
         self._hand_out: Any = None
         self._newest: bytes | None = None
-        self._trace: deque[tuple[int, tuple[Range, ...]]] = deque(maxlen=TRACE_STEPS)  # by step
         self._verdict = NOTHING_WRONG
         self._saturated: frozenset[str] = frozenset()
         self._now: list[Finding] = []
@@ -196,7 +198,7 @@ class _Sensor:
         self.observer.forget()
 
     def describe(self, row: JsonObject, now_s: float, *, anew: bool) -> None:
-        """Take its row of `describe`; `anew`: the monitor has connected. What lies between is no loss."""
+        """Take its row of `describe`; `anew`: after connecting; nothing before counts as lost."""
         before, self._row = self._row, row
         if anew:
             self.lost, self._status, self.observer = None, {}, StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
@@ -205,7 +207,6 @@ class _Sensor:
         if before and row.get("serial") != before.get("serial"):
             self.reset()
             self._newest = None
-            self._trace.clear()
         if anew or not before or any(row.get(name) != before.get(name) for name in ("rate_hz", "serial")):
             self.observer.begin(number(row.get("rate_hz")) or 0.0, _ns(now_s))
 
@@ -231,11 +232,7 @@ class _Sensor:
         self._newest = self.observer.newest
         columns = list(zip(*samples, strict=True))
         found = tuple(_range(columns[index]) for index in _WRENCH)
-        self.peaks = _widest(self.peaks or found, found)
-        step = int(now_s / TRACE_STEP_S)
-        if self._trace and self._trace[-1][0] == step:
-            found = _widest(self._trace.pop()[1], found)
-        self._trace.append((step, found))
+        self.peaks = tuple(map(_widest, self.peaks or found, found))
 
     def _judge(self, now_s: float) -> None:
         seen = self._observation(now_s)
@@ -285,9 +282,6 @@ class _Sensor:
         row, status, clock = self._row, self._status, self._status.get("clock")
         settings = _mapping(row.get("settings"))
         sample = self._newest and SampleDecoder(len(self._newest), self._imu_units).decode(self._newest)
-        last = int(now_s / TRACE_STEP_S)
-        past = dict(self._trace)
-        steps = [past.get(step) for step in range(last - TRACE_STEPS + 1, last + 1)]
         return SensorState(
             position=self.position,
             name=text(row.get("name")),
@@ -298,7 +292,6 @@ class _Sensor:
             settings={name: settings[name] for name in SETTINGS if isinstance(settings.get(name), int)},
             sample=sample or None,
             peaks=self.peaks,
-            traces=tuple(tuple(step[axis] if step else None for step in steps) for axis in range(len(AXES))),
             saturated=self._saturated,
             verdict=self._verdict,
             alerts=tuple(alerts),
@@ -427,9 +420,9 @@ class Model:
                 sensor.reset()
 
     def say(self, message: str, bad: bool = False) -> None:
-        """Set the message for the user."""
+        """Set the message for the user, with the time of day."""
         with self._lock:
-            self._message, self._message_ends_s = Message(text(message), bad), 0.0
+            self._message, self._message_ends_s = Message(f"{clock_text()} {text(message)}", bad), 0.0
 
     def state(self, now_s: float) -> State:
         """The current state."""
@@ -490,8 +483,8 @@ def _range(column: Sequence[float]) -> Range:
     return Range(min(column), max(column))
 
 
-def _widest(one: tuple[Range, ...], other: tuple[Range, ...]) -> tuple[Range, ...]:
-    return tuple(Range(min(a.low, b.low), max(a.high, b.high)) for a, b in zip(one, other, strict=True))
+def _widest(one: Range, other: Range) -> Range:
+    return Range(min(one.low, other.low), max(one.high, other.high))
 
 
 def _spread(values: Any) -> Spread | None:

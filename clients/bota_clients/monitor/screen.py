@@ -1,4 +1,4 @@
-"""The screen as rows of text, from a state alone; and the same rows as a table for --once.
+"""The terminal's view as rows of text, from a state alone; and the same rows in plain text for --once.
 
 Nothing depends on color alone: bars, peak marks and warnings differ in their characters too. The three colors
 can be told apart with common color blindness, on light and dark backgrounds.
@@ -7,9 +7,8 @@ can be told apart with common color blindness, on light and dark backgrounds.
 from __future__ import annotations
 
 import math
-import statistics
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -19,7 +18,7 @@ from rich.text import Text
 
 from bota_clients import numbers
 from bota_clients.monitor import words
-from bota_clients.monitor.model import AXES, TRACE_STEP_S, Alert, Range, SensorState, State
+from bota_clients.monitor.model import AXES, Alert, Range, SensorState, State
 
 KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
@@ -27,15 +26,15 @@ KEYS: Final = (
     ("p", "pause", "freeze the display; samples and peaks still count"),
     ("0", "reset", "reset peaks and past warnings"),
     ("n", "next", "the next sensor of the chain"),
-    ("w", "warn", "all warnings of this sensor"),
     ("?", "help", "this page"),
     ("q", "quit", "also Ctrl-C; Ctrl-L redraws the screen"),
 )  # key, its short name, what it does
 _HELP: Final = """
-Bars are centered on zero; their scale grows with the marked peaks, for which
-every sample counts. A trace has its own scale; a column of it is 0.25 s.
+Arrows, Page Up and Page Down scroll. Bars are centered on zero; their scale grows
+with the marked peaks, for which every sample counts.
 age     of a sample on arrival; only on the server's own machine
 jitter  of the intervals between the samples' stamps
+Delay   of the sensor's filters, which comes before the age
 lost    on the bus since the server started; on the way here since connecting
 Clock   locked: the server follows the sensor's own clock, else oversampling
 Fx!     this axis is saturated; warnings stay listed until the reset
@@ -50,53 +49,41 @@ BAD: Final = "bold #d55e00"
 ALARM: Final = "bold reverse #d55e00"
 NOTICE: Final = "bold reverse"
 
-_LEAST: Final = (24, 8)  # width and height
-_MESSAGE_ROWS_FROM: Final = 12
-_PANEL_ROWS: Final = 18
+_MESSAGE_ROWS: Final = 3
 _TABLE_WIDTH: Final = 80
 _LEAST_SCALE: Final = {"N": 5.0, "Nm": 0.2, "counts": 1000.0}
 _VALUE_WIDTH: Final = 9
 _AXIS_WIDTH: Final = 4 + _VALUE_WIDTH + 1  # label, value, space
-_LEVELS: Final = "▁▂▃▄▅▆▇"  # of a trace
-_LEAST_TRACE: Final = 0.05  # of the bar's scale, so that noise does not look like a signal
+_WITH_PEAKS: Final = 56  # width from which the peaks are shown as numbers too
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
     """The user's choices."""
 
-    selected: int = 0  # which sensor, counted from 0 in the state's order
+    selected: int = 0  # which sensor comes first, counted from 0 in the state's order
     paused: str = ""  # time of day of the pause; empty if not paused
     recording: str = ""  # the running recording, in words
     question: str = ""  # the pending question
     help: bool = False
-    warnings: int = 0  # the page of all warnings, from 1; 0: none. After the last comes the first
-    ascii: bool = False
 
 
-class Row(NamedTuple):
-    """One row of the screen. Rows of the highest rank are dropped first."""
+class Screen(NamedTuple):
+    """Rows that are no wider than the screen; the body scrolls if it is higher than the room for it."""
 
-    rank: int
-    text: Text
+    head: list[Text]
+    body: list[Text]
+    foot: list[Text]
 
 
-def render(state: State, look: Look, width: int, height: int) -> list[Text]:
-    """Exactly `height` rows, none wider than `width`."""
-    if width < _LEAST[0] or height < _LEAST[1]:
-        rows = [Text(f"too small: {_LEAST[0]}x{_LEAST[1]} at least")]
-    elif look.help:
-        rows = [Text.assemble(("ethercat-monitor ", VALUE), state.server.address), Text()]
-        rows += [
-            Text.assemble((f"  {key}  ", VALUE), (name.ljust(8), LABEL), what) for key, name, what in KEYS
-        ]
-        rows += map(Text, _HELP.splitlines())
-    elif look.warnings and state.sensors:
-        rows = _warnings(state.sensors[look.selected % len(state.sensors)], look.warnings, width, height)
-    else:
-        rows = _overview(state, look, width, height)
-    rows = rows[:height] + [Text()] * (height - len(rows))
-    return [_fitted(row, width, look.ascii) for row in rows]
+def render(state: State, look: Look, width: int) -> Screen:
+    """The screen."""
+    body = _help() if look.help else _overview(state, look, width)
+    screen = Screen([_title(state, look, width)], body, [*_message(state, look, width), _keys(look, width)])
+    for row in (row for part in screen for row in part):
+        row.no_wrap = True
+        row.truncate(width, overflow="ellipsis")
+    return screen
 
 
 def table(state: State) -> list[str]:
@@ -110,8 +97,7 @@ def table(state: State) -> list[str]:
     lines += [f"  {wrong}"] if wrong else [f"  {'; '.join(row)}" for row in (facts[:4], facts[4:]) if row]
     lines += [f"  client {words.client(client)}" for client in state.clients]
     for sensor in state.sensors:
-        rows = [*_panel(sensor, (), _TABLE_WIDTH, trace=False), *_alerts(sensor, 1 << 16, 1 << 16)]
-        lines += ["", *(row.text.plain.rstrip() for row in rows)]
+        lines += ["", *(row.plain.rstrip() for row in _panel(sensor, _TABLE_WIDTH, bars=False))]
     level, what = words.verdict(state)
     return [*lines, "", f"{level.words.capitalize()}: {what}."]
 
@@ -133,43 +119,33 @@ def line(sensor: SensorState, now: str) -> str:
     return "  ".join(parts)
 
 
-def _overview(state: State, look: Look, width: int, height: int) -> list[Text]:
-    gone = not state.server.connected and state.server.since_s is not None
-    shared = [Row(1 if gone else 3, _server(state)), Row(6, _clients(state, width))]
-    foot = [*_message(state, look, width, height), _keys(look, width)]
-    body = _sensors(state, look, width, height - 1 - len(shared) - len(foot))
-    rows = [Row(0, _title(state, look, width)), *body, *shared]
-    while len(rows) > height - len(foot):
-        worst = max(row.rank for row in rows)
-        del rows[max(n for n, row in enumerate(rows) if row.rank == worst)]
-    blank = [Text()] * (height - len(foot) - len(rows))
-    return [*(row.text for row in rows), *blank, *foot]
+def _help() -> list[Text]:
+    rows = [Text.assemble((f"  {key}  ", VALUE), (name.ljust(8), LABEL), what) for key, name, what in KEYS]
+    return [*rows, *map(Text, _HELP.splitlines())]
 
 
-def _sensors(state: State, look: Look, width: int, height: int) -> list[Row]:
-    """As many sensors as fit, starting with the selected one; of the others the state."""
+def _overview(state: State, look: Look, width: int) -> list[Text]:
+    """Server, sensors from the selected one on, clients."""
+    rows = [_server(state)]
     if not state.sensors:
-        text = "no sensor known yet" if not state.server.connected else "the server has no sensors"
-        return [Row(0, Text(text, LABEL))]
-    first = look.selected % len(state.sensors)
-    ordered = [*state.sensors[first:], *state.sensors[:first]]
-    count = max(1, min(len(ordered), height // _PANEL_ROWS))
-    rows: list[Row] = []
-    for number, sensor in enumerate(ordered[:count]):
-        others = () if number else sorted(ordered[count:], key=lambda other: other.position)
-        rows += [Row(7, Text())] if number else []
-        own = _panel(sensor, others, width)
-        room = height // count - bool(number)
-        rows += [*own, *_alerts(sensor, width, max(2, room - len(own)))]
-    return rows
+        unknown = "no sensor known yet" if not state.server.connected else "the server has no sensors"
+        rows.append(Text(unknown, LABEL))
+    first = look.selected % max(1, len(state.sensors))
+    for number, sensor in enumerate([*state.sensors[first:], *state.sensors[:first]]):
+        rows += [*([Text()] if number else []), *_panel(sensor, width)]
+    return [*rows, _clients(state)]
 
 
 def _title(state: State, look: Look, width: int) -> Text:
+    """Address, what is special, sensors that have findings, connection."""
     server = state.server
-    left = Text.assemble(("ethercat-monitor ", VALUE), server.address)
+    left = Text(server.address, VALUE)
     right = Text()
     for name, what in (("REPLAY ", server.replay), ("", look.recording), ("PAUSED ", look.paused)):
         right.append(f" {name}{what} " if what else "", NOTICE)
+    for sensor in state.sensors if len(state.sensors) > 1 else ():
+        if level := sensor.verdict.level:
+            right.append(f" {sensor.position}", LABEL).append(f" {level.words} ", ALARM)
     right.append(f" {words.link(server)} ", ALARM if words.trouble(server) else "")
     left.truncate(max(0, width - right.cell_len))
     left.pad_right(max(0, width - right.cell_len - left.cell_len))
@@ -182,31 +158,22 @@ def _server(state: State) -> Text:
         return _field("Server", wrong, BAD)
     if server.uptime_s is None:
         return _field("Server", "waiting for its status")
-    facts = [f"{name.lower()} {value}" for name, value in words.server_facts(server)]
-    return _field("Server", "  ".join(facts[:4]))
+    return _field("Server", "  ".join(f"{n.lower()} {v}" for n, v in words.server_facts(server)[:4]))
 
 
-def _clients(state: State, width: int) -> Text:
-    text = str(len(state.clients)) if state.server.connected else "not known"
-    for number, client in enumerate(state.clients):
-        left = len(state.clients) - number
-        more = f"{':' if not number else ' ·'} {words.client(client)}"
-        if len(text) + len(more) + 16 > width - (10 if left > 1 else 0):
-            text += f" and {left} more"
-            break
-        text += more
-    return _field("Clients", text)
+def _clients(state: State) -> Text:
+    known = f"{len(state.clients)}: {' · '.join(map(words.client, state.clients))}"
+    return _field("Clients", known if state.server.connected else "not known")
 
 
-def _message(state: State, look: Look, width: int, height: int) -> list[Text]:
-    """The latest message, on up to three rows."""
+def _message(state: State, look: Look, width: int) -> list[Text]:
+    """The question or the latest message."""
     text, style = state.events[-1] if state.events else "", LABEL
     if look.question:
         text, style = look.question, NOTICE
     elif state.message is not None:
         text, style = state.message.text, BAD if state.message.bad else ""
-    most = 3 if height >= _MESSAGE_ROWS_FROM else 1
-    lines = textwrap.wrap(text, width, break_on_hyphens=False)[:most]
+    lines = textwrap.wrap(text, max(1, width), break_on_hyphens=False)[:_MESSAGE_ROWS]
     return [Text(line, style) for line in lines or [""]]
 
 
@@ -215,27 +182,12 @@ def _keys(look: Look, width: int) -> Text:
     other |= {"p": "resume"} if look.paused else {}
     row = Text()
     for key, name, _ in KEYS:
-        row.append(key, VALUE)
-        row.append((f" {other.get(key, name)} " if width >= 60 else " ") + " " * (width >= 68), LABEL)
+        row.append(key, VALUE).append(f" {other.get(key, name)}  " if width >= 60 else " ", LABEL)
     return row
 
 
-def _warnings(sensor: SensorState, page: int, width: int, height: int) -> list[Text]:
-    """All warnings of the sensor, a page of them."""
-    lines = [line for alert in sensor.alerts for line in _alert(alert, width)] or [Text("none")]
-    room = height - 4
-    pages = math.ceil(len(lines) / room)
-    number = (page - 1) % pages
-    shown = lines[number * room :][:room]
-    title = Text(f"Warnings of sensor {sensor.position}: page {number + 1} of {pages}", VALUE)
-    blank = [Text()] * (room - len(shown) + 1)
-    return [title, Text(), *shown, *blank, Text("w: next page, any other key: return", LABEL)]
-
-
-def _panel(
-    sensor: SensorState, others: Iterable[SensorState], width: int, *, trace: bool = True
-) -> list[Row]:
-    """The rows of `sensor`, without its alerts."""
+def _panel(sensor: SensorState, width: int, *, bars: bool = True) -> list[Text]:
+    """The rows of one sensor."""
     stream = f"{words.rate(sensor)}   age {words.times(sensor.age_us)}   jitter {words.jitter(sensor)}"
     lost = _field("Lost", "")
     for number, (text, bad) in enumerate(words.losses(sensor)):
@@ -244,33 +196,26 @@ def _panel(
     clock = _field("Clock", words.clock(sensor), NOTICE if unlocked else "")
     if sensor.hand_out_us is not None:
         clock.append(f"   age at hand-out {words.times(sensor.hand_out_us)}")
+    identity = Text(words.identity(sensor), VALUE if sensor.al_state in {"OP", ""} else BAD)
+    if sensor.old_s is not None:
+        identity = Text.assemble((f"values {numbers.duration(sensor.old_s)} old ", ALARM), " ", identity)
+    alerts = [row for alert in sensor.alerts for row in _alert(alert, width)]
+    none = _field("Warnings", "none" if sensor.sample is not None else "no sample yet")
     return [
-        Row(2, _identity(sensor, others, width)),
-        *_axes(sensor, 0, width, trace=trace),
-        *_axes(sensor, 1, width, trace=trace),
+        identity,
+        *_axes(sensor, 0, width, bars=bars),
+        *_axes(sensor, 1, width, bars=bars),
+        *(alerts or [none]),
         *_imu(sensor),
-        Row(3, _field("Stream", stream)),
-        Row(4, lost),
-        Row(5, clock),
+        _field("Stream", stream),
+        _field("Delay", words.delays(sensor)),
+        lost,
+        clock,
     ]
 
 
 def _field(name: str, text: str, style: str = "") -> Text:
     return Text.assemble((name.ljust(9), LABEL), (text, style))
-
-
-def _alerts(sensor: SensorState, width: int, most: int) -> list[Row]:
-    """At most `most` rows of alerts, or one that says there are none."""
-    if not sensor.alerts:
-        return [Row(1, _field("Warnings", "none" if sensor.sample is not None else "no sample yet"))]
-    rows: list[Row] = []
-    for number, alert in enumerate(sensor.alerts):
-        lines = _alert(alert, width)
-        left = len(sensor.alerts) - number - 1
-        if rows and len(rows) + len(lines) + bool(left) > most:
-            return [*rows, Row(3, _field("", f"and {left + 1} more: press w"))]
-        rows += [Row(3 if number else 1, line) for line in lines]
-    return rows
 
 
 def _alert(alert: Alert, width: int) -> list[Text]:
@@ -285,69 +230,42 @@ def _alert(alert: Alert, width: int) -> list[Text]:
     return [head, Text(f"  -> {alert.remedy}")]
 
 
-def _identity(sensor: SensorState, others: Iterable[SensorState], width: int) -> Text:
-    rest = Text()
-    if sensor.old_s is not None:
-        rest.append(f" values {numbers.duration(sensor.old_s)} old ", ALARM)
-    for other in others:
-        level = other.verdict.level
-        rest.append(f" {other.position}", LABEL)
-        rest.append(f" {level.words} " if level else f" {level.words}", ALARM if level else "")
-    # The state and what is on the right are to be read at every width.
-    state = f"  {sensor.al_state}" if sensor.al_state else ""
-    room = max(0, width - len(state) - rest.cell_len - bool(rest))
-    who = words.who(sensor)
-    who = who if len(who) <= room else words.who(sensor, firmware=False)
-    row = Text(who, VALUE if sensor.al_state in {"OP", ""} else BAD)
-    row.truncate(room)
-    row.append(state)
-    if rest.cell_len:
-        row.pad_right(width - rest.cell_len - row.cell_len)
-    return row.append_text(rest)
-
-
-def _axes(sensor: SensorState, which: int, width: int, *, trace: bool) -> list[Row]:
+def _axes(sensor: SensorState, which: int, width: int, *, bars: bool) -> list[Text]:
     """Force, or torque if `which` is 1: a heading and a row an axis."""
     unit, axes = sensor.units[which], range(3 * which, 3 * which + 3)
-    shown = (80 if width >= 180 else 24 if width >= 110 else 16 if width >= 76 else 0) if trace else 0
-    with_peaks = width >= 56
-    left = width - _AXIS_WIDTH - 2 * _VALUE_WIDTH * with_peaks - (shown + 1 if shown else 0)
-    across = max(5, left - 1 + left % 2)
     peaks = sensor.peaks or (None,) * len(AXES)
+    with_peaks = width >= _WITH_PEAKS
+    left = width - _AXIS_WIDTH - 2 * _VALUE_WIDTH * with_peaks
+    across = max(5, left - 1 + left % 2) if bars else 0
     scale = scale_for((peak for axis in axes if (peak := peaks[axis])), _LEAST_SCALE[unit])
     ends = f"-{scale:g}", f"+{scale:g}"
-    middle = ends[0].ljust(across // 2) + "0" + ends[1].rjust(across // 2)
+    middle = f"{ends[0].ljust(across // 2)}0{ends[1].rjust(across // 2)}"
     head = f"{('Force', 'Torque')[which]} {unit}".ljust(_AXIS_WIDTH) + middle[:across]
-    head += "min".rjust(_VALUE_WIDTH) + "max".rjust(_VALUE_WIDTH) if with_peaks else ""
-    head += f" last {shown * TRACE_STEP_S:g} s" if shown else ""
-    rows = [Row(4, Text(head, LABEL))]
+    head += f"{'min':>{_VALUE_WIDTH}}{'max':>{_VALUE_WIDTH}}" if with_peaks else ""
+    rows = [Text(head, LABEL)]
     sample = sensor.sample
     for axis in axes:
-        saturated = AXES[axis] in sensor.saturated
-        label = f"{AXES[axis]}{'!' if saturated else ''}".ljust(4)
-        row = Text.assemble((label, ALARM if saturated else LABEL))
-        rows.append(Row(0, row))
+        saturated, peak = AXES[axis] in sensor.saturated, peaks[axis]
+        row = Text.assemble((f"{AXES[axis]}{'!' * saturated}".ljust(4), ALARM if saturated else LABEL))
+        rows.append(row)
         if sample is None:
             row.append("--".rjust(_VALUE_WIDTH))
             continue
-        value, peak, digits = (*sample.force, *sample.torque)[axis], peaks[axis], words.DIGITS[unit]
+        value, digits = (*sample.force, *sample.torque)[axis], words.DIGITS[unit]
         row.append(numbers.quantity(value, digits, _VALUE_WIDTH), VALUE if sensor.old_s is None else LABEL)
-        row.append(" ").append_text(bar(value, peak, scale, across))
-        if with_peaks:
-            for extreme in peak or ():
-                row.append(numbers.quantity(extreme, digits, _VALUE_WIDTH - 1).rjust(_VALUE_WIDTH), PEAK)
-        if shown:
-            row.append(f" {trace_of(sensor.traces[axis], scale, shown)}", BAR)
+        row.append(" ").append_text(bar(value, peak, scale, across) if bars else Text())
+        for extreme in (peak or ()) if with_peaks else ():
+            row.append(numbers.quantity(extreme, digits, _VALUE_WIDTH - 1).rjust(_VALUE_WIDTH), PEAK)
     return rows
 
 
-def _imu(sensor: SensorState) -> list[Row]:
+def _imu(sensor: SensorState) -> list[Text]:
     sample = sensor.sample
     if sample is None:
-        return [Row(5, _field("IMU", "--"))]
+        return [_field("IMU", "--")]
     temperature = Text.assemble(("   Temperature ", LABEL), (f"{sample.temperature:.1f} °C", VALUE))
     if sensor.imu_off:
-        return [Row(4, _field("IMU", "off").append_text(temperature))]
+        return [_field("IMU", "off").append_text(temperature)]
     rows = []
     for name, values, unit, label in (
         ("Acceleration", sample.acceleration, "m/s²", "a"),
@@ -363,7 +281,7 @@ def _imu(sensor: SensorState) -> list[Row]:
     if sample.orientation is not None:
         rows[1].append("   Orient. ", LABEL)
         rows[1].append(" ".join(f"{v:+.2f}" for v in sample.orientation), VALUE)
-    return [Row(5 + number, row) for number, row in enumerate(rows)]
+    return rows
 
 
 def scale_for(ranges: Iterable[Range], least: float) -> float:
@@ -391,32 +309,3 @@ def bar(value: float, peak: Range | None, scale: float, width: int) -> Text:
     for style, run in groupby(cells, itemgetter(1)):
         text.append("".join(cell for cell, _ in run), style)
     return text
-
-
-def trace_of(past: Sequence[Range | None], scale: float, width: int) -> str:
-    """The last `width` steps in a row of characters: of each step the value furthest from the median."""
-    shown = past[-width:]
-    known = [r for r in shown if r is not None]
-    if not known:
-        return " " * width
-    low, high = min(r.low for r in known), max(r.high for r in known)
-    usual = statistics.median((r.low + r.high) / 2 for r in known)
-    half = max((high - low) / 2, _LEAST_TRACE * scale / 2)
-
-    def level(step: Range) -> str:
-        value = step.high if step.high - usual >= usual - step.low else step.low
-        at = (value - (low + high) / 2 + half) / (2 * half)
-        return _LEVELS[round(at * (len(_LEVELS) - 1))]
-
-    return "".join(level(step) if step else " " for step in shown).rjust(width)
-
-
-def _fitted(row: Text, width: int, ascii_only: bool) -> Text:
-    fitted = row.copy()
-    if ascii_only:
-        fitted = Text()
-        for piece in row.divide(sorted({edge for s in row.spans for edge in (s.start, s.end)})):
-            fitted.append(words.to_ascii(piece.plain), piece.spans[0].style if piece.spans else piece.style)
-    fitted.no_wrap = True
-    fitted.truncate(width, overflow="crop" if width < 40 else "ellipsis")
-    return fitted

@@ -25,7 +25,7 @@ WAYS: Final = {
     "tare": ("Taring sensor {}: keep it stationary", "sensor {} was {}tared"),
     "undo": ("Undoing the tare of sensor {}", "the tare of sensor {} was {}undone"),
     "clear": ("Clearing the offset of sensor {}", "the offset of sensor {} was {}cleared"),
-}  # what can be done, what is said when it begins, and afterwards
+}  # what can be done, the message when it begins, and that of its end
 
 
 def start_tare(address: Address, position: int, say: Say, way: str = "tare") -> threading.Thread:

@@ -8,25 +8,9 @@ from typing import Any
 from bota_clients.monitor.model import Alert, Client, SensorState, ServerState, Spread, State
 from bota_clients.numbers import duration, milliseconds
 from bota_ethercat.health.verdict import Level
-from bota_ethercat.program.output import SPELLED
 from bota_ethercat.text.json_text import finite
 
 DIGITS = {"N": 2, "Nm": 3, "counts": 0, "m/s²": 2, "rad/s": 3}  # decimals by unit
-_DRAWN = str.maketrans({**SPELLED, **dict(zip("█▌▐─┼├┤▁▂▃▄▅▆▇", "###-|[]_.,-=+*", strict=True))})
-
-
-def to_ascii(text: str) -> str:
-    """The text for an ASCII terminal."""
-    return text.translate(_DRAWN).encode("ascii", "replace").decode()
-
-
-def can_show(encoding: str | None) -> bool:
-    """Whether this encoding has the characters that the views draw with."""
-    try:
-        "".join(map(chr, _DRAWN)).encode(encoding or "ascii")
-    except (UnicodeEncodeError, LookupError):
-        return False
-    return True
 
 
 def link(server: ServerState) -> str:
@@ -85,14 +69,19 @@ def server_facts(server: ServerState) -> list[tuple[str, str]]:
     ]
 
 
-def who(sensor: SensorState, *, firmware: bool = True) -> str:
-    """Position, name, serial number and firmware."""
-    parts = [f"Sensor {sensor.position}", sensor.name]
-    if sensor.serial is not None:
-        parts.append(f"serial {sensor.serial}")
-    if sensor.firmware and firmware:
-        parts.append(f"firmware {sensor.firmware}")
+def identity(sensor: SensorState) -> str:
+    """Position, AL state, name, serial number and firmware."""
+    serial = "" if sensor.serial is None else f"serial {sensor.serial}"
+    firmware = f"firmware {sensor.firmware}" if sensor.firmware else ""
+    parts = (f"Sensor {sensor.position}", sensor.al_state, sensor.name, serial, firmware)
     return "  ".join(part for part in parts if part)
+
+
+def delays(sensor: SensorState) -> str:
+    """By how much the sensor's filters delay its values."""
+    force_torque, *imu = ("not known" if ms is None else f"{ms:g} ms" for ms in sensor.delay_ms.values())
+    of_imu = "" if sensor.imu_off else f"   acceleration {imu[0]}   angular rate {imu[1]}"
+    return f"force, torque {force_torque}{of_imu}"
 
 
 def rate(sensor: SensorState) -> str:
@@ -186,7 +175,7 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
     return {
         "sensor": sensor.position,
         "state": sensor.al_state,
-        **_plain(sensor, "name serial firmware nominal_hz units"),
+        **_plain(sensor, "name serial firmware nominal_hz delay_ms units"),
         "force": sample and sample.force,
         "torque": sample and sample.torque,
         "force_min_max": peaks and peaks[:3],

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from bota_clients.errors import DiskError
+from bota_clients.numbers import count
 from bota_clients.recording.file_format import RECORDER
 from bota_clients.recording.reader import Description, Event
 from bota_clients.recording.writer import DiskFile, RecordingWriter, remove
@@ -58,10 +59,13 @@ class Source(Client):
         )  # fmt: skip
         self._problem = ""
 
-    def batch(self) -> Batch:
-        """Everything received meanwhile; never blocks, but to have the server describe what has changed."""
+    def batch(self, timeout_s: float = 0.0) -> Batch:
+        """Everything received meanwhile, waiting at most `timeout_s` for the first.
+
+        Blocks to have the server describe what has changed, too.
+        """
         batch: Batch = []
-        for item in self.poll_all():
+        for item in self.poll_all(timeout_s):
             if isinstance(item, DataMessage):
                 batch.append(item)
             elif isinstance(item, Connected):
@@ -109,7 +113,7 @@ class Tally:
         self.dropped = 0
         self._streams: dict[int, StreamAccounting] = {}
 
-    def count(self, frame: DataMessage) -> None:
+    def take(self, frame: DataMessage) -> None:
         """Count a frame that is recorded."""
         stream = self._streams.get(frame.sensor)
         if stream is None:
@@ -126,36 +130,18 @@ class Tally:
         """The counts by position on the bus, ascending; from any thread."""
         return {position: stream.counts for position, stream in sorted(dict(self._streams).items())}
 
-    def brief(self) -> str:
-        """The same as `losses` in few words, the sensors' counts joined by +; from any thread."""
-        sensors = self.sensors.values()
-        missing = self.dropped + sum(sensor.withheld for sensor in sensors)
-        found = [f"{missing} lost"] if missing else []
-        for name, counts in (
-            ("gaps", [sensor.lost for sensor in sensors]),  # without a rate, one for each GAP
-            ("invalid", [sensor.invalid for sensor in sensors]),
-        ):
-            if any(counts):
-                found.append(f"{'+'.join(map(str, counts))} {name}")
-        return ", ".join(found) or "nothing lost"
-
-    def losses(self) -> list[str]:
-        """What is missing, in words; nothing if nothing is."""
-        found = [f"{_frames(self.dropped)} came but could not be written"] if self.dropped else []
+    def losses(self) -> str:
+        """What is missing, in words; from any thread."""
+        found = [f"{count(self.dropped, 'frame')} came but could not be written"] if self.dropped else []
         for position, sensor in self.sensors.items():
-            if sensor.withheld:
-                found.append(f"{_frames(sensor.withheld)} of sensor {position} not read in time")
-            if lost := sensor.lost:
-                found.append(
-                    f"sensor {position}: {lost} times samples were or may have been lost on the bus (GAP)"
-                )
-            if sensor.invalid:
-                found.append(f"{_frames(sensor.invalid)} of sensor {position} invalid")
-        return found
-
-
-def _frames(count: int) -> str:
-    return "1 frame" if count == 1 else f"{count} frames"
+            for number, what in (
+                (sensor.withheld, "not read in time"),
+                (sensor.lost, "after a GAP: samples were or may have been lost on the bus"),
+                (sensor.invalid, "invalid"),
+            ):
+                if number:
+                    found.append(f"{count(number, 'frame')} of sensor {position} {what}")
+        return ", ".join(found) or "nothing was lost"
 
 
 class Parts:
@@ -318,7 +304,7 @@ class Recorder:
         if isinstance(item, DataMessage):
             self._unflushed += 1
             self.saved += 1
-            self.tally.count(item)
+            self.tally.take(item)
             writer.frame(item)
         elif isinstance(item, Description):
             self._description = item

@@ -145,7 +145,7 @@ class McapFile:
         return position, False
 
     def _forgive(self, left: int) -> None:
-        """It was cut off: ignore the last bytes, so many, and damaged chunks before them."""
+        """It was cut off: ignore the `left` bytes of an incomplete record, and damaged chunks before them."""
         if left == self._size - len(MAGIC):
             raise NotARecordingError(f"{self.path} was cut off before anything was recorded")
         more = f", and the last {left} bytes, an incomplete record, were ignored" if left else ""

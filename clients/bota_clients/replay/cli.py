@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import address, number, parser, typed
+from bota_clients.arguments import address, number, parser
 from bota_clients.program import Signals, start
 from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.program.server_choice import is_address, own_server
@@ -28,8 +28,6 @@ class ReplayOptions(argparse.Namespace):
     loop: bool
     original: bool
     at_once: bool
-    control_users: list[str]
-    control_groups: list[str]
 
 
 def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
@@ -50,12 +48,6 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
     add("--original-stamps", action="store_true", dest="original",
         help="send sequence numbers and stamps as recorded, instead of moving them to now")  # fmt: skip
     add("--at-once", action="store_true", help="start without waiting for a subscriber")
-    add("--host", type=_host, action="append", dest="hosts", metavar="ADDRESS",
-        help="address to listen on; repeatable (default 127.0.0.1 and ::1)")  # fmt: skip
-    add("--control-user", action="append", default=[], dest="control_users", metavar="NAME",
-        help="user who may shut it down, besides root and its own user")  # fmt: skip
-    add("--control-group", action="append", default=[], dest="control_groups", metavar="NAME",
-        help="group whose members may shut it down")  # fmt: skip
     options = made.parse_intermixed_args(argv, ReplayOptions())
     names: list[str] = options.names
     old = names.pop() if len(names) > 1 and is_address(names[-1]) else None
@@ -63,18 +55,15 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
         made.error(f"the address is given twice: leave out {old}, or --server")
     try:
         server: Address = options.server or (own_server() if old is None else Address.parse(old))
-        hosts = _HOSTS if server.host == DEFAULT_HOST else [_host(server.host)]
-    except (ValueError, argparse.ArgumentTypeError) as error:
+        own = _HOSTS if server.host == DEFAULT_HOST else [str(ipaddress.ip_address(server.host))]
+    except ValueError as error:
         made.error(str(error))
-    options.paths, options.port, options.hosts = [*map(Path, names)], server.port, options.hosts or hosts
+    options.paths, options.port, options.hosts = [*map(Path, names)], server.port, own
     return options
 
 
 def _speed(text: str) -> float:
     return math.inf if text == "max" else number(1e-6, 1e6, "a number, such as 2 or 0.5, or 'max'")(text)
-
-
-_host = typed(lambda text: str(ipaddress.ip_address(text)), "an IP address of this machine")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -83,7 +83,7 @@ class Player:
     def run(self) -> None:
         """Play, from the first subscriber on unless it is to start at once."""
         hub, options, recordings = self.hub, self._options, self._recordings
-        hub.permissions.control_uids = controlling_uids(options.control_users, options.control_groups)
+        hub.permissions.control_uids = controlling_uids((), ())
         hub.permissions.names = local_names()
         hub.start(Actions(hub, self, self.sensors, {"replay": self._about()}).handle)
         more = f" and {len(recordings) - 1} more" if len(recordings) > 1 else ""
@@ -158,9 +158,8 @@ class Player:
         self._wait(due_ns)
         if self._signals.asked:
             return
-        now = time.monotonic_ns()
-        self.hub.publish(((encode_data(*frame), frame.sensor, frame.flags),), now)
-        self.sensors.count(frame, due_ns, now)
+        self.hub.publish(((encode_data(*frame), frame.sensor, frame.flags),), time.monotonic_ns())
+        self.sensors.count(frame)
 
     def _wait(self, due_ns: int) -> None:
         """Serve the sockets until a frame is due."""

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any, Final, NoReturn
-
-import numpy as np
 
 from bota_clients.recording.reader import Description, Event, Identity, RecordedSensor
 from bota_ethercat.accounting import NOT_NEW
@@ -19,9 +17,6 @@ from bota_ethercat.pdo import is_finite
 from bota_ethercat.text.untrusted import rows
 from ethercat_server.serving.connection import Connection
 
-_MISSED_NS: Final = 10_000_000
-_RECENT_NS: Final = 10_000_000_000
-_WINDOW: Final = 100_000  # number of frames that the distributions cover
 _NO_BUS: Final = {"p50": 0.0, "p99": 0.0, "p999": 0.0, "max": 0.0}
 _STATES: Final[Mapping[str, str]] = {ServerEvent.SENSOR_LOST: "lost", ServerEvent.SENSOR_BACK: "OP"}
 
@@ -64,7 +59,7 @@ class ReplayedSensor:
         return self.row
 
     def status(self) -> dict[str, Any]:
-        """Its part of the `status` reply, but for the age."""
+        """Its part of the `status` reply."""
         rate_hz = self.row.get("rate_hz")
         ago_s = round(time.monotonic() - self._emergency_at, 3)
         return {
@@ -78,6 +73,7 @@ class ReplayedSensor:
             "emergencies": self._emergencies,
             "emergency": self._emergency and {**self._emergency, "ago_s": ago_s},
             "settling": False,
+            "age_us": _NO_BUS,
             "clock": {
                 "mode": "locked",
                 "stamps": "polling",
@@ -107,8 +103,6 @@ class ReplayedSensors:
             for at in range(max(found, default=-1) + 1)
         ]
         self.sent = 0
-        self._late: deque[tuple[int, int]] = deque(maxlen=_WINDOW)  # when a frame was sent, how late that was
-        self._missed = 0
         self._started = time.monotonic()
 
     def describe(self, description: Description) -> None:
@@ -122,29 +116,27 @@ class ReplayedSensors:
         if (sensor := self._at(event.event.get("sensor"))) is not None:
             sensor.take(event)
 
-    def count(self, frame: DataMessage, due_ns: int, now_ns: int) -> None:
-        """A frame was sent; `due_ns` is when it was due, 0 if it had no time."""
+    def count(self, frame: DataMessage) -> None:
+        """A frame was sent."""
         self.sent += 1
         self.sensors[frame.sensor].count(frame)
-        if due_ns:
-            self._late.append((now_ns, now_ns - due_ns))
-            self._missed += now_ns - due_ns > _MISSED_NS
 
     def status(self) -> dict[str, Any]:
-        """The `status` reply, except for the clients."""
-        since_ns = time.monotonic_ns() - _RECENT_NS
-        late = _summary_us([late for _, late in self._late])
-        recent = _summary_us([late for at_ns, late in self._late if at_ns >= since_ns])
+        """The `status` reply, except for the clients; there are no times of a bus."""
         return {
             "cycles": self.sent,
             "round_trip": {"least_us": None, "usual_us": None},
-            "missed_deadlines": self._missed,
+            "missed_deadlines": 0,
             "lost_frames": 0,
             "duplicate_frames": 0,
-            "wake_us": late,
+            "wake_us": _NO_BUS,
             "exchange_us": _NO_BUS,
-            "last_10s": {"wake_us": recent, "exchange_us": _NO_BUS, "age_us": [recent] * len(self.sensors)},
-            "sensors": [{**sensor.status(), "age_us": late} for sensor in self.sensors],
+            "last_10s": {
+                "wake_us": _NO_BUS,
+                "exchange_us": _NO_BUS,
+                "age_us": [_NO_BUS] * len(self.sensors),
+            },
+            "sensors": [sensor.status() for sensor in self.sensors],
             "uptime_s": round(time.monotonic() - self._started, 3),
         }
 
@@ -159,11 +151,3 @@ class ReplayedSensors:
         if isinstance(position, bool) or not isinstance(position, int):
             return None
         return self.sensors[position] if 0 <= position < len(self.sensors) else None
-
-
-def _summary_us(late_ns: list[int]) -> dict[str, float]:
-    """p50, p99, p999 and max in µs, as `status` gives them."""
-    if not late_ns:
-        return _NO_BUS
-    found = np.percentile(np.maximum(late_ns, 0), (50, 99, 99.9, 100)) / 1000
-    return dict(zip(_NO_BUS, found.round(3).tolist(), strict=True))

@@ -20,7 +20,6 @@ from bota_clients.recording.columns import Floats
 from bota_clients.report.measure import (
     FEWEST_WINDOWS,
     Noise,
-    measure_drift,
     measure_noise,
     measure_spectrum,
 )
@@ -31,7 +30,7 @@ from bota_ethercat.pdo import STANDARD_GRAVITY
 
 
 class Check(NamedTuple):
-    """The outcome of one check. Texts are plain; whoever shows them escapes them."""
+    """The outcome of one check. Texts are plain: to be escaped where they are shown."""
 
     found: str  # with figures
     level: Level = Level.GOOD
@@ -48,7 +47,6 @@ class Examination:
         self.series = Series(subject)
         self.noise = measure_noise(self.series)
         self.spectrum = measure_spectrum(self.series)
-        self.drift = measure_drift(self.series)
         # Of the judge of all programs; the checks beyond it are this report's own.
         self.stream = judge(_observe(self.series))
         self.checks = [check for each in _CHECKS if (check := _made(each, self)) is not None]
@@ -92,6 +90,7 @@ class _Kind(NamedTuple):
     make: Callable[[Series, Noise, Sequence[Finding]], Check] | None
     matters: str = ""  # why it matters if something is found
     remedy: str = ""
+    good: str = ""  # the outcome if nothing is found; `make` is not called then
 
 
 def _made(kind: _Kind, examination: Examination) -> Check | None:
@@ -101,8 +100,10 @@ def _made(kind: _Kind, examination: Examination) -> Check | None:
         return None
     if series.count < kind.fewest:
         findings, result = [], _too_few(series.count)
+    elif kind.make is None or (kind.good and not findings):
+        result = Check(kind.good)
     else:
-        result = kind.make(series, examination.noise, findings) if kind.make else Check("")
+        result = kind.make(series, examination.noise, findings)
     level = max([result.level, *(finding.level for finding in findings)])
     found = " ".join([*(f"{finding.found}." for finding in findings), result.found]).rstrip()
     is_wrong = level >= Level.LOOK
@@ -123,7 +124,7 @@ def _too_few(samples: int) -> Check:
 def _losses(series: Series, _: Noise, findings: Sequence[Finding]) -> Check:
     lost, withheld = series.lost, series.withheld
     if not lost:
-        return Check("" if findings else f"None of {count(series.count, 'sample')}.")
+        return Check("")
     places = count(int(np.sum(series.missing > 0)), "place")
     every = all(finding.size == lost for finding in findings)
     found = f"In {places}." if every else f"{lost} of them where the sensor was not silent, in {places}."
@@ -286,7 +287,7 @@ def _stuck(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
     return Check(f"No channel is stuck; the longest constant run of a force or torque is {run_text}.")
 
 
-def _saturation(series: Series, _: Noise, findings: Sequence[Finding]) -> Check:
+def _saturation(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
     texts = [
         f"{channel.title} was saturated in {count(len(times), 'sample')} "
         f"({share(len(times), series.count)}), first {seconds(times[0])} after the start"
@@ -294,15 +295,10 @@ def _saturation(series: Series, _: Noise, findings: Sequence[Finding]) -> Check:
     ]
     if any(bits(getattr(series.samples, field)) >> len(axes) for field, axes, _ in SATURATIONS):
         texts.append("a saturation field has an undefined bit")
-    if not findings:
-        return Check("No channel was saturated.")
     return Check(f"{listing(texts)}." if texts else "")
 
 
-def _warnings(series: Series, _: Noise, findings: Sequence[Finding]) -> Check:
-    if not findings:
-        only = " other than of saturation" if series.warnings else ""
-        return Check(f"The sensor reported no warnings{only}.")
+def _warnings(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
     texts = [
         f"{meaning.meaning} ({meaning.severity.value}) in {count(len(times), 'sample')}, "
         f"first {seconds(times[0])} after the start"
@@ -312,9 +308,7 @@ def _warnings(series: Series, _: Noise, findings: Sequence[Finding]) -> Check:
     return Check(f"{listing(texts)}." if texts else "")
 
 
-def _numbers(series: Series, _: Noise, findings: Sequence[Finding]) -> Check:
-    if not findings:
-        return Check("Every value is a finite number.")
+def _numbers(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
     channels = [channel.title for n, channel in enumerate(CHANNELS) if not series.finite[:, n].all()]
     if not np.isfinite(series.samples.temperature).all():
         channels.append("Temperature")
@@ -352,7 +346,7 @@ _FEWEST: Final = 100  # samples to judge their intervals by
 _SATURATED: Final = {f"warning {int(row.flag)}" for row in SATURATIONS}
 _CHECKS: Final = (
     _Kind("Lost samples", ["lost"], _FEWEST, _losses,
-          "A controller acts on stale data; spectra and derivatives are wrong there."),
+          "A controller acts on stale data; spectra and derivatives are wrong there.", good="None."),
     _Kind("Silent or stuck sensor", ["silence", "invalid", "repeated"], 0, _silence,
           "What is published in the meantime is stale."),
     _Kind("Stuck values", [], 1, _stuck, "The channel does not measure.",
@@ -364,15 +358,16 @@ _CHECKS: Final = (
     _Kind("Noise of the IMU", [], 0, _imu, "Gravity compensation and the like become noisy.",
           "Record again with the sensor stationary. If it persists, contact the manufacturer."),
     _Kind("Saturation", _SATURATED, 1, _saturation, "The measured values are less than the real ones.",
-          "If it is unloaded, it may have been damaged by overload: tare it and compare."),
+          "If it is unloaded, it may have been damaged by overload: tare it and compare.",
+          "No channel was saturated."),
     _Kind("Warnings", {f"warning {1 << bit}" for bit in range(32)} - _SATURATED, 1, _warnings,
-          "The sensor reports it."),
-    _Kind("Numbers", ["not_finite"], 1, _numbers, "A single one of them corrupts every sum and filter."),
+          "The sensor reports it.", good="The sensor reported none, but those of saturation."),
+    _Kind("Numbers", ["not_finite"], 1, _numbers, "A single one of them corrupts every sum and filter.",
+          good="Every value is a finite number."),
     _Kind("Stamps", ["clock"], _FEWEST, _stamps, "Sensor fusion and derivatives suffer."),
     _Kind("Sampling rate", ["rate"], _FEWEST, _rate),
     _Kind("Gravity", [], 0, _gravity, "Gravity compensation subtracts the wrong weight."),
     _Kind("Temperature", ["temperature"], 0, _temperature),
-    _Kind("Age of samples", ["age"], 0, None),
     _Kind("Settings", ["calibration_matrix", "coordinate_system"], 0, None),
 )  # fmt: skip
 
@@ -392,7 +387,6 @@ def _observe(series: Series) -> Observation:
         silent_s=float(series.silences.max(initial=0.0)),
         rate_hz=1 / series.mean_period if judged else None,
         nominal_hz=1 / nominal if nominal else 0.0,
-        age_p99_us=series.subject.age_p99_us,
         not_finite=int(np.sum(series.not_finite)),
         warnings=bits(samples.warnings),
         force_torque_saturated=bits(samples.force_torque_saturated),

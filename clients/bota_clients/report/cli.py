@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bota_clients.arguments import add_force, add_imu_units, add_server, number, parser, server_of
-from bota_clients.errors import RecordingError, ReportError
-from bota_clients.program import discard_output, interrupt_on_signals, not_installed, say
+from bota_clients.errors import ReportError
+from bota_clients.program import discard_output, interrupt_on_signals, say, start
 from bota_ethercat.address import Address
-from bota_ethercat.errors import ConnectionFailedError, ProtocolError, UnreachableError
+from bota_ethercat.errors import UnreachableError
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.new_file import NewFile
@@ -91,33 +91,32 @@ def _choice(text: str) -> SensorChoice:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a report; returns the exit code."""
-    options = parse_options(argv)
+    return start(_PROGRAM, "report.cli", parse_options(argv))
+
+
+def run(options: ReportOptions) -> int:
+    """Make a report; returns the exit code."""
     try:
         words, exit_code = make(options)
-    except ImportError as error:
-        return not_installed(_PROGRAM, error)
     except KeyboardInterrupt:
-        sentence = "stopped: no report was written"
+        say(_PROGRAM, "stopped: no report was written")
+        return 1
     except UnreachableError as error:
-        sentence = f"{error.at(options.server)}, or give its HOST:PORT"
-    except ConnectionFailedError as error:
-        sentence = f"the server at {options.server} cannot be used: {error}"
-    except (RecordingError, ReportError, ProtocolError) as error:
-        sentence = str(error)
-    else:
-        try:
-            print(words, flush=True)
-        except BrokenPipeError:
-            discard_output()  # the report is written all the same
-        say(_PROGRAM, f"the report is in {options.output}")
-        return exit_code
-    say(_PROGRAM, sentence)
-    return 1
+        raise ReportError(f"{error.at(options.server)}, or give its HOST:PORT") from None
+    try:
+        print(words, flush=True)
+    except BrokenPipeError:
+        discard_output()  # the report is in its file
+    say(_PROGRAM, f"the report is in {options.output}")
+    return exit_code
 
 
 def make(options: ReportOptions) -> tuple[str, int]:
     """Write the report; the words for the standard output, and the exit code."""
-    from bota_clients.report import checks, page, subjects  # noqa: PLC0415 - needs the extra
+    from rich.console import Console  # noqa: PLC0415 - needs the extra, and so do these
+    from rich.progress import Progress  # noqa: PLC0415
+
+    from bota_clients.report import checks, page, subjects  # noqa: PLC0415
 
     interrupt_on_signals()
     with NewFile(options.output, force=options.force) as file:
@@ -126,28 +125,17 @@ def make(options: ReportOptions) -> tuple[str, int]:
             found = subjects.of_recording(options.recording, *which)
         else:
             assert options.server is not None
-            with _progress(options.seconds) as progress:
-                found = subjects.of_server(options.server, options.seconds, *which, progress)
+            console = Console(stderr=True)
+            with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+                task = progress.add_task("listening", total=options.seconds)
+                show = partial(progress.update, task)
+                found = subjects.of_server(options.server, options.seconds, *which, show)
         examinations = [checks.Examination(each) for each in found]
         now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         file.write(page.render(examinations, made=now, program=f"{_PROGRAM} {VERSION}", note=options.note))
         file.finish()
     words = page.as_json(examinations) if options.json else "\n".join(map(_summary, examinations))
     return words, int(any(each.level is Level.TROUBLE for each in examinations))
-
-
-@contextlib.contextmanager
-def _progress(seconds: float) -> Iterator[Callable[[float], None]]:
-    """Shows the remaining time on a terminal, on a line that is cleared at the end."""
-
-    def show(text: str) -> None:
-        if sys.stderr.isatty():
-            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-
-    try:
-        yield lambda passed: show(f"listening, {seconds - passed:.0f} s left")
-    finally:
-        show("")
 
 
 def _summary(examination: Examination) -> str:

@@ -1,4 +1,4 @@
-"""What is measured of a sensor beside its stream: noise, spectra and drift.
+"""What is measured of a sensor beside its stream: noise and spectra.
 
 Noise is compared with a healthy sensor although the sensor may move and touch things: docs/report.md says
 how. The range of the cubics of force and torque tells contacts and quick motion; if the accelerometer shows
@@ -15,10 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from matplotlib import mlab
 
-from bota_clients.numbers import figure
 from bota_clients.recording.columns import Floats, Ints
 from bota_clients.report.series import CHANNELS, Bools, Series, noise_limit
-from bota_ethercat.pdo import STANDARD_GRAVITY
 
 _WINDOW_S: Final = 0.5
 _FEWEST_SAMPLES: Final = 32  # in a window
@@ -151,60 +149,3 @@ def measure_spectrum(series: Series) -> Spectrum | None:
     frequency = np.arange(1, length // 2 + 1) * resolution_hz
     segments = 1 + (count - length) // (length // 2)
     return Spectrum(frequency, density, segments, count * series.period, count - len(values), resolution_hz)
-
-
-_FEWEST_SPANS: Final = 4
-_MOST_SPANS: Final = 300
-_TURNED_DEG: Final = 2.0
-_LEAST_CHANGE: Final = 0.5  # °C: below this a drift per degree is meaningless
-
-
-class Drift(NamedTuple):
-    """How the readings moved over the recording: medians of m equal spans of about a second."""
-
-    time: Floats  # (m,) s, the middle of each span
-    readings: Floats  # (m, 7) force (N) and torque (Nm) less those of the first span, temperature (°C)
-    change: Floats  # (7,) from the first tenth of the spans to the last
-    turned_deg: float  # how far the direction of gravity moved, by the accelerometer; NaN without one
-
-    def sentence(self) -> str:
-        """What it means."""
-        if not self.turned_deg < _TURNED_DEG:
-            how = (
-                "The IMU cannot tell whether the sensor was turned"
-                if math.isnan(self.turned_deg)
-                else f"The sensor was turned by up to {figure(self.turned_deg, 2)}°"
-            )
-            return f"{how}: the readings changed with the load too, so they say nothing about drift."
-        per_degree = ""
-        if abs(self.change[6]) >= _LEAST_CHANGE:
-            slope = max(self.change[:3] / self.change[6], key=abs)
-            per_degree = f" That is {figure(slope, 2)} N/°C on the axis that changed most."
-        return (
-            "The sensor was not turned. If its load was constant, the change of the readings is its drift; "
-            f"no limit is published for it.{per_degree}"
-        )
-
-
-def measure_drift(series: Series) -> Drift | None:
-    """Medians over time, without samples that are not numbers; None if the recording is too short."""
-    s = series.samples
-    good = ~series.not_finite & ~series.saturated[:, :6].any(axis=1)
-    rows = np.column_stack([series.time, s.force, s.torque, s.temperature, s.acceleration])[good]
-    spans = int(np.clip(series.duration, 0, _MOST_SPANS))
-    index = np.clip(rows[:, 0] / (series.duration or 1.0) * spans, 0, spans - 1).astype(np.int64)
-    order = np.argsort(index, kind="stable")
-    edges = np.flatnonzero(np.diff(index[order])) + 1
-    if len(edges) + 1 < _FEWEST_SPANS:
-        return None
-    medians = np.array([np.median(part, axis=0) for part in np.split(rows[order], edges)])
-    medians[:, 1:7] -= medians[0, 1:7]
-    readings, gravity = medians[:, 1:8], medians[:, 8:]
-    tenth = max(1, len(medians) // 10)
-    change = np.median(readings[-tenth:], axis=0) - np.median(readings[:tenth], axis=0)
-    lengths = np.linalg.norm(gravity, axis=1)
-    turned_deg = math.nan
-    if np.all(lengths >= STANDARD_GRAVITY / 4):
-        units = gravity / lengths[:, None]
-        turned_deg = float(np.degrees(np.arccos(np.clip(units @ units[0], -1, 1)).max()))
-    return Drift(medians[:, 0], readings, change, turned_deg)

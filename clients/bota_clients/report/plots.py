@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from bota_clients.numbers import count, seconds
 from bota_clients.numbers import figure as number
 from bota_clients.recording.columns import Floats, Ints
-from bota_clients.report.measure import Drift, Noise, Spectrum
-from bota_clients.report.series import CHANNELS, GROUPS, Group, Series
+from bota_clients.report.measure import Spectrum
+from bota_clients.report.series import GROUPS, Group, Series
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.sensor.meaning import meaning
 
@@ -205,30 +205,6 @@ def over_time(figure: Figure, series: Series, group: Group) -> str:
     return f"{group.title} in {group.unit} over {seconds(series.duration)}: {', '.join(texts) or 'nothing'}."
 
 
-def noise_bars(figure: Figure, noise: Noise) -> str:
-    """One bar for each channel: its noise relative to the limit, where one is known."""
-    percent = noise.deviation / noise.limit * 100
-    known = np.flatnonzero(np.isfinite(percent))
-    if not len(known):
-        return ""
-    percent, titles = percent[known], [CHANNELS[index].title for index in known]
-    figure.set_figheight(0.9 + 0.24 * len(known))
-    _margins(figure, left=0.13)
-    panel = figure.subplots()
-    lengths = np.minimum(percent, 400)
-    bars = panel.barh(titles, lengths, 0.62, color=np.where(percent > 100, BAD, PLAIN))
-    texts = [f"{number(value, 2)} %{' above the limit' if value > 100 else ''}" for value in percent]
-    panel.bar_label(bars, texts, padding=5, color=INK)
-    panel.axvline(100, color=LIMIT, linestyle="--", linewidth=1.2)
-    panel.text(100.8, -0.75, "limit of a healthy sensor", color=LIMIT, va="center")
-    panel.set(ylim=(len(known) - 0.4, -1.2), xlim=(0, max(125.0, lengths.max() * 1.25)))
-    panel.set_xlabel("noise (standard deviation), % of the limit of a healthy sensor")
-    panel.grid(axis="y", visible=False)
-    return (
-        ", ".join(f"{title} {number(value, 2)} %" for title, value in zip(titles, percent, strict=True)) + "."
-    )
-
-
 def cutoffs(series: Series) -> dict[str, float]:
     """The cut-off frequency of each group's filter, Hz, where it is known."""
     filters = meaning(series.subject.settings, round(series.subject.rate_hz))
@@ -269,21 +245,18 @@ def spectra(figure: Figure, series: Series, spectrum: Spectrum) -> str:
     )
 
 
-def drifts(figure: Figure, series: Series, drift: Drift) -> str:
-    """Force, torque and temperature as medians over time."""
-    *panels, lowest = _panels(figure, series)
-    for panel, first, label in zip(panels, (0, 3), ("force, N", "torque, Nm"), strict=True):
-        for axis in range(3):
-            _axis(panel, axis, drift.time, drift.readings[:, first + axis], 1.0)
-        panel.set_ylabel(f"Δ {label}")
-        panel.legend(loc="upper left", ncols=3, handlelength=2.2, columnspacing=1.2)
-    lowest.plot(drift.time, drift.readings[:, 6], color=PLAIN)
-    lowest.set_ylabel("temperature, °C")
-    change = [number(value, 2) for value in drift.change]
-    return (
-        f"From the first tenth to the last: force {', '.join(change[:3])} N, "
-        f"torque {', '.join(change[3:6])} Nm, temperature {change[6]} °C."
-    )
+def temperature(figure: Figure, series: Series) -> str:
+    """The mean of each bin."""
+    time, low, high, mean = envelope(series.time, series.samples.temperature, series.width)
+    known = np.isfinite(mean)
+    if not known.any():
+        return ""
+    figure.set_figheight(2.0)
+    _margins(figure)
+    panel = figure.subplots()
+    panel.plot(time[known], mean[known], color=PLAIN)
+    panel.set(xlim=(0, series.width), xlabel="time, s", ylabel="°C")
+    return f"Temperature from {number(np.nanmin(low))} to {number(np.nanmax(high))} °C."
 
 
 def intervals(figure: Figure, series: Series) -> str:

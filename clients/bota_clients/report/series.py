@@ -18,7 +18,6 @@ import numpy.typing as npt
 from bota_clients.recording.columns import Columns, Floats, Ints
 from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.errors import SettingError
-from bota_ethercat.framing import DataFlag
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor
@@ -44,7 +43,6 @@ class Subject:
     settings: Mapping[str, SettingValue]  # those that exist and have a valid value
     columns: Columns
     source: str  # a file name or a server's address
-    age_p99_us: float | None = None  # of the samples on arrival; None from a recording, or another machine
     remarks: tuple[str, ...] = ()  # sentences about the recording for the reader of the report
 
     @property
@@ -171,13 +169,11 @@ def limit_origin(sinc_length: int) -> str:
     )
 
 
-_LONGER: Final = 1.5  # an interval of more than this many periods has room for a lost sample
-_SURELY_LONGER: Final = 2.5  # one of more than this has lost some whether they are marked or not
-_SHORT: Final = 0.75  # an interval shorter than this follows one that a late stamp made too long
-# A frame without a sample tells of a silence as far as this from a sample, ...
+_LONG: Final = 2.5  # an interval of more than this many periods is none between two successive samples
+# Beside a silence, samples are lost if more periods and more time than this pass without any frame; ...
 _COVERED_PERIODS: Final = 4
 _COVERED_S: Final = 0.01
-# ... and as far as this from the next such frame: the server looks less often after a sensor it has lost.
+# ... between two REPEATED or INVALID ones more time: the server polls a sensor that it has lost less often.
 _COVERED_BETWEEN_S: Final = 0.1
 # CLOCK_REALTIME that moves against CLOCK_MONOTONIC by more than this between two samples was adjusted.
 _STEP_NS: Final = 1_000_000
@@ -207,7 +203,7 @@ class Series:
         self.imu_off = subject.settings.get("imu_active") == 0
         self.intervals: Floats = np.diff(self.time)  # (n - 1,) s
         jumps = np.diff(frames.sequence)
-        self.step = max(1, int(np.median(jumps))) if len(jumps) else 1  # `every`: one sample in so many
+        self.step = max(1, int(np.median(jumps))) if len(jumps) else 1  # `every` of the subscription
         nominal = subject.nominal_period_s
         self.nominal_period = None if nominal is None else nominal * self.step  # s, by the settings
         forward = self.intervals[self.intervals > 0]
@@ -215,10 +211,14 @@ class Series:
         self.period = float(np.median(forward)) if len(forward) else self.nominal_period or 1e-3
         self.width = max(self.duration, self.period)  # of the plots over time, s
         self.silent: Bools = np.diff(np.flatnonzero(frames.fresh)) > 1  # REPEATED or INVALID frames between
-        self.missing = self._missing()
+        accounting = StreamAccounting(every=self.step, fresh_only=False)
+        # Not the usual interval: where every other sample is lost, that is two periods.
+        accounting.rate_hz = self.step / (self.nominal_period or self.period)
+        self.counts = accounting.counts  # the frames' kinds, as every client counts them
+        self.missing = self._missing(accounting)
         # Whether the samples on either side do not follow one another.
         self.broken: Bools = self.silent | (self.missing > 0) | (self.intervals <= 0)
-        self.broken |= self.intervals > _SURELY_LONGER * self.period
+        self.broken |= self.intervals > _LONG * self.period
         # By how much each interval with nothing missing in it differs from the usual one, s.
         self.deviations: Floats = self.intervals[~self.broken] - self.period
         off = np.abs(self.deviations)
@@ -232,13 +232,6 @@ class Series:
         # s, over everything but silences.
         self.mean_period = float(self.intervals[kept].sum() / periods) if periods else self.period
         self.silences = self._silences()
-        accounting = StreamAccounting(every=self.step, fresh_only=False)
-        # Not the usual interval: where every other sample is lost, that is two periods.
-        accounting.rate_hz = self.step / (self.nominal_period or self.period)
-        heads = frames.sequence, frames.monotonic_ns, frames.flags
-        for head in zip(*(array.tolist() for array in heads), strict=True):
-            accounting.take(*head)
-        self.counts = accounting.counts  # the frames' kinds, as every client counts them
         self.lost = int(self.missing.sum())  # samples, except those of a silent sensor
         # Those of the lost samples that the server had numbered: the client or recorder was too slow.
         self.withheld = min(self.counts.withheld // self.step, self.lost)
@@ -253,25 +246,23 @@ class Series:
             if column.any()
         ]
 
-    def _missing(self) -> Ints:
+    def _missing(self, accounting: StreamAccounting) -> Ints:
         """(n - 1,) how many samples are missing between one and the next, beside those of a silent sensor.
 
-        Told by the time that passed and by the mark GAP. A stamp that is late makes one interval long and the
-        next one short: that is no loss. Where the sensor was silent, it is the time of which no frame tells.
+        As every client counts them. Where the sensor was silent, as many as have room between frames too far
+        apart to tell of a silence.
         """
-        wide = self.intervals / self.period
-        following = np.append(wide[1:], 1.0)[: len(wide)]
-        missing = _room(np.where(following < _SHORT, wide + following - 1, wide))
-        marked = self.samples.flags[1:] & DataFlag.GAP != 0
-        marked |= np.diff(self.samples.sequence) > self.step
-        lost = ((wide > _LONGER) & marked) | (wide > _SURELY_LONGER)
-        # Samples that have room between frames too far apart to tell of a silence.
-        fresh, intervals = self.frames.fresh, np.diff(self.frame_time)
+        frames, summed = self.frames, list[int]()
+        heads = (array.tolist() for array in (frames.sequence, frames.monotonic_ns, frames.flags))
+        for head in zip(*heads, strict=True):
+            accounting.take(*head)
+            summed.append(self.counts.missing)
+        lost = np.diff(np.array(summed, np.int64)[frames.fresh]) // self.step
+        fresh, intervals = frames.fresh, np.diff(self.frame_time)
         near = np.where(fresh[:-1] | fresh[1:], _COVERED_S, _COVERED_BETWEEN_S)
         untold = intervals > np.maximum(near, _COVERED_PERIODS * self.period)
-        summed = np.cumsum(np.where(untold, _room(intervals / self.period), 0))
-        told = np.diff(np.concatenate(([0], summed))[np.flatnonzero(fresh)])
-        return np.where(self.silent, told, np.where(lost, np.maximum(missing, 0), 0))
+        told = np.cumsum(np.where(untold, _room(intervals / self.period), 0))
+        return np.where(self.silent, np.diff(np.append(0, told)[np.flatnonzero(fresh)]), lost)
 
     def _silences(self) -> Floats:
         """How long the sensor was silent each time, s, the time before the first and after the last too."""
@@ -285,7 +276,7 @@ class Series:
 
 
 def _room(periods: Floats) -> Ints:
-    """How many samples have room in an interval of so many periods."""
+    """Samples missing in intervals of this many periods."""
     return np.round(np.clip(periods, 0, 1e12)).astype(np.int64) - 1
 
 

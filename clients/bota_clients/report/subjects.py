@@ -3,19 +3,22 @@ stream."""
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections import Counter, defaultdict, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from tempfile import TemporaryDirectory
+from typing import Final
 
 import numpy as np
 
 from bota_clients.errors import ReportError
 from bota_clients.numbers import count, listing, moment
+from bota_clients.record.recorder import Parts, Recorder, Source
 from bota_clients.recording.columns import Columns, columns
+from bota_clients.recording.file_format import FORMAT_VERSION
 from bota_clients.recording.reader import (
     Histories,
     Identity,
@@ -25,16 +28,10 @@ from bota_clients.recording.reader import (
     open_recording,
 )
 from bota_clients.report.series import Subject, subject
-from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.address import Address
-from bota_ethercat.client import Client
-from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health.observer import p99
 from bota_ethercat.pdo import ImuUnits
-from bota_ethercat.sensor_choice import MOST_PLACES, SensorChoice
-from bota_ethercat.text import untrusted
-from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.text.untrusted import printable
 
 _MOST_EVENTS_NAMED: Final = 10
@@ -42,8 +39,10 @@ _MOST_SENSORS_NAMED: Final = 4
 _LONGEST_CHANGE_NS: Final = 2_000_000_000  # a change of settings takes the sensor out of operation for less
 
 
-def of_recording(path: Path, choice: SensorChoice | None, imu_units: ImuUnits) -> list[Subject]:
-    """The sensors of the recording at `path`, or those chosen, by position.
+def of_recording(
+    path: Path, choice: SensorChoice | None, imu_units: ImuUnits, source: str = ""
+) -> list[Subject]:
+    """The sensors of the recording at `path`, or those chosen, by position; it is named as `source`.
 
     RecordingError if it cannot be read, ReportError if it has no such sensor.
     """
@@ -52,12 +51,13 @@ def of_recording(path: Path, choice: SensorChoice | None, imu_units: ImuUnits) -
         found = [sensor for sensor in recorded if _meant(sensor, choice)]
         if not found:
             there = [(s.sensor, who.name, who.serial) for s in recorded for *_, who in s.history]
-            raise _no_sensor(str(path), choice, dict.fromkeys(there))
+            raise _no_sensor(source or str(path), choice, dict.fromkeys(there))
         remarks = [f"The recording was cut off: {recording.cut_off}."] if recording.cut_off else []
         if others := [str(sensor.sensor) for sensor in recording.sensors if sensor not in recorded]:
             remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
         remarks += _event_remarks(event.name for event in recording.events)
-        subjects = [_subject(recording, sensor, choice, imu_units) for sensor in found]
+        source = source or path.name
+        subjects = [_subject(recording, sensor, choice, imu_units, source) for sensor in found]
         return [subject.with_remarks(remarks) for subject in subjects]
 
 
@@ -110,15 +110,19 @@ class _Frames:
 
 
 def _subject(
-    recording: Recording, sensor: RecordedSensor, choice: SensorChoice | None, imu_units: ImuUnits
+    recording: Recording,
+    sensor: RecordedSensor,
+    choice: SensorChoice | None,
+    imu_units: ImuUnits,
+    source: str,
 ) -> Subject:
     """Its longest stretch without a change of settings or sensor."""
-    source, history = _Frames(recording), sensor.history
-    frames = columns(source, sensor.sensor, imu_units)
+    counted, history = _Frames(recording), sensor.history
+    frames = columns(counted, sensor.sensor, imu_units)
     row, values, remarks = sensor._asdict(), None, list[str]()
     if history:
         # The first settings were in effect before they were received.
-        ends = [0, *source.before[1:], len(frames)]
+        ends = [0, *counted.before[1:], len(frames)]
         longest = max(_meant(sensor, choice), key=lambda number: ends[number + 1] - ends[number])
         kept, numbers = history[longest], np.arange(len(frames))
         row |= {**kept.identity._asdict(), "rate_hz": kept.rate_hz}
@@ -130,7 +134,7 @@ def _subject(
             changing = frames.monotonic_ns > frames.monotonic_ns[-1:] - _LONGEST_CHANGE_NS
             frames = frames.where(~changing | (np.arange(len(frames)) <= last))
         remarks = _remarks(history, kept, frames)
-    made = subject(row, values, frames, recording.path.name, sensor.sensor)
+    made = subject(row, values, frames, source, sensor.sensor)
     return made.with_remarks(remarks)
 
 
@@ -155,20 +159,6 @@ def _remarks(history: Sequence[Settings], kept: Settings, frames: Columns) -> li
 
 
 _BATCH_S: Final = 0.05
-_MOST_AGES: Final = 1 << 16
-_MOST_FRAMES: Final = 4_000_000  # half an hour at 1600 Hz; more than that is what a recording is for
-
-
-class _Received:
-    """Frames in order of arrival, and by sensor the ages of the samples that were waited for, µs."""
-
-    def __init__(self) -> None:
-        self.all: deque[DataMessage] = deque(maxlen=_MOST_FRAMES)
-        self.ages_us: defaultdict[int, deque[float]] = defaultdict(lambda: deque(maxlen=_MOST_AGES))
-
-    def frames(self, sensor: int | None = None) -> Iterator[DataMessage]:
-        """The frames of the sensor at this position, or of all."""
-        return (frame for frame in self.all if sensor in (None, frame.sensor))
 
 
 def of_server(
@@ -176,65 +166,20 @@ def of_server(
     seconds: float,
     choice: SensorChoice | None,
     imu_units: ImuUnits,
-    progress: Callable[[float], None],
+    show: Callable[..., None],
 ) -> list[Subject]:
-    """The server's sensors, or those chosen, after `seconds`; `progress` gets the time listened so far, s.
+    """The server's sensors, or those chosen, from a recording of `seconds`, which is not kept.
 
-    ConnectionFailedError or RefusedError if there is no stream; ReportError if there is no such sensor.
+    `show` gets the time so far, s, as `completed`. ConnectionFailedError or RefusedError if there is no
+    stream; ReportError if there is no such sensor.
     """
-    with Client(address.port, address.host, fresh_only=False, raw=True, reconnect=False).connect() as client:
-        there = _rows(client.description)
-        rows = {
-            position: row
-            for position, row in there.items()
-            if choice is None or choice.matches(position, str(row.get("name")), row.get("serial", -1))
-        }
-        if not rows:
-            known = [(position, row.get("name"), row.get("serial")) for position, row in there.items()]
-            raise _no_sensor(str(address), choice, known)
-        received, remark = _listen(client, seconds, progress)
-        if not remark:
-            now = _rows(client.ask("describe"))
-            if any(now.get(at, {}).get("settings") != row.get("settings") for at, row in rows.items()):
-                changed = "The settings were changed while listening"
-                remark = f"{changed}: limits and filters here are those of the start."
-        events = [str(event.get("event")) for event in client.events if isinstance(event, dict)]
-    remarks = [*([remark] if remark else []), *_event_remarks(events)]
-    return [
-        replace(
-            subject(row, row.get("settings"), columns(received, position, imu_units), str(address), position),
-            age_p99_us=p99(received.ages_us[position]),
-        ).with_remarks(remarks)
-        for position, row in rows.items()
-    ]
-
-
-def _rows(description: JsonObject) -> dict[int, dict[str, Any]]:
-    return {
-        row["sensor"]: row
-        for row in untrusted.rows(description.get("sensors"))
-        if type(row.get("sensor")) is int and 0 <= row["sensor"] < MOST_PLACES
-    }
-
-
-def _listen(client: Client, seconds: float, progress: Callable[[float], None]) -> tuple[_Received, str]:
-    """What came in `seconds`, and why it ended early, if it did."""
-    received = _Received()
-    begin = time.monotonic()
-    while (passed := time.monotonic() - begin) < seconds:
-        progress(passed)
-        try:
-            frames = client.poll(min(_BATCH_S, seconds - passed))
-        except ConnectionFailedError as error:
-            if not received.all:
-                raise
-            return received, f"The connection ended after {passed:.1f} s of {seconds:g}: {error}."
-        received.all.extend(frames)
-        if frames and client.session.same_machine and not frames[-1].flags & NOT_NEW:
-            age_us = time.monotonic() * 1e6 - frames[-1].monotonic_ns * 1e-3
-            received.ages_us[frames[-1].sensor].append(age_us)
-    if not received.all:
-        raise ReportError(
-            f"nothing was received in {seconds:g} s: check ethercat-sensor watch and the server's log"
-        )
-    return received, ""
+    with TemporaryDirectory() as folder, contextlib.closing(Source(address, None)) as source:
+        source.connect()
+        path = Path(folder, "live.mcap")
+        recorder = Recorder(Parts(path, None, None, overwrite=False), "", {"format": FORMAT_VERSION})
+        begin = time.monotonic()
+        while (passed := time.monotonic() - begin) < seconds:
+            show(completed=passed)
+            recorder.put(source.batch(min(_BATCH_S, seconds - passed)))
+        recorder.stop("")
+        return of_recording(path, choice, imu_units, str(address))

@@ -1,6 +1,6 @@
 // A control loop at 1 kHz: a velocity that follows the force felt at the sensor, and zero when the force is not known.
 //
-//     control_loop [--server HOST:PORT] [--hz 1000] [--seconds N]        (without --server: $BOTA_SERVER)
+//     control_loop [--server HOST:PORT] [--hz 1000]        (without --server: $BOTA_SERVER)
 //
 // What to copy: one `latest` a cycle, `fresh` asked before the sample is used, a command that goes to zero otherwise.
 // The robot is left out: `send_to_robot` stands for it.
@@ -23,7 +23,7 @@ using bota_ethercat::Vector3;
 /// m/s, along the sensor's axes.
 void send_to_robot(const Vector3& /*velocity*/) {}
 
-/// An admittance without mass: so many m/s for each N beyond a dead band, limited.
+/// An admittance without mass: m/s per N beyond a dead band, limited.
 Vector3 follow(const Vector3& force) {
     constexpr double kDeadBand = 2.0, kGain = 0.01, kLimit = 0.1;  // N, m/s per N, m/s
     Vector3 velocity{};
@@ -46,52 +46,32 @@ int main(int argc, char** argv) {
     bota_ethercat::Options options;
     options.max_age = std::chrono::milliseconds(5);  // four samples at 800 Hz: older is not acted on
     const char* server = nullptr;
-    double hz = 1000.0, seconds = 1e9;
+    double hz = 1000.0;
     for (int i = 1; i < argc; i += 2) {
         const char* const value = i + 1 < argc ? argv[i + 1] : "";
         if (std::strcmp(argv[i], "--server") == 0) server = value;
-        else if (std::strcmp(argv[i], "--hz") == 0) hz = std::atof(value);
-        else if (std::strcmp(argv[i], "--seconds") == 0) seconds = std::atof(value);
-        else hz = 0.0;
+        else hz = std::strcmp(argv[i], "--hz") == 0 ? std::atof(value) : 0.0;
     }
-    if (!(hz >= 1.0 && hz <= 10000.0 && seconds >= 0.0 && seconds <= 1e9))
-        return std::fprintf(stderr, "usage: control_loop [--server HOST:PORT] [--hz 1 to 10000] [--seconds N]\n"), 2;
-    if (!bota_ethercat::choose_server(server, options))
-        return std::fprintf(stderr, "control_loop: %s is no HOST:PORT\n", server ? server : "$BOTA_SERVER"), 2;
+    if (!(hz >= 1.0 && hz <= 10000.0) || !bota_ethercat::choose_server(server, options))
+        return std::fprintf(stderr, "usage: control_loop [--server HOST:PORT, else $BOTA_SERVER] [--hz 1 to 10000]\n"), 2;
     std::signal(SIGINT, [](int) { ending = 1; });
     std::signal(SIGTERM, [](int) { ending = 1; });
 
     bota_ethercat::Client sensor(options);
     if (!sensor.connect()) return std::fprintf(stderr, "control_loop: %s\n", sensor.error()), 1;
-    std::printf("%s, %.0f Hz\n", sensor.description().sensors[0].name.c_str(), sensor.description().sensors[0].rate_hz);
     const bota_ethercat::Scheduling given = bota_ethercat::make_real_time(70, -1, true);
     if (!given.refused.empty()) std::fprintf(stderr, "control_loop: not granted: %s\n", given.refused.c_str());
 
-    long cycles = 0, used = 0, held = 0;
-    std::int64_t oldest_ns = 0;
     auto before = bota_ethercat::Condition::fresh;
     const auto period_ns = static_cast<std::int64_t>(1e9 / hz);
-    std::int64_t due_ns = bota_ethercat::monotonic_now_ns();
-    const std::int64_t end_ns = due_ns + static_cast<std::int64_t>(seconds * 1e9);
-    for (; !ending && due_ns < end_ns; due_ns += period_ns, ++cycles) {
+    for (std::int64_t due_ns = bota_ethercat::monotonic_now_ns(); !ending; due_ns += period_ns) {
         sleep_until(due_ns);
         const bota_ethercat::Reading reading = sensor.latest();
-        Vector3 velocity{};  // stands still unless the force is known
-        if (reading.fresh()) {
-            velocity = follow(reading.sample.force);
-            ++(reading.is_new ? used : held);  // a loop faster than the sensor holds each sample for a while
-            if (reading.age_ns > oldest_ns) oldest_ns = reading.age_ns;
-        }
-        send_to_robot(velocity);
+        send_to_robot(reading.fresh() ? follow(reading.sample.force) : Vector3{});
         if (reading.condition != before)  // in a real controller another thread prints
             std::fprintf(stderr, "control_loop: %s %s\n", to_string(reading.condition), sensor.error());
         before = reading.condition;
     }
     send_to_robot({});
-    const bota_ethercat::Counters counters = sensor.counters();
-    std::printf("%ld cycles: %ld with a new sample, %ld with the one before, %ld without; oldest used %.0f us; "
-                "%llu gaps, %llu samples passed over\n",
-                cycles, used, held, cycles - used - held, static_cast<double>(oldest_ns) * 1e-3,
-                static_cast<unsigned long long>(counters.gaps), static_cast<unsigned long long>(counters.passed_over));
     return 0;
 }

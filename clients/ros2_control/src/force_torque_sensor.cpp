@@ -25,13 +25,16 @@ public:
         std::string wrong = take_sensor();
         for (const auto& [name, value] : info_.hardware_parameters)
             if (wrong.empty()) wrong = set_parameter(parameters_, name, value);
+        if (wrong.empty() && parameters_.wants_compensated && !parameters_.has_payload)
+            wrong = "the compensated wrench needs the parameter payload_file, or tool_mass and tool_center_of_gravity";
         return wrong.empty() ? CallbackReturn::SUCCESS : refuse(wrong, CallbackReturn::ERROR);
     }
 
     CallbackReturn on_configure(const rclcpp_lifecycle::State&) override {
         handles_.clear();
-        for (const auto& interface : info_.sensors[0].state_interfaces)
-            handles_.emplace_back(get_state_interface_handle(info_.sensors[0].name + "/" + interface.name), signal(interface.name));
+        for (const auto& sensor : info_.sensors)
+            for (const auto& interface : sensor.state_interfaces)
+                handles_.emplace_back(get_state_interface_handle(sensor.name + "/" + interface.name), place(sensor, interface.name));
         loop_ = std::make_unique<SensorLoop>(parameters_, [this](Level level, const std::string& text) { log(level, text); });
         std::string why;
         if (!loop_->open(why)) return loop_.reset(), refuse(why, CallbackReturn::FAILURE);
@@ -78,19 +81,26 @@ public:
     }
 
 private:
-    /// The one <sensor> of the URDF; what is wrong with it, or nothing.
+    /// The place in `Values` of a state interface; the second <sensor> has those of the compensated wrench.
+    std::size_t place(const hardware_interface::ComponentInfo& sensor, const std::string& name) const {
+        return signal(&sensor == &info_.sensors[0] ? name : "compensated." + name);
+    }
+
+    /// Each <sensor> of the URDF; what is wrong with it, or nothing.
     std::string take_sensor() {
-        if (info_.sensors.size() != 1 || !info_.joints.empty() || !info_.gpios.empty())
-            return "its <ros2_control> tag must have one <sensor> and nothing else";
-        const hardware_interface::ComponentInfo& sensor = info_.sensors[0];
-        if (sensor.state_interfaces.empty()) return "the <sensor> " + sensor.name + " has no <state_interface>";
-        for (const auto& interface : sensor.state_interfaces) {
-            const std::size_t which = signal(interface.name);
-            if (which == kSignals.size()) return detail::unknown("state interface", interface.name, kSignals);
-            if (interface.data_type != "double")
-                return "the state interface " + interface.name + " has the data type " + interface.data_type + "; it must be double";
-            if (which >= kImu && which < kOrientation) parameters_.wants_imu = true;
-            if (which >= kOrientation && which < kTemperature) parameters_.wants_orientation = true;
+        if (info_.sensors.empty() || info_.sensors.size() > 2 || !info_.joints.empty() || !info_.gpios.empty())
+            return "its <ros2_control> tag must have one <sensor>, perhaps a second one for the compensated wrench, and nothing else";
+        for (const auto& sensor : info_.sensors) {
+            if (sensor.state_interfaces.empty()) return "the <sensor> " + sensor.name + " has no <state_interface>";
+            for (const auto& interface : sensor.state_interfaces) {
+                const std::size_t which = place(sensor, interface.name);
+                if (which == kSignals.size()) return detail::unknown("state interface", interface.name, kSignals);
+                if (interface.data_type != "double")
+                    return "the state interface " + interface.name + " has the data type " + interface.data_type + "; it must be double";
+                if (which >= kImu && which < kOrientation) parameters_.wants_imu = true;
+                if (which >= kOrientation && which < kTemperature) parameters_.wants_orientation = true;
+                if (which >= kCompensated && which < kMeasured) parameters_.wants_compensated = true;
+            }
         }
         return {};
     }
@@ -108,6 +118,9 @@ private:
             log(Level::warning, "the sensor's setting coordinate_system is on: forces are in the frame stored in the sensor");
         if (sensor.inertia_compensation == true)
             log(Level::warning, "the sensor's setting inertia_compensation is on: it subtracts gravity and inertia itself");
+        if (parameters_.payload.mass > 0.0 && parameters_.payload.accelerometer_offset == Vector3{})  // as force_bound_95 in Python
+            log(Level::warning, "the accelerometer is not identified: the compensated force may be wrong by " +
+                                    detail::text(1.13 * parameters_.payload.mass) + " N (95 %); use the file of an identification");
     }
 
     void show() {

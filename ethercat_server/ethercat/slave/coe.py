@@ -1,25 +1,32 @@
-"""SDO transfers over CoE by single datagrams: generators that yield after each and end with the result.
+"""CoE, CAN objects over EtherCAT: SDO transfers by single datagrams, abort codes, emergency messages.
 
-So the acquisition loop goes on in between. At start-up `finish` runs the same steps to their end.
+Transfers are generators that yield after each datagram and end with the result, so that the acquisition loop
+continues in between; at start-up `finish` runs the same steps to their end. Emergencies are counted, the last
+one is kept, and they are logged and reported at a bounded rate.
+
+Sources: ETG.1000.6 (abort codes: table "SDO Abort Codes"), CiA 301.
 """
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import struct
-from collections.abc import Generator, Sequence
-from typing import Final, Protocol, TypeVar
+from collections import defaultdict
+from collections.abc import Callable, Generator, Sequence
+from enum import IntEnum
+from typing import Any, Final, NamedTuple, Protocol, Self, TypeVar
 
-from ethercat_server.errors import BusError, SetUpError
+from ethercat_server.errors import BusError, SdoAbortError, SetUpError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
 from ethercat_server.ethercat.datagrams import Registers
-from ethercat_server.ethercat.slave.abort_codes import refused
-from ethercat_server.ethercat.slave.emergencies import Emergencies, Emergency
 from ethercat_server.ethercat.slave.registers import MAILBOX_FULL, MAILBOX_IN_STATUS
 
+log = logging.getLogger(__name__)
+
 T = TypeVar("T")
-# Work in steps: yields when the loop should have its turn, returns the result.
+# An operation in steps: yields after each datagram, returns the result.
 Steps = Generator[None, None, T]
 
 _SHORTEST: Final = 16
@@ -40,7 +47,7 @@ _LONGEST_EXPEDITED: Final = 4
 _MOST_DRAINED: Final = 4
 _SIZE_BYTES: Final = 4  # the size goes before what is longer
 _ANSWER_S: Final = 0.7  # until the request is sent again
-_TRANSFER_S: Final = 2.1  # in all: frames lost for a moment are no refusal
+_TRANSFER_S: Final = 2.1  # in all: a short loss of frames is not an error
 
 
 class Sdo(Protocol):
@@ -48,7 +55,7 @@ class Sdo(Protocol):
 
     @property
     def clock(self) -> Clock:
-        """The time that passes meanwhile."""
+        """The clock of the bus."""
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """Upload an object; SdoAbortError if the sensor refuses, BusError if it does not answer."""
@@ -74,18 +81,206 @@ def finish(
                 return result
             clock.sleep(pause_s)
     finally:
-        steps.close()  # given up between two steps, they undo what is half done while the bus is open
+        steps.close()  # if aborted, it cleans up while the bus is open
+
+
+class AbortCode(IntEnum):
+    """Reason why a slave aborted an SDO transfer."""
+
+    meaning: str
+
+    def __new__(cls, code: int, meaning: str) -> Self:
+        """A code with its meaning, which completes the sentence "the sensor refused: ..."."""
+        member = int.__new__(cls, code)
+        member._value_ = code
+        member.meaning = meaning
+        return member
+
+    TOGGLE_NOT_CHANGED = 0x05030000, "the toggle bit did not alternate"
+    TIMEOUT = 0x05040000, "the SDO protocol timed out"
+    UNKNOWN_COMMAND = 0x05040001, "the command specifier is invalid or unknown"
+    OUT_OF_MEMORY = 0x05040005, "out of memory"
+    UNSUPPORTED_ACCESS = 0x06010000, "unsupported access to an object"
+    WRITE_ONLY = 0x06010001, "the object is write-only"
+    READ_ONLY = 0x06010002, "the object is read-only"
+    SUBINDEX_0_NOT_ZERO = 0x06010003, "sub-index 0 must be set to 0 before the sub-indices are written"
+    NO_COMPLETE_ACCESS = 0x06010004, "complete access is not supported for entries of variable length"
+    LONGER_THAN_MAILBOX = 0x06010005, "the object is longer than the mailbox"
+    MAPPED_TO_RXPDO = 0x06010006, "the object is mapped to an RxPDO, so it cannot be written"
+    NO_OBJECT = 0x06020000, "the object does not exist"
+    NOT_MAPPABLE = 0x06040041, "the object cannot be mapped to a PDO"
+    MAPPING_TOO_LONG = 0x06040042, "the mapped objects exceed the length of the PDO"
+    PARAMETERS_INCOMPATIBLE = 0x06040043, "the parameters are incompatible"
+    DEVICE_INCOMPATIBLE = 0x06040047, "the device is incompatible"
+    HARDWARE_ERROR = 0x06060000, "access failed because of a hardware error"
+    LENGTH_MISMATCH = 0x06070010, "the data type or length does not match"
+    TOO_LONG = 0x06070012, "the data is too long"
+    TOO_SHORT = 0x06070013, "the data is too short"
+    NO_SUBINDEX = 0x06090011, "the sub-index does not exist"
+    INVALID_VALUE = 0x06090030, "the value is out of range"
+    TOO_HIGH = 0x06090031, "the value is too high"
+    TOO_LOW = 0x06090032, "the value is too low"
+    MAXIMUM_BELOW_MINIMUM = 0x06090036, "the maximum is less than the minimum"
+    GENERAL = 0x08000000, "general error"
+    CANNOT_STORE = 0x08000020, "the data cannot be transferred or stored"
+    LOCAL_CONTROL = 0x08000021, "the data cannot be transferred or stored because of local control"
+    NOT_IN_THIS_STATE = 0x08000022, "the data cannot be transferred or stored in the present state"
+    NO_DICTIONARY = 0x08000023, "there is no object dictionary"
+
+
+def abort_meaning(code: int) -> str:
+    """The meaning of an abort code."""
+    known = next((row for row in AbortCode if row == code), None)
+    return known.meaning if known else "a reason that the standard does not define"
+
+
+_EMERGENCY: Final = struct.Struct("<HHB")  # CoE header, error code, error register; manufacturer data follow
+_COE_EMERGENCY: Final = 1
+_DATA_SIZE: Final = 5
+_CLASS_MASK: Final = 0xFF00
+_LOG_EVERY_NS: Final = 60_000_000_000  # for the same code of the same sensor
+_MOST_CODES: Final = 16  # of one sensor that are logged in that time
+_TELL_AGAIN_NS: Final = 10_000_000_000  # for the same code, if no other one came in between
+_TELL_EVERY_NS: Final = 1_000_000_000
+_TELL_AT_ONCE: Final = 5  # of one sensor, and then one each `_TELL_EVERY_NS`
+
+# By error code without its lower byte; what is not here belongs to the class of its first digit.
+ERROR_CLASSES: Final[dict[int, str]] = {
+    0x0000: "error reset, or no error",
+    0x1000: "generic error",
+    0x2000: "current",
+    0x2100: "current on the input side",
+    0x2200: "current inside the device",
+    0x2300: "current on the output side",
+    0x3000: "voltage",
+    0x3100: "mains voltage",
+    0x3200: "voltage inside the device",
+    0x3300: "output voltage",
+    0x4000: "temperature",
+    0x4100: "ambient temperature",
+    0x4200: "temperature of the device",
+    0x5000: "hardware of the device",
+    0x6000: "software of the device",
+    0x6100: "internal software",
+    0x6200: "user software",
+    0x6300: "data set",
+    0x7000: "additional modules",
+    0x8000: "monitoring",
+    0x8100: "communication",
+    0x8200: "protocol error",
+    0x9000: "external error",
+    0xA000: "change of the AL state failed",
+    0xF000: "additional functions",
+    0xFF00: "device-specific",
+}
+
+
+class Emergency(NamedTuple):
+    """One emergency message."""
+
+    code: int
+    register: int  # the error register, object 0x1001
+    data: bytes  # at most five bytes of the manufacturer's
+
+    @classmethod
+    def parse(cls, body: bytes) -> Self | None:
+        """From a CoE message, without the mailbox header; None if it is not an emergency."""
+        if len(body) < _EMERGENCY.size:
+            return None
+        header, code, register = _EMERGENCY.unpack_from(body)
+        if header >> 12 != _COE_EMERGENCY:
+            return None
+        return cls(code, register, body[_EMERGENCY.size : _EMERGENCY.size + _DATA_SIZE])
+
+    @property
+    def is_reset(self) -> bool:
+        """Whether it says that an error is over."""
+        return not self.code & _CLASS_MASK
+
+    @property
+    def text(self) -> str:
+        """The class of its error code in words."""
+        known = ERROR_CLASSES.get(self.code & _CLASS_MASK) or ERROR_CLASSES.get(self.code & 0xF000)
+        return known or "of no class that CiA 301 defines"
+
+    def __str__(self) -> str:
+        data = self.data.hex() or "none"
+        return f"emergency 0x{self.code:04X} ({self.text}), error register 0x{self.register:02X}, data {data}"
+
+    def as_json(self) -> dict[str, Any]:
+        """The keys by which clients get it."""
+        return {"code": self.code, "text": self.text, "register": self.register, "data": self.data.hex()}
+
+
+class _OfSensor:
+    """The emergencies of one sensor."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.last: Emergency | None = None
+        self.at_ns = 0
+        self.logged_ns: dict[int, int] = {}  # when each code was logged, within `_LOG_EVERY_NS`
+        self.told = (-1, 0)  # the last code that was reported, and when
+        self.told_until_ns = 0  # a leaky bucket: one report each `_TELL_EVERY_NS`
+
+
+class Emergencies:
+    """The emergencies of all sensors."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._monotonic_ns = clock.monotonic_ns
+        self._sensors: defaultdict[int, _OfSensor] = defaultdict(_OfSensor)
+        # Called at a bounded rate: number of the sensor, emergency, how many the sensor has sent.
+        self.tell: Callable[[int, Emergency, int], None] = lambda _number, _emergency, _count: None
+
+    def note(self, number: int, emergency: Emergency) -> None:
+        """Record an emergency of the sensor `number`."""
+        sensor, now_ns = self._sensors[number], self._monotonic_ns()
+        sensor.count += 1
+        sensor.last, sensor.at_ns = emergency, now_ns
+        if self._is_to_be_logged(sensor, emergency.code, now_ns):
+            level = logging.INFO if emergency.is_reset else logging.WARNING
+            log.log(level, "sensor %d reports %s", number, emergency)
+        if self._is_to_be_told(sensor, emergency.code, now_ns):
+            self.tell(number, emergency, sensor.count)
+
+    def _is_to_be_logged(self, sensor: _OfSensor, code: int, now_ns: int) -> bool:
+        recent = {code: at for code, at in sensor.logged_ns.items() if now_ns - at < _LOG_EVERY_NS}
+        sensor.logged_ns = recent
+        if code in recent or len(recent) >= _MOST_CODES:
+            return False
+        recent[code] = now_ns
+        return True
+
+    def _is_to_be_told(self, sensor: _OfSensor, code: int, now_ns: int) -> bool:
+        told_code, told_ns = sensor.told
+        if code == told_code and now_ns - told_ns < _TELL_AGAIN_NS:
+            return False
+        if sensor.told_until_ns - now_ns > (_TELL_AT_ONCE - 1) * _TELL_EVERY_NS:
+            return False
+        sensor.told_until_ns = max(sensor.told_until_ns, now_ns) + _TELL_EVERY_NS
+        sensor.told = (code, now_ns)
+        return True
+
+    def status(self, number: int) -> dict[str, Any]:
+        """The sensor's part of the `status` reply."""
+        sensor = self._sensors[number]
+        last: dict[str, Any] | None = None
+        if sensor.last is not None:
+            ago_s = round((self._monotonic_ns() - sensor.at_ns) * 1e-9, 3)
+            last = {**sensor.last.as_json(), "ago_s": ago_s}
+        return {"emergencies": sensor.count, "emergency": last}
 
 
 class MessageLostError(Exception):
-    """A message was taken from the mailbox and lost on its way."""
+    """A message was read from the mailbox, and the frame with it was lost."""
 
 
 class MailboxSdo:
-    """The mailboxes of slave `number`. A slave has one of these, whoever uses it: it drops a message that
-    reuses the last counter.
+    """The mailboxes of slave `number`.
 
-    Emergencies come in among the answers: each is noted.
+    There is one object for each slave, because the slave drops a message that reuses the last counter.
+    Emergencies that arrive among the answers are recorded.
     """
 
     def __init__(
@@ -134,13 +329,13 @@ class MailboxSdo:
         yield from self._transfer(index, subindex, command, data)
 
     def look(self) -> None:
-        """Read what the slave says unasked. Who waits for an answer does that too: it is left to them."""
+        """Read a message if one is there, unless a transfer is under way, which reads them itself."""
         if not self._in_use:
             with contextlib.suppress(MessageLostError):
                 self._take()
 
     def drain(self, most: int = _MOST_DRAINED) -> Steps[None]:
-        """Read away what is there: `most` messages at most."""
+        """Discard the messages that are there, at most `most`."""
         for _ in range(most):
             with contextlib.suppress(MessageLostError):
                 if self._take() is None:
@@ -172,15 +367,19 @@ class MailboxSdo:
                         continue
                     if answer[0] == _ABORT:
                         code = int.from_bytes(answer[1][:4], "little")
-                        raise refused(self._number, f"{doing} object 0x{index:04X}:{subindex}", code)
+                        raise SdoAbortError(
+                            f"sensor {self._number} refused {doing} object 0x{index:04X}:{subindex}: "
+                            f"{abort_meaning(code)} (abort 0x{code:08X})",
+                            code,
+                        )
                     return answer
             yield
         raise SetUpError(self._unanswered(doing, index, subindex, "no answer"))
 
     def _answer(self, index: int, subindex: int, expected: int) -> tuple[int, bytes] | None:
-        """Command and data of the answer if it is there; other messages are dropped.
+        """Command and data of the answer if it is there.
 
-        Such as the late answer to a request that was repeated: about the same object, but another command's.
+        Others are dropped, such as the late answer to another command about the same object.
         """
         body = self._take()
         if body is None or len(body) < _SDO_HEADER.size + 4:
@@ -195,7 +394,7 @@ class MailboxSdo:
 
     def _put(self, body: bytes) -> bool:
         """Send a CoE message; False if that failed. It has another counter than the one before."""
-        self._counter = max(2, self._counter + 1 & 7)  # 1 is left to SOEM, whose mapping begins with it
+        self._counter = max(2, self._counter + 1 & 7)  # SOEM's mapping begins with 1
         header = _HEADER.pack(len(body), 0, 0, _TYPE_COE | self._counter << 4)
         return self._bus.write_register(self._number, self._out, (header + body).ljust(self._out_size, b"\0"))
 

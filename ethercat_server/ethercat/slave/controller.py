@@ -10,24 +10,24 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-from ethercat_server.errors import BusError, SetUpError
+from ethercat_server.errors import BusError, SdoAbortError, SetUpError
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.datagrams import Datagrams
+from ethercat_server.ethercat.datagrams import Datagrams, repeat
 from ethercat_server.ethercat.exchange import Area
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import ACKNOWLEDGE_S, STATE_S, AlState, AlStatus
-from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps
-from ethercat_server.ethercat.slave.emergencies import Emergencies
+from ethercat_server.ethercat.slave.coe import Emergencies, MailboxSdo, Steps
 from ethercat_server.ethercat.slave.sii import OF_FIRMWARE
 
 _START_ATTEMPTS: Final = 20
+_MOST_BYTES: Final = 1486  # of process data in a frame
 _MAILBOXES_END: Final = 2 * reg.SYNC_MANAGER_SIZE
 _SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")  # length, control, activation
 _HARDWARE: Final = struct.Struct("<BBxxH")  # numbers of FMMUs and of sync managers, features
 
 
 class GoneError(SetUpError):
-    """The slave stopped answering in the middle."""
+    """The slave stopped answering during an operation."""
 
 
 class SlaveController:
@@ -35,10 +35,10 @@ class SlaveController:
 
     Attributes:
         number: of the sensor.
-        attempts: how often a datagram is sent until it is answered; more than one only while nothing streams.
-        sdo: its mailbox, whoever uses it.
+        attempts: how often an unanswered datagram is sent; more than once only while nothing streams.
+        sdo: its mailbox.
         areas: its process data in the logical address space, as `read_mapping` has found it.
-        features: what the controller can do, from then on.
+        features: of the controller (register 0x0008), from then on.
     """
 
     def __init__(
@@ -60,15 +60,12 @@ class SlaveController:
 
     def status(self) -> AlStatus | None:
         """Its AL status; None if it does not answer."""
-        for _ in range(self.attempts):
-            data = self._bus.read_register(self.number, reg.AL_STATUS, reg.AL_STATUS_SIZE)
-            if data is not None:
-                return AlStatus.parse(data)
-        return None
+        data = repeat(self.attempts, self._bus.read_register, self.number, reg.AL_STATUS, reg.AL_STATUS_SIZE)
+        return AlStatus.parse(data) if data else None
 
     def write(self, address: int, data: bytes) -> None:
         """Write registers; GoneError if it does not answer."""
-        if not any(self._bus.write_register(self.number, address, data) for _ in range(self.attempts)):
+        if not repeat(self.attempts, self._bus.write_register, self.number, address, data):
             raise self._gone()
 
     def go(self, state: AlState) -> Steps[None]:
@@ -89,7 +86,7 @@ class SlaveController:
                 )
 
     def enter_preop(self) -> Steps[None]:
-        """By way of INIT: what another master has set up (FMMUs, sync managers, SYNC0) is cleared."""
+        """Through INIT, clearing what another master has set up (FMMUs, sync managers, SYNC0)."""
         yield from self.go(AlState.INIT)
         self._read_hardware()
         self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
@@ -99,6 +96,34 @@ class SlaveController:
         self.write(reg.SII_OWNER, OF_FIRMWARE)  # a slave reads its SII on the way to PREOP
         yield from self.go(AlState.PREOP)
 
+    def mapped_size(self, assignment: int, in_sii: int) -> Steps[int]:
+        """Bytes of process data by the PDOs that the object `assignment` lists; `in_sii` if there is none.
+
+        BusError if it cannot be.
+        """
+        bits = 0
+        try:
+            for at in range(1, 1 + (yield from self._read_number(assignment, 0, 0xFF))):
+                pdo = yield from self._read_number(assignment, at, 0xFFFF)
+                for entry in range(1, 1 + (yield from self._read_number(pdo, 0, 0xFF))):
+                    bits += (yield from self._read_number(pdo, entry, 0xFFFFFFFF)) & 0xFF
+                    if bits > 8 * _MOST_BYTES:
+                        raise BusError(
+                            f"sensor {self.number} maps more than {_MOST_BYTES} bytes of process data, which "
+                            "fit no frame: power it off and on"
+                        )
+        except SdoAbortError:
+            return in_sii
+        return (bits + 7) // 8
+
+    def _read_number(self, index: int, subindex: int, most: int) -> Steps[int]:
+        if (value := int.from_bytes((yield from self.sdo.read(index, subindex)), "little")) > most:
+            raise BusError(
+                f"sensor {self.number} has {value:#x} in object 0x{index:04X}:{subindex}, which cannot be: "
+                "power it off and on"
+            )
+        return value
+
     def map(self, managers: bytes = b"", fmmus: bytes = b"") -> None:
         """Write sync managers from the third on, and FMMUs: by default those that `read_mapping` has read."""
         self.write(reg.SYNC_MANAGER + _MAILBOXES_END, managers or self._managers)
@@ -107,7 +132,7 @@ class SlaveController:
     def read_mapping(self) -> int:
         """Read back how a master has mapped the process data; returns the bytes of the inputs.
 
-        SetUpError if something was not written: SOEM writes it once, and does not look whether that worked.
+        SetUpError if something was not written: SOEM writes it once and does not verify it.
         """
         self._read_hardware()
         self._fmmus = self._bus.read_surely(self.number, reg.FMMU, self._units * reg.FMMU_SIZE)
@@ -129,9 +154,9 @@ class SlaveController:
         return sum(area.end - area.start for area in self.areas if area.kind == reg.FMMU_READ)
 
     def latch_events(self) -> bool:
-        """Have the controller latch when samples come to be; False if it has no distributed clock.
+        """Have the controller latch the times of new samples; False if it has no distributed clock.
 
-        Another master may end that at any time.
+        Another master may switch that off at any time.
         """
         if self._latch is None:
             return False
@@ -139,7 +164,7 @@ class SlaveController:
         return True
 
     def enter_op(self) -> Steps[None]:
-        """From PREOP with the process data mapped, which has to be exchanged meanwhile."""
+        """From PREOP, with the process data mapped and being exchanged."""
         yield from self.go(AlState.SAFEOP)
         yield from self.go(AlState.OP)
 
@@ -148,7 +173,7 @@ class SlaveController:
         return SetUpError(f"sensor {self.number} did not answer when it was mapped: check cable and power")
 
     def _acknowledge(self, status: AlStatus) -> Steps[None]:
-        # The request waits until the error is gone: the slave sees only what was written to AL control last.
+        # The next request must wait for the error to clear: the slave sees only the last write to AL control.
         self.write(reg.AL_CONTROL, status.acknowledge())
         deadline = Deadline(self._bus.clock, ACKNOWLEDGE_S)
         while (now := (yield from self._next_status())).error:

@@ -22,11 +22,9 @@ DL_STATUS: Final = 0x0110
 AL_CONTROL: Final = 0x0120
 AL_STATUS: Final = 0x0130
 AL_STATUS_SIZE: Final = 6  # AL status, two reserved bytes, AL status code
-AL_STATUS_CODE: Final = 0x0134
 PDI_CONTROL: Final = 0x0140
 EVENT_MASK: Final = 0x0200
 EVENT_REQUEST: Final = 0x0210
-AL_EVENT_REQUEST: Final = 0x0220
 RX_ERRORS: Final = 0x0300  # two bytes a port: invalid frames, physical layer errors
 FORWARDED_ERRORS: Final = 0x0308  # a byte a port: frames that another slave had found invalid
 PROCESSING_UNIT_ERRORS: Final = 0x030C
@@ -49,7 +47,6 @@ FMMU_SIZE: Final = 16
 SYNC_MANAGER: Final = 0x0800
 SYNC_MANAGER_SIZE: Final = 8
 # Offsets within a sync manager.
-SM_CONTROL: Final = 4
 SM_STATUS: Final = 5
 SM_ACTIVATE: Final = 6
 # In a sync manager's activate register: a frame that exchanges its buffer is a DC event.
@@ -65,7 +62,6 @@ DC_RECEIVE_TIMES: Final = 0x0900  # four bytes a port, ns: when the frame that w
 DC_SYSTEM_TIME: Final = 0x0910
 DC_RECEIVE_TIME: Final = 0x0918  # eight bytes: the same, at the processing unit
 DC_OFFSET: Final = 0x0920
-DC_DELAY: Final = 0x0928
 DC_DIFFERENCE: Final = 0x092C
 DC_SPEED_START: Final = 0x0930
 DC_SPEED_DIFFERENCE: Final = 0x0932

@@ -1,5 +1,4 @@
-"""The SII, a slave's EEPROM: its layout, its decoding, and reading it through the controller's registers, one
-or two datagrams a step.
+"""The SII, a slave's EEPROM: its layout, its decoding, and reading it through the controller's registers.
 
 It is never written. Sources: ETG.1000.4, registers 0x0500 to 0x050F, ETG.1000.6 and ETG.2010. pysoem's own
 reading takes an EEPROM that cannot be read for one full of zeros, after minutes.
@@ -14,7 +13,7 @@ from typing import Any, Final
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.datagrams import Registers
+from ethercat_server.ethercat.datagrams import Registers, repeat
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.registers import SII_CONTROL, SII_OWNER
 
@@ -198,13 +197,13 @@ def read_sii(bus: Registers, slave: int, word: int, count: int, owner: bytes = O
         while len(data) < 2 * count:
             data += yield from _read_word(bus, slave, word + len(data) // 2)
     finally:
-        # No waiting here: the one who reads may have given up.
-        any(bus.write_register(slave, SII_OWNER, owner) for _ in range(_ATTEMPTS_TO_GIVE_BACK))
+        # Without waiting: the caller may have aborted.
+        repeat(_ATTEMPTS_TO_GIVE_BACK, bus.write_register, slave, SII_OWNER, owner)
     return bytes(data[: 2 * count])
 
 
 def _wait_for_firmware(bus: Registers, slave: int) -> Steps[None]:
-    """Let the slave's own firmware finish an access; one that never does is interrupted."""
+    """Wait until the slave's own firmware has finished an access, for a limited time."""
     deadline = Deadline(bus.clock, _WORD_S)
     while not deadline.passed:
         found = bus.read_register(slave, SII_OWNER, 2)
@@ -214,7 +213,7 @@ def _wait_for_firmware(bus: Registers, slave: int) -> Steps[None]:
 
 
 def _read_word(bus: Registers, slave: int, word: int) -> Steps[bytes]:
-    """What one read command gives: two words, or four."""
+    """The two or four words of one read command."""
     deadline = Deadline(bus.clock, _WORD_S)
     answer, asked = "no answer", False
     while not deadline.passed:

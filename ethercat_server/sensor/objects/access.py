@@ -8,12 +8,10 @@ from typing import Any, Final
 from bota_ethercat.control import MAX_SDO_BYTES, ErrorCode
 from bota_ethercat.errors import RequestError
 from bota_ethercat.sensor.sdo_types import SDO_TYPES, SdoType
-from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import CutOffError, extended
 from ethercat_server.ethercat.slave.coe import Sdo, Steps
 from ethercat_server.sensor.objects import dictionary
-from ethercat_server.sensor.objects.dictionary import ObjectEntry
-from ethercat_server.sensor.objects.search import find_objects, full_name
+from ethercat_server.sensor.objects.dictionary import ObjectEntry, find_objects, full_name
 from ethercat_server.sensor.sensor import Sensor
 from ethercat_server.sensor.set_up import read_offset
 
@@ -46,7 +44,7 @@ def entry_named(name: str) -> ObjectEntry:
 
 
 def read_named(sdo: Sdo, entry: ObjectEntry, kind: SdoType | None) -> Steps[Mapping[str, Any]]:
-    """The same for an entry of the dictionary, whose type is known."""
+    """As `read`, for an entry of the dictionary, whose type is known."""
     if kind is None:
         kind = SDO_TYPES.get(entry.type.name.lower())
     found = yield from read(sdo, *entry.address, kind)
@@ -54,7 +52,7 @@ def read_named(sdo: Sdo, entry: ObjectEntry, kind: SdoType | None) -> Steps[Mapp
 
 
 def bytes_to_write(values: Mapping[str, Any]) -> bytes:
-    """What a request `sdo_write` asks to write; RequestError if it asks nothing clear."""
+    """The bytes that a request `sdo_write` writes; RequestError if it is ambiguous or wrong."""
     kind: SdoType | None = values["type"]
     data: bytes | None = values["hex"]
     if (kind is None) == (data is None) or (kind is None) != (values["value"] is None):
@@ -74,17 +72,16 @@ def bytes_to_write(values: Mapping[str, Any]) -> bytes:
 
 
 def write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> Steps[Mapping[str, Any]]:
-    """Write an entry, and look after it from now on if it is a setting or the offset."""
+    """Write an entry; a setting or the offset is restored from now on when the sensor has lost it."""
     try:
         yield from sdo.write(index, subindex, data)
     except CutOffError as error:
         sensor.change_interrupted = True
         raise extended(error, "; whether it took the value is not known") from None
-    # What was written is to be in force after a power cut too, if it is one of what the server looks after.
     entry = dictionary.BY_ADDRESS.get((index, subindex))
     if entry is not None and entry.setting is not None:
         try:
-            value = entry.decode_setting(data, SETTINGS[entry.setting].is_bool)
+            value = entry.decode_setting(data)
         except ValueError:
             value = None
         if value is not None:

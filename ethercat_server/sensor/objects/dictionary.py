@@ -1,4 +1,4 @@
-"""The sensor's object dictionary: one row per object entry.
+"""The sensor's object dictionary: one row per object entry, found by address or by name.
 
 Sources: Table III.1 and Listing III.6 of the design note, and the dump of a real Rokubi. The server
 configures the sensor by it and the virtual sensor answers by it; nothing else knows an index.
@@ -6,8 +6,11 @@ configures the sensor by it and the virtual sensor answers by it; nothing else k
 
 from __future__ import annotations
 
+import difflib
+import re
 import struct
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -99,7 +102,7 @@ class ObjectEntry:
     unit: str = ""
     setting: str | None = None  # name of the setting in `bota_ethercat.settings`
     codes: Mapping[SettingValue, int] | None = None  # wire value of each setting value, where they differ
-    values: Mapping[int, str] | None = None  # wire values that mean something, for what is no setting
+    values: Mapping[int, str] | None = None  # meanings of wire values, for entries that are not settings
 
     @property
     def address(self) -> tuple[int, int]:
@@ -125,7 +128,7 @@ class ObjectEntry:
         """Wire bytes of a checked setting value."""
         return self.type.pack(self.codes[value] if self.codes else int(value))
 
-    def decode_setting(self, data: bytes, is_bool: bool) -> SettingValue:
+    def decode_setting(self, data: bytes) -> SettingValue:
         """The setting value in `data`; ValueError if it is none that the setting can have."""
         try:
             raw = self.type.unpack(data)
@@ -139,7 +142,7 @@ class ObjectEntry:
                 if code == raw:
                     return value
             raise ValueError(f"object 0x{self.index:04X}:{self.subindex} holds {raw}, which means nothing")
-        return bool(raw) if is_bool else int(raw)
+        return bool(raw) if self.setting and SETTINGS[self.setting].is_bool else int(raw)
 
 
 U8, U16, U32, REAL32 = ObjectType.U8, ObjectType.U16, ObjectType.U32, ObjectType.REAL32
@@ -166,7 +169,7 @@ SAVE_PARAMETERS: Final = 1
 
 
 def _calibration_type(subindex: int) -> ObjectType:
-    """REAL32 but for a password, the offsets, range and gains of the converters, and the bridges' DACs."""
+    """REAL32, except the password, the converters' offsets, range and gains, and the bridges' DACs."""
     if subindex == 0x01 or 0x27 <= subindex <= 0x2C or 0x4C <= subindex <= 0x51:
         return U32
     if subindex == 0x2D:
@@ -230,28 +233,136 @@ OBJECTS: Final[tuple[ObjectEntry, ...]] = (
     ObjectEntry(0x8030, 2, "Status", U8, RO, values={0: "success"}),
 )  # fmt: skip
 
-BY_ADDRESS: Final[Mapping[tuple[int, int], ObjectEntry]] = {row.address: row for row in OBJECTS}
 BY_SETTING: Final[Mapping[str, ObjectEntry]] = {row.setting: row for row in OBJECTS if row.setting}
 
 # The device works out the valid SINC range from the other filters, so SINC goes last.
-SETTING_WRITE_ORDER: Final[tuple[str, ...]] = (
-    "calibration_matrix",
-    "temperature_compensation",
-    "imu_active",
-    "coordinate_system",
-    "inertia_compensation",
-    "orientation_estimation",
-    "acceleration_range_g",
-    "angular_rate_range_dps",
-    "acceleration_filter",
-    "angular_rate_filter",
-    "chop",
-    "fast",
-    "fir",
-    "sinc_length",
-)
+_LAST: Final = ("chop", "fast", "fir", "sinc_length")
+SETTING_WRITE_ORDER: Final = (*(name for name in SETTINGS if name not in _LAST), *_LAST)
 
 
 def is_sensor(vendor: int, product: int) -> bool:
     """Whether this is the identity of a Bota Gen-0 sensor."""
     return (vendor, product) == (VENDOR_ID, PRODUCT_CODE)
+
+
+def _highest_subindices() -> Iterator[ObjectEntry]:
+    """Sub-index 0 of each object that has parts, as Listing III.6 reads it."""
+    highest: dict[int, int] = {}
+    for row in OBJECTS:
+        if row.subindex:
+            highest[row.index] = max(row.subindex, highest.get(row.index, 0))
+    for index, last in highest.items():
+        yield ObjectEntry(index, 0, "Highest sub-index", ObjectType.U8, Access.RO, last)
+
+
+# Every object in Bota's manual, also those that the firmware seen does not have.
+KNOWN_OBJECTS: Final[tuple[ObjectEntry, ...]] = tuple(
+    sorted(
+        (
+            *OBJECTS,
+            *_highest_subindices(),
+            # Table III.1 has it, without a type; the firmware seen has none.
+            ObjectEntry(0x8003, 0, "Force/torque range", ObjectType.OCTETS, Access.RO, ""),
+        ),
+        key=lambda row: row.address,
+    )
+)
+
+BY_ADDRESS: Final[Mapping[tuple[int, int], ObjectEntry]] = {row.address: row for row in KNOWN_OBJECTS}
+
+# Names of the objects that have parts.
+TITLES: Final[Mapping[int, str]] = {
+    0x1018: "Identity",
+    0x2000: "Factory calibration",
+    0x6000: "Measurement",
+    0x8000: "Force/torque offset",
+    0x8001: "Acceleration offset",
+    0x8002: "Angular rate offset",
+    0x8006: "Force/torque filter",
+    0x8010: "Configuration",
+    0x8030: "Control",
+}
+
+# Other names that Table III.1 and Listing III.6 have; sub-index 0 of what has parts is all of it.
+NOTE_NAMES: Final[tuple[tuple[int, int, str], ...]] = (
+    (0x2000, 0, "Calibration"),
+    (0x6000, 0, "Sensor Data"),
+    (0x8002, 0, "Angular Velocities Offset"),
+    (0x8005, 0, "Angular Velocities Range"),
+    (0x8008, 0, "Angular Velocities Filter"),
+    (0x8010, 0, "Device configuration"),
+    (0x8010, 1, "Force/Torque Calibration Matrix Active"),
+    (0x8010, 2, "Temperature Compensation Active"),
+    (0x8010, 4, "Coordinate System Cong. Active"),
+    (0x8010, 5, "Inertia and Gravity Comp. Active"),
+    (0x8010, 6, "Orientation Estimation Active"),
+)
+
+_ADDRESS: Final = re.compile(r"(0x[0-9a-f]{1,4})(?::(0x[0-9a-f]{1,2}|[0-9]{1,3}))?", re.IGNORECASE)
+
+
+def find_objects(text: str) -> list[ObjectEntry]:
+    """The entries that `text` names, in order of address; none if nothing is called so.
+
+    Only letters and digits count: `SINC length` and `sinc_length` are the same. An address that the
+    dictionary does not have gives an entry without a type: it can be read too.
+    """
+    if (address := _ADDRESS.fullmatch(text.strip())) is None:
+        return _BY_NAME.get(_plain(text), [])
+    index, subindex = int(address[1], 16), _number(address[2] or "0")
+    if subindex > 0xFF:
+        return []
+    if found := _entry(index, subindex) if address[2] else _parts(index):
+        return found
+    return [ObjectEntry(index, subindex, "Not in the dictionary", ObjectType.OCTETS, Access.RO, "")]
+
+
+def similar_names(text: str) -> list[str]:
+    """Names that are spelled much like `text`. Takes milliseconds: not for the server's loop."""
+    return [_SPELLED[name] for name in difflib.get_close_matches(_plain(text), _SPELLED, n=3)]
+
+
+def full_name(entry: ObjectEntry) -> str:
+    """The entry's name with that of the object it is a part of, which no other entry has."""
+    title = TITLES.get(entry.index)
+    return f"{title} {entry.name}" if title else entry.name
+
+
+def _number(text: str) -> int:
+    return int(text, 16) if text.lower().startswith("0x") else int(text)
+
+
+def _plain(text: str) -> str:
+    return "".join(c for c in text.casefold() if c.isalnum())
+
+
+def _parts(index: int) -> list[ObjectEntry]:
+    return [row for row in KNOWN_OBJECTS if row.index == index]
+
+
+def _entry(index: int, subindex: int) -> list[ObjectEntry]:
+    row = BY_ADDRESS.get((index, subindex))
+    return [row] if row else []
+
+
+def _names() -> Iterable[tuple[str, Sequence[ObjectEntry]]]:
+    for row in KNOWN_OBJECTS:
+        for name in {row.name, full_name(row), row.setting or row.name}:
+            yield name, [row]
+    for index, title in TITLES.items():
+        yield title, _parts(index)
+    for index, subindex, name in NOTE_NAMES:
+        whole = index in TITLES and subindex == 0
+        yield name, _parts(index) if whole else _entry(index, subindex)
+
+
+def _by_name() -> tuple[dict[str, list[ObjectEntry]], dict[str, str]]:
+    found: dict[str, dict[tuple[int, int], ObjectEntry]] = defaultdict(dict)
+    spelled: dict[str, str] = {}
+    for name, rows in _names():
+        found[_plain(name)].update({row.address: row for row in rows})
+        spelled.setdefault(_plain(name), name)
+    return {name: [rows[address] for address in sorted(rows)] for name, rows in found.items()}, spelled
+
+
+_BY_NAME, _SPELLED = _by_name()

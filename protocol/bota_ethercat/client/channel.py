@@ -14,8 +14,8 @@ from typing import Final, Protocol
 
 from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 
+# Bytes that the kernel may keep, and so the age of what a client that has stalled gets: some 0.5 s.
 RECEIVE_BUFFER: Final = 65536
-"""Bytes that the kernel may keep, and so the age of what a client that has stalled gets: some 0.5 s."""
 CONNECT_TIMEOUT_S: Final = 2.0
 _SEND_TIMEOUT_S: Final = 1.0
 _KEEPALIVE: Final = tuple(
@@ -23,8 +23,8 @@ _KEEPALIVE: Final = tuple(
     for option, value in (("TCP_KEEPIDLE", 2), ("TCP_KEEPALIVE", 2), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3))
     if hasattr(socket, option)  # the second is what macOS calls the first
 )
+# 0 on Windows, where a socket has no timeouts of the kernel's.
 _DONT_WAIT: Final = getattr(socket, "MSG_DONTWAIT", 0)
-"""0 on Windows, where a socket has no timeouts of the kernel's."""
 
 
 class Channel(Protocol):

@@ -6,13 +6,14 @@
         for sample in sensor:  # NoSampleError when there is none for some periods, and it says why
             print(sample.force, sample.torque)
 
-No REPEATED or INVALID frame passes for a sample. A connection that ends is made anew while one of `latest`,
-`receive`, `poll` and the iteration is called; they are for one thread, `ask` is for any. If it is read more
-slowly than the sensor samples, the server withholds samples and sets GAP in `frame.flags`.
+REPEATED and INVALID frames are no samples. `latest`, `receive`, `poll` and the iteration reconnect where
+necessary; they are for one thread, `ask` is for any. A client that reads more slowly than the sensor samples
+has samples withheld, and GAP in `frame.flags`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -24,16 +25,10 @@ from bota_ethercat.address import Address
 from bota_ethercat.client.channel import RECEIVE_BUFFER, Channel, TcpChannel
 from bota_ethercat.client.reading import Condition, Reading
 from bota_ethercat.client.real_time import Scheduling, make_real_time
-from bota_ethercat.client.session import ClientEvent, Session
-from bota_ethercat.errors import (
-    ConnectionFailedError,
-    NoReplyError,
-    ProtocolError,
-    RefusedError,
-    UnreachableError,
-)
+from bota_ethercat.client.session import ClientEvent, Session, check_granted
+from bota_ethercat.errors import ConnectionFailedError, NoReplyError, ProtocolError, UnreachableError
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
+from bota_ethercat.pdo import ImuUnits, Sample
 from bota_ethercat.text.json_text import JsonObject
 
 ANSWER_TIMEOUT_S: Final = 5.0
@@ -110,8 +105,8 @@ class Client:
     ) -> None:
         """Nothing is sent yet.
 
-        `sensors`: by position on the bus, of those that are there; None for all. `every`: one frame in so
-        many. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames come, too.
+        `sensors`: by position on the bus, of those that are there; None for all. `every`: one frame in
+        `every`. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames come, too.
         `stream` False: no frames, only requests and events. `reconnect` False: ConnectionFailedError tells
         that the only connection has ended. `timeout_s`: how long `receive` waits for a sample; by default 5
         periods, at least 20 ms. `channel`: another one than TCP.
@@ -124,7 +119,6 @@ class Client:
             sensors, every=every, fresh_only=fresh_only, raw=raw, stream=stream, imu_units=imu_units
         )
         self.channel: Channel = TcpChannel(host, port, receive_buffer) if channel is None else channel
-        self._decoders = {size: SampleDecoder(size, imu_units) for size in LAYOUTS}
         self._reconnect, self._timeout_s = reconnect, timeout_s
         self._open = False
         self._failed: ProtocolError | None = None
@@ -152,7 +146,7 @@ class Client:
         return self
 
     def close(self) -> None:
-        """End the connection for good. From any thread, which ends a wait and fails requests that wait."""
+        """End the connection, and do not reconnect. From any thread; waiting calls and requests fail."""
         self._closing.set()
         self.channel.shutdown()
         if not self._stepping:  # else the thread that is there closes the socket, which it may be reading
@@ -165,7 +159,7 @@ class Client:
     @property
     def description(self) -> JsonObject:
         """The server's newest description; empty before the first connection."""
-        return self.session.description or {}
+        return self.session.description
 
     # -- samples
 
@@ -174,7 +168,7 @@ class Client:
     ) -> Reading:
         """The newest sample of a sensor, by default the first, and whether it may be used; for control loops.
 
-        Takes all that has arrived; with `timeout_s` waits at most so long for a sample that no reading had.
+        Takes all that has arrived; with `timeout_s` waits at most that long for a sample that no reading had.
         Tells by `condition` what is wrong, and does not raise.
         """
         session = self.session
@@ -234,16 +228,18 @@ class Client:
 
     def frames(self) -> Iterator[DataMessage]:
         """The frames as they come; without end, or with `reconnect` False until the connection ends."""
-        while True:
-            try:
-                frames = self.poll(_AGAIN_S)
-            except ConnectionFailedError:
-                return
-            yield from frames
+        with contextlib.suppress(ConnectionFailedError):
+            while True:
+                yield from self.poll(_AGAIN_S)
 
     def decode(self, frame: DataMessage) -> Sample:
         """The sample in `frame`."""
-        return self._decoders[len(frame.process_data)].decode(frame.process_data)
+        return self.session.state(frame.sensor).decode(frame)
+
+    def measured_ns(self, frame: DataMessage, channel: str = "force_torque") -> int | None:
+        """As `Reading.measured_ns`, with the filters as of now."""
+        delay_ns = getattr(self.session.state(frame.sensor).delay_ns, channel)
+        return None if delay_ns is None else frame.stamp_ns - delay_ns
 
     # -- requests
 
@@ -269,8 +265,7 @@ class Client:
         finally:
             self.session.forget(future)
         reply = future.result()
-        if reply.get("ok") is not True:
-            raise RefusedError.of(reply)
+        check_granted(reply)
         return reply
 
     def request(self, action: str, **values: object) -> Future[JsonObject]:

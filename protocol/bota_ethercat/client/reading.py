@@ -6,6 +6,7 @@ Conditions, their numbers and the rules are those of the C++ header (`reading.hp
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import Final, NamedTuple
 
@@ -13,14 +14,16 @@ from bota_ethercat.accounting import FrameKind, StreamAccounting
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.sensor.warnings_register import WarningFlag
+from bota_ethercat.text.untrusted import number
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
+_MOST_HZ: Final = 1e6  # a higher rate is no sensor's
+_MOST_MS: Final = 1e5  # a longer delay is no filter's
 _LEAST_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
-_WARNINGS: Final = slice(
-    LAYOUTS[min(LAYOUTS)].offsets["warnings"], LAYOUTS[min(LAYOUTS)].offsets["warnings"] + 4
-)
+_WARNINGS_AT: Final = LAYOUTS[min(LAYOUTS)].offsets["warnings"]
+_WARNINGS: Final = slice(_WARNINGS_AT, _WARNINGS_AT + 4)
 _NO_WARNINGS: Final = bytes(4)
 
 
@@ -30,34 +33,40 @@ class Condition(IntEnum):
     0 to 2: there is a sample no older than `max_age_s`, and they say what it is worth. Others: there is none.
     """
 
-    FRESH = 0
-    SATURATED = 1
-    NOT_FINITE = 2
-    LATE = 3
-    BAD_CLOCK = 4
-    REPEATED = 5
-    INVALID = 6
-    SILENT = 7
-    SENSOR_LOST = 8
-    DISCONNECTED = 9
+    meaning: str
+    FRESH = 0, "fresh"
+    SATURATED = 1, "saturated: the sensor is overloaded"
+    NOT_FINITE = 2, "not finite: the sensor sends NaN or infinity"
+    LATE = 3, "late: what arrives is too old"
+    BAD_CLOCK = 4, "bad clock: the server's stamps are ahead of this machine's"
+    REPEATED = 5, "repeated: the sensor gives nothing new"
+    INVALID = 6, "invalid: the sensor does not answer on the bus"
+    SILENT = 7, "silent: nothing arrives from the server"
+    SENSOR_LOST = 8, "lost: the server says that the sensor is lost"
+    DISCONNECTED = 9, "disconnected"
+
+    def __new__(cls, number: int, meaning: str) -> Condition:
+        """A number with its meaning."""
+        member = int.__new__(cls, number)
+        member._value_, member.meaning = number, meaning
+        return member
 
     def __str__(self) -> str:
-        """What it means."""
-        return _MEANINGS[self]
+        return self.meaning
 
 
-_MEANINGS: Final = {
-    Condition.FRESH: "fresh",
-    Condition.SATURATED: "saturated: the sensor is overloaded",
-    Condition.NOT_FINITE: "not finite: the sensor sends NaN or infinity",
-    Condition.LATE: "late: what arrives is too old",
-    Condition.BAD_CLOCK: "bad clock: the server's stamps are ahead of this machine's",
-    Condition.REPEATED: "repeated: the sensor gives nothing new",
-    Condition.INVALID: "invalid: the sensor does not answer on the bus",
-    Condition.SILENT: "silent: nothing arrives from the server",
-    Condition.SENSOR_LOST: "lost: the server says that the sensor is lost",
-    Condition.DISCONNECTED: "disconnected",
-}
+class Delays(NamedTuple):
+    """Group delay of each channel's filters, ns; None: unknown."""
+
+    force_torque: int | None = None
+    acceleration: int | None = None
+    angular_rate: int | None = None
+
+    @classmethod
+    def parse(cls, delay_ms: Mapping[str, object]) -> Delays:
+        """From `delay_ms` in a message."""
+        values = (number(delay_ms.get(channel)) for channel in cls._fields)
+        return cls(*(round(ms * 1e6) if ms is not None and 0 <= ms < _MOST_MS else None for ms in values))
 
 
 class Reading(NamedTuple):
@@ -68,11 +77,20 @@ class Reading(NamedTuple):
     sample: Sample | None  # the newest new and valid one; None before the first
     frame: DataMessage | None  # what it came in: sequence, stamps, flags
     is_new: bool  # no earlier reading had it
+    # Of the sample, now; infinity if unknown. From its arrival where the server's clock is not ours.
     age_s: float
-    """Of the sample, now; infinity if unknown. From its arrival where the server's clock is not ours."""
-    gap: bool  # samples were lost or withheld, or the connection was made anew, since the reading before
+    gap: bool  # samples were lost or withheld, or the connection was lost, since the reading before
     passed_over: int  # new samples since the reading before that came before this one
     warnings_seen: int  # warnings registers of all of them, joined by OR: a warning can last one sample
+    delay_ns: Delays  # of the filters with which the sample was made
+
+    def measured_ns(self, channel: str = "force_torque") -> int | None:
+        """When it was measured, CLOCK_REALTIME: `frame.stamp_ns` less the group delay of the filters.
+
+        `acceleration` and `angular_rate` are the other channels. None: no sample, or an unknown delay.
+        """
+        delay_ns = getattr(self.delay_ns, channel)
+        return None if self.frame is None or delay_ns is None else self.frame.stamp_ns - delay_ns
 
     @property
     def fresh(self) -> bool:
@@ -85,24 +103,30 @@ class SensorState:
 
     def __init__(self, sensor: int, *, every: int, fresh_only: bool, imu_units: ImuUnits) -> None:
         self.accounting = StreamAccounting(every=every, fresh_only=fresh_only)
-        self.lost = False
-        """The server says so."""
+        self.lost = False  # the server says so
         self.sensor = sensor
-        self.unread = 0
-        """New samples since the last reading."""
-        self.told_ns = -1
-        """Up to this instant, of the server's clock, it was told to be silent."""
+        self.unread = 0  # new samples since the last reading
+        self.told_ns = -1  # up to this instant, of the server's clock, it was told to be silent
         self._decoders = {size: SampleDecoder(size, imu_units) for size in LAYOUTS}
         self._flags = 0
         self._received_ns = self._sampled_received_ns = 0
         self._sampled: DataMessage | None = None
-        self._same_clock = self._anew = self._gap = False
+        self._same_clock = self._reconnected = self._gap = False
         self._carried = 0
         self._warnings = 0
+        self.delay_ns = self._sampled_delay_ns = Delays()
+
+    def take_in_force(self, message: Mapping[str, object]) -> None:
+        """The rate and the delays that a description or an event gives; others stay as they were."""
+        rate_hz, delay_ms = number(message.get("rate_hz")), message.get("delay_ms")
+        if rate_hz is not None and 0 < rate_hz <= _MOST_HZ:
+            self.accounting.rate_hz = rate_hz
+        if isinstance(delay_ms, dict):
+            self.delay_ns = Delays.parse(delay_ms)
 
     def begin(self) -> None:
         """A new connection."""
-        self._anew = self.accounting.counts.frames > 0  # what was lost meanwhile is not known
+        self._reconnected = self.accounting.counts.frames > 0  # what was lost meanwhile is not known
         self.accounting.begin()
         self.lost = False
 
@@ -113,14 +137,14 @@ class SensorState:
         """
         sequence, _, monotonic_ns, _, flags, _, process_data = frame
         accounting = self.accounting
-        unusual = flags or self._anew or self._carried or self.lost
+        unusual = flags or self._reconnected or self._carried or self.lost
         if unusual or not accounting.take_next(sequence, monotonic_ns):
             restarts = accounting.counts.restarts
             kind = accounting.take(sequence, monotonic_ns, flags)
             if kind is FrameKind.OLD:
                 return None
-            if self._anew or accounting.counts.restarts > restarts:
-                self._anew, self._carried = False, _GAP
+            if self._reconnected or accounting.counts.restarts > restarts:
+                self._reconnected, self._carried = False, _GAP
             if kind is not FrameKind.NEW:
                 self._flags, self._received_ns = flags, received_ns
                 self._carried |= flags & _GAP
@@ -131,6 +155,7 @@ class SensorState:
             self.lost = False
         self._flags, self._same_clock = flags, same_clock
         self._sampled, self._received_ns, self._sampled_received_ns = frame, received_ns, received_ns
+        self._sampled_delay_ns = self.delay_ns
         self.unread += 1
         if (warnings := process_data[_WARNINGS]) != _NO_WARNINGS:
             self._warnings |= int.from_bytes(warnings, "little")
@@ -155,7 +180,7 @@ class SensorState:
             condition = self.why_old(silence_ns, now_ns, connected=connected, ahead=ahead)
         reading = Reading(
             condition, self.sensor, sample, frame, self.unread > 0, age_ns * 1e-9,
-            self._gap or self._carried != 0, max(0, self.unread - 1), self._warnings,
+            self._gap or self._carried != 0, max(0, self.unread - 1), self._warnings, self._sampled_delay_ns,
         )  # fmt: skip
         self.unread = self._warnings = 0
         self._gap = False

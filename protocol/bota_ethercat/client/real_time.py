@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 HIGHEST_PRIORITY: Final = 98  # 99 is the kernel's own threads'
+# MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: pages stay in memory once they have been used.
 _MLOCK: Final = 1 | 2 | 4
-"""MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: pages stay in memory once they have been used."""
 _CAP_IPC_LOCK: Final = 14
 _LIMITS: Final = "a file in /etc/security/limits.d"
 

@@ -4,8 +4,8 @@ The rules it keeps:
 
 - A connection begins with `describe`: the version is checked, and of the sensors asked for, those that are
   there are subscribed to. If none is there, or at first not all are, the connection has failed.
-- Whoever has the socket passes what arrives to `received` and sends what is returned.
-- After a connection that ended the next attempt is due at `retry_at_ns`: later each time, at once after one
+- The owner of the socket passes what arrives to `received` and sends what is returned.
+- After a connection that ended the next attempt is due at `retry_at_ns`: later each time, and soon after one
   that lasted.
 - What is known of a sensor is kept over connections; the first sample of a new one has GAP.
 - Frames that are no news are not handed out, unless `raw`.
@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import boot_id
-from bota_ethercat.client.reading import SensorState
+from bota_ethercat.client.reading import Delays, SensorState
 from bota_ethercat.control import Event, check_version, request
 from bota_ethercat.errors import (
     BadMessageError,
@@ -37,10 +37,9 @@ from bota_ethercat.text.untrusted import printable, rows
 
 _FIRST_RETRY_NS: Final = 100_000_000
 _LONGEST_RETRY_NS: Final = 1_000_000_000
+# After a connection that lasted this long the next attempt follows as soon as after the first.
 _LASTED_NS: Final = 1_000_000_000
-"""A connection that lasted this long was a good one: the next attempt follows at once."""
-_MOST_HZ: Final = 1e6
-_MOST_ITEMS: Final = 65536  # kept while nobody takes them; a tare of 20,000 samples needs fewer
+_MOST_ITEMS: Final = 65536  # kept until they are taken; a tare of 20,000 samples needs fewer
 _HANDSHAKE_NS: Final = 5_000_000_000
 _LEAST_TIMEOUT_S: Final = 0.02
 _TIMEOUT_PERIODS: Final = 5
@@ -62,8 +61,8 @@ class Disconnected(NamedTuple):
     was_connected: bool
 
 
+# What the client tells of its connection, and the server's events as they came.
 ClientEvent = Connected | Disconnected | JsonObject
-"""What the client tells of its connection, and the server's events as they came."""
 
 
 class Session:
@@ -71,7 +70,7 @@ class Session:
 
     Attributes:
         connected: whether there is a connection and its subscription is granted.
-        description: the server's newest description; None before the first connection.
+        description: the server's newest description; empty before the first connection.
         items: what has arrived and was not taken yet, in order: new and valid frames, or all of them if
             `raw`; the server's events; `Connected` and `Disconnected`.
         same_machine: whether the server's CLOCK_MONOTONIC is this machine's.
@@ -94,7 +93,7 @@ class Session:
         """What to subscribe to, `sensors` None for all; nothing unless `stream`."""
         self.wanted = None if sensors is None else tuple(sensors)
         self.connected = self.same_machine = False
-        self.description: JsonObject | None = None
+        self.description: JsonObject = {}
         self.items: deque[DataMessage | ClientEvent] = deque(maxlen=_MOST_ITEMS)
         self.sensors: dict[int, SensorState] = {}
         self.connections = 0
@@ -109,8 +108,8 @@ class Session:
         self._batch: list[DataMessage] = []
         self._ids = itertools.count(1)
         self._replies: dict[int, Future[JsonObject]] = {}
-        self._describing: Future[JsonObject] | None = None
-        self._subscribing: Future[JsonObject] | None = None
+        # The request that is to be granted next, and what its reply goes to.
+        self._handshake: tuple[Future[JsonObject], Callable[[JsonObject], bytes]] | None = None
         self._missing: tuple[int, ...] = ()
         self._retry_ns = _FIRST_RETRY_NS
         self._opened_ns = 0
@@ -123,24 +122,22 @@ class Session:
         self._open, self._opened_ns = True, now_ns
         self.same_machine = is_near
         self._decoder = FrameDecoder()
-        self._describing, sent = self.ask("describe")
-        return sent
+        return self._ask_first(self._described, "describe")
 
     def ended(self, reason: str, now_ns: int, *, reachable: bool = True) -> None:
         """The connection has ended, or none could be made."""
         was_connected = self.connected
-        lasted = self._open and now_ns - self._opened_ns >= _LASTED_NS
+        if self._open and now_ns - self._opened_ns >= _LASTED_NS:
+            self._retry_ns = _FIRST_RETRY_NS
         self.connected = self._open = False
-        self._describing = self._subscribing = None
-        self._retry_ns = _FIRST_RETRY_NS if lasted else self._retry_ns
+        self._handshake = None
         self.retry_at_ns = now_ns + self._retry_ns
         self._retry_ns = min(self._retry_ns * 3 // 2, _LONGEST_RETRY_NS)
         self.problem = reason
+        error = ConnectionFailedError(f"the connection ended before the reply: {reason}")
         for identifier in list(self._replies):
             if (future := self._replies.pop(identifier, None)) is not None:
-                future.set_exception(
-                    ConnectionFailedError(f"the connection ended before the reply: {reason}")
-                )
+                future.set_exception(error)
         self.items.append(Disconnected(reason, reachable, was_connected))
 
     def get_buffer(self) -> memoryview:
@@ -190,7 +187,7 @@ class Session:
         return future, encode_json(request(action, identifier, **values))
 
     def forget(self, future: Future[JsonObject]) -> None:
-        """Nobody waits for this reply any more; from any thread."""
+        """Drop the reply to this request; from any thread."""
         for identifier, waiting in list(self._replies.items()):
             if waiting is future:
                 self._replies.pop(identifier, None)
@@ -204,26 +201,24 @@ class Session:
         future = self._replies.pop(identifier, None) if type(identifier) is int else None
         if future is not None:
             future.set_result(message)
-        if future is None:
+        if future is None or self._handshake is None or future is not self._handshake[0]:
             return b""
-        if future is self._describing:
-            self._describing = None
-            return self._described(message)
-        if future is self._subscribing:
-            self._subscribing = None
-            self._granted(message)
-        return b""
+        check_granted(message)
+        return self._handshake[1](message)
+
+    def _ask_first(self, then: Callable[[JsonObject], bytes], action: str, **values: object) -> bytes:
+        future, sent = self.ask(action, **values)
+        self._handshake = future, then
+        return sent
 
     def _described(self, reply: JsonObject) -> bytes:
-        _check_granted(reply)
         check_version(reply)
         theirs, ours = reply.get("boot_id"), boot_id()
         if isinstance(theirs, str) and ours is not None:
             self.same_machine = theirs == ours
-        self.describe(reply)
         if not self._stream:
-            self._begin()
-            return b""
+            return self._granted(reply)
+        self.describe(reply)
         there = [position for row in rows(reply.get("sensors")) if (position := _position(row)) is not None]
         values: dict[str, Any] = {"every": self._every, "fresh_only": self._fresh_only}
         if self.wanted is not None:
@@ -234,30 +229,26 @@ class Session:
                 has = ", ".join(map(str, there[:16])) or "none"
                 raise ConnectionFailedError(f"the server has no sensor {text} (it has: {has})")
             values["sensors"] = found
-        self._subscribing, sent = self.ask("subscribe", **values)
-        return sent
+        return self._ask_first(self._granted, "subscribe", **values)
 
-    def _granted(self, reply: JsonObject) -> None:
-        _check_granted(reply)
+    def _granted(self, reply: JsonObject) -> bytes:
         self.describe(reply)
-        self._begin()
-
-    def _begin(self) -> None:
+        self._handshake = None
         self._begun_ns = -1
         for state in self.sensors.values():
             state.begin()
-        assert self.description is not None
         self.connected, self.problem = True, ""
         self.connections += 1
         self.items.append(Connected(self.description, self.connections > 1, self._missing))
+        return b""
 
     def describe(self, description: JsonObject) -> None:
         """Take a description of the server, which may be newer than that of the connection."""
         self.description = description
         for row in rows(description.get("sensors")):
             if (position := _position(row)) is not None:
-                self.state(position)
-            self._take_rate(row)
+                self.state(position).delay_ns = Delays()
+                self.state(position).take_in_force(row)
 
     def _take_event(self, message: JsonObject) -> None:
         state = self.sensors.get(position) if (position := _position(message)) is not None else None
@@ -265,13 +256,8 @@ class Session:
             state.lost = True
         elif state is not None and message["event"] in (Event.SENSOR_BACK, Event.RECONFIGURED):
             state.lost = False
-            self._take_rate(message)
+            state.take_in_force(message)
         self.items.append(message)
-
-    def _take_rate(self, message: JsonObject) -> None:
-        position, rate_hz = _position(message), message.get("rate_hz")
-        if position in self.sensors and isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ:
-            self.sensors[position].accounting.rate_hz = float(rate_hz)
 
     # -- what is known
 
@@ -303,13 +289,14 @@ class Session:
         if self._begun_ns < 0:
             self._begun_ns = newest_ns
         for state in awaited:
-            if newest_ns - max(state.accounting.new_ns, state.told_ns, self._begun_ns) > timeout_ns:
+            if newest_ns - max(state.accounting.new_ns, state.told_ns, self._begun_ns) >= timeout_ns:
                 state.told_ns = newest_ns
                 return state.sensor
         return None
 
 
-def _check_granted(reply: JsonObject) -> None:
+def check_granted(reply: JsonObject) -> None:
+    """RefusedError unless the server granted it."""
     if reply.get("ok") is not True:
         raise RefusedError.of(reply)
 

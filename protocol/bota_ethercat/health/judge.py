@@ -51,10 +51,9 @@ class Saturation(NamedTuple):
     flag: WarningFlag
 
 
+_WRENCH: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 SATURATIONS: Final = (
-    Saturation(
-        "force_torque_saturated", ("Fx", "Fy", "Fz", "Mx", "My", "Mz"), WarningFlag.FORCE_TORQUE_SATURATED
-    ),
+    Saturation("force_torque_saturated", _WRENCH, WarningFlag.FORCE_TORQUE_SATURATED),
     Saturation("acceleration_saturated", ("ax", "ay", "az"), WarningFlag.ACCELERATION_SATURATED),
     Saturation("angular_rate_saturated", ("ωx", "ωy", "ωz"), WarningFlag.ANGULAR_RATE_SATURATED),
 )
@@ -70,22 +69,22 @@ _STANDSTILL_S: Final = 0.02
 
 def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:
     """The verdict on a stream."""
+    return verdict(_findings(seen, limits))
+
+
+def _findings(seen: Observation, limits: Limits) -> Iterator[Finding]:
     silent = seen.silent_s > limits.stale_after
-    findings: list[Finding] = []
     if silent:
-        findings.append(_silence(seen))
+        yield _silence(seen)
     elif seen.is_lost:
-        findings.append(_trouble("silence", "The server has lost the sensor", _advice(seen)))
+        yield _trouble("silence", "The server has lost the sensor", _advice(seen))
     elif not seen.samples and seen.state not in _STREAMING:
-        findings.append(
-            _trouble("silence", f"The sensor is in state {seen.state}, not OP", "See the server's log")
-        )
-    findings += _values(seen, limits)
-    findings += _losses(seen, limits)
+        yield _trouble("silence", f"The sensor is in state {seen.state}, not OP", "See the server's log")
+    yield from _values(seen, limits)
+    yield from _losses(seen, limits)
     if not silent and not seen.is_lost:
-        findings += _arrival(seen, limits)
-    findings += _circumstances(seen)
-    return verdict(findings)
+        yield from _arrival(seen, limits)
+    yield from _circumstances(seen)
 
 
 def _trouble(key: str, found: str, remedy: str, about: About = About.STREAM, size: float = 0.0) -> Finding:
@@ -119,11 +118,8 @@ def _silence(seen: Observation) -> Finding:
 def _values(seen: Observation, limits: Limits) -> Iterator[Finding]:
     """What is wrong with the samples themselves."""
     if seen.not_finite:
-        yield _trouble(
-            "not_finite",
-            "Samples have values that are not finite",
-            "Power-cycle the sensor; if it persists, contact support",
-        )
+        remedy = "Power-cycle the sensor; if it persists, contact support"
+        yield _trouble("not_finite", "Samples have values that are not finite", remedy)
     if seen.settings.get("calibration_matrix") is False:
         found = "settings.calibration_matrix is off, force and torque are counts and not N and Nm"
         yield _trouble("calibration_matrix", found, "Switch it on", About.SENSOR)
@@ -141,10 +137,11 @@ def _values(seen: Observation, limits: Limits) -> Iterator[Finding]:
 
 def _temperature(celsius: float, limits: Limits) -> Iterator[Finding]:
     if celsius >= limits.temperature_warn:
-        make = _trouble if celsius >= limits.temperature_error else _look
-        yield make(
-            "temperature", f"The sensor has {celsius:.1f} °C", "Let it cool down", About.SENSOR, celsius
+        make, found = (
+            _trouble if celsius >= limits.temperature_error else _look,
+            f"The sensor has {celsius:.1f} °C",
         )
+        yield make("temperature", found, "Let it cool down", About.SENSOR, celsius)
     elif celsius < limits.coldest:
         found = f"The sensor says {celsius:.1f} °C, which its electronics cannot have"
         yield _look("temperature", found, "Do not use it; contact support", About.SENSOR)
@@ -154,8 +151,7 @@ def saturated_axes(seen: Observation) -> dict[int, list[str]]:
     """The saturated axes, by their flag in the warnings register."""
     found = {}
     for field, axes, flag in SATURATIONS:
-        bits = getattr(seen, field)
-        if bits:
+        if bits := getattr(seen, field):
             names = [name for place, name in enumerate(axes) if bits >> place & 1]
             found[int(flag)] = names or ["an undefined axis"]
     return found
@@ -179,6 +175,10 @@ def _many(count: int, total: int, seen: Observation, limits: Limits) -> Level:
     return Level.TROUBLE if many else Level.LOOK
 
 
+def _frames(count: int) -> str:
+    return "1 frame was" if count == 1 else f"{count} frames were"
+
+
 def _percent(part: int, total: int) -> str:
     percent = 100 * part / total
     return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
@@ -188,14 +188,11 @@ def _arrival(seen: Observation, limits: Limits) -> Iterator[Finding]:
     """How the samples arrive, of a stream that is not silent."""
     yield from _rate(seen, limits)
     if seen.invalid >= limits.lost_warn:
-        total = seen.samples + seen.invalid
-        frames = "1 frame was" if seen.invalid == 1 else f"{seen.invalid} frames were"
-        found = f"{frames} invalid, the sensor did not answer the bus"
-        level = _many(seen.invalid, total, seen, limits)
+        found = f"{_frames(seen.invalid)} invalid, the sensor did not answer the bus"
+        level = _many(seen.invalid, seen.samples + seen.invalid, seen, limits)
         yield Finding(level, About.STREAM, "invalid", found, _advice(seen), seen.invalid)
     if seen.repeated >= limits.lost_warn:
-        frames = "1 frame was" if seen.repeated == 1 else f"{seen.repeated} frames were"
-        found = f"{frames} repeated, the sensor had nothing new"
+        found = f"{_frames(seen.repeated)} repeated, the sensor had nothing new"
         yield _look("repeated", found, "If it goes on, power-cycle it", size=seen.repeated)
     if seen.age_p99_us is not None and seen.age_p99_us >= limits.age_warn * 1e6:
         make = _trouble if seen.age_p99_us >= limits.age_error * 1e6 else _look
@@ -223,12 +220,8 @@ def _circumstances(seen: Observation) -> Iterator[Finding]:
     if seen.emergency:
         yield _look("emergency", seen.emergency, "If it comes again, contact support", About.SENSOR)
     if seen.settings.get("coordinate_system") is True:
-        yield _look(
-            "coordinate_system",
-            "settings.coordinate_system is on, force and torque are in a frame configured in the sensor",
-            "Switch it off, or correct the URDF",
-            About.SENSOR,
-        )
+        found = "settings.coordinate_system is on, force and torque are in a frame configured in the sensor"
+        yield _look("coordinate_system", found, "Switch it off, or correct the URDF", About.SENSOR)
     if seen.locked is False:
         found = "The server does not follow the sensor's clock (yet), stamps are less exact"
         yield _look("clock", found, "If it goes on, the machine is too busy", About.CLOCK)

@@ -20,50 +20,29 @@ _FLAGS: Final = tuple(
     for name in ("warnings", "force_torque_saturated", "acceleration_saturated", "angular_rate_saturated")
 )
 _TEMPERATURE: Final = COMMON.index("temperature")
-_MOST_AGES: Final = 1 << 16
+_MOST_KEPT: Final = 1 << 16
 _HIGHEST_HZ: Final = 1e6  # a rate beyond it is no sensor's, and not known
-
-
-class _Intervals(NamedTuple):
-    """The intervals between samples that follow one another, ns."""
-
-    number: int = 0
-    total: int = 0
-    squares: int = 0
-    least: int = 1 << 64
-    most: int = 0
 
 
 class _Batch(NamedTuple):
     """What came at one moment."""
 
     at_ns: int
-    counts: tuple[int, int, int, int] = (0, 0, 0, 0)  # samples, missing ones; frames repeated and invalid
-    silent_ns: int = 0  # how long before there had been no sample; 0 if it brings none
-    stamps: tuple[int, int] | None = None  # `monotonic_ns` of the first and the last sample
+    counts: tuple[int, ...] = (0,) * 5  # samples, missing ones; frames repeated and invalid; not finite
     flags: tuple[int, ...] = (0,) * len(_FLAGS)
-    not_finite: int = 0
-    intervals: _Intervals = _Intervals()
+    silent_ns: int = 0  # how long before there had been no sample; 0 if it brings none
+    first_ns: int = 0  # `monotonic_ns` of the first and the last sample; 0 if it brings none
+    last_ns: int = 0
 
     def then(self, later: _Batch) -> _Batch:
         """Both, as one."""
-        n, m, r, i = map(operator.add, self.counts, later.counts)
-        stamps = [batch.stamps for batch in (self, later) if batch.stamps is not None]
-        one, two = self.intervals, later.intervals
         return _Batch(
             later.at_ns,
-            (n, m, r, i),
-            max(self.silent_ns, later.silent_ns),
-            (stamps[0][0], stamps[-1][1]) if stamps else None,
+            tuple(map(operator.add, self.counts, later.counts)),
             tuple(map(operator.or_, self.flags, later.flags)),
-            self.not_finite + later.not_finite,
-            _Intervals(
-                one.number + two.number,
-                one.total + two.total,
-                one.squares + two.squares,
-                min(one.least, two.least),
-                max(one.most, two.most),
-            ),
+            max(self.silent_ns, later.silent_ns),
+            self.first_ns or later.first_ns,
+            later.last_ns or self.last_ns,
         )
 
 
@@ -79,10 +58,12 @@ class StreamObserver:
         self.newest: bytes | None = None
         self._accounting = StreamAccounting(fresh_only=False)
         self._window_ns = window_ns
-        self._previous_ns: int | None = None
-        self._batches: deque[_Batch] = deque()
-        self._ages: deque[tuple[int, float]] = deque(maxlen=_MOST_AGES)
+        self._previous_ns: int | None = None  # the newest sample's stamp, unless other frames have come since
         self._temperature: float | None = None
+        self._batches: deque[_Batch] = deque()
+        # When each came, and: the age of samples, ns; the interval between samples that follow one another.
+        self._ages: deque[tuple[int, int]] = deque(maxlen=_MOST_KEPT)
+        self._intervals: deque[tuple[int, int]] = deque(maxlen=_MOST_KEPT)
         self.begin(nominal_hz, start_ns)
 
     @property
@@ -99,45 +80,37 @@ class StreamObserver:
 
     def forget(self) -> None:
         """Forget all that has been."""
-        self._batches.clear()
-        self._ages.clear()
+        for kept in (self._batches, self._ages, self._intervals):
+            kept.clear()
 
     def take(self, frames: Sequence[DataMessage], now_ns: int) -> list[tuple[Any, ...]]:
         """Frames that came just now, oldest first; the values of the new samples, as in COMMON."""
         if not frames:
             return []
-        counts, take = self._accounting.counts, self._accounting.take
-        before = counts.new, counts.missing, counts.repeated, counts.invalid
+        counts, take, before = self._accounting.counts, self._accounting.take, self._counted()
         fresh: list[DataMessage] = []
-        intervals: list[int] = []
         previous, missing = self._previous_ns, counts.missing
         for frame in frames:
             if take(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
                 previous = None
                 continue
             if previous is not None and counts.missing == missing:
-                intervals.append(frame.monotonic_ns - previous)
+                self._intervals.append((now_ns, frame.monotonic_ns - previous))
             previous, missing = frame.monotonic_ns, counts.missing
             fresh.append(frame)
         self._previous_ns = previous
-        after = counts.new, counts.missing, counts.repeated, counts.invalid
-        n, m, r, i = map(operator.sub, after, before)
-        batch = _Batch(now_ns, (n, m, r, i))
+        not_finite = sum(not is_finite(frame.process_data) for frame in fresh)
+        batch = _Batch(now_ns, (*map(operator.sub, self._counted(), before), not_finite))
         rows = [COMMON.struct.unpack_from(frame.process_data) for frame in fresh]
         if fresh:
             self.newest, self._temperature = fresh[-1].process_data, rows[-1][_TEMPERATURE]
             batch = batch._replace(
-                silent_ns=now_ns - self._fresh_at_ns,
-                stamps=(fresh[0].monotonic_ns, fresh[-1].monotonic_ns),
                 flags=tuple(functools.reduce(operator.or_, (row[index] for row in rows)) for index in _FLAGS),
-                not_finite=sum(not is_finite(frame.process_data) for frame in fresh),
+                silent_ns=now_ns - self._fresh_at_ns,
+                first_ns=fresh[0].monotonic_ns,
+                last_ns=fresh[-1].monotonic_ns,
             )
             self._fresh_at_ns = now_ns
-        if intervals:
-            squares = sum(interval * interval for interval in intervals)
-            batch = batch._replace(
-                intervals=_Intervals(len(intervals), sum(intervals), squares, min(intervals), max(intervals))
-            )
         if self._window_ns is None and self._batches:
             batch = self._batches.pop().then(batch)
         self._batches.append(batch)
@@ -147,7 +120,7 @@ class StreamObserver:
     def note_age(self, frame: DataMessage, now_ns: int) -> None:
         """This frame was waited for and came just now, on the server's own machine."""
         if not frame.flags & NOT_NEW:
-            self._ages.append((now_ns, (now_ns - frame.monotonic_ns) * 1e-3))
+            self._ages.append((now_ns, now_ns - frame.monotonic_ns))
 
     def silent_s(self, now_ns: int) -> float:
         """Time since the newest sample came, or since the beginning."""
@@ -156,15 +129,15 @@ class StreamObserver:
     def observation(self, now_ns: int, window_ns: int | None = None) -> Observation:
         """What was seen until now, at most in the last `window_ns`."""
         window_ns = window_ns or self._window_ns
-        seen = self._seen(now_ns, window_ns)
+        self._drop(now_ns)
+        batches = (each for each in self._batches if window_ns is None or each.at_ns >= now_ns - window_ns)
+        seen = functools.reduce(_Batch.then, batches, _Batch(now_ns))
         seconds = (now_ns - self._start_ns) * 1e-9
-        if window_ns is not None:
-            seconds = min(seconds, window_ns * 1e-9)
-        samples, lost, repeated, invalid = seen.counts
+        samples, lost, repeated, invalid, not_finite = seen.counts
         warnings, force_torque, acceleration, angular_rate = seen.flags
-        span_ns = seen.stamps[1] - seen.stamps[0] if seen.stamps else 0
+        span_ns = seen.last_ns - seen.first_ns
         return Observation(
-            seconds=seconds,
+            seconds=seconds if window_ns is None else min(seconds, window_ns * 1e-9),
             samples=samples,
             lost=lost,
             repeated=repeated,
@@ -173,7 +146,7 @@ class StreamObserver:
             rate_hz=(samples - 1) * 1e9 / span_ns if span_ns > 0 else None,
             nominal_hz=self._nominal_hz,
             age_p99_us=p99(self.ages_us(now_ns, window_ns)),
-            not_finite=seen.not_finite,
+            not_finite=not_finite,
             temperature=self._temperature,
             warnings=warnings,
             force_torque_saturated=force_torque,
@@ -184,29 +157,30 @@ class StreamObserver:
     def ages_us(self, now_ns: int, window_ns: int | None = None) -> list[float]:
         """The ages noted, at most those of the last `window_ns`."""
         self._drop(now_ns)
-        return [age_us for at_ns, age_us in self._ages if window_ns is None or at_ns >= now_ns - window_ns]
+        return [age * 1e-3 for at_ns, age in self._ages if window_ns is None or at_ns >= now_ns - window_ns]
 
     def jitter_us(self, now_ns: int) -> tuple[float, float] | None:
         """Standard deviation of the intervals between stamps, and the largest deviation from their mean."""
-        count, total, squares, least, most = self._seen(now_ns, self._window_ns).intervals
-        if count < 2:
-            return None
-        mean = total / count
-        return math.sqrt(count * squares - total * total) / count / 1e3, max(most - mean, mean - least) / 1e3
-
-    def _seen(self, now_ns: int, window_ns: int | None) -> _Batch:
         self._drop(now_ns)
-        batches = (each for each in self._batches if window_ns is None or each.at_ns >= now_ns - window_ns)
-        return functools.reduce(_Batch.then, batches, _Batch(now_ns))
+        intervals = [interval for _, interval in self._intervals]
+        if len(intervals) < 2:
+            return None
+        mean = sum(intervals) / len(intervals)
+        deviation = math.dist(intervals, [mean] * len(intervals)) / math.sqrt(len(intervals))
+        return deviation / 1e3, max(max(intervals) - mean, mean - min(intervals)) / 1e3
+
+    def _counted(self) -> tuple[int, ...]:
+        counts = self._accounting.counts
+        return counts.new, counts.missing, counts.repeated, counts.invalid
 
     def _drop(self, now_ns: int) -> None:
         """Drop what is older than the window."""
         if self._window_ns is None:
             return
-        while self._batches and self._batches[0].at_ns < now_ns - self._window_ns:
-            self._batches.popleft()
-        while self._ages and self._ages[0][0] < now_ns - self._window_ns:
-            self._ages.popleft()
+        oldest_ns = now_ns - self._window_ns
+        for kept in (self._batches, self._ages, self._intervals):
+            while kept and kept[0][0] < oldest_ns:
+                kept.popleft()
 
 
 def p99(values: Collection[float]) -> float | None:

@@ -11,7 +11,8 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
-from bota_ethercat.settings import PUBLISHED_RATES_HZ, SETTINGS, Setting
+from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
+from bota_ethercat.settings import SETTINGS
 
 OPTION: Final = "--print-completion"
 _SHELLS: Final = ("bash", "zsh", "tcsh")
@@ -80,11 +81,6 @@ def _completer(action: argparse.Action, file: Any) -> Any:
 
 def _assignments() -> Iterator[str]:
     """The settings with the values that are worth offering."""
-    for setting in SETTINGS.values():
-        yield from (f"{setting.name}={value}" for value in _values(setting))
-
-
-def _values(setting: Setting) -> Sequence[object]:
-    if setting.name == "sinc_length":
-        return tuple(PUBLISHED_RATES_HZ)  # the manual's
-    return ("true", "false") if setting.choices is None else setting.choices
+    for name, setting in SETTINGS.items():
+        values = FORCE_TORQUE_FILTERS if name == "sinc_length" else setting.choices or ("true", "false")
+        yield from (f"{name}={value}" for value in values)

@@ -8,8 +8,8 @@ import json
 import sys
 from typing import Final
 
+# Characters of units and tables, and how ASCII writes them.
 SPELLED: Final = {"²": "2", "°": "deg", "µ": "u", "±": "+-", "ω": "w", "…": "...", "·": "|"}
-"""Characters of units and tables, and how ASCII writes them."""
 
 
 def never_fail() -> None:

@@ -62,10 +62,8 @@ def _in_file(path: Path) -> Address:
         return THIS_MACHINE
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path} is not a text file: it must be TOML in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path} is not valid TOML: {error}") from None
+    except ValueError as error:
+        raise ValueError(f"{path} is not TOML in UTF-8: {error}") from None
     server = content.pop("server", str(THIS_MACHINE))
     if content or not isinstance(server, str):
         raise ValueError(f'{path} takes one key: server = "{THIS_MACHINE}"')

@@ -12,8 +12,7 @@ from importlib import import_module  # noqa: E402
 
 from bota_ethercat.program.output import never_fail  # noqa: E402
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+INTERRUPTED = 130  # Exit code after Ctrl-C, as shells have it
 
 
 def run(module: str) -> int:

@@ -6,12 +6,13 @@ $XDG_STATE_HOME/bota-ethercat-bridge/tares.json, or below ~/.local/state.
 from __future__ import annotations
 
 import json
-import math
 import os
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from bota_ethercat.control import six_numbers
 
 
 def remember(serial: int, before: Sequence[float], after: Sequence[float]) -> None:
@@ -26,13 +27,14 @@ def remember(serial: int, before: Sequence[float], after: Sequence[float]) -> No
 
 def former(serial: int | None, now: Sequence[float], sensor: str) -> list[float]:
     """The offset of before the last tare of `sensor`; ValueError unless that tare made the offset `now`."""
-    row = _read(_path()).get(str(serial))
-    if not isinstance(row, dict) or not _are_offsets(row.get("before")) or not _are_offsets(row.get("after")):
-        raise ValueError(f"no tare of {sensor} by this user is known")
-    if array("f", row["after"]) != array("f", now):  # as the sensor keeps it
+    row: Any = _read(_path()).get(str(serial))
+    try:
+        before, after = six_numbers(row["before"]), six_numbers(row["after"])
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"no tare of {sensor} by this user is known") from None
+    if array("f", after) != array("f", now):  # as the sensor keeps it
         raise ValueError(f"the offset of {sensor} has changed since its last tare here")
-    before: list[float] = row["before"]
-    return before
+    return list(before)
 
 
 def _path() -> Path:
@@ -47,11 +49,3 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def _are_offsets(value: object) -> bool:
-    return (
-        isinstance(value, Sequence)
-        and len(value) == 6
-        and all(isinstance(number, float) and math.isfinite(number) for number in value)
-    )

@@ -5,7 +5,7 @@ Cut-off frequencies are those of `filters`; what it lacks is called not in the t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.sensor.filters import (
@@ -31,6 +31,13 @@ _ON_OFF: Final[Mapping[str, tuple[str, str]]] = {
     "chop": ("CHOP on: less drift, unpredictable latency", "CHOP off"),
 }
 _IMU: Final = ("no IMU", "internal IMU", "external IMU", "both IMUs")
+_OTHERS: Final[Mapping[str, Callable[[int], str]]] = {
+    "imu_active": lambda value: _IMU[value] if 0 <= value < len(_IMU) else NOT_IN_TABLE,
+    "acceleration_range_g": lambda value: f"±{value} g",
+    "angular_rate_range_dps": lambda value: f"±{value} °/s",
+    "acceleration_filter": lambda value: _or_not(ACCELERATION_FILTERS.get(value)),
+    "angular_rate_filter": lambda value: _or_not(ANGULAR_RATE_FILTERS.get(value)),
+}
 
 
 def value_meaning(
@@ -43,19 +50,7 @@ def value_meaning(
     """
     if name in _ON_OFF:
         return _ON_OFF[name][0 if value else 1]
-    if name == "imu_active":
-        return _IMU[value] if 0 <= value < len(_IMU) else NOT_IN_TABLE
-    if name == "acceleration_range_g":
-        return f"±{value} g"
-    if name == "angular_rate_range_dps":
-        return f"±{value} °/s"
-    if name == "acceleration_filter":
-        return _or_not(ACCELERATION_FILTERS.get(value))
-    if name == "angular_rate_filter":
-        return _or_not(ANGULAR_RATE_FILTERS.get(value))
-    if name != "sinc_length":
-        raise KeyError(name)
-    return _sinc_meaning(value, rate_hz, chop)
+    return _sinc_meaning(value, rate_hz, chop) if name == "sinc_length" else _OTHERS[name](value)
 
 
 def _sinc_meaning(length: int, rate_hz: int | None, chop: SettingValue | None) -> str:
@@ -81,10 +76,9 @@ def _cutoff_text(row: ForceTorqueFilter) -> str:
 class Meaning(NamedTuple):
     """What a set of settings means. None: not in the tables, or not among the settings."""
 
-    rate_hz: int | None
-    """Sampling rate."""
+    rate_hz: int | None  # Sampling rate
+    # Of force and torque. None with FAST on, which switches between the two cut-offs, and with CHOP on.
     cutoff_hz: float | None
-    """Of force and torque. None with FAST on, which switches between the two cut-offs, and with CHOP on."""
     force_torque: Response
     acceleration: ImuFilter | None
     angular_rate: ImuFilter | None

@@ -125,6 +125,15 @@ def fir_gain(share: float) -> float:
 
 
 @functools.cache
+def noise_bandwidth(fir: bool) -> float:
+    """Bandwidth of force and torque for white noise, as a share of the sampling rate."""
+    # Both filters together last 24 periods, so that for steps of less than 1/48 the sum is the integral.
+    steps = 64
+    gains = (sinc_gain(n / steps) * (fir_gain(n / steps) if fir else 1.0) for n in range(1, 4 * steps))
+    return (0.5 + sum(gain * gain for gain in gains)) / steps
+
+
+@functools.cache
 def fir_taps() -> tuple[float, ...]:
     """The FIR filter's coefficients; their sum is 1."""
     window = [kaiser(2 * k / (FIR_TAPS - 1) - 1) for k in range(FIR_TAPS)]

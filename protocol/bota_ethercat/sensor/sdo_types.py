@@ -64,8 +64,8 @@ _ROWS: Final = (
     SdoType("string", ("visible_string", "str"), ""),
 )
 
+# By every name, in lower case.
 SDO_TYPES: Final[Mapping[str, SdoType]] = {name: row for row in _ROWS for name in (row.name, *row.aliases)}
-"""By every name, in lower case."""
 
 SDO_TYPE_NAMES: Final = tuple(row.name for row in _ROWS)
 

@@ -38,51 +38,33 @@ class WarningMeaning(NamedTuple):
     remedy: str
 
 
-WARNINGS: Final[tuple[WarningMeaning, ...]] = (
-    WarningMeaning(
-        WarningFlag.FORCE_TORQUE_SATURATED, Severity.ERROR,
-        "Force/torque (ADC) saturated", "Reduce sensor loading",
-    ),
-    WarningMeaning(
-        WarningFlag.ACCELERATION_SATURATED, Severity.ERROR,
-        "Acceleration saturated", "Reduce acceleration or increase acceleration range",
-    ),
-    WarningMeaning(
-        WarningFlag.ANGULAR_RATE_SATURATED, Severity.ERROR,
-        "Angular velocities (gyro) saturated",
-        "Reduce angular velocities or increase angular velocities range",
-    ),
-    WarningMeaning(
-        WarningFlag.ADC_OUT_OF_SYNC, Severity.ERROR,
-        "ADC out of sync", "Contact support (repair required)",
-    ),
-    WarningMeaning(
-        WarningFlag.FORCE_TORQUE_OUT_OF_RANGE, Severity.ERROR,
-        "Force/torque measurement exceeding the range", "Reduce sensor loading",
-    ),
-    WarningMeaning(
-        WarningFlag.OVERTEMPERATURE, Severity.WARNING,
-        "Overtemperature", "Power off the sensor and let it cool down",
-    ),
-    WarningMeaning(
-        WarningFlag.WRONG_SUPPLY_VOLTAGE, Severity.FATAL,
-        "Wrong supply voltage", "Remove sensor from power supply",
-    ),
+WARNINGS: Final = tuple(
+    WarningMeaning(*row)
+    for row in (
+        (WarningFlag.FORCE_TORQUE_SATURATED, Severity.ERROR,
+         "Force/torque (ADC) saturated", "Reduce sensor loading"),
+        (WarningFlag.ACCELERATION_SATURATED, Severity.ERROR,
+         "Acceleration saturated", "Reduce acceleration or increase acceleration range"),
+        (WarningFlag.ANGULAR_RATE_SATURATED, Severity.ERROR, "Angular velocities (gyro) saturated",
+         "Reduce angular velocities or increase angular velocities range"),
+        (WarningFlag.ADC_OUT_OF_SYNC, Severity.ERROR,
+         "ADC out of sync", "Contact support (repair required)"),
+        (WarningFlag.FORCE_TORQUE_OUT_OF_RANGE, Severity.ERROR,
+         "Force/torque measurement exceeding the range", "Reduce sensor loading"),
+        (WarningFlag.OVERTEMPERATURE, Severity.WARNING,
+         "Overtemperature", "Power off the sensor and let it cool down"),
+        (WarningFlag.WRONG_SUPPLY_VOLTAGE, Severity.FATAL,
+         "Wrong supply voltage", "Remove sensor from power supply"),
+    )
 )  # fmt: skip
 
 
 def explain(register: int) -> list[WarningMeaning]:
     """The meaning of every set bit, lowest first; reserved bits are listed too, as warnings."""
-    found = [row for row in WARNINGS if register & row.flag]
-    reserved = register & 0xFFFFFFFF & ~sum(row.flag for row in WARNINGS)
-    for bit in range(32):
-        if reserved >> bit & 1:
-            found.append(
-                WarningMeaning(
-                    1 << bit,
-                    Severity.WARNING,
-                    f"Reserved bit {bit} set",
-                    "Check the firmware's manual: this bit has no published meaning",
-                )
-            )
-    return found
+    remedy = "Check the firmware's manual: this bit has no published meaning"
+    reserved = register & ~sum(row.flag for row in WARNINGS)
+    return [row for row in WARNINGS if register & row.flag] + [
+        WarningMeaning(1 << bit, Severity.WARNING, f"Reserved bit {bit} set", remedy)
+        for bit in range(32)
+        if reserved >> bit & 1
+    ]

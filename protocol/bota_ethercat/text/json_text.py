@@ -43,7 +43,7 @@ def parse_json_object(text: bytes) -> JsonObject:
     except ValueError as error:
         raise BadMessageError(f"the message has a number that cannot be used: {error}") from None
     if not isinstance(value, dict):
-        raise BadMessageError(f"the message is a JSON {_json_kind(value)}: it must be an object")
+        raise BadMessageError("the message must be an object, not another JSON value")
     if decoded.count("[") + decoded.count("{") > MAX_JSON_DEPTH and _depth(value) > MAX_JSON_DEPTH:
         raise BadMessageError(f"the message is nested more than {MAX_JSON_DEPTH} deep")
     return value
@@ -58,13 +58,6 @@ def _finite_float(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text[:20]} is too large")
     return value
-
-
-def _json_kind(value: object) -> str:
-    if value is None:
-        return "null"
-    kinds = {list: "array", str: "string", bool: "boolean", int: "number", float: "number"}
-    return kinds.get(type(value), "value")
 
 
 def _depth(value: object) -> int:

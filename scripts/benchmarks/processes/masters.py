@@ -1,27 +1,21 @@
-"""What is compared with the server, one client each: the C program of yardstick.c, the polling design.
+"""Becomes the C program of yardstick.c, with which the server is compared, for one client.
 
-Arguments: FILE IFACE RATE_HZ, and for the C program PROGRAM PRIORITY. pysoem brings the sensors to OP. The
-polling design exchanges, sends the raw bytes, sleeps for a period; nothing is added but the figures that both
-write at SIGTERM: (wake-up lateness, exchange) pairs in ns.
+Arguments: FILE IFACE RATE_HZ PROGRAM PRIORITY. pysoem brings the sensors to OP.
 """
 
 from __future__ import annotations
 
 import os
-import select
 import shutil
-import signal
 import socket
 import subprocess
 import sys
-import time
-from array import array
 from pathlib import Path
 from typing import Any, Final
 
-from ethercat_server.ethercat.raw_socket import packet_sockets
+from ethercat_server.ethercat.soem import packet_sockets
 from scripts.benchmarks.chain import ScriptError
-from scripts.benchmarks.records import PORT, write
+from scripts.benchmarks.records import PORT
 
 _OP_ATTEMPTS: Final = 500
 
@@ -58,50 +52,17 @@ def operational_master(ifname: str) -> Any:
     raise ScriptError(f"the sensor on {ifname} does not reach OP")
 
 
-def become(
-    program: str, priority: str, *, path: str, master: Any, client: socket.socket, rate_hz: str
-) -> None:
-    """Hand the sensors and the client over to the C program."""
+def main(path: str, ifname: str, rate_hz: str, program: str, priority: str) -> None:
+    """Wait for the client, bring the sensors to OP, hand both over to the C program."""
+    with socket.create_server(("127.0.0.1", PORT)) as listener:
+        client, _ = listener.accept()
+    master = operational_master(ifname)
     (raw,) = packet_sockets()
     for descriptor in (raw, client.fileno()):
         os.set_inheritable(descriptor, True)
     outputs = sum(len(slave.output) for slave in master.slaves)
     numbers = (raw, client.fileno(), rate_hz, priority, outputs, len(master.slaves))
     os.execv(program, [program, "master", *map(str, numbers), path])  # noqa: S606 - built here
-
-
-def poll(path: str, master: Any, client: socket.socket, rate_hz: str) -> None:
-    """Exchange, send, sleep."""
-    stopping: list[int] = []
-    signal.signal(signal.SIGTERM, lambda number, _frame: stopping.append(number))
-    period_s = 1 / float(rate_hz)
-    figures = array("q")
-    asleep = time.monotonic_ns()
-    while not stopping:
-        woke = time.monotonic_ns()
-        select.select([client], [], [], 0)  # for a shutdown request
-        sent = time.monotonic_ns()
-        master.send_processdata()
-        master.receive_processdata(int(period_s * 1e6))
-        figures.extend((woke - asleep - int(period_s * 1e9), time.monotonic_ns() - sent))
-        try:
-            client.sendall(master.slaves[0].input)
-        except ConnectionError:
-            break
-        asleep = time.monotonic_ns()
-        time.sleep(period_s)
-    master.close()
-    write(Path(path), figures)
-
-
-def main(path: str, ifname: str, rate_hz: str, *c_program: str) -> None:
-    """Wait for the client, bring the sensors to OP, pass samples on."""
-    with socket.create_server(("127.0.0.1", PORT)) as listener:
-        client, _ = listener.accept()
-    master = operational_master(ifname)
-    if c_program:
-        become(*c_program, path=path, master=master, client=client, rate_hz=rate_hz)
-    poll(path, master, client, rate_hz)
 
 
 if __name__ == "__main__":

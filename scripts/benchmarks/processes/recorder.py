@@ -1,14 +1,13 @@
-"""Records when each sample arrives: at a TCP client, at a ROS 2 subscriber, or at a client that polls.
+"""Records when each sample arrives: at a TCP client, or at a ROS 2 subscriber.
 
-All of them note the time before anything is decoded.
+Both note the time before anything is decoded.
 
-Arguments: KIND FILE WARM_UP_S SECONDS PRIORITY, then of `polling` its rate, of `ros` the topics of arrays.
+Arguments: KIND FILE WARM_UP_S SECONDS PRIORITY, then of `ros` the topics of arrays.
 """
 
 from __future__ import annotations
 
 import gc
-import select
 import sys
 import time
 from collections.abc import Callable
@@ -20,7 +19,7 @@ from bota_ethercat.control import request
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.virtual_sensor.signals import decode_clock
-from scripts.benchmarks.records import PORT, Recording, connect, sleep_until
+from scripts.benchmarks.records import PORT, Recording, connect
 
 SIZE: Final = 61
 _DEPTH: Final = 50
@@ -41,20 +40,6 @@ def tcp(recording: Recording, port: int = PORT) -> None:
                 clock = decode_clock(decode(frame.process_data).array)
                 if not recording.take(frame.sensor, *clock, frame.monotonic_ns, now):
                     return
-
-
-def polling(recording: Recording, rate_hz: str, port: int = PORT) -> None:
-    """A timer, and a look for one message at each tick."""
-    period_ns, decode = int(1e9 / float(rate_hz)), SampleDecoder(SIZE).decode
-    with connect(port) as connection:
-        due = now = time.monotonic_ns()
-        while True:
-            due += period_ns * max(1, (now - due) // period_ns)
-            sleep_until(due)
-            data = connection.recv(SIZE) if select.select([connection], [], [], 0)[0] else b""
-            now = time.monotonic_ns()
-            if len(data) == SIZE and not recording.take(0, *decode_clock(decode(data).array), 0, now):
-                return
 
 
 def ros(recording: Recording, *topics: str) -> None:
@@ -97,7 +82,7 @@ def ros(recording: Recording, *topics: str) -> None:
     rclpy.try_shutdown()
 
 
-KINDS: Final[dict[str, Callable[..., None]]] = {"tcp": tcp, "polling": polling, "ros": ros}
+KINDS: Final[dict[str, Callable[..., None]]] = {"tcp": tcp, "ros": ros}
 
 
 def main(kind: str, path: str, warm_up_s: str, seconds: str, priority: str, *arguments: str) -> None:

@@ -1,6 +1,7 @@
 // Runs the C++ client for tests: a command per line on standard input, and for each a line of JSON on standard output.
 //
 //   new [OPTION=VALUE ...]    another client; the one before is gone
+//   now NS                    it is this time, of all clocks, from now on
 //   moved                     the same client, moved to another place and back
 //   connect MS | reconnect | close | latest [POSITION] | peek [POSITION] | next MS
 //   server [HOST:PORT]        which one a program uses that is given this, or nothing
@@ -36,6 +37,14 @@ WRAPPED(int, ppoll, other_calls, (pollfd* all, nfds_t count, const timespec* tim
 WRAPPED(int, setsockopt, other_calls, (int fd, int level, int what, const void* value, socklen_t size), fd, level, what, value, size)
 WRAPPED(int, getsockopt, other_calls, (int fd, int level, int what, void* value, socklen_t* size), fd, level, what, value, size)
 WRAPPED(ssize_t, send, other_calls, (int fd, const void* bytes, size_t size, int flags), fd, bytes, size, flags)
+// Time stands still once the test has said what time it is.
+static std::int64_t set_ns = 0;
+extern "C" int __real_clock_gettime(clockid_t clock, timespec* now);
+extern "C" int __wrap_clock_gettime(clockid_t clock, timespec* now) {
+    if (set_ns == 0) return __real_clock_gettime(clock, now);
+    *now = {static_cast<time_t>(set_ns / 1'000'000'000), static_cast<long>(set_ns % 1'000'000'000)};
+    return 0;
+}
 WRAPPED(ssize_t, recv, receives, (int fd, void* into, size_t size, int flags), fd, into, size, flags)
 
 namespace {
@@ -108,6 +117,12 @@ void print(const Reading& r) {
     std::printf(",\"gap\":%s,\"withheld\":%" PRIu64 ",\"lost\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"warnings_seen\":%" PRIu32
                 ",\"connection\":%" PRIu32 ",\"more_waits\":%s",
                 yes(r.gap), r.withheld, r.lost, r.passed_over, r.warnings_seen, r.connection, yes(r.more_waits));
+    std::printf(",\"measured_ns\":[");
+    for (const Channel channel : {Channel::force_torque, Channel::acceleration, Channel::angular_rate}) {
+        const auto measured_ns = r.measured_ns(channel);
+        std::printf("%s%s", channel == Channel::force_torque ? "" : ",", measured_ns ? std::to_string(*measured_ns).c_str() : "null");
+    }
+    std::printf("]");
     print("array", r.sample.array());
     std::printf(",\"temperature\":");
     print(r.sample.temperature);
@@ -121,7 +136,7 @@ Options options_from(std::istringstream& words) {
         const auto number = [&] { return std::stoll(value); };
         if (key == "host") options.host = value;
         else if (key == "port") options.port = static_cast<std::uint16_t>(number());
-        else if (key == "sensor") options.sensors.push_back(static_cast<std::uint8_t>(number()));
+        else if (key.rfind("sensor", 0) == 0) options.sensors.push_back(static_cast<std::uint8_t>(number()));
         else if (key == "every") options.every = static_cast<std::uint32_t>(number());
         else if (key == "fresh_only") options.fresh_only = number() != 0;
         else if (key == "max_age_ms") options.max_age = std::chrono::milliseconds(number());
@@ -172,6 +187,11 @@ int main(int argc, char** argv) {
             maybe_client.emplace(options);
             maybe_control.emplace(options.host, options.port);
             allocated = received = called = 0;
+            set_ns = 0;
+            continue;
+        }
+        if (command == "now") {
+            words >> set_ns;
             continue;
         }
         if (command == "server") {

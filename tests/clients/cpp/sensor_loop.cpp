@@ -8,6 +8,8 @@
 //   take CONDITION NOW_MS AGE_MS CHECKED FORCE [RECEIVED_MS CONNECTED]
 //                        what controllers see of this, with the parameters of `new`
 //   check JSON           what speaks against sensor 0 of this description
+//   tool MODEL LAG_S FIR RATE_HZ COUNT
+//                        the load of the tool of `new` in each of so many samples, a line each: seconds, acceleration, angular rate
 //
 // Built with ASan or TSan, whose hook counts what the cycles allocate.
 #include "bota_ethercat_hardware/sensor_loop.hpp"
@@ -172,9 +174,27 @@ int main() {
             reading.has_sample = age >= 0;
             if (age >= 0) reading.age_ns = std::llround(age * 1e6);
             reading.sample.force[0] = force;
+            received.tool[0] = 0.25;
             allocations = 0;
             const bool good = gate->take(received, std::llround(now * 1e6));
             print(good, gate->values());
+        } else if (command == "tool") {
+            std::string model;
+            double lag_s = 0, rate_hz = 0;
+            int fir = 0, count = 0;
+            words >> model >> lag_s >> fir >> rate_hz >> count;
+            Tool tool(parameters.payload, model, lag_s, fir != 0, rate_hz);
+            const char* separator = "[";
+            for (; count > 0 && std::getline(std::cin, line); --count) {
+                std::vector<double> numbers;
+                for (std::istringstream text(line); text >> line;) numbers.push_back(std::strtod(line.c_str(), nullptr));
+                bota_ethercat::Sample sample;
+                std::copy_n(numbers.begin() + 1, 3, sample.acceleration.begin());
+                std::copy_n(numbers.begin() + 4, 3, sample.angular_rate.begin());
+                for (const double value : tool.follow(sample, numbers[0]))
+                    std::isnan(value) ? std::printf("%snull", separator) : std::printf("%s%.17g", separator, value), separator = ",";
+            }
+            std::printf("]");
         } else if (command == "log") {
             const std::lock_guard<std::mutex> guard(lines_lock);
             std::printf("[");

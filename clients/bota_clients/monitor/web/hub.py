@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
 from bota_clients.monitor import words
-from bota_clients.monitor.model import AXES, Model, SensorState, State, clock_text
+from bota_clients.monitor.model import AXES, Model, SensorState, State
 from bota_clients.monitor.tare import WAYS, Say
 from bota_clients.numbers import duration
 from bota_ethercat.accounting import NOT_NEW
@@ -206,7 +206,7 @@ class Hub:
                 page.send(texts[page.sensor])
 
     def send_points(self, now_s: float) -> None:
-        """Send new points to the pages that keep up; one that lags is told later that it has missed some."""
+        """Send new points to the pages that keep up; to others, the next ones are marked `skipped`."""
         silent = now_s - self._points_s > _SILENT_S
         for batch in self._model.batches(silent=silent):
             self._points_s, start_s, text = now_s, batch["start"], _json(batch)
@@ -258,19 +258,16 @@ class Hub:
             return "Only a page opened by the link that ethercat-monitor printed may do this"
         if action == "reset":
             self._model.reset()
-            self._say("Peaks and past warnings are reset")
+            self._model.say("Peaks and past warnings are reset")
         elif self._taring is not None and self._taring.is_alive():
-            self._say("A tare is running already", True)
+            self._model.say("A tare is running already", True)
         else:
-            self._taring = self._tare(page.sensor, self._say, action)
+            self._taring = self._tare(page.sensor, self._model.say, action)
         return None
 
     def _send_kept(self, page: Page) -> None:
         for _, text in self._kept.get(page.sensor, ()):
             page.send(text)
-
-    def _say(self, text: str, bad: bool = False) -> None:
-        self._model.say(f"{clock_text()} {text}", bad)
 
 
 def is_loopback(host: str) -> bool:
@@ -316,6 +313,7 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
     sample, rate_hz = sensor.sample, sensor.nominal_hz
     stream = {
         "Rate": words.rate(sensor),
+        "Filter delay": words.delays(sensor),
         "Age": words.times(sensor.age_us),
         "Age at hand-out": words.times(sensor.hand_out_us),
         "Jitter": words.jitter(sensor),
@@ -327,7 +325,7 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
             stream["Orientation xyzw"] = " ".join(f"{part:+.2f}" for part in sample.orientation)
     return {
         "position": sensor.position,
-        "identity": "  ".join(part for part in (words.who(sensor), sensor.al_state) if part),
+        "identity": words.identity(sensor),
         "old": None if sensor.old_s is None else duration(sensor.old_s),
         "has_sample": sample is not None,
         "nominal_hz": rate_hz,

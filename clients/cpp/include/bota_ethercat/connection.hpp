@@ -37,7 +37,7 @@ inline std::int64_t monotonic_now_ns() noexcept {
     return std::int64_t{now.tv_sec} * 1'000'000'000 + now.tv_nsec;
 }
 
-/// Who makes a connection that was lost anew.
+/// What reconnects after a loss.
 enum class Reconnect : std::uint8_t {
     by_itself,  ///< `latest`, `update` and `next`, a non-blocking step in each call
     when_told,  ///< only `Client::reconnect` and `connect`; without a connection the others just read the clock
@@ -47,7 +47,7 @@ struct Options {
     std::string host = "localhost";
     std::uint16_t port = 12001;
     std::vector<std::uint8_t> sensors{};  ///< positions on the bus; empty = all
-    std::uint32_t every = 1;              ///< one frame in so many
+    std::uint32_t every = 1;              ///< one frame in `every`
     bool fresh_only = true;               ///< REPEATED frames only every 10 ms, to show that the sensor is silent
     ImuUnits imu_units = ImuUnits::g_dps;
     nanoseconds max_age = std::chrono::milliseconds(10);  ///< an older sample is never `Condition::fresh`
@@ -259,7 +259,7 @@ public:
         drop();
     }
 
-    /// Over for good, until `connect`.
+    /// Nothing is tried again until `connect`.
     void close() noexcept {
         lose("closed by this program");
         socket_.close();
@@ -301,7 +301,7 @@ private:
         socket_ = Socket(::socket(address.ai_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0));
         if (socket_.fd() < 0) return fail(errno);
         set(IPPROTO_TCP, TCP_NODELAY, 1);
-        // A host that is gone without a word is noticed within some 5 s. A stopped server is not gone.
+        // An unreachable host is noticed within some 5 s. A stopped server still answers probes.
         set(SOL_SOCKET, SO_KEEPALIVE, 1);
         set(IPPROTO_TCP, TCP_KEEPIDLE, 2);
         set(IPPROTO_TCP, TCP_KEEPINTVL, 1);

@@ -56,7 +56,7 @@ public:
     explicit Control(std::string host = "localhost", std::uint16_t port = 12001) : options_{std::move(host), port} {}
 
     /// Send any request, a JSON object such as `{"action":"sdo_read","index":32784}`, and wait for its reply.
-    /// True if it was granted: `reply` has it. False: `error` says why, `error_code` is the server's word if it refused.
+    /// True if it was granted: `reply` has it. False: `error` says why, `error_code` is the server's if it refused.
     bool ask(std::string_view request, nanoseconds timeout = std::chrono::seconds(10)) {
         reply_.clear();
         code_.clear();

@@ -283,16 +283,24 @@ inline std::string encode_json(std::string_view text) {
     return message;
 }
 
+/// What the sensor's filters delay alike.
+enum class Channel : std::uint8_t { force_torque, acceleration, angular_rate };
+
+/// Group delay of the filters of each `Channel`, ns; none: not known.
+using Delays = std::array<std::optional<std::int64_t>, 3>;
+
 /// A sensor as the server describes it.
 struct SensorInfo {
     std::uint8_t sensor = 0;  ///< position on the bus
     std::uint64_t serial = 0;
     std::uint32_t pdo_size = 0;  ///< bytes of process data
     double rate_hz = 0.0;        ///< 0: not known
+    Delays delay_ns;
     Text<32> name, hardware, firmware, state;
     // Settings that decide what the numbers mean. None: the server does not say.
     std::optional<bool> calibration_matrix, coordinate_system, inertia_compensation, orientation_estimation;
     std::optional<int> imu_active;
+    std::optional<bool> fir;
 };
 
 /// What `describe` and `subscribe` answer.
@@ -311,10 +319,19 @@ struct Description {
 
 namespace detail {
 
-/// What a description or an event says of a sensor's rate and settings; what it does not say stays as it was.
+/// What a description or an event says of a sensor's rate, delays and settings; what it does not say stays as it was.
 inline void read_in_force(json::Value of, SensorInfo& into) noexcept {
     double rate_hz = 0.0;
     if (of["rate_hz"].get(rate_hz) && rate_hz > 0.0 && rate_hz <= 1e6) into.rate_hz = rate_hz;
+    if (const json::Value delay_ms = of["delay_ms"]; delay_ms.is_object()) {
+        constexpr const char* kChannels[] = {"force_torque", "acceleration", "angular_rate"};
+        for (std::size_t i = 0; i < into.delay_ns.size(); ++i) {
+            double ms = -1.0;
+            into.delay_ns[i].reset();
+            if (delay_ms[kChannels[i]].get(ms) && ms >= 0.0 && ms < 1e5)
+                into.delay_ns[i] = static_cast<std::int64_t>(std::nearbyint(ms * 1e6));
+        }
+    }
     const json::Value settings = of["settings"];
     const auto get = [&settings](const char* name, auto& setting) {
         auto value = setting.value_or(0);
@@ -325,6 +342,7 @@ inline void read_in_force(json::Value of, SensorInfo& into) noexcept {
     get("inertia_compensation", into.inertia_compensation);
     get("orientation_estimation", into.orientation_estimation);
     get("imu_active", into.imu_active);
+    get("fir", into.fir);
 }
 
 /// False if this is no description, or one of another protocol version.

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
+#include <optional>
 
 #include "bota_ethercat/connection.hpp"
 
@@ -127,12 +128,13 @@ struct Reading {
     std::uint64_t sequence = 0;      ///< of the sample
     std::uint64_t stamp_ns = 0;      ///< of the sample, CLOCK_REALTIME
     std::uint64_t monotonic_ns = 0;  ///< of the sample, CLOCK_MONOTONIC of the server's machine
+    Delays delay_ns{};               ///< of the filters with which the sample was made
     std::int64_t received_ns = 0;    ///< when it was read from the socket, CLOCK_MONOTONIC here
     std::int64_t age_ns = std::numeric_limits<std::int64_t>::max();  ///< of the sample, now; max = not known
     bool age_is_lower_bound = false;                                 ///< it counts from the arrival
 
     // Since the reading of this sensor before this one:
-    bool gap = false;                   ///< samples were lost or withheld, or the connection was made anew
+    bool gap = false;                   ///< samples were lost or withheld, or the connection was lost
     std::uint64_t withheld = 0;         ///< frames that the server had and this client did not read in time
     std::uint64_t lost = 0;             ///< samples that the server never had; an estimate, at least one a gap
     std::uint64_t passed_over = 0;      ///< samples that came and that `latest` left out for a newer one
@@ -144,6 +146,13 @@ struct Reading {
     /// The one thing to ask before a sample is used to control something: it is recent, finite and not saturated. Who wants
     /// saturated samples too, to see which way an overload goes, asks for `condition == Condition::saturated`.
     bool fresh() const noexcept { return condition == Condition::fresh; }
+
+    /// When it was measured, CLOCK_REALTIME: `stamp_ns` less the group delay. None: no sample, or the delay is not known.
+    std::optional<std::uint64_t> measured_ns(Channel channel = Channel::force_torque) const noexcept {
+        const auto delay = delay_ns[static_cast<std::size_t>(channel)];
+        if (!has_sample || !delay) return std::nullopt;
+        return stamp_ns - static_cast<std::uint64_t>(*delay);
+    }
 };
 
 /// Counts of one sensor since the client was made.
@@ -158,12 +167,13 @@ namespace detail {
 class SensorState {
 public:
     StreamAccounting accounting;
+    Delays delay_ns{};
     bool lost = false;                  // says the server
     std::uint64_t all_passed_over = 0;  // in readings so far
 
     /// The sensor of a new connection.
     void begin(std::uint32_t every, bool fresh_only) noexcept {
-        anew_ = accounting.counts.frames() > 0;  // nobody knows what was lost meanwhile
+        reconnected_ = accounting.counts.frames() > 0;  // what was lost meanwhile is not known
         accounting.begin();
         accounting.every = every;
         accounting.fresh_only = fresh_only;
@@ -176,8 +186,8 @@ public:
         const std::uint64_t restarts = accounting.counts.restarts;
         const FrameKind kind = accounting.take(frame.sequence, frame.monotonic_ns, frame.flags);
         if (kind == FrameKind::old) return;
-        if (anew_ || accounting.counts.restarts > restarts || (frame.flags & kGap) != 0) carried_gap_ = true;
-        anew_ = false;
+        if (reconnected_ || accounting.counts.restarts > restarts || (frame.flags & kGap) != 0) carried_gap_ = true;
+        reconnected_ = false;
         next_.flags = frame.flags;
         next_.wkc = frame.wkc;
         received_ns_ = received_ns;
@@ -188,6 +198,7 @@ public:
         next_.stamp_ns = frame.stamp_ns;
         next_.monotonic_ns = frame.monotonic_ns;
         next_.received_ns = received_ns;
+        next_.delay_ns = delay_ns;
         next_.age_is_lower_bound = !same_clock;  // another connection may lead to another machine
         next_.warnings_seen |= little_endian<std::uint32_t>(frame.process_data + kWarningsAt);
         next_.gap = next_.gap || carried_gap_;
@@ -247,7 +258,7 @@ private:
     std::array<std::uint8_t, kPdoSizeWithOrientation> process_data_{};  // of the newest sample
     std::size_t size_ = 0;
     std::int64_t received_ns_ = 0;  // of the newest frame of any kind
-    bool anew_ = false, carried_gap_ = false;
+    bool reconnected_ = false, carried_gap_ = false;
     StreamCounts read_;  // when the last reading was taken
 };
 

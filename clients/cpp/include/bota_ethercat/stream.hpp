@@ -26,7 +26,7 @@ public:
         return connection_.connect(timeout, [this](std::string_view text) { take(text); });
     }
 
-    /// A step of making a lost connection anew, without waiting, one attempt per `reconnect_every`; true once connected.
+    /// A step of reconnecting, without waiting, one attempt per `reconnect_every`; true once connected.
     /// With `Reconnect::when_told` only this and `connect` do so: call it every few milliseconds.
     bool reconnect() noexcept {
         connection_.now_ns = monotonic_now_ns();
@@ -187,7 +187,7 @@ private:
             sensors_[place].lost = false;
             for (std::size_t i = 0; i < description_.sensor_count; ++i)
                 if (description_.sensors[i].sensor == place) read_in_force(message, description_.sensors[i]);
-            take_rates();
+            take_in_force();
         }
     }
 
@@ -213,14 +213,15 @@ private:
         connection_.error.clear();
         ++connections_;
         for (SensorState& each : sensors_) each.begin(connection_.options.every, connection_.options.fresh_only);
-        take_rates();
+        take_in_force();
     }
 
     /// A rate that is not known is what it was.
-    void take_rates() noexcept {
+    void take_in_force() noexcept {
         for (std::size_t i = 0; i < description_.sensor_count; ++i) {
             const SensorInfo& info = description_.sensors[i];
             if (info.rate_hz > 0.0) sensors_[info.sensor].accounting.rate_hz = info.rate_hz;
+            sensors_[info.sensor].delay_ns = info.delay_ns;
         }
     }
 
@@ -243,12 +244,8 @@ private:
 
 }  // namespace detail
 
-/// A subscription to the samples of one server.
-///
-/// If the connection is lost, readings report `Condition::disconnected` (or `fresh` for as long as the last sample is
-/// younger than `max_age`) and keep the last sample, whose age grows. By default `latest`, `update` and `next` go on trying to
-/// connect; with `Reconnect::when_told` only `reconnect` and `connect` do. Host names are asked for in `connect` only.
-/// After a new connection the first sample has `gap`, and `connection` is one more.
+/// A subscription to the samples of one server. After the loss of the connection readings keep the last sample, whose age grows;
+/// the first sample of a new connection has `gap`, and `connection` is one more. Host names are looked up in `connect` only.
 ///
 ///     bota_ethercat::Client first({"localhost", 12001}), second("localhost", 12002);
 ///     first = std::move(second);  // what is left of `second` can only be destroyed or assigned to
@@ -258,8 +255,7 @@ public:
     explicit Client(Options options = {}) : Subscription(options) {}
     explicit Client(std::string host, std::uint16_t port) : Client(Options{std::move(host), port}) {}
 
-    // As `Client(const Client&)` or `Client(Client&&)` these would make `Client({"localhost", 12001})` ambiguous: the braces could
-    // be a client to copy or move from. A template and a reference to an lvalue cannot be made from braces.
+    // Neither a template nor a reference to an lvalue can be made from the braces of `Client({"localhost", 12001})`.
     Client(Client&) = delete;
     template <typename Other, typename = std::enable_if_t<std::is_same_v<Other, Client>>>
     Client(Other&& other) noexcept : Subscription(std::move(other)) {}

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <charconv>
 #include <cstdint>
+#include <fstream>
 #include <limits>
 #include <optional>
 #include <string>
@@ -11,6 +12,8 @@
 #include <vector>
 
 #include <bota_ethercat.hpp>
+
+#include "bota_ethercat_hardware/compensation.hpp"
 
 namespace bota_ethercat_hardware {
 
@@ -36,8 +39,11 @@ struct Parameters {
     double connect_timeout = 5.0;            ///< s that on_configure waits for the server
     bool on_activate_tare = false;
     int receive_priority = 51;               ///< SCHED_FIFO, of the receiving thread, above a controller manager's 50; 0: none
-    // From the <sensor> tag:
-    bool wants_imu = false, wants_orientation = false;
+    bool has_payload = false;                ///< then `payload` is known, and the compensated wrench
+    Payload payload;
+    Wrench bias{};                           ///< subtracted from the compensated wrench until the sensor is tared
+    // From the <sensor> tags, or as the payload needs it:
+    bool wants_imu = false, wants_orientation = false, wants_compensated = false;
 
     std::uint8_t sensor() const noexcept { return client.sensors.front(); }
 };
@@ -60,6 +66,19 @@ bool number(std::string_view text, Number least, Number most, Number& into) noex
     return true;
 }
 
+/// As many numbers as `into` has, with blanks or commas between them, in brackets or not.
+template <std::size_t Size>
+bool numbers(std::string_view text, std::array<double, Size>& into, double least = -1e6) noexcept {
+    constexpr std::string_view kBetween = " \t\r\n,[]";
+    std::size_t count = 0;
+    for (std::size_t at = 0; (at = text.find_first_not_of(kBetween, at)) != text.npos; ++count) {
+        const std::size_t end = std::min(text.find_first_of(kBetween, at), text.size());
+        if (count == Size || !number(text.substr(at, end - at), least, 1e6, into[count])) return false;
+        at = end;
+    }
+    return count == Size;
+}
+
 inline bool reaction(std::string_view text, Reaction most, Reaction& into) noexcept {
     const auto found = static_cast<Reaction>(std::find(std::begin(kReactions), std::end(kReactions), text) - kReactions);
     return found <= most && (into = found, true);
@@ -69,6 +88,8 @@ struct Row {
     const char *name, *allowed;
     bool (*parse)(std::string_view text, Parameters& into);
 };
+
+bool read_payload(const std::string& path, Parameters& into);
 
 using P = Parameters;
 using S = std::string_view;
@@ -92,24 +113,36 @@ inline constexpr Row kRows[] = {
     {"receive_priority", "0 to 99", [](S t, P& p) { return number(t, 0, 99, p.receive_priority); }},
     {"imu_raw_units", "g_dps or si",
      [](S t, P& p) { return p.client.imu_units = static_cast<bota_ethercat::ImuUnits>(t == "si"), t == "si" || t == "g_dps"; }},
+    {"payload_file", "a file that ethercat-identify --yaml or ~/identify/solve wrote",
+     [](S t, P& p) { return read_payload(std::string(t), p); }},
+    // Of the tool, under the names that the file has:
+    {"tool_mass", "0 to 1000 (kg)",
+     [](S t, P& p) { return p.has_payload = p.wants_imu = number(t, 0.0, 1000.0, p.payload.mass); }},
+    {"tool_center_of_gravity", "three numbers (m)", [](S t, P& p) { return numbers(t, p.payload.center); }},
+    {"accelerometer.offset", "three numbers (m/s^2)", [](S t, P& p) { return numbers(t, p.payload.accelerometer_offset); }},
+    {"accelerometer.scale", "three numbers, about 1", [](S t, P& p) { return numbers(t, p.payload.accelerometer_scale, 0.1); }},
+    {"bias", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.bias); }},
 };
+inline constexpr std::size_t kOfTool = 5;  // the last rows
 
-/// Whether two names differ in one place only, by one or two letters.
-inline bool are_near(std::string_view a, std::string_view b) noexcept {
-    for (; !a.empty() && !b.empty() && a.front() == b.front(); b.remove_prefix(1)) a.remove_prefix(1);
-    for (; !a.empty() && !b.empty() && a.back() == b.back(); b.remove_suffix(1)) a.remove_suffix(1);
-    return std::max(a.size(), b.size()) <= 2;
+/// Parameters of the ROS 2 node in a YAML file, a line each; false if they are wrong, or tool_mass is not among them.
+inline bool read_payload(const std::string& path, Parameters& into) {
+    std::ifstream file(path);
+    for (std::string line; std::getline(file, line);) {
+        const S text = S(line).substr(0, line.find('#'));
+        const std::size_t colon = std::min(text.find(':'), text.size());
+        for (const Row* row = std::end(kRows) - kOfTool; row != std::end(kRows); ++row)
+            if (stripped(text.substr(0, colon)) == row->name && !row->parse(stripped(text.substr(colon + 1)), into)) return false;
+    }
+    return into.has_payload;
 }
 
-/// That there is nothing of this kind and name; what there is, and if one has nearly that name, whether it was meant.
+/// That there is nothing of this kind and name, and what there is.
 template <typename Names>
 std::string unknown(std::string_view kind, std::string_view name, const Names& names) {
-    std::string meant, all;
-    for (const std::string_view each : names) {
-        if (are_near(name, each)) meant = " (did you mean \"" + std::string(each) + "\"?)";
-        all.append(all.empty() ? "" : ", ").append(each);
-    }
-    return "there is no " + std::string(kind) + " \"" + std::string(name) + "\"" + meant + "; there are: " + all;
+    std::string all;
+    for (const std::string_view each : names) all.append(all.empty() ? "" : ", ").append(each);
+    return "there is no " + std::string(kind) + " \"" + std::string(name) + "\"; there are: " + all;
 }
 
 }  // namespace detail

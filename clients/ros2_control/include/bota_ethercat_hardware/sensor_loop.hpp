@@ -40,14 +40,18 @@ using bota_ethercat::SensorInfo;
 // -- what controllers see: no allocation, no locks, no system calls
 
 /// In this order they are in `Values`. Force N, torque Nm, acceleration m/s^2 (+g along the axis that points up),
-/// angular velocity rad/s, orientation x y z w, temperature degrees Celsius, age s, condition a `bota_ethercat::Condition`.
-inline constexpr std::array<std::string_view, 19> kSignals = {
+/// angular velocity rad/s, orientation x y z w, temperature degrees Celsius, force and torque without the tool's and without bias,
+/// age s, condition a `bota_ethercat::Condition`.
+inline constexpr std::array<std::string_view, 25> kSignals = {
     "force.x", "force.y", "force.z", "torque.x", "torque.y", "torque.z",
     "linear_acceleration.x", "linear_acceleration.y", "linear_acceleration.z",
     "angular_velocity.x", "angular_velocity.y", "angular_velocity.z",
-    "orientation.x", "orientation.y", "orientation.z", "orientation.w", "temperature", "age", "condition",
+    "orientation.x", "orientation.y", "orientation.z", "orientation.w", "temperature",
+    "compensated.force.x", "compensated.force.y", "compensated.force.z",
+    "compensated.torque.x", "compensated.torque.y", "compensated.torque.z", "age", "condition",
 };
-inline constexpr std::size_t kImu = 6, kOrientation = 12, kTemperature = 16, kMeasured = 17, kAge = 17, kCondition = 18;
+inline constexpr std::size_t kImu = 6, kOrientation = 12, kTemperature = 16, kCompensated = 17, kMeasured = 23,
+                             kAge = 23, kCondition = 24;
 using Values = std::array<double, kSignals.size()>;
 
 inline constexpr double kNaN = NAN, kInfinity = INFINITY;
@@ -61,6 +65,7 @@ inline std::size_t signal(std::string_view name) noexcept {
 /// What the receiving thread found.
 struct Received {
     bota_ethercat::Reading reading;
+    Wrench tool{};  ///< load of the tool in the sample
     bool is_checked = true;  ///< false: sensor or settings may be others than when they were accepted
     bool is_connected = true;
     std::int64_t at_ns = 0;  ///< CLOCK_MONOTONIC of the reading
@@ -114,7 +119,7 @@ inline Reaction reaction(const Parameters& parameters, int condition) noexcept {
 /// Turns what was received last into the values of the state interfaces and a verdict.
 class Gate {
 public:
-    explicit Gate(const Parameters& parameters) noexcept : parameters_(parameters) {
+    explicit Gate(const Parameters& parameters) noexcept : parameters_(parameters), bias_(parameters.bias) {
         values_.fill(kNaN);
         values_[kAge] = kInfinity;
     }
@@ -132,7 +137,7 @@ public:
         values_[kCondition] = condition_;
         const Reaction doing = reaction(parameters_, condition_);
         if (doing == Reaction::use) {
-            fill(reading.sample);
+            fill(reading.sample, received.tool);
             trouble_ns_ = kNever;
             return true;
         }
@@ -148,21 +153,25 @@ public:
     bool usable() const noexcept { return reaction(parameters_, condition_) == Reaction::use; }
     /// `error_after` counts from the next reading.
     void restart() noexcept { trouble_ns_ = kNever; }
+    /// The sensor was tared: no bias is left.
+    void clear_bias() noexcept { bias_ = {}; }
 
 private:
     static constexpr std::int64_t kNever = INT64_MAX;
 
     /// All that is measured.
-    void fill(const bota_ethercat::Sample& sample) noexcept {
+    void fill(const bota_ethercat::Sample& sample, const Wrench& tool) noexcept {
         const auto twelve = sample.array();
         std::copy(twelve.begin(), twelve.end(), values_.begin());
         for (std::size_t i = 0; i < sample.orientation.size(); ++i)
             values_[kOrientation + i] = sample.has_orientation ? sample.orientation[i] : kNaN;
         values_[kTemperature] = sample.temperature;
+        for (std::size_t i = 0; i < tool.size(); ++i) values_[kCompensated + i] = twelve[i] - bias_[i] - tool[i];
     }
 
     const Parameters& parameters_;
     Values values_{};
+    Wrench bias_;
     int condition_ = static_cast<int>(Condition::silent);
     std::int64_t sampled_ns_ = kNever;  // the instant of the newest sample, CLOCK_MONOTONIC; it outlives a connection
     std::int64_t trouble_ns_ = kNever;  // since when nothing was usable
@@ -203,11 +212,11 @@ inline std::string objection(const Parameters& parameters, const SensorInfo& sen
         return "has a sample every " + text(1.0 / sensor.rate_hz) + " s: raise max_age (" + text(*parameters.max_age) +
                " s) to at least " + text(2.0 / sensor.rate_hz);
     if (parameters.wants_imu && sensor.imu_active == 0)
-        return "has its IMU switched off: set imu_active to 1, or leave linear_acceleration and angular_velocity out of the URDF";
-    if (parameters.wants_orientation && sensor.pdo_size == bota_ethercat::kPdoSize)
-        return "does not map its orientation (61 bytes of process data): leave orientation out of the URDF";
-    if (parameters.wants_orientation && sensor.orientation_estimation == false)
-        return "does not estimate its orientation: switch its setting orientation_estimation on";
+        return "has its IMU switched off: set imu_active to 1, or leave linear_acceleration, angular_velocity and payload out of the URDF";
+    if (parameters.has_payload && sensor.inertia_compensation == true)
+        return "subtracts gravity and inertia itself: switch its setting inertia_compensation off, or leave the payload out";
+    if (parameters.wants_orientation && (sensor.pdo_size == bota_ethercat::kPdoSize || sensor.orientation_estimation == false))
+        return "does not send its orientation (77 bytes of process data, setting orientation_estimation): leave it out of the URDF";
     for (const auto& [name, setting] : {std::pair("coordinate_system", &SensorInfo::coordinate_system),
                                         std::pair("inertia_compensation", &SensorInfo::inertia_compensation)})
         if (before.*setting && sensor.*setting && before.*setting != sensor.*setting)
@@ -254,12 +263,19 @@ public:
     /// Whether the age counts from the arrival: the server is on another machine.
     bool age_is_lower_bound() noexcept { return latest_.take().reading.age_is_lower_bound; }
 
-    /// Set the sensor's offset so that it reads zero now. Waits for its samples.
+    /// Set the sensor's offset so that it reads the load of the tool now, or zero where that is not known. Waits for samples.
     bool tare(std::string& why) {
+        Wrench load{};
+        if (parameters_.has_payload && !mean_load(load, why)) return false;
         bota_ethercat::Control control(parameters_.client.host, parameters_.client.port);
         bota_ethercat::TareResult result;
-        if (control.tare(result, parameters_.sensor())) return true;
-        return why = std::string("the sensor could not be tared: ") + control.error(), false;
+        if (!control.tare(result, parameters_.sensor(), 400, load))
+            return why = std::string("the sensor could not be tared: ") + control.error(), false;
+        gate_.clear_bias();
+        log_(Level::info, parameters_.has_payload
+                              ? "tared to the load of the tool in this pose: right in every pose"
+                              : "tared to zero in this pose, the weight of a tool included: it shows in others; give tool_mass");
+        return true;
     }
 
     /// Wait for a sample that was taken from now on and that controllers may use.
@@ -287,6 +303,18 @@ public:
 private:
     static constexpr int kPaceMs = 5;  // without anything from the server: how soon it is seen that nothing comes
     static constexpr std::int64_t kQuietNs = 1'000'000'000;
+    static constexpr int kMostSamples = 1000;  // until they are handed over
+    static constexpr int kLoads = 100;         // samples of the load before a tare
+
+    /// The load of the tool, N and Nm: the mean of some samples.
+    bool mean_load(Wrench& mean, std::string& why) {
+        for (int count = 1; count <= kLoads; ++count) {
+            if (!wait_until_usable(why)) return false;
+            const Wrench& load = latest_.take().tool;
+            for (std::size_t i = 0; i < mean.size(); ++i) mean[i] += (load[i] - mean[i]) / count;
+        }
+        return true;
+    }
 
     static double seconds_since(std::int64_t begin_ns) noexcept { return seconds(monotonic_now_ns() - begin_ns); }
 
@@ -315,7 +343,12 @@ private:
     /// Read all that has arrived, or take a step towards a connection, and hand it over.
     void receive() noexcept {
         Received& received = latest_.next();
-        received.reading = client_.latest(parameters_.sensor());
+        for (int left = kMostSamples; left > 0; --left) {  // the load of the tool needs every sample
+            received.reading = client_.next({});
+            if (!received.reading.is_new) break;
+            if (tool_) load_ = tool_->follow(received.reading.sample, seconds(static_cast<std::int64_t>(received.reading.monotonic_ns)));
+        }
+        received.tool = load_;
         received.at_ns = monotonic_now_ns();
         received.is_connected = client_.connected();
         const std::pair news(client_.connections(), client_.reconfigurations());
@@ -344,6 +377,10 @@ private:
                                                  : "the sensor's settings were changed, and are accepted");
         max_age_ns_ = std::llround(bota_ethercat_hardware::max_age(parameters_, *found) * 1e9);
         client_.set_max_age(std::chrono::nanoseconds(max_age_ns_));
+        if (!parameters_.has_payload) return;
+        const auto& [force_ns, acceleration_ns, _] = found->delay_ns;
+        const double lag_s = force_ns && acceleration_ns ? seconds(*force_ns - *acceleration_ns) : 0.0;
+        tool_.emplace(parameters_.payload, found->name.view(), lag_s, found->fir.value_or(false), found->rate_hz);
     }
 
     /// Log why there is no connection, and what the controllers see, when it changes and has been quiet for a while.
@@ -368,6 +405,8 @@ private:
     // The receiving thread's, once it runs:
     bota_ethercat::Client client_;
     std::optional<SensorInfo> sensor_;  // of `open`, unchanged since
+    std::optional<Tool> tool_;
+    Wrench load_{};                     // of the tool, in the newest sample
     std::string objection_, trouble_;   // why the sensor is not used; why there is no connection
     std::pair<std::uint32_t, std::uint32_t> checked_{};  // connections and reconfigurations
     std::int64_t checked_ns_ = 0, max_age_ns_ = 0, quiet_until_ns_ = 0;

@@ -1,4 +1,4 @@
-// The wrench as two arrows on a drawing of the sensor: a parallel projection on a plain canvas.
+// The wrench as two arrows beside the sensor's axes: a parallel projection on a plain canvas.
 
 import { colors } from "./dom.js";
 
@@ -38,21 +38,25 @@ export class Wrench {
     const { canvas } = this;
     const ratio = devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
-    if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
+    canvas.width = Math.round(width * ratio); // this clears it
+    canvas.height = Math.round(height * ratio);
     const pen = canvas.getContext("2d");
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.clearRect(0, 0, width, height);
     pen.lineCap = pen.lineJoin = "round";
     this.center = [width / 2, height / 2];
     this.unit = Math.min(width / 2.3, height / 2.2);
-    this.#body(pen);
-    this.#axes(pen);
-    return [[force, colors.ink, 0], [torque, colors.torque, 1]].map(([vector, color, i]) => {
-      const size = vector ? Math.hypot(...vector) : 0;
+    pen.font = `600 ${Math.max(11, this.unit * 0.11)}px system-ui, sans-serif`;
+    pen.textAlign = "center";
+    pen.textBaseline = "middle";
+    for (const [name, axis] of [["x", [1, 0, 0]], ["y", [0, 1, 0]], ["z", [0, 0, 1]]]) {
+      this.#arrow(pen, axis.map((v) => v * 0.62), colors[name], 1.5, 0);
+      pen.fillText(name, ...this.#project(axis.map((v) => v * 0.7)));
+    }
+    return [[force, colors.ink, 1], [torque, colors.torque, 2]].map(([vector, color, heads], i) => {
+      const size = vector ? Math.hypot(...vector) : NaN;
       const full = fit(this.full[i], Number.isFinite(size) ? size : 0, units[i]);
       this.full[i] = full;
-      if (vector && Number.isFinite(size) && size > full * 0.01) this.#arrow(pen, vector.map((v) => v / full), color, i === 1);
+      if (size > full * 0.01) this.#arrow(pen, vector.map((v) => v / full), color, Math.max(3, this.unit * 0.035), heads);
       return full;
     });
   }
@@ -64,68 +68,20 @@ export class Wrench {
     return [this.center[0] + this.unit * across, this.center[1] - this.unit * up];
   }
 
-  #path(pen, points) {
-    pen.beginPath();
-    for (const point of points) pen.lineTo(...this.#project(point));
-  }
-
-  #circle(pen, radius, z) {
-    this.#path(pen, Array.from({ length: 49 }, (_, i) => {
-      const turn = (i * Math.PI) / 24;
-      return [radius * Math.cos(turn), radius * Math.sin(turn), z];
-    }));
-  }
-
-  #body(pen) {
-    pen.lineWidth = 1.25;
-    pen.strokeStyle = colors.muted;
-    pen.fillStyle = colors.raised;
-    const [radius, depth] = [0.36, -0.16];
-    const far = this.pitch >= 0 ? [depth, 0] : [0, depth];
-    this.#circle(pen, radius, far[0]);
-    pen.fill();
-    pen.stroke();
-    const side = [Math.cos(-this.yaw) * radius, Math.sin(-this.yaw) * radius];
-    this.#path(pen, [[...side, 0], [...side, depth], [-side[0], -side[1], depth], [-side[0], -side[1], 0]]);
-    pen.fill();
-    for (const sign of [1, -1]) {
-      this.#path(pen, [[sign * side[0], sign * side[1], 0], [sign * side[0], sign * side[1], depth]]);
-      pen.stroke();
-    }
-    this.#circle(pen, radius, far[1]);
-    pen.fill();
-    pen.stroke();
-    pen.strokeStyle = colors.grid;
-    this.#circle(pen, radius * 0.55, far[1]);
-    pen.stroke();
-  }
-
-  #axes(pen) {
-    pen.font = `600 ${Math.max(11, this.unit * 0.11)}px system-ui, sans-serif`;
-    pen.textAlign = "center";
-    pen.textBaseline = "middle";
-    for (const [name, axis] of [["x", [1, 0, 0]], ["y", [0, 1, 0]], ["z", [0, 0, 1]]]) {
-      pen.strokeStyle = pen.fillStyle = colors[name];
-      pen.lineWidth = 1.5;
-      this.#path(pen, [[0, 0, 0], axis.map((v) => v * 0.62)]);
-      pen.stroke();
-      pen.fillText(name, ...this.#project(axis.map((v) => v * 0.7)));
-    }
-  }
-
-  #arrow(pen, vector, color, twice) {
-    const [x0, y0] = this.#project([0, 0, 0]);
+  /** From the center; a torque has two heads, as is usual. */
+  #arrow(pen, vector, color, width, heads) {
+    const [x0, y0] = this.center;
     const [x1, y1] = this.#project(vector);
     const length = Math.hypot(x1 - x0, y1 - y0);
-    pen.strokeStyle = pen.fillStyle = color;
-    pen.lineWidth = Math.max(3, this.unit * 0.035);
     const [dx, dy] = length ? [(x1 - x0) / length, (y1 - y0) / length] : [0, -1];
     const head = Math.min(Math.max(11, this.unit * 0.12), length * 0.6);
+    pen.strokeStyle = pen.fillStyle = color;
+    pen.lineWidth = width;
     pen.beginPath();
     pen.moveTo(x0, y0);
-    pen.lineTo(x1 - dx * head * 0.8, y1 - dy * head * 0.8);
+    pen.lineTo(x1 - (heads ? dx * head * 0.8 : 0), y1 - (heads ? dy * head * 0.8 : 0));
     pen.stroke();
-    for (let i = 0; i < (twice ? 2 : 1); i++) {
+    for (let i = 0; i < heads; i++) {
       const [tx, ty] = [x1 - dx * i * head * 0.85, y1 - dy * i * head * 0.85];
       pen.beginPath();
       pen.moveTo(tx, ty);

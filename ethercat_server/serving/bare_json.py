@@ -6,7 +6,7 @@ is understood and a malformed line affects no other.
 
 from __future__ import annotations
 
-import re
+import json
 from collections.abc import Iterator
 from typing import Final
 
@@ -15,7 +15,8 @@ from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject, encode_jso
 
 BARE_JSON_FIRST_BYTE: Final = b"{"  # A connection that starts with this byte is a bare JSON connection
 
-_NEWLINE: Final = ord("\n")
+_BRACE: Final = ord("}")
+_RAW_DECODE: Final = json.JSONDecoder().raw_decode
 
 
 def encode_bare_json(message: JsonObject) -> bytes:
@@ -30,15 +31,11 @@ class BareJsonDecoder:
     has closed its side, so that a half-finished object is reported.
     """
 
-    _STRUCTURE = re.compile(rb'["\\{}\n]')
-    _STRING_STRUCTURE = re.compile(rb'["\\\n]')
-
     def __init__(self, *, max_json_length: int = MAX_JSON_LENGTH) -> None:
         self._max_json_length = max_json_length
         self._buffer = bytearray()
         self._broken: str | None = None
         self._ended = False
-        self._reset_scan()
 
     @property
     def pending(self) -> int:
@@ -58,15 +55,11 @@ class BareJsonDecoder:
         """The next whole message, or None; raises as `FrameDecoder.next_message`."""
         if self._broken is not None:
             raise RemoteProtocolError(self._broken)
-        if not self._scanned:
-            self._buffer = self._buffer.lstrip(b" \t\r\n")
+        self._buffer = self._buffer.lstrip(b" \t\r\n")
         end = self._find_end()
-        if end is None and self._ended and self._buffer:
-            end = len(self._buffer)
         if end is not None and end <= self._max_json_length:
             text = bytes(self._buffer[:end])
             del self._buffer[:end]
-            self._reset_scan()
             return parse_json_object(text)
         if end is not None or len(self._buffer) > self._max_json_length:
             self._broken = f"a line of more than {self._max_json_length} bytes"
@@ -79,36 +72,15 @@ class BareJsonDecoder:
         while (message := self.next_message()) is not None:
             yield message
 
-    def _reset_scan(self) -> None:
-        self._scanned = 0
-        self._depth = 0
-        self._in_string = False
-
     def _find_end(self) -> int | None:
-        """Where the first message ends; each byte is scanned once, however it arrives."""
-        position = self._scanned
-        while True:
-            pattern = self._STRING_STRUCTURE if self._in_string else self._STRUCTURE
-            match = pattern.search(self._buffer, position)
-            if match is None:
-                self._scanned = len(self._buffer)
-                return None
-            position = match.end()
-            byte = match.group()
-            if byte == b"\n":
-                return position
-            if byte == b'"':
-                self._in_string = not self._in_string
-            elif byte == b"\\":
-                # Skip the escaped byte, once it is there: a newline is never escaped.
-                if position == len(self._buffer):
-                    self._scanned = position - 1
-                    return None
-                if self._buffer[position] != _NEWLINE:
-                    position += 1
-            elif byte == b"{":
-                self._depth += 1
-            elif byte == b"}":
-                self._depth -= 1
-                if self._depth <= 0:
-                    return position
+        """Where the first message ends: behind an object, else where the line or all input does."""
+        line, newline, _ = self._buffer[: self._max_json_length + 1].partition(b"\n")
+        if _BRACE in line and line.startswith(BARE_JSON_FIRST_BYTE):
+            text = line.decode("utf-8", "surrogateescape")
+            try:
+                return len(text[: _RAW_DECODE(text)[1]].encode("utf-8", "surrogateescape"))
+            except (ValueError, RecursionError):  # not whole yet, or malformed
+                pass
+        if newline or (self._ended and line):
+            return len(line) + len(newline)
+        return None

@@ -19,25 +19,6 @@ _LISTENER: Final = 0
 _BUFFER_SIZE: Final = 65536
 
 
-class ManualClock:
-    """A clock that stands still until it is advanced."""
-
-    def __init__(self, now_ns: int = 1_000_000_000) -> None:
-        self.now_ns = now_ns
-
-    def monotonic_ns(self) -> int:
-        """See `Clock`."""
-        return self.now_ns
-
-    def time_ns(self) -> int:
-        """See `Clock`."""
-        return self.now_ns
-
-    def sleep(self, seconds: float, /) -> None:
-        """See `Clock`."""
-        self.now_ns += round(seconds * 1e9)
-
-
 class InMemoryStream:
     """One end of a connection: the server's `Stream`, or the client's end, which a test uses alike."""
 

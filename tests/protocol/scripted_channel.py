@@ -1,0 +1,92 @@
+"""A scripted server in memory and in simulated time, and the `Channel` to it: no sockets, no threads."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+
+from bota_ethercat.errors import ConnectionFailedError, UnreachableError
+from bota_ethercat.framing import FrameDecoder
+from tests.bridge.scripted_server import Script
+
+
+class MemoryServer(Script):
+    """What it sends has arrived at once; `Client(1, channel=ScriptedChannel(server))` is its client."""
+
+    def __init__(self) -> None:
+        super().__init__(self)
+        self.now_ns = 10**15
+        self.listens = self.is_connected = True
+        self.arrived = bytearray()
+        self._agenda: list[tuple[int, Callable[[], object]]] = []
+
+    def at(self, now_ns: int, action: Callable[[], object]) -> None:
+        """Do something at this time; one thing after the other."""
+        self._agenda.append((now_ns, action))
+
+    def go_on(self, seconds: float) -> None:
+        """Time passes, until something arrives."""
+        until_ns = self.now_ns + math.ceil(seconds * 1e9)
+        while not self.arrived and self._agenda and self._agenda[0][0] <= until_ns:
+            self.now_ns, action = self._agenda.pop(0)
+            action()
+        if not self.arrived:
+            self.now_ns = until_ns
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    time_ns = monotonic_ns
+
+    def send_raw(self, data: bytes) -> None:
+        self.arrived += data
+
+    def drop(self) -> None:
+        self.is_connected = False
+
+
+class ScriptedChannel:
+    """See `Channel`. Time passes while the client waits."""
+
+    is_near = True
+    own = ("memory", 0)
+
+    def __init__(self, server: MemoryServer) -> None:
+        self._server = server
+        self._requests = FrameDecoder()
+        self.monotonic_ns = server.monotonic_ns
+
+    def wait(self, event: threading.Event, seconds: float, /) -> bool:
+        self._server.now_ns += math.ceil(seconds * 1e9)
+        return event.is_set()
+
+    def connect(self, timeout_s: float) -> bool:
+        if not self._server.listens:
+            raise UnreachableError("Connection refused")
+        self._server.connections += 1
+        self._server.is_connected, self._requests = True, FrameDecoder()
+        return True
+
+    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+        arrived = self._server.arrived
+        if not arrived and not self._server.is_connected:
+            raise ConnectionFailedError("the server closed it")
+        self._server.go_on(timeout_s)
+        count = min(len(buffer), len(arrived))
+        buffer[:count] = arrived[:count]
+        del arrived[:count]
+        return count
+
+    def send(self, data: bytes) -> None:
+        self._server.receive(self._requests, data)
+
+    def shutdown(self) -> None:
+        self._server.drop()
+
+    def close(self) -> None:
+        self._server.drop()
+        self._server.arrived.clear()
+
+    def fileno(self) -> int:
+        return -1
