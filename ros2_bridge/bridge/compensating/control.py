@@ -58,9 +58,8 @@ class CompensationControl:
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
         self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
         self._payload_watch: PayloadWatch | None = None
-        # What the latest second of motion left, and when that was looked up, s.
-        self._motion: MotionError | None = None
-        self._motion_s = -math.inf
+        # What the latest second of motion leaves, and when that was computed, s.
+        self._motion: tuple[float, MotionError | None] = -math.inf, None
         self._watched: object = None
         live.check = self._check
         self._guard = node.create_guard_condition(self._follow_sensor)
@@ -91,10 +90,10 @@ class CompensationControl:
         output, source, parameters = self.output, self.choice.source, self.parameters
         payload, bias, has_subscribers = parameters.payload, self.bias, output.has_subscribers
         bound = force_bound_95(payload, parameters.accelerometer) if source.is_imu else None
-        if (now_s := self.link.clock.monotonic()) - self._motion_s >= _MOTION_S:
-            self._motion = source.error(payload.mass) if payload.mass and has_subscribers else None
-            self._motion_s = now_s
-        motion = self._motion
+        now_s, (then_s, motion) = self.link.clock.monotonic(), self._motion
+        if now_s - then_s >= _MOTION_S:
+            motion = source.error(payload.mass) if payload.mass and has_subscribers else None
+            self._motion = now_s, motion
         age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
         parts = ["bias"] if bias != NO_WRENCH else []
         if payload.mass:
