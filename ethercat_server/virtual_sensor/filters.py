@@ -17,6 +17,7 @@ from bota_ethercat.sensor.filters import ImuFilter
 from bota_ethercat.sensor.response import FIR_TAPS, fir_taps
 
 Signal = Callable[[float], Sequence[float]]
+Past = Sequence[tuple[float, float]]  # instants, s before a sample, and their weights
 _STEPS: Final = 4  # instants in a sample period
 # The third-order sinc filter: three moving averages over a period, one after the other.
 _SINC: Final = [
@@ -63,22 +64,13 @@ class LoadFilter:
         return [self._signal(max(0.0, end_s - (n + 0.5) * step_s)) for n in range(_STEPS)]
 
 
-class ImuFilterProfile:
+def imu_filter(row: ImuFilter) -> Past:
     """Of accelerometer or gyroscope: a first-order low-pass filter, and the rest of the table's delay."""
-
-    def __init__(self, row: ImuFilter | None) -> None:
-        """None: it measures at once."""
-        if row is None:
-            self._instants, self._weights = [0.0], [1.0]
-            return
-        constant_s = 1 / (math.tau * row.bandwidth_hz)
-        rest_s = row.delay_ms * 1e-3 - constant_s
-        self._instants = [rest_s + constant_s * x for x, _ in _EXPONENTIAL]
-        self._weights = [weight for _, weight in _EXPONENTIAL]
-
-    def at(self, signal: Signal, seconds: float) -> tuple[float, ...]:
-        """The signal as it is measured at this time."""
-        return weighted(self._weights, [signal(max(0.0, seconds - before)) for before in self._instants])
+    constant_s = 1 / (math.tau * row.bandwidth_hz)
+    rest_s = row.delay_ms * 1e-3 - constant_s
+    return [(rest_s + constant_s * x, weight) for x, weight in _EXPONENTIAL]
 
 
-UNFILTERED: Final = ImuFilterProfile(None)
+def filtered(signal: Signal, past: Past, seconds: float) -> tuple[float, ...]:
+    """The signal as it is measured at this time."""
+    return weighted([weight for _, weight in past], [signal(max(0.0, seconds - s)) for s, _ in past])

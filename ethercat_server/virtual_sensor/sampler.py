@@ -141,9 +141,10 @@ class Sampler:
         return self._data
 
     def prepare(self, expected: int) -> None:
-        """Compute the sample that a frame at the time `expected` will read, while there is time."""
+        """Compute the next sample, or that which a frame at `expected` will read, while there is time."""
         number = self.number_at(expected)
-        if number not in (self._number, self._prepared_number) and not self.stuck:
+        number += number == self._number
+        if number != self._prepared_number and not self.stuck:
             self._prepared = self._make(number)
             self._prepared_number = number
 

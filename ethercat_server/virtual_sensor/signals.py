@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
-from ethercat_server.virtual_sensor.filters import UNFILTERED, ImuFilterProfile, LoadFilter
+from ethercat_server.virtual_sensor.filters import LoadFilter, Past, filtered, imu_filter
 
 Vector = tuple[float, float, float]
 
@@ -236,7 +236,8 @@ class Scene:
         self._noise = noise
         self._settings: tuple[SettingValue, ...] = ()  # of the filters
         self._load_filter: LoadFilter | None = None
-        self._acceleration_filter = self._rate_filter = UNFILTERED
+        self._acceleration_filter: Past = [(0.0, 1.0)]
+        self._rate_filter: Past = [(0.0, 1.0)]
         self.set_sinc_length(_REFERENCE_SINC)
 
     def set_sinc_length(self, sinc_length: int) -> None:
@@ -254,8 +255,8 @@ class Scene:
         fir, acceleration, rate = wanted[1:]
         period_s = sinc_length / BASE_SAMPLING_RATE_HZ
         self._load_filter = LoadFilter(self.load, self._load_noise, period_s, fir=bool(fir))
-        self._acceleration_filter = ImuFilterProfile(ACCELERATION_FILTERS[acceleration])
-        self._rate_filter = ImuFilterProfile(ANGULAR_RATE_FILTERS[rate])
+        self._acceleration_filter = imu_filter(ACCELERATION_FILTERS[acceleration])
+        self._rate_filter = imu_filter(ANGULAR_RATE_FILTERS[rate])
 
     def specific_force(self, seconds: float) -> Vector:
         """m/s²."""
@@ -286,8 +287,8 @@ class Scene:
             load = tuple(map(operator.add, self.load(seconds), self._load_noise()))
         else:
             load = self._load_filter.at(number, seconds)
-        force = self._acceleration_filter.at(self.specific_force, seconds)
-        rate = self._rate_filter.at(self.rate, seconds)
+        force = filtered(self.specific_force, self._acceleration_filter, seconds)
+        rate = filtered(self.rate, self._rate_filter, seconds)
         values = [*load, *(a / STANDARD_GRAVITY for a in force), *map(math.degrees, rate)]
         if self._noise:
             for axis in range(6, 9):

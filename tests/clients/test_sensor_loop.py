@@ -223,15 +223,17 @@ def test_no_time_limit(running: Loop) -> None:
 TOOL = {
     "tool_mass": 1.25,
     "tool_center_of_gravity": "[0.01,-0.02,0.08]",
+    "tool_inertia": "0.01,0.02,0.015,0.001,-0.002,0.003",
     "accelerometer.offset": "0.3,-0.2,0.1",
     "accelerometer.scale": "1.01,0.99,1.002",
+    "accelerometer.cross_axis": "0.001,-0.002,0.003,-0.004,0.005,-0.006",
 }
 # mm from the mounting face, of the drawings in Bota's URDFs: wrench origin, IMU.
 HEIGHTS = {
     "SENS": (35, 9.3), "ROKS": (32, 9.8), "ROKA": (32, 9.8), "MEDS": (32, 9.8), "MEDA": (32, 9.8),
     "LAXS": (44.5, 11.95), "MEGS": (59, 13.4), "NONE": (0, 0),
 }  # fmt: skip
-# By ft_compensation for `TOOL` on a SENS, of the samples of `moving`: specific force, alignment, compensator.
+# By ft_compensation for `TOOL` on a SENS, of the samples of `moving`: alignment, specific force, compensator.
 LOADS = json.loads((Path(__file__).parent / "golden_loads.json").read_text())
 
 
@@ -240,7 +242,7 @@ def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
     random_ = random.Random(7)
     time_s = 1000.0
     for number in range(60):
-        time_s += {28: 5, 36: 6, 44: 200, 45: 0}.get(number, 1) / rate_hz * random_.uniform(0.98, 1.02)
+        time_s += {28: 3, 36: 7, 44: 200, 45: 0}.get(number, 1) / rate_hz * random_.uniform(0.98, 1.02)
         swing = [math.sin((3 + axis) * time_s + axis) for axis in range(6)]
         values = [*(9 * each for each in swing[:3]), *(2 * each for each in swing[3:])]
         yield time_s, tuple(math.nan if number == 50 and axis == 4 else v for axis, v in enumerate(values))
@@ -266,7 +268,8 @@ def test_the_load_of_the_tool_is_that_of_the_golden_table(running: Loop, row: di
 @pytest.mark.parametrize(("model", "heights"), HEIGHTS.items())
 def test_the_imu_is_where_the_model_has_it(running: Loop, model: str, heights: tuple[float, float]) -> None:
     running.new(tool_mass=2)
-    force = loads(running, model, 0, False, 800, (1.0, (0.0, 0.0, 9.0, 3.0, 0.0, 0.0)))[2]
+    turning = [(1 + number / 800, (0.0, 0.0, 9.0, 3.0, 0.0, 0.0)) for number in range(4)]
+    force = loads(running, model, 0, False, 800, *turning)[-4]
     origin, imu_at = heights
     assert force == pytest.approx(-2 * (9.0 - 3.0**2 * (origin - imu_at) / 1000))
 
@@ -283,7 +286,8 @@ def test_the_payload_from_the_file_of_an_identification(running: Loop, tmp_path:
     record(recording, posed())
     assert run_here(identify, recording, "--yaml", path).code == 0
     (parameters,) = yaml.safe_load(path.read_text()).values()
-    given = {name: parameters["ros__parameters"][name] for name in TOOL}
+    given = {name: value for name, value in parameters["ros__parameters"].items() if name in TOOL}
+    assert given.keys() >= TOOL.keys() - {"tool_inertia", "accelerometer.cross_axis"}
     found = []
     for asked in ({"payload_file": path}, {k: str(v).replace(" ", "") for k, v in given.items()}):
         assert running.new(**asked) == ""
@@ -465,6 +469,18 @@ def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> Non
         wait_until(lambda: wrench(loop.read()) == 4, "the last sample")
         assert loop.read()["compensated.force.z"] == pytest.approx(2 * STANDARD_GRAVITY)
         loop.do("stop")
+
+
+def test_the_first_sample_while_the_sensor_turns(running: Loop, server: PlayedSensor) -> None:
+    """How fast it spins up, and so the inertia of the tool, is not known yet."""
+    loop = running.opened(server.port, "compensated", tool_mass=1, on_invalid="hold")
+    begin_ns = time.monotonic_ns()
+    for number, condition in ((1, NOT_FINITE), (2, FRESH)):
+        data = encode(61, {"acceleration.z": 1.0, "angular_rate.x": 100.0, "force.x": number})
+        server.send(encode_data(number, 5, begin_ns + number * 1_250_000, 0, 0, 3, data))
+        seen = loop.until(condition)
+    assert wrench(seen) == 2
+    assert seen["compensated.force.x"] == pytest.approx(2)
 
 
 def test_without_a_payload_the_log_says_what_zero_is(running: Loop, server: PlayedSensor) -> None:

@@ -15,6 +15,7 @@ from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import DATAGRAM_HEADER, FRAME_HEADER, Command
 from ethercat_server.sensor.objects.dictionary import KNOWN_OBJECTS, NOTE_NAMES
 from ethercat_server.simulation.backend import MemoryBackend
+from tests.server.test_objects import IN_THE_NOTE
 from tests.simulation import SimulatedBus, SimulatedServer, registers, simulated_bus, simulated_server
 from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign, no_mailbox
 from tests.tool.running import complaints, one_sentence, refused, told, tool_here
@@ -121,11 +122,12 @@ def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
 
 
 def test_every_row_of_table_iii_1_is_read_by_name(bench: SimulatedBus) -> None:
-    names = [name for _, _, name in NOTE_NAMES]
+    rows = (*NOTE_NAMES, *IN_THE_NOTE)
+    names = [name for _, _, name in rows]
     ended = tool_here("read", bench.near, *names, "--json", code=1)
     found = ended.json["sensors"][0]["objects"]
     read = {(int(row["index"], 16), row["subindex"]) for row in found}
-    assert {(index, subindex) for index, subindex, _ in NOTE_NAMES} <= read
+    assert {(index, subindex) for index, subindex, _ in rows} <= read
     unreadable = {row["index"] for row in found if "error" in row}
     assert unreadable == {"0x8003", "0x6000"}, "no range, and no quaternion in 61 bytes"
     assert re.search(
@@ -165,7 +167,7 @@ def test_watch_shows_each_block_and_writes_nothing(bench: SimulatedBus) -> None:
 
 
 def test_watch_gives_si_units_rate_and_warnings() -> None:
-    with simulated_bus("--signal", "sine", "--pdo", "77", "--sinc", "128") as bus:
+    with simulated_bus("--signal", "ramp", "--pdo", "77", "--sinc", "128") as bus:
         bus.command("warn 0x20")
         ended = tool_here("watch", bus.near, "--samples", 200, "--interval", 10, "--json")
     (row,) = map(json.loads, ended.out.splitlines())

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import address, number, parser
+from bota_clients.arguments import address, number, parser, typed
 from bota_clients.program import Signals, start
 from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.program.server_choice import is_address, own_server
@@ -55,8 +55,8 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
         made.error(f"the address is given twice: leave out {old}, or --server")
     try:
         server: Address = options.server or (own_server() if old is None else Address.parse(old))
-        own = _HOSTS if server.host == DEFAULT_HOST else [str(ipaddress.ip_address(server.host))]
-    except ValueError as error:
+        own = _HOSTS if server.host == DEFAULT_HOST else [_host(server.host)]
+    except (ValueError, argparse.ArgumentTypeError) as error:
         made.error(str(error))
     options.paths, options.port, options.hosts = [*map(Path, names)], server.port, own
     return options
@@ -64,6 +64,9 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
 
 def _speed(text: str) -> float:
     return math.inf if text == "max" else number(1e-6, 1e6, "a number, such as 2 or 0.5, or 'max'")(text)
+
+
+_host = typed(lambda text: str(ipaddress.ip_address(text)), "an IP address of this machine")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,6 +1,6 @@
 // Runs the class behind the ros2_control plugin for tests: a command per line on standard input, for each a line of JSON.
 //
-//   new [PARAMETER=VALUE ...] [imu] [orientation]   another loop; the one before is gone
+//   new [PARAMETER=VALUE ...] [imu] [orientation] [compensated]   another loop; the one before is gone
 //   open | wait MS | tare | log | max_age | stop
 //   read                 one cycle
 //   run SECONDS HZ       cycles at a steady pace: how many in which condition
@@ -144,6 +144,7 @@ int main() {
             for (std::string word; words >> word;) {
                 const std::size_t at = word.find('=');
                 if (word == "imu") parameters.wants_imu = true;
+                else if (word == "compensated") parameters.wants_compensated = true;
                 else if (word == "orientation") parameters.wants_orientation = true;
                 else if (why.empty()) why = set_parameter(parameters, word.substr(0, at), at == std::string::npos ? "" : word.substr(at + 1));
             }
@@ -183,7 +184,7 @@ int main() {
             double lag_s = 0, rate_hz = 0;
             int fir = 0, count = 0;
             words >> model >> lag_s >> fir >> rate_hz >> count;
-            Tool tool(parameters.payload, model, lag_s, fir != 0, rate_hz);
+            Tool tool(parameters.payload, model, Alignment(lag_s, 0.00096, fir != 0, rate_hz));
             const char* separator = "[";
             for (; count > 0 && std::getline(std::cin, line); --count) {
                 std::vector<double> numbers;

@@ -1,14 +1,17 @@
 // Weight and inertia of the tool, to be subtracted from force and torque (docs/compensation.md):
 //
-//     tool force = -m s, tool torque = c x tool force,  s = s_imu + alpha x d + omega x (omega x d)
+//     tool force = -m s,  s = s_imu + alpha x d + omega x (omega x d)
+//     tool torque = c x tool force - J alpha - omega x J omega
 //
-// s: specific force (acceleration minus gravity) at the center of gravity c, d from the IMU to c; brought to the instant of
-// force and torque first. As ros2_bridge/ft_compensation, to which the tests hold it: specific_force, alignment, compensator.
+// s: specific force (acceleration minus gravity) at the center of gravity c, d from the IMU to c, all at the instant of force and
+// torque. As ros2_bridge/ft_compensation: alignment, specific_force, compensator.
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <deque>
+#include <optional>
 #include <string_view>
 #include <utility>
 #include <vector>
@@ -24,7 +27,9 @@ using Wrench = std::array<double, 6>;  // Fx Fy Fz (N) Mx My Mz (Nm), about the 
 struct Payload {
     double mass = 0.0;  ///< kg
     Vector3 center{};   ///< of gravity, m from the wrench origin
+    std::array<double, 6> inertia{};  ///< Ixx Iyy Izz Ixy Ixz Iyz about it, kg m^2, in the sensor's axes; zeros: a point mass
     Vector3 accelerometer_offset{}, accelerometer_scale{1, 1, 1};  ///< m/s^2, none
+    std::array<double, 6> accelerometer_cross_axis{};              ///< xy xz yx yz zx zy: of the first, part of the second subtracted
 };
 
 inline Vector3 cross(const Vector3& a, const Vector3& b) noexcept {
@@ -42,89 +47,166 @@ inline double imu_height(std::string_view model) noexcept {
     return 0.0;
 }
 
-/// The weights of the newest specific force and those before it, for a force that is `lag` sample periods later: with the
-/// sensor's FIR filter on its window (22 taps, Kaiser, beta 8.8), else between two samples. {1} if the force is not later.
-inline std::vector<double> alignment_taps(double lag, bool fir) {
-    constexpr double kNegligible = 0.1, kHalf = 10.5, kBeta = 8.8;
-    const auto bessel = [](double x) {  // modified, of order 0
-        double sum = 0.0, term = 1.0;
-        for (int k = 1; k <= 30; ++k) sum += term, term *= x * x / (4.0 * k * k);
-        return sum;
-    };
-    if (!(lag >= kNegligible)) return {1.0};
-    std::vector<double> taps(static_cast<std::size_t>(lag + (fir ? kHalf : 1.0)) + 1);
-    double sum = 0.0;
-    for (std::size_t k = 0; k < taps.size(); ++k) {
-        const double off = std::abs(static_cast<double>(k) - lag), x = off / kHalf;
-        if (fir) taps[k] = x <= 1.0 ? bessel(kBeta * std::sqrt(1.0 - x * x)) : 0.0;
-        else taps[k] = off < 1.0 ? 1.0 - off : 0.0;
-        sum += taps[k];
+/// Weights of the IMU's latest samples, the newest first, that bring it to the instant of force and torque.
+struct Alignment {
+    using Taps = std::vector<double>;
+
+    /// Force and torque are `lag_s` later than the accelerometer (none: unknown), the gyroscope `gyroscope_s`.
+    Alignment(std::optional<double> lag_s, double gyroscope_s, bool fir, double rate_hz) : period_s(1.0 / rate_hz) {
+        constexpr double kParabolaS = 0.014, kLineS = 0.0025, kLatestSlopeS = 0.0015, kFurthestS = 0.002;
+        const double at_s = std::min(-lag_s.value_or(0.0), kFurthestS), turned_s = std::min(at_s + gyroscope_s, kFurthestS);
+        const double at = at_s * rate_hz, turned = turned_s * rate_hz;
+        lead = 1 + static_cast<int>(std::max(-at, 0.0));
+        if (fir && lag_s) {  // the IMU passes the window of the FIR filter, too
+            const Taps before = window(-turned - 1.0);
+            taps = {window(-at), window(-turned), Taps(before.size() + 2)};
+            for (std::size_t k = 0; k < before.size(); ++k)
+                taps[2][k] += 0.5 * rate_hz * before[k], taps[2][k + 2] -= 0.5 * rate_hz * before[k];
+            return;
+        }
+        gap_s = std::max(0.008, 2.5 / rate_hz);
+        const int count = std::max(3, static_cast<int>(std::nearbyint(kParabolaS * rate_hz)) + 1);
+        taps = {value(at, std::max(2, static_cast<int>(std::nearbyint(kLineS * rate_hz)) + 1)), fit(2, count, turned, 1.0, 0.0),
+                fit(2, count, std::min(turned_s, -kLatestSlopeS) * rate_hz, 0.0, rate_hz)};
     }
-    for (double& tap : taps) tap /= sum;
-    return taps;
-}
+
+    double period_s, gap_s = 0.1;  ///< samples further apart than `gap_s` do not belong together
+    int lead;                      ///< so many samples after a gap tell nothing of the instant that force and torque are of
+    std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
+
+private:
+    /// Of the polynomial through `count` samples, by least squares: `value` times its value and `slope` times its slope, `at`
+    /// sample periods after the newest. Centered, 1, v and v^2 less its mean are orthogonal.
+    static Taps fit(int order, int count, double at, double value, double slope) {
+        const double middle = 0.5 * (count - 1), mean = (count * count - 1) / 12.0, v0 = at + middle;
+        double squares = 0.0, fourths = 0.0;
+        for (int k = 0; k < count; ++k) {
+            const double v = middle - k, parabola = v * v - mean;
+            squares += v * v, fourths += parabola * parabola;
+        }
+        Taps taps;
+        for (int k = 0; k < count; ++k) {
+            const double v = middle - k, parabola = order == 2 ? (v * v - mean) / fourths : 0.0;
+            taps.push_back(value * (1.0 / count + v0 * v / squares + (v0 * v0 - mean) * parabola) +
+                           slope * (v / squares + 2.0 * v0 * parabola));
+        }
+        return taps;
+    }
+
+    /// Between two samples, or on a line through `count`.
+    static Taps value(double at, int count) {
+        if (std::abs(at) < 0.1) return {1.0};
+        if (at > 0.0) return fit(1, count, at, 1.0, 0.0);
+        Taps taps(static_cast<std::size_t>(-at) + 2, 0.0);
+        taps.back() = -at - std::floor(-at);
+        taps[taps.size() - 2] = 1.0 - taps.back();
+        return taps;
+    }
+
+    /// The FIR filter's (22 taps, Kaiser, beta 8.8), that many sample periods before the newest sample.
+    static Taps window(double center) {
+        constexpr double kHalf = 10.5, kBeta = 8.8;
+        const auto bessel = [](double x) {  // modified, of order 0
+            double sum = 0.0, term = 1.0;
+            for (int k = 1; k <= 30; ++k) sum += term, term *= x * x / (4.0 * k * k);
+            return sum;
+        };
+        Taps taps(static_cast<std::size_t>(std::max(0.0, center + kHalf)) + 1);
+        double sum = 0.0;
+        for (std::size_t k = 0; k < taps.size(); ++k) {
+            const double x = (static_cast<double>(k) - center) / kHalf;
+            sum += taps[k] = std::abs(x) <= 1.0 ? bessel(kBeta * std::sqrt(1.0 - x * x)) : 0.0;
+        }
+        for (double& tap : taps) tap /= sum;
+        return taps;
+    }
+};
 
 /// The load of the tool, of one sample after the other.
 class Tool {
 public:
-    /// `lag_s`: by how much force and torque are later than the accelerometer; `rate_hz` of the samples.
-    Tool(const Payload& payload, std::string_view model, double lag_s, bool fir, double rate_hz)
-        : payload_(payload), taps_(alignment_taps(lag_s * rate_hz, fir)), rate_hz_(rate_hz), lever_(payload.center) {
+    Tool(const Payload& payload, std::string_view model, Alignment alignment)
+        : payload_(payload), alignment_(std::move(alignment)), lever_(payload.center) {
         lever_[2] -= imu_height(model);
+        for (const auto& taps : alignment_.taps) count_ = std::max(count_, taps.size());
     }
 
-    /// N, Nm; NaN if acceleration or angular rate are not finite, or the IMU is off. `time_s` is by a clock that nobody sets.
+    /// N, Nm; NaN if acceleration or angular rate are not finite, the IMU is off, or the sensor turns and what was before is not
+    /// known. `time_s` is by a clock that nobody sets.
     Wrench follow(const bota_ethercat::Sample& sample, double time_s) {
+        constexpr double kTurning = 0.05;  // rad/s: less is a gyroscope's offset
+        if (!sample.imu_is_finite()) time_s_ = -INFINITY;
+        if (!sample.imu_is_finite() || sample.acceleration == Vector3{}) return none();
+        take(row(sample), time_s - time_s_);
+        time_s_ = time_s;
         const Vector3& rate = sample.angular_rate;
-        if (!sample.imu_is_finite()) rates_.clear();
-        if (!sample.imu_is_finite() || sample.acceleration == Vector3{}) return {NAN, NAN, NAN, NAN, NAN, NAN};
-        Vector3 s = sample.acceleration;
-        for (std::size_t i = 0; i < 3; ++i) s[i] = (s[i] - payload_.accelerometer_offset[i]) / payload_.accelerometer_scale[i];
-        const Vector3 tangential = cross(slope(rate, time_s), lever_), centripetal = cross(rate, cross(rate, lever_));
-        for (std::size_t i = 0; i < 3; ++i) s[i] += tangential[i] + centripetal[i];
-        Vector3 force = aligned(s, time_s);
-        for (double& each : force) each *= -payload_.mass;
-        const Vector3 torque = cross(payload_.center, force);
+        const bool turns = rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2] > kTurning * kTurning;
+        if (known_ <= alignment_.lead && turns && lever_ != Vector3{}) return none();
+        const Vector3 omega = aligned(1, 3), alpha = aligned(2, 3), tangential = cross(alpha, lever_);
+        const Vector3 centripetal = cross(omega, cross(omega, lever_)), s = aligned(0, 0);
+        Vector3 force{};
+        for (std::size_t i = 0; i < 3; ++i) force[i] = -payload_.mass * (s[i] + tangential[i] + centripetal[i]);
+        Vector3 torque = cross(payload_.center, force);
+        const Vector3 spun = inertia(alpha), turned = cross(omega, inertia(omega));
+        for (std::size_t i = 0; i < 3; ++i) torque[i] -= spun[i] + turned[i];
         return {force[0], force[1], force[2], torque[0], torque[1], torque[2]};
     }
 
 private:
-    /// Angular acceleration, rad/s^2: the slope of the angular rate over 5 ms, and so half of that late. Zero until there is one.
-    Vector3 slope(const Vector3& rate, double time_s) {
-        constexpr double kSlopeS = 0.005, kGapS = 0.1;
-        const double passed_s = rates_.empty() ? 0.0 : time_s - rates_.back().first;
-        if (!(0.0 < passed_s && passed_s <= kGapS)) rates_.clear();
-        rates_.emplace_back(time_s, rate);
-        while (rates_.size() > 2 && time_s - rates_[1].first >= kSlopeS) rates_.pop_front();
-        if (rates_.size() < 2) return {};
-        Vector3 result = rate;
-        for (std::size_t i = 0; i < 3; ++i) result[i] = (rate[i] - rates_[0].second[i]) / (time_s - rates_[0].first);
-        return result;
+    using Row = std::array<double, 6>;  // true acceleration, angular rate
+
+    static Wrench none() noexcept { return {NAN, NAN, NAN, NAN, NAN, NAN}; }
+
+    Vector3 inertia(const Vector3& v) const noexcept {
+        const auto& [xx, yy, zz, xy, xz, yz] = payload_.inertia;
+        return {xx * v[0] + xy * v[1] + xz * v[2], xy * v[0] + yy * v[1] + yz * v[2], xz * v[0] + yz * v[1] + zz * v[2]};
     }
 
-    /// `s` as it was when force and torque of this sample were. A value stands for up to four samples that were lost after it.
-    Vector3 aligned(const Vector3& s, double time_s) {
-        if (taps_.size() == 1) return s;
-        const double lost = std::nearbyint((time_s - time_s_) * rate_hz_) - 1.0;
-        if (!(lost >= 0.0 && lost <= 4.0)) history_.clear();
-        for (double left = history_.empty() ? 0.0 : lost; left >= 0.0; --left) history_.push_front(s);
-        if (history_.size() > taps_.size()) history_.resize(taps_.size());
-        time_s_ = time_s;
+    Row row(const bota_ethercat::Sample& sample) const noexcept {
+        Vector3 a = sample.acceleration;
+        for (std::size_t i = 0; i < 3; ++i) a[i] = (a[i] - payload_.accelerometer_offset[i]) / payload_.accelerometer_scale[i];
+        const auto& [xy, xz, yx, yz, zx, zy] = payload_.accelerometer_cross_axis;
+        const Vector3& w = sample.angular_rate;
+        return {a[0] - xy * a[1] - xz * a[2], a[1] - yx * a[0] - yz * a[2], a[2] - zx * a[0] - zy * a[1], w[0], w[1], w[2]};
+    }
+
+    /// Append a sample that comes so long after the one before, and what was between them.
+    void take(const Row& row, double passed_s) {
+        if (!(passed_s > 0.0 && passed_s <= alignment_.gap_s)) {
+            history_.assign(count_, row);
+            known_ = 1;
+            return;
+        }
+        const int periods = static_cast<int>(std::nearbyint(passed_s / alignment_.period_s));
+        const Row before = history_.front();
+        if (known_ == 1)  // of two samples only, the slope is that between them
+            for (std::size_t k = 0; k < count_; ++k)
+                for (std::size_t i = 3; i < 6; ++i)
+                    history_[k][i] = before[i] - (row[i] - before[i]) / std::max(periods, 1) * static_cast<double>(k);
+        for (int lost = 1; lost < periods; ++lost) {
+            history_.push_front(row);
+            for (std::size_t i = 0; i < 6; ++i) history_.front()[i] = before[i] + (row[i] - before[i]) * lost / periods;
+        }
+        history_.push_front(row);
+        history_.resize(count_);
+        known_ += std::max(periods, 1);
+    }
+
+    /// Three of the columns from `first` on, with these weights.
+    Vector3 aligned(std::size_t taps, std::size_t first) const noexcept {
         Vector3 sum{};
-        double weight = 0.0;
-        for (std::size_t k = 0; k < history_.size(); weight += taps_[k++])
-            for (std::size_t i = 0; i < 3; ++i) sum[i] += taps_[k] * history_[k][i];
-        if (!(weight > 0.0)) return s;
-        for (double& each : sum) each /= weight;
+        for (std::size_t k = 0; k < alignment_.taps[taps].size(); ++k)
+            for (std::size_t i = 0; i < 3; ++i) sum[i] += alignment_.taps[taps][k] * history_[k][first + i];
         return sum;
     }
 
     Payload payload_;
-    std::vector<double> taps_;
-    double rate_hz_, time_s_ = 0.0;
-    Vector3 lever_;                                  // from the IMU to the center of gravity
-    std::deque<std::pair<double, Vector3>> rates_;   // with their times, the oldest first
-    std::deque<Vector3> history_;                    // the newest first
+    Alignment alignment_;
+    Vector3 lever_;            // from the IMU to the center of gravity
+    std::size_t count_ = 0;    // of the samples that are kept
+    std::deque<Row> history_;  // the newest first
+    int known_ = 0;            // since the last gap
+    double time_s_ = -INFINITY;
 };
 
 }  // namespace bota_ethercat_hardware

@@ -119,11 +119,13 @@ inline constexpr Row kRows[] = {
     {"tool_mass", "0 to 1000 (kg)",
      [](S t, P& p) { return p.has_payload = p.wants_imu = number(t, 0.0, 1000.0, p.payload.mass); }},
     {"tool_center_of_gravity", "three numbers (m)", [](S t, P& p) { return numbers(t, p.payload.center); }},
+    {"tool_inertia", "six numbers (kg m^2)", [](S t, P& p) { return numbers(t, p.payload.inertia); }},
     {"accelerometer.offset", "three numbers (m/s^2)", [](S t, P& p) { return numbers(t, p.payload.accelerometer_offset); }},
     {"accelerometer.scale", "three numbers, about 1", [](S t, P& p) { return numbers(t, p.payload.accelerometer_scale, 0.1); }},
+    {"accelerometer.cross_axis", "six numbers", [](S t, P& p) { return numbers(t, p.payload.accelerometer_cross_axis); }},
     {"bias", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.bias); }},
 };
-inline constexpr std::size_t kOfTool = 5;  // the last rows
+inline constexpr std::size_t kOfTool = 7;  // the last rows
 
 /// Parameters of the ROS 2 node in a YAML file, a line each; false if they are wrong, or tool_mass is not among them.
 inline bool read_payload(const std::string& path, Parameters& into) {

@@ -133,6 +133,8 @@ public:
             condition_ = static_cast<int>(received.is_connected ? Condition::late : Condition::disconnected);
         else if (!received.is_checked && reading.condition <= Condition::saturated)
             condition_ = kUnchecked;
+        else if (parameters_.wants_compensated && reading.condition <= Condition::saturated && std::isnan(received.tool[0]))
+            condition_ = static_cast<int>(Condition::not_finite);
         values_[kAge] = sampled_ns_ == kNever ? kInfinity : seconds(now_ns - sampled_ns_);
         values_[kCondition] = condition_;
         const Reaction doing = reaction(parameters_, condition_);
@@ -378,9 +380,12 @@ private:
         max_age_ns_ = std::llround(bota_ethercat_hardware::max_age(parameters_, *found) * 1e9);
         client_.set_max_age(std::chrono::nanoseconds(max_age_ns_));
         if (!parameters_.has_payload) return;
-        const auto& [force_ns, acceleration_ns, _] = found->delay_ns;
-        const double lag_s = force_ns && acceleration_ns ? seconds(*force_ns - *acceleration_ns) : 0.0;
-        tool_.emplace(parameters_.payload, found->name.view(), lag_s, found->fir.value_or(false), found->rate_hz);
+        const auto& [force_ns, acceleration_ns, rate_ns] = found->delay_ns;
+        std::optional<double> lag_s;
+        if (force_ns && acceleration_ns) lag_s = seconds(*force_ns - *acceleration_ns);
+        const double gyroscope_s = seconds(rate_ns.value_or(0) - acceleration_ns.value_or(0));
+        const double rate_hz = found->rate_hz > 0.0 ? found->rate_hz : 1600.0;
+        tool_.emplace(parameters_.payload, found->name.view(), Alignment(lag_s, gyroscope_s, found->fir.value_or(false), rate_hz));
     }
 
     /// Log why there is no connection, and what the controllers see, when it changes and has been quiet for a while.
