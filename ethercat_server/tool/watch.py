@@ -1,47 +1,40 @@
-"""`watch`: live values in SI units per block of samples: a table on a terminal, else one line per block."""
+"""`watch`: mean force and torque of each sensor, and what its stream is like, once an interval."""
 
 from __future__ import annotations
 
 import argparse
-import math
+import contextlib
 import sys
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
 
-from bota_ethercat.accounting import NOT_NEW, FrameKind, StreamAccounting, StreamCounts
 from bota_ethercat.control import Event
-from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.judge import Observation, judge
+from bota_ethercat.health.observer import COMMON, StreamObserver
 from bota_ethercat.health.verdict import LIMITS
-from bota_ethercat.pdo import Sample
 from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import number, whole
 from ethercat_server.access.sensors import Sensors, note
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.process.command_line import FAILED
+from ethercat_server.sensor.sensor import Found
 from ethercat_server.tool.command import (
     DONE,
     Command,
     argument,
     chosen,
-    columns,
     say,
     say_json,
     sensor_arguments,
     sensors_of,
 )
 
-_TERMINAL_INTERVAL_S: Final = 0.25
-_LINE_INTERVAL_S: Final = 1.0
-# Name, letter, unit, digits.
-_VECTORS: Final = (
-    ("force", "F", "N", 3), ("torque", "M", "Nm", 4), ("acceleration", "A", "m/s²", 3),
-    ("angular_rate", "R", "rad/s", 4),
-)  # fmt: skip
 _FOREVER_S: Final = 1e9
-_LEAST_INTERVALS: Final = 10  # for a rate
+_FORCE: Final = COMMON.index("force.x")  # torque follows
+_COUNTS: Final = ("lost", "repeated", "invalid")
 # What is told of a watched sensor, unless the event has a message of its own.
 _TOLD: Final[Mapping[str, str]] = {
     Event.SENSOR_LOST: "sensor {sensor} is lost",
@@ -51,187 +44,85 @@ _TOLD: Final[Mapping[str, str]] = {
 }
 
 
-class Block:
-    """Statistics of a block of samples of one sensor: mean, standard deviation, rate, warnings, losses.
+class _Watched:
+    """One sensor: what came in this interval, and how many samples were used in all."""
 
-    Attributes:
-        counts: of this block.
-        total: what `finish` counted of the blocks before.
-    """
+    def __init__(self, found: Found, rate_hz: object, now_ns: int) -> None:
+        self.found, self.rate_hz, self.samples = found, rate_hz, 0
+        self.observer = StreamObserver(number(rate_hz) or 0.0, now_ns)
+        self._sums, self._summed = [0.0] * 6, 0
 
-    def __init__(self) -> None:
-        self.total = Counter[str]()
-        self._accounting, self._gap = StreamAccounting(), 0
-        self._begin()
+    def take(self, frames: list[DataMessage], now_ns: int, most: int) -> None:
+        """Take frames, and at most so many samples of them into the mean."""
+        for row in self.observer.take(frames, now_ns)[:most]:
+            self._sums = [a + b for a, b in zip(self._sums, row[_FORCE : _FORCE + 6], strict=True)]
+            self._summed += 1
+            self.samples += 1
 
-    def _begin(self) -> None:
-        self.counts = self._accounting.counts = StreamCounts()
-        self._first_ns, self._intervals, self._warnings = self._accounting.new_ns, 0, 0
-        self._means, self._squares = [0.0] * 12, [0.0] * 12  # the squares are of the deviations, summed up
-        self._newest: Sample | None = None
-
-    @property
-    def samples(self) -> int:
-        """All so far."""
-        return self.total["samples"] + self.counts.new
-
-    def take(self, frame: DataMessage, sample: Sample, *, settled: bool) -> None:
-        """Add a frame and what it holds; a sample that has not settled is left out, its GAP is the next's."""
-        self._gap |= frame.flags & DataFlag.GAP
-        if not settled and not frame.flags & NOT_NEW:
-            return
-        kind = self._accounting.take(frame.sequence, frame.monotonic_ns, frame.flags | self._gap)
-        self._gap = 0
-        # A stuck sensor has nothing newer than what it repeats.
-        if kind is FrameKind.NEW or (kind is FrameKind.REPEATED and self._newest is None):
-            self._newest = sample
-        if kind is FrameKind.NEW:
-            self._warnings |= sample.warnings
-            for n, value in enumerate(sample.array):  # Welford's algorithm
-                before = value - self._means[n]
-                self._means[n] += before / self.counts.new
-                self._squares[n] += before * (value - self._means[n])
-            if self._first_ns < 0:
-                self._first_ns = frame.monotonic_ns
-            else:
-                self._intervals += 1
-
-    def finish(self) -> dict[str, Any] | None:
-        """The statistics in SI units, ready for JSON, None without frames; then begin the next block."""
-        counts, span_ns = self.counts, self._accounting.new_ns - self._first_ns
-        if not counts.frames:
-            return None
-        found: dict[str, Any] = {
-            "samples": counts.new,
-            "rate_hz": self._intervals * 1e9 / span_ns if self._intervals >= _LEAST_INTERVALS else None,
-            "invalid": counts.invalid,
-            "repeated": counts.repeated,
-            "gaps": counts.gaps,
-        }
-        self.total.update(samples=counts.new, invalid=counts.invalid, repeated=counts.repeated)
-        if self._newest is not None:
-            means = self._means if counts.new else self._newest.array
-            deviations = [math.sqrt(squares / max(1, counts.new)) for squares in self._squares]
-            at = {name: slice(3 * n, 3 * n + 3) for n, (name, *_) in enumerate(_VECTORS)}
-            found |= {name: means[where] for name, where in at.items()}
-            found["deviation"] = {name: deviations[where] for name, where in at.items()}
-            found["temperature"] = self._newest.temperature
-            found["orientation"] = self._newest.orientation
+    def finish(self, now_ns: int) -> dict[str, Any]:
+        """The interval in SI units, ready for JSON, without force and torque if it has no sample."""
+        seen, count = self.observer.observation(now_ns), self._summed
+        found = {"samples": count, "rate_hz": seen.rate_hz, **{key: getattr(seen, key) for key in _COUNTS}}
+        if count:
+            means = [value / count for value in self._sums]
+            found |= {"force": means[:3], "torque": means[3:]}
         found["warnings"] = [
             {"severity": row.severity.value, "meaning": row.meaning, "remedy": row.remedy}
-            for row in explain(self._warnings)
+            for row in explain(seen.warnings)
         ]
-        self._begin()
+        self.observer.begin(number(self.rate_hz) or 0.0, now_ns)
+        self._sums, self._summed = [0.0] * 6, 0
         return found
 
 
-class _Watch:
-    """Collects frames and shows them."""
-
-    def __init__(self, opened: Sensors, args: argparse.Namespace) -> None:
-        self._opened, self._args = opened, args
-        self._sensors = {sensor.number: sensor for sensor in chosen(opened, args)}
-        self._blocks = {number: Block() for number in self._sensors}
-        self._on_terminal = sys.stdout.isatty() and not args.json
-        usual = _TERMINAL_INTERVAL_S if self._on_terminal else _LINE_INTERVAL_S
-        self._interval_s = args.interval or usual
-        self._began_ns, self._height = opened.clock.monotonic_ns(), 0
-
-    def run(self) -> None:
-        """Until it is over, or KeyboardInterrupt."""
-        if not self._args.json and not self._on_terminal:
-            say("\n".join(f"{sensor} (mean of each block)" for sensor in self._sensors.values()))
-        opened, most = self._opened, self._args.samples or math.inf
-        opened.wait_settled(self._sensors)
-        self._began_ns = opened.clock.monotonic_ns()
-        end, show = (Deadline(opened.clock, s) for s in (self._args.seconds or _FOREVER_S, self._interval_s))
-        awaited = set[int]()
-        for frames, events in opened.stream(sensors=list(self._sensors)):
-            settling = {event["sensor"] for event in events if self._tell(event)}
-            for frame in frames:
-                block = self._blocks[frame.sensor]
-                if block.samples < most:
-                    settled = frame.sensor not in awaited | settling
-                    block.take(frame, opened.client.decode(frame), settled=settled)
-            if end.passed or all(block.samples >= most for block in self._blocks.values()):
-                return
-            opened.wait_settled(settling)
-            awaited = settling  # their samples that came meanwhile are in the next batch
-            if show.passed:
-                show = Deadline(opened.clock, self._interval_s)
-                self.show()
-
-    def _tell(self, event: JsonObject) -> bool:
-        """Say what happened to a watched sensor; whether its data has to settle."""
-        kind, number = event["event"], event.get("sensor")
-        if kind == Event.SHUTTING_DOWN:
-            raise ServerError(f"{self._opened.used} is shutting down")
-        if kind not in _TOLD or number not in self._sensors:
-            return False
-        note(str(event.get("message") or _TOLD[kind].format_map({"lost_s": None, **event})))
-        return kind in (Event.SENSOR_BACK, Event.RECONFIGURED)
-
-    def show(self) -> None:
-        """Show all blocks and start new ones."""
-        found = {number: row for number, block in self._blocks.items() if (row := block.finish())}
-        if not self._on_terminal:
-            for number, row in found.items():
-                if self._args.json:
-                    say_json({**self._sensors[number].as_json(), **row}, indent=None)
-                else:
-                    say(f"sensor {number}  {_line(row)}")
-        elif found:
-            text = "\n".join(f"{self._sensors[number]}\n{_table(row)}" for number, row in found.items())
-            # Cursor to the first line of the previous table, then clear from there.
-            sys.stdout.write((f"\x1b[{self._height}F" if self._height else "") + "\x1b[J")
-            self._height = text.count("\n") + 1
-            say(text)
-
-    def finish(self) -> int:
-        """Say how many samples there were, and which sensor sent none; the exit code."""
-        if not self._args.json:
-            say(
-                ", ".join(f"sensor {number}: {each.samples} samples" for number, each in self._blocks.items())
-            )
-        silent_s = (self._opened.clock.monotonic_ns() - self._began_ns) * 1e-9
-        silent = {number: each.total for number, each in self._blocks.items() if not each.samples}
-        if silent_s <= LIMITS.stale_after or not silent:
-            return DONE
-        for number, total in silent.items():
-            seen = Observation(invalid=total["invalid"], repeated=total["repeated"], silent_s=silent_s)
-            note(f"sensor {number}: {judge(seen).sentence}")
-        return FAILED
+def _tell(opened: Sensors, event: JsonObject, watched: Mapping[int, _Watched]) -> bool:
+    """Say what happened to a watched sensor; whether its data has to settle."""
+    kind, of = event["event"], whole(event.get("sensor"))
+    if kind == Event.SHUTTING_DOWN:
+        raise ServerError(f"{opened.used} is shutting down")
+    if kind not in _TOLD or of is None or of not in watched:
+        return False
+    note(str(event.get("message") or _TOLD[kind].format_map({"lost_s": None, **event})))
+    watched[of].rate_hz = event.get("rate_hz", watched[of].rate_hz)
+    return kind in (Event.SENSOR_BACK, Event.RECONFIGURED)
 
 
-def _counts(row: dict[str, Any]) -> str:
-    rate = f"{row['rate_hz']:7.1f} Hz" if row["rate_hz"] else "     -- Hz"
-    text = f"{row['samples']:5d} samples {rate}"
-    return text + "".join(f"  {key} {row[key]}" for key in ("invalid", "repeated", "gaps") if row[key])
+def _follow(opened: Sensors, args: argparse.Namespace, watched: Mapping[int, _Watched]) -> None:
+    """Until it is over, or KeyboardInterrupt."""
+    most = args.samples or sys.maxsize
+    end, show = (Deadline(opened.clock, s) for s in (args.seconds or _FOREVER_S, args.interval))
+    awaited = set[int]()
+    for frames, events in opened.stream(sensors=list(watched), fresh_only=False):
+        settling = {event["sensor"] for event in events if _tell(opened, event, watched)}
+        for sensor, each in watched.items():
+            left = 0 if sensor in awaited | settling else most - each.samples
+            of_one = [frame for frame in frames if frame.sensor == sensor]
+            each.take(of_one, opened.clock.monotonic_ns(), left)
+        if end.passed or all(each.samples >= most for each in watched.values()):
+            return
+        opened.wait_settled(settling)
+        awaited = settling  # their samples that came meanwhile are in the next batch
+        if show.passed:
+            show = Deadline(opened.clock, args.interval)
+            _show(opened, args, watched)
 
 
-def _warnings(row: dict[str, Any]) -> list[str]:
-    return [f"{warning['severity']}: {warning['meaning']}" for warning in row["warnings"]]
+def _show(opened: Sensors, args: argparse.Namespace, watched: Mapping[int, _Watched]) -> None:
+    for sensor, each in watched.items():
+        row = each.finish(opened.clock.monotonic_ns())
+        if args.json:
+            say_json({**each.found.as_json(), **row}, indent=None)
+        else:
+            say(f"sensor {sensor}  {_line(row)}")
 
 
 def _line(row: dict[str, Any]) -> str:
-    parts = [_counts(row)]
+    rate = f"{row['rate_hz']:7.1f} Hz" if row["rate_hz"] else "     -- Hz"
+    parts = [f"{row['samples']:5d} samples {rate}", *(f"{key} {row[key]}" for key in _COUNTS if row[key])]
     if "force" in row:
-        for name, letter, unit, digits in _VECTORS:
-            parts.append(f"{letter} " + " ".join(f"{v:+.{digits}f}" for v in row[name]) + f" {unit}")
-        parts.append(f"{row['temperature']:.1f} °C")
-    return "  ".join([*parts, *_warnings(row)])
-
-
-def _table(row: dict[str, Any]) -> str:
-    rows: list[tuple[str, ...]] = [("", "x", "y", "z", "", "standard deviation")]
-    for name, _, unit, digits in _VECTORS if "force" in row else ():
-        means = [f"{v:+{digits + 6}.{digits}f}" for v in row[name]]
-        deviations = " ".join(f"{v:.{digits}f}" for v in row["deviation"][name])
-        rows.append((name.replace("_", " "), *means, unit, deviations))
-    lines = [f"  {_counts(row)}", columns(rows, indent=2)]
-    if "force" in row:
-        lines.append(f"  temperature {row['temperature']:.1f} °C")
-    return "\n".join([*lines, *(f"  {text}" for text in _warnings(row) or ["no warnings"])])
+        parts.append("F {:+.3f} {:+.3f} {:+.3f} N".format(*row["force"]))
+        parts.append("M {:+.4f} {:+.4f} {:+.4f} Nm".format(*row["torque"]))
+    return "  ".join([*parts, *(f"{each['severity']}: {each['meaning']}" for each in row["warnings"])])
 
 
 def _positive(text: str) -> float:
@@ -248,25 +139,38 @@ def _watch(args: argparse.Namespace) -> int:
     if args.samples is not None and args.samples < 1:
         raise UsageError(f"--samples {args.samples}: it must be 1 or more")
     with sensors_of(args) as opened:
-        watch = _Watch(opened, args)
+        sensors = chosen(opened, args)
+        if not args.json:
+            say("\n".join(map(str, sensors)))
+        watched, began_ns = dict[int, _Watched](), opened.clock.monotonic_ns()
         try:
-            watch.run()
-        except KeyboardInterrupt:
-            pass  # the normal end
+            with contextlib.suppress(KeyboardInterrupt):  # the normal end
+                opened.wait_settled([found.number for found in sensors])
+                rows, began_ns = opened.ask("describe")["sensors"], opened.clock.monotonic_ns()
+                for found in sensors:
+                    watched[found.number] = _Watched(found, rows[found.number]["rate_hz"], began_ns)
+                _follow(opened, args, watched)
         finally:
-            watch.show()
-        return watch.finish()
+            _show(opened, args, watched)
+        silent_s = (opened.clock.monotonic_ns() - began_ns) * 1e-9
+    silent = {sensor: each.observer.counts for sensor, each in watched.items() if not each.samples}
+    if silent_s <= LIMITS.stale_after or not silent:
+        return DONE
+    for sensor, counts in silent.items():
+        seen = Observation(invalid=counts.invalid, repeated=counts.repeated, silent_s=silent_s)
+        note(f"sensor {sensor}: {judge(seen).sentence}")
+    return FAILED
 
 
-_LENGTH: Final = f"length of a block (default {_LINE_INTERVAL_S:g}, on a terminal {_TERMINAL_INTERVAL_S:g})"
 COMMANDS: Final = (
     Command(
-        "watch", "show live values until Ctrl-C",
+        "watch", "show force, torque and the state of the stream until Ctrl-C",
         (
             *sensor_arguments(all_if_none=True),
             argument("--samples", "stop after N samples of each sensor", type=int, metavar="N"),
             argument("--seconds", "stop after S seconds", type=_positive, metavar="S"),
-            argument("--interval", _LENGTH, type=_positive, metavar="S"),
+            argument("--interval", "time between two lines (%(default)s)", type=_positive, metavar="S",
+                     default=1.0),
         ),
         _watch,
     ),

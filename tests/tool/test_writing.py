@@ -151,7 +151,7 @@ def test_chop_that_divides_the_rate_is_taken_and_told(single: SimulatedBus) -> N
     assert told("plan", near, "--set", "imu_active=3", code=3)["then"]["rate_hz"] == 400
     assert len(told("tare", near, "--samples", 20)["new_offset"]) == 6
     watched = told("watch", near, "--samples", 100, "--interval", 9)
-    assert (round(watched["rate_hz"]), watched["gaps"]) == (400, 0)
+    assert (round(watched["rate_hz"]), watched["lost"]) == (400, 0)
 
 
 def test_tare_makes_the_mean_the_target(bench: SimulatedBus) -> None:
