@@ -191,7 +191,7 @@ def test_watch_counts_the_samples_that_the_bus_lost(chain: SimulatedBus) -> None
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_the_normal_end_of_watch(chain: SimulatedBus, number: signal.Signals) -> None:
-    chain.at(0.7, lambda: signal.raise_signal(number))
+    chain.at(1.2, lambda: signal.raise_signal(number))
     ended = tool_here("watch", chain.near, "--interval", 0.1)
     assert complaints(ended.err) == []
     assert "sensor 1 " in ended.out.splitlines()[-1]
