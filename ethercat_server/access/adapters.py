@@ -57,7 +57,6 @@ class Adapter(NamedTuple):
     upper: tuple[str, ...] = ()  # interfaces that stand on it, such as VLANs
     parent: str = ""  # device behind it, by the kernel's name, such as 0000:00:1f.6 or virtio2
     counters: Mapping[str, int] = {}
-    carrier_changes: int | None = None
     routes: Routes = Routes()
     holder: Holder | None = None  # the EtherCAT master that uses it
 
@@ -117,7 +116,6 @@ def _link(row: Any, rows: Sequence[Any]) -> Adapter:
         upper=tuple(_name(each) for each in rows if _stands_on(each, row["index"])),
         parent=row.get_attr("IFLA_PARENT_DEV_NAME") or "",
         counters={key: int(stats[key]) for key in stats.keys() if isinstance(stats[key], int)},  # noqa: SIM118
-        carrier_changes=row.get_attr("IFLA_CARRIER_CHANGES"),
     )
 
 

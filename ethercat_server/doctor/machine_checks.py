@@ -60,61 +60,32 @@ def examine_machine(machine: Machine) -> Iterator[Finding]:
 
 
 _SWITCH: Final = "/sys/kernel/debug/sched/preempt"
-# Preemption models and the kernel option that makes each the default.
-_MODELS: Final = {
-    "none": "PREEMPT_NONE", "voluntary": "PREEMPT_VOLUNTARY", "full": "PREEMPT", "lazy": "PREEMPT_LAZY",
-}  # fmt: skip
-_GOOD_CLOCKS: Final = frozenset(
-    {"tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "xen"}
-)
 
 
 def _preemption(machine: Machine) -> Finding:
-    version = machine.text("/proc/version", "")
+    version, switch = machine.text("/proc/version", ""), machine.text(_SWITCH, "")
     if machine.text("/sys/kernel/realtime", "") == "1" or "PREEMPT_RT" in version:
         return ok("fully preemptible (PREEMPT_RT)", model="rt")
-    dynamic = "PREEMPT_DYNAMIC" in version or "PREEMPT_DYNAMIC" in machine.config
-    switched = re.search(r"\((\w+)\)", machine.text(_SWITCH, ""))
-    asked = re.findall(rf"\bpreempt=({'|'.join(_MODELS)})\b", machine.text("/proc/cmdline", "") * dynamic)
-    built = (model for model, option in _MODELS.items() if option in machine.config)
-    usual = "full" if dynamic or "PREEMPT" in version.split() else "voluntary" if version else None
-    model = switched[1] if switched else next(iter((*asked, *built, usual)))
-    if model is None:
-        raise CannotLookError("neither /proc/version nor the kernel's configuration can be read")
-    sure = bool(switched or asked or not dynamic)
+    dynamic = "PREEMPT_DYNAMIC" in version
+    built = None if dynamic or not version else "full" if "PREEMPT" in version.split() else "voluntary"
+    switched = re.search(r"\((\w+)\)", switch)
+    asked = dynamic and re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline", ""))
+    if not (model := switched[1] if switched else asked[1] if asked else built):
+        raise CannotLookError(f"{_SWITCH} cannot be read: run with sudo")
     real_time_kernel = "sudo apt install linux-image-rt-amd64"
     if re.search(r"^ID=\"?ubuntu", machine.text("/etc/os-release", ""), re.MULTILINE):
         real_time_kernel = "sudo pro attach && sudo pro enable realtime-kernel"
-    hidden = not sure and not machine.names("/sys/kernel/debug")
-    mount = ("sudo mount -t debugfs none /sys/kernel/debug",) if hidden else ()
-    unsure = f", unless changed since boot: {_SWITCH} cannot be read"
     late = "kernel code is rarely preempted: under load the server wakes milliseconds late"
     return graded(
-        f"{model}{' (dynamic)' * dynamic}" + unsure * (not sure),
+        f"{model}{' (dynamic)' * dynamic}",
         (model in {"full", "lazy"}, note,
          "no real-time kernel: drivers and interrupts may delay the server by some 100 µs under load",
          real_time_kernel),
         (not dynamic, warning, late, real_time_kernel),
         (True, warning, f"{late}; to make it permanent, add preempt=full to the kernel command line",
-         *mount, f"echo full | sudo tee {_SWITCH}"),
-        model=model, dynamic=dynamic, certain=sure,
+         f"echo full | sudo tee {_SWITCH}"),
+        model=model, dynamic=dynamic,
     )  # fmt: skip
-
-
-def _clock_source(machine: Machine) -> Finding:
-    folder = "/sys/devices/system/clocksource/clocksource0"
-    source = machine.text(f"{folder}/current_clocksource")
-    others = machine.text(f"{folder}/available_clocksource", "").split()
-    better = next((name for name in others if name in _GOOD_CLOCKS), None)
-    slow = "reading the time takes microseconds, and the server does so several times per exchange"
-    log = "'dmesg | grep -i tsc' says why the kernel rejects better ones"
-    return graded(
-        source,
-        (source in _GOOD_CLOCKS, ok, ""),
-        (better, warning, slow, f"echo {better} | sudo tee {folder}/current_clocksource"),
-        (True, note, f"{slow}; {log}"),
-        source=source,
-    )
 
 
 _NEEDED: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
@@ -183,13 +154,13 @@ def _idle_states(machine: Machine) -> Finding:
     text = f"{name}, {deepest} µs to wake"
     if limit is not None:
         text += f" (limited by a program to {limit} µs, through {_LATENCY_FILE})"
-    deep = sorted({state for (state, _), latency in allowed.items() if latency > _LIGHT_US})
-    commands = [f"echo 1 | sudo tee {_CPUS}/cpu*/cpuidle/{state}/disable" for state in deep]
+    deep = sorted({state[-1] for (state, _), latency in allowed.items() if latency > _LIGHT_US})
+    command = f"echo 1 | sudo tee {_CPUS}/cpu*/cpuidle/state[{''.join(deep)}]/disable"
     why = f"each wake-up may be late by that; {_PERMANENT}"
     return graded(
         text,
-        (deepest > _DEEP_US, warning, why, *commands),
-        (deepest > _LIGHT_US, note, why, *commands),
+        (deepest > _DEEP_US, warning, why, command),
+        (deepest > _LIGHT_US, note, why, command),
         deepest=name, latency_us=deepest, limit_us=limit,
     )  # fmt: skip
 
@@ -202,67 +173,6 @@ def _latency_limit_us(machine: Machine) -> int | None:
     except (OSError, struct.error):
         return None
     return int(limit) if 0 <= limit < _NO_CONSTRAINT_US else None
-
-
-def _isolation(machine: Machine) -> Finding:
-    online, apart = machine.processors, machine.isolated
-    tickless = machine.text(f"{_CPUS}/nohz_full", "").replace("(null)", "")
-    files = (f"{_CPUS}/cpu{number}/topology/thread_siblings_list" for number in apart)
-    busy = {sibling for file in files for sibling in processor_list(machine.text(file, ""))} - set(apart)
-    last = online[-1] if online else 0
-    text = f"{as_list(apart)} of {len(online)} isolated" if apart else f"none of {len(online)} is isolated"
-    return graded(
-        f"{text}, but {as_list(busy)} shares a core with them" if busy else text,
-        (len(online) == 1, warning, "other programs and interrupts delay the server: use two or more"),
-        (not apart, note,
-         "under load the server shares its processor; to isolate one, add "
-         f"isolcpus=managed_irq,domain,{last} nohz_full={last} rcu_nocbs={last} to the kernel command "
-         f"line and cpu = {last} to /etc/ethercat-server/default.toml"),
-        (busy, note, "load there slows the server down: isolate it too, or disable hyper-threading",
-         f"echo off | sudo tee {_CPUS}/smt/control"),
-        why=f"the server's --cpu {max(apart, default=0)} uses it",
-        online=len(online), isolated=apart, nohz_full=tickless,
-    )  # fmt: skip
-
-
-def _virtualization(machine: Machine) -> Iterator[Finding]:
-    container, virtual = _container(machine), _virtual_machine(machine)
-    if container:
-        yield note(
-            f"in a container ({container})",
-            "privileges (real-time priority, raw sockets) and parts of /sys may be missing: run it with "
-            "--cap-add NET_RAW,NET_ADMIN,SYS_NICE,IPC_LOCK and the interface, or on the host",
-            container=container,
-        )
-    if virtual:
-        yield warning(
-            f"a virtual machine ({virtual})",
-            "the host may suspend it for milliseconds at any time: use a physical machine, or pin its "
-            "processors and pass the network card through",
-            virtual_machine=virtual,
-        )
-    if not container and not virtual:
-        yield ok("neither a virtual machine nor a container", container="", virtual_machine="")
-
-
-def _container(machine: Machine) -> str:
-    environment = machine.text("/proc/1/environ", "").split("\0")
-    named = [text.partition("=")[2] for text in environment if text.startswith("container=")]
-    named.append(machine.text("/run/systemd/container", ""))
-    marks = {"/.dockerenv": "docker", "/run/.containerenv": "podman"}
-    named += [name for mark, name in marks.items() if machine.path(mark).exists()]
-    return next(filter(None, named), "")
-
-
-def _virtual_machine(machine: Machine) -> str:
-    if hypervisor := machine.text("/sys/hypervisor/type", ""):
-        return hypervisor
-    names = (machine.text(f"/sys/class/dmi/id/{name}", "") for name in ("sys_vendor", "product_name"))
-    product = " ".join(filter(None, names))
-    flags = re.search(r"^flags\s*:(.*)$", machine.text("/proc/cpuinfo", ""), re.MULTILINE)
-    if flags and "hypervisor" in flags[1].split():
-        return product or "hypervisor unknown"
-    return product if re.search(r"QEMU|KVM|VMware|VirtualBox|Virtual Machine", product) else ""
 
 
 _ETHERCAT_SPEED: Final = 100
@@ -282,7 +192,6 @@ _ERRORS: Final = (
 _DROPS: Final = (
     "rx_dropped", "tx_dropped", "rx_fifo_errors", "rx_missed_errors", "rx_over_errors", "tx_fifo_errors",
 )  # fmt: skip
-_FEW_CARRIER_CHANGES: Final = 20
 _LIST: Final = "ethercat-sensor adapters"
 _CORRUPTED: Final = "corrupted: check cable, connectors, shield and sources of interference"
 
@@ -375,24 +284,6 @@ def _energy_efficient_ethernet(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _card_counters(machine: Machine) -> Finding:
-    found, changes = machine.link.counters, machine.link.carrier_changes
-    if not found:
-        raise CannotLookError("the kernel provides no counters")
-    errors = {key: found[key] for key in _ERRORS if found.get(key)}
-    drops = {key: found[key] for key in _DROPS if found.get(key)}
-    loose = (changes or 0) > _FEW_CARRIER_CHANGES
-    command = f"ip -s -s link show {machine.shown}"
-    return graded(
-        _counted(errors or drops or {"carrier changes": changes or 0} if errors or drops or loose else {})
-        or f"no errors in {found.get('rx_packets', 0)} frames received",
-        (errors, warning, f"frames were {_CORRUPTED}", command),
-        (drops, note, "includes frames of unknown protocols; see 'card meanwhile' for new ones", command),
-        (loose, note, "a loose connector, or a sensor that is often power-cycled", command),
-        **dict[str, Any](errors | drops, carrier_changes=changes),
-    )  # fmt: skip
-
-
 def rising(before: Mapping[str, int], after: Mapping[str, int]) -> Finding:
     """Errors that the card counted during the measurement."""
     if not before or not after:
@@ -456,7 +347,7 @@ _DHCP_CLIENTS: Final = frozenset({"dhclient", "dhcpcd", "udhcpc", "connmand", "w
 _LEFT_ALONE: Final = frozenset({"unmanaged", "initialized", "pending", "linger"})  # by systemd-networkd
 
 
-def _managers(machine: Machine) -> Finding:
+def _managers(machine: Machine) -> Iterator[Finding]:
     index, name, found = machine.link.ifindex, machine.shown, {}
     state = machine.text(f"/run/NetworkManager/devices/{index}", "")
     if re.search(r"^managed=(true|1)$", state, re.MULTILINE):
@@ -475,12 +366,15 @@ def _managers(machine: Machine) -> Finding:
         arguments = machine.text(f"/proc/{pid}/cmdline", "").split("\0")
         if command in _DHCP_CLIENTS and machine.ifname in arguments:
             found[f"{command} ({pid})"] = f"sudo kill {pid}"
-    why = "it sends frames of its own and may take the interface down; scripts/install-service configures "
-    return graded(
-        ", ".join(found) or "no network manager configures it",
-        (found, warning, f"{why}NetworkManager and systemd-networkd permanently", *found.values()),
-        managers=list(found),
-    )
+    if not found:
+        yield ok("no network manager configures it")
+    for manager, command in found.items():
+        yield warning(
+            manager,
+            "it sends frames of its own and may take the interface down; scripts/install-service configures "
+            "NetworkManager and systemd-networkd permanently",
+            command,
+        )
 
 
 def _addresses(machine: Machine) -> Finding:
@@ -504,27 +398,28 @@ def _addresses(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _membership(machine: Machine) -> Finding:
+def _membership(machine: Machine) -> Iterator[Finding]:
     link, name = machine.link, machine.shown
-    above, below = f"part of {link.master}", f"below {', '.join(link.upper)}"
-    return graded(
-        above if link.master else below if link.upper else "no bridge, bond or VLAN",
-        (link.master, bad, "a bridge or bond intercepts the sensor's frames and sends others",
-         f"sudo ip link set {name} nomaster"),
-        (link.upper, warning, "they (VLANs, for instance) send through it",
-         *(f"sudo ip link delete {upper}" for upper in link.upper)),
-        master=link.master, upper=list(link.upper),
-    )  # fmt: skip
+    if link.master:
+        yield bad(
+            f"part of {link.master}",
+            "a bridge or bond intercepts the sensor's frames and sends others",
+            f"sudo ip link set {name} nomaster",
+        )
+    for upper in link.upper:
+        yield warning(
+            f"below {upper}", "it (a VLAN, for instance) sends through it", f"sudo ip link delete {upper}"
+        )
+    if not link.master and not link.upper:
+        yield ok("no bridge, bond or VLAN")
 
 
 _BY_SUBJECT: Final[Mapping[str, Mapping[str, Look]]] = {
-    "kernel": {"preemption": _preemption, "clock source": _clock_source},
+    "kernel": {"preemption": _preemption},
     "rights": {"capabilities": _capabilities},
-    "processors": {"governor": _governor, "idle states": _idle_states, "isolation": _isolation,
-                   "virtualization": _virtualization},
+    "processors": {"governor": _governor, "idle states": _idle_states},
     "interface": {"link": _link_state, "speed": _speed, "driver": _driver, "coalescing": _coalescing,
-                  "offloads": _offloads, "EEE": _energy_efficient_ethernet, "counters": _card_counters,
-                  "interrupts": _affinity},
+                  "offloads": _offloads, "EEE": _energy_efficient_ethernet, "interrupts": _affinity},
     "other software": {"managers": _managers, "addresses": _addresses, "membership": _membership},
 }  # fmt: skip
 CHECKS: Final = tuple(
