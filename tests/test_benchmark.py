@@ -28,7 +28,7 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.signals import decode_clock
 from scripts.benchmarks import modes, statistics
 from scripts.benchmarks import program as benchmark
-from scripts.benchmarks.chain import ScriptError, Setup, Turn
+from scripts.benchmarks.chain import ScriptError, Turn
 from scripts.benchmarks.processes import masters, recorder
 from scripts.benchmarks.records import Recording, began, write
 from scripts.benchmarks.statistics import Arrivals, Ints
@@ -38,7 +38,6 @@ from tests.server.running import PATIENCE_S, needs_bus
 
 ROOT = Path(__file__).parent.parent
 PERIOD = 1_250_000
-SETUP = Setup(800, 1, 6.0, 0)
 NO_STOPS = np.empty((0, 2), dtype=np.int64)
 
 
@@ -105,13 +104,13 @@ def test_summary_of_two_sensors() -> None:
     figures, ages = statistics.summary(streams, PERIOD, NO_STOPS)
     assert (figures["made"], figures["arrivals"], figures["lost"]) == (6, 5, 1)
     assert (figures["age_us"]["p50"], figures["age_us"]["min"], figures["age_us"]["max"]) == (100, 100, 200)
-    assert figures["stamp_error_us"] == {"p50": 0.0, "p99_absolute": 0.0}
+    assert figures["stamp_error_us"] == {"p99_absolute": 0.0}
     assert len(ages) == 5
 
 
 def turn(median_us: float, lost: int, cpu: float) -> Turn:
     ages = np.array([median_us * 1000] * 3)
-    counts = {"made": 100, "lost": lost, "machine_stops": 1, "longest_stop_us": 10.0 * lost}
+    counts = {"made": 100, "lost": lost}
     return {**counts, "age_us": statistics.spread_us(ages), "cpu_percent": {"server": cpu}}, ages
 
 
@@ -119,8 +118,7 @@ def test_turns_are_pooled_and_their_ratios_are_medians() -> None:
     ours = [turn(100, 1, 10), turn(120, 0, 12), turn(900, 5, 20)]
     theirs = [turn(100, 0, 5), turn(100, 0, 5), turn(450, 0, 5)]
     figures, ages = modes.together(ours)
-    assert (figures["made"], figures["lost"], figures["machine_stops"]) == (300, 6, 3)
-    assert (figures["longest_stop_us"], figures["cpu_percent"]["server"]) == (50.0, 12.0)
+    assert (figures["made"], figures["lost"], figures["cpu_percent"]["server"]) == (300, 6, 12.0)
     assert (figures["age_us"]["p50"], len(ages)) == (120.0, 9)
     found = modes.ratios(ours, theirs)
     assert (found["age_p50"], found["cpu"]) == (1.2, 2.4)
@@ -147,13 +145,13 @@ ROWS: list[dict[str, Any]] = [
 
 
 def test_the_table_has_what_there_is() -> None:
-    this, bare_c, ratio, driver = benchmark.cells(modes.MODES["comparison"], ROWS)
+    this, bare_c, ratio, driver = benchmark.cells("comparison", ROWS)
     assert this == ["800 Hz, 1", "this", "1 (1) of 200", "80.0", "120", "150", "-", "9.0", "-"]
     assert bare_c[3:6] == ["40.0", "60.0", "-"]
     assert ratio[2:] == ["", "2.00", "3.00", "4.00", "", "5.00", ""]
     assert driver[2] == "it cannot be had"
     shown = io.StringIO()
-    Console(file=shown, width=108).print(benchmark.table(modes.MODES["comparison"], ROWS))
+    Console(file=shown, width=108).print(benchmark.table("comparison", ROWS))
     assert "…" not in shown.getvalue(), "it fits the narrowest table"
 
 
@@ -187,13 +185,13 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
 
 def test_an_option_measures_only_what_it_names() -> None:
     for given, expected in {
-        "": ("comparison", False),
-        "--vendor": ("comparison", True),
-        "--load 4": ("load", 4),
-        "--path": ("path", True),
+        "": ("comparison", False, None),
+        "--vendor": ("comparison", True, None),
+        "--load 4": ("load", False, 4),
+        "--path": ("path", False, None),
     }.items():
         options = benchmark.parse(given.split())
-        assert (options.mode, options.argument) == expected
+        assert (options.mode, options.vendor, options.load) == expected
 
 
 # -- its programs
@@ -261,15 +259,13 @@ def test_a_client_records_every_sample_and_its_age(
     assert ages.min() > 0
 
 
-def test_the_c_master_looks_once_at_each_sample_and_not_before_it_is_there(
-    c_program: Path, tmp_path: Path
-) -> None:
+def test_the_c_master_looks_once_at_each_sample_and_not_before_it_is_there(c_program: Path) -> None:
     """Of two sensors, the second half a period after the first; one answer in 16 is lost."""
     period = 5_000_000
     start = time.monotonic_ns() - 10**9
     raw, bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     connection, client = socket.socketpair()
-    arguments = (raw.fileno(), connection.fileno(), 200, 0, 2, 2, tmp_path / "own")
+    arguments = (raw.fileno(), connection.fileno(), 200, 0, 2, 2)
     command = [str(c_program), "master", *map(str, arguments)]
     asked: list[int] = []
     with raw, bus, connection, client:
@@ -286,8 +282,7 @@ def test_the_c_master_looks_once_at_each_sample_and_not_before_it_is_there(
                     frame[at : at + 61] = clock_data(number, start + i * period // 2 + number * period)
                 bus.send(frame)
         running.terminate()
-        bus.send(frame)
-        assert running.wait(PATIENCE_S) == 0
+        running.wait(PATIENCE_S)
         received = client.recv(65536)
     assert asked == [(asked[0] + n) % 256 for n in range(50)]
     messages = [received[at : at + 94] for at in range(0, len(received), 94)]
@@ -301,7 +296,6 @@ def test_the_c_master_looks_once_at_each_sample_and_not_before_it_is_there(
         ]
         assert numbers == sorted(set(numbers)), "each once"
     assert len(messages) > 40, "hardly an exchange was in vain"
-    assert len(statistics.read_numbers(tmp_path / "own", 2)) >= 46
 
 
 # -- runs
@@ -322,8 +316,9 @@ def test_what_is_measured_is_shown_and_written(
     monkeypatch.setattr(benchmark, "loopback_up", lambda: None)
     monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)
     shown = io.StringIO()
-    one = ("--vendor", "--no-ros", "--rates", "800", "--sensors", "1", "--rt-priority", "0")
-    options = benchmark.parse(["--json", str(tmp_path / "b.json"), *one])
+    monkeypatch.setattr(benchmark, "find_spec", lambda _: None)
+    monkeypatch.setattr(benchmark, "may_be_real_time", lambda: False)
+    options = benchmark.parse(["--json", str(tmp_path / "b.json"), "--vendor", "--quick", "--seconds", "6"])
     benchmark.run(options, Console(file=shown, width=100), idle_states=True)
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))
@@ -376,7 +371,7 @@ def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     project = programs[1, "this"]
     # Some may be lost to a busy machine, but only while it kept the server from running at all.
     unexplained = project["lost"] - project["lost_in_stops"]
-    assert unexplained <= project["server"]["missed_deadlines"] + project["server"]["lost_frames"]
+    assert unexplained <= project["missed_deadlines"] + project["lost_frames"]
     assert project["repeated"] == 0
 
 

@@ -16,8 +16,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
-import numpy as np
-
 from bota_ethercat.client import Client
 from bota_ethercat.errors import ProtocolError
 from ethercat_server.access.private_server import change_flags
@@ -141,7 +139,14 @@ class Chain(contextlib.ExitStack):
         self.callback(self.stop)  # before the bus
         os.sched_setaffinity(bus.pid, own_cpus()[:1])
         self._watched["sensor"] = bus.pid
-        self.canaries()
+        # A canary on each CPU, with a higher priority than everything else, wakes twice a sample period.
+        priority = min(99, setup.priority + 2) if setup.priority else 0
+        for cpu in sorted(os.sched_getaffinity(0)):
+            path = self.directory / f"canary-{cpu}"
+            how = (cpu, priority, setup.period_ns / 2000)
+            self._canaries.append(
+                self.python(path.name, f"{PROCESSES}.canary", path, *how, result=path, watch=False)
+            )
         return bus.ifname
 
     def start(self, name: str, *command: object, result: Path | None = None, watch: bool = True) -> Child:
@@ -156,16 +161,6 @@ class Chain(contextlib.ExitStack):
         """Start a module of this project."""
         return self.start(name, sys.executable, "-m", module, *arguments, **how)
 
-    def canaries(self) -> None:
-        """One on each CPU, with a higher priority than everything else; they wake twice a sample period."""
-        priority = min(99, self.setup.priority + 2) if self.setup.priority else 0
-        for cpu in sorted(os.sched_getaffinity(0)):
-            path = self.directory / f"canary-{cpu}"
-            how = (cpu, priority, self.setup.period_ns / 2000)
-            self._canaries.append(
-                self.python(path.name, f"{PROCESSES}.canary", path, *how, result=path, watch=False)
-            )
-
     def server(self) -> Client:
         """Start ethercat-server on a bus; a connection to it once its sensors stream."""
         self.python(
@@ -177,9 +172,9 @@ class Chain(contextlib.ExitStack):
 
     def master(self, c_program: Path) -> None:
         """Start the C program in place of the server, on its CPU."""
-        path, setup = self.directory / "master", self.setup
-        how = (path, self.bus(), setup.rate_hz, c_program, setup.priority)
-        child = self.python("server", f"{PROCESSES}.masters", *how, result=path)
+        setup = self.setup
+        how = (self.bus(), setup.rate_hz, c_program, setup.priority)
+        child = self.python("server", f"{PROCESSES}.masters", *how)
         os.sched_setaffinity(child.pid, own_cpus()[1:])
 
     def connect(self, sensors: int) -> Client:
@@ -244,18 +239,11 @@ class Chain(contextlib.ExitStack):
         self.wait(path.exists, "the recording did not end")
         if self._link:
             status = self._link.ask("status")
-            names = ("wake_us", "exchange_us", "missed_deadlines", "lost_frames")
-            usage["server"] = {name: status[name] for name in names}
+            usage |= {name: status[name] for name in ("missed_deadlines", "lost_frames")}
             usage["hand_out_us"] = status["sensors"][0]["age_us"]
         self.stop()
-        if (loop := self.directory / "master").exists():
-            late, exchange = statistics.read_numbers(loop, 2).astype(float).T
-            spreads = map(statistics.spread_us, (late, exchange))
-            usage["server"] = dict(zip(("wake_us", "exchange_us"), spreads, strict=True))
-        stopped = self.stops()
-        result, ages = statistics.summary(statistics.read_arrivals(path), self.setup.period_ns, stopped)
-        longest = round(float(np.max(np.diff(stopped))) / 1000, 1) if len(stopped) else 0.0
-        return {**result, "machine_stops": len(stopped), "longest_stop_us": longest, **usage}, ages
+        result, ages = statistics.summary(statistics.read_arrivals(path), self.setup.period_ns, self.stops())
+        return {**result, **usage}, ages
 
     def stop(self) -> list[str]:
         """End everything, the last first; what was wrong about how they ended."""

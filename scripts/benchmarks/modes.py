@@ -1,4 +1,4 @@
-"""What `scripts/benchmark` measures: a table of modes, each but the comparison an option.
+"""What `scripts/benchmark` measures, as rows, and how a row is shown.
 
 The comparison is of this project with a bare C program and Bota's driver, on virtual sensors. This project
 and the C program alternate in short turns, so that the machine's noise meets both. Bota's closed Python
@@ -13,11 +13,11 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
-from scripts.benchmarks import path, statistics
+from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import PROCESSES, WARM_UP_S, Chain, Child, Figures, ScriptError, Setup, Turn
 from scripts.benchmarks.processes.masters import build
 from scripts.benchmarks.statistics import Arrivals, Floats
@@ -35,10 +35,6 @@ RATIOS: Final = {
     "age_p99": ("age_us", "p99"),
     "age_p999": ("age_us", "p999"),
     "cpu": ("cpu_percent", "server"),
-}
-_SUMMED: Final = {
-    *("made", "arrivals", "lost", "lost_in_stops", "repeated"),
-    *("machine_stops", "missed_deadlines", "lost_frames"),
 }
 
 
@@ -70,7 +66,7 @@ def turn(setup: Setup, name: str) -> Turn:
         figures, ages = chain.measure(recorder)
         if name == DRIVER:
             ages = first_ages(statistics.read_arrivals(recorder.result)[0])
-            figures |= {"age_us": statistics.spread_us(ages), "every_age_us": figures["age_us"]}
+            figures["age_us"] = statistics.spread_us(ages)
     return figures, ages
 
 
@@ -108,21 +104,17 @@ def compare(setup: Setup, with_driver: bool) -> list[Figures]:
 
 
 def together(turns: Sequence[Turn]) -> Turn:
-    """Counts are summed, ages pooled; of other figures it is the median, of the longest the longest."""
-    ages = np.concatenate([each for _, each in turns])
-    return {**_pool([figures for figures, _ in turns]), "age_us": statistics.spread_us(ages)}, ages
-
-
-def _pool(values: Sequence[Any], name: str = "") -> Any:
-    if isinstance(values[0], dict):
-        return {key: _pool([value[key] for value in values], key) for key in values[0]}
-    if not isinstance(values[0], int | float):
-        return values[-1]
-    if name in _SUMMED:
-        return sum(values)
-    if name == "max" or name.startswith("longest"):
-        return max(values)
-    return round(float(np.median(values)), 1)
+    """Counts are summed, ages pooled; of other figures it is the median."""
+    figures, ages = [each for each, _ in turns], np.concatenate([each for _, each in turns])
+    found: Figures = {}
+    for name, first in figures[0].items():
+        if isinstance(first, int):
+            found[name] = sum(each[name] for each in figures)
+        elif first is not None:
+            found[name] = {
+                key: round(float(np.median([each[name][key] for each in figures])), 1) for key in first
+            }
+    return {**found, "age_us": statistics.spread_us(ages)}, ages
 
 
 def ratios(ours: Sequence[Turn], theirs: Sequence[Turn]) -> dict[str, float]:
@@ -184,61 +176,33 @@ def _losses(row: Figures) -> str:
     return f"{row['lost']} ({row['lost_in_stops']})" if row.get("lost") is not None else _NONE
 
 
-class Mode(NamedTuple):
-    """What can be measured."""
-
-    help: str
-    measure: Callable[[Setup, Any], list[Figures]]  # takes the option's argument, too; the rows of the result
-    columns: Mapping[str, Callable[[Figures], str]]  # of the table, by heading: how a row is shown
-    argument: Mapping[str, Any] | None = None  # how argparse takes the option's argument, if it has one
-    rates: tuple[int, ...] = (800,)
-    sensors: tuple[int, ...] = (1,)
-    seconds: float = 6.0
-    page: Any = None  # the argument with which the page is renewed; None: it is not on the page
-
-
-MODES: Final = {
-    "comparison": Mode(
-        "",
-        compare,
-        {
-            "sensors": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}",
-            "": lambda row: row["program"],
-            "lost (in stalls)": lambda row: (
-                f"{_losses(row)} of {row['made']}" if "made" in row else row.get("missing", "")
-            ),
-            "age p50, µs": _shown("age_us", "p50", "age_p50"),
-            "p99": _shown("age_us", "p99", "age_p99"),
-            "p99.9": _shown("age_us", "p999", "age_p999"),
-            "stamp error p99, µs": _shown("stamp_error_us", "p99_absolute"),
-            "CPU, %": _shown("cpu_percent", "server", "cpu"),
-            "memory, MB": _shown("rss_mb", "server"),
-        },
-        rates=(800, 1600),
-        sensors=(1, 2),
-    ),
-    "load": Mode(
-        "only ages beside N endless loops, ordinary and real-time",
-        load,
-        {
-            "beside loops": lambda row: f"{row['rate_hz']} Hz, {row['loops']} loops: {row['chain']}",
-            "lost (in stalls)": _losses,
-            "handed out, µs": lambda row: _points(row, "hand_out_us"),
-            "on arrival, µs": lambda row: _points(row, "age_us"),
-        },
-        argument={"type": int, "choices": range(1, 65), "metavar": "N"},
-        page=4,
-    ),
-    "path": Mode(
-        "only what a sample costs the server: source lines, calls, system calls",
-        lambda _setup, _argument: path.measure(),
-        {
-            "slave controller": lambda row: row["clock"],
-            "clients": lambda row: str(row["clients"]),
-            "source lines": lambda row: f"{row['lines']:.0f} / {row['mean_lines']:.0f}",
-            "calls": lambda row: f"{row['calls']:.0f} / {row['mean_calls']:.0f}",
-            "files": lambda row: f"{row['files']:.0f}",
-            "system calls": lambda row: f"{row['system_calls']:.0f} / {row['mean_system_calls']:.1f}",
-        },
-    ),
+# Of the table of each, by heading: how a row is shown.
+TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
+    "comparison": {
+        "sensors": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}",
+        "": lambda row: row["program"],
+        "lost (in stalls)": lambda row: (
+            f"{_losses(row)} of {row['made']}" if "made" in row else row.get("missing", "")
+        ),
+        "age p50, µs": _shown("age_us", "p50", "age_p50"),
+        "p99": _shown("age_us", "p99", "age_p99"),
+        "p99.9": _shown("age_us", "p999", "age_p999"),
+        "stamp error p99, µs": _shown("stamp_error_us", "p99_absolute"),
+        "CPU, %": _shown("cpu_percent", "server", "cpu"),
+        "memory, MB": _shown("rss_mb", "server"),
+    },
+    "load": {
+        "beside loops": lambda row: f"{row['rate_hz']} Hz, {row['loops']} loops: {row['chain']}",
+        "lost (in stalls)": _losses,
+        "handed out, µs": lambda row: _points(row, "hand_out_us"),
+        "on arrival, µs": lambda row: _points(row, "age_us"),
+    },
+    "path": {
+        "slave controller": lambda row: row["clock"],
+        "clients": lambda row: str(row["clients"]),
+        "source lines": lambda row: f"{row['lines']:.0f} / {row['mean_lines']:.0f}",
+        "calls": lambda row: f"{row['calls']:.0f} / {row['mean_calls']:.0f}",
+        "files": lambda row: f"{row['files']:.0f}",
+        "system calls": lambda row: f"{row['system_calls']:.0f} / {row['mean_system_calls']:.1f}",
+    },
 }

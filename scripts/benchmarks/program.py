@@ -11,7 +11,7 @@ import re
 import struct
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,7 +21,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bota_clients.arguments import number, typed
+from bota_clients.arguments import number
+from scripts.benchmarks import path
 from scripts.benchmarks.chain import (
     OVERSAMPLING_HZ,
     Figures,
@@ -30,15 +31,17 @@ from scripts.benchmarks.chain import (
     loopback_up,
     stoppable,
 )
-from scripts.benchmarks.modes import MODES, Mode, answer
+from scripts.benchmarks.modes import TABLES, answer, compare, load
 from scripts.benchmarks.records import may_be_real_time
 
 MOST_CPUS: Final = 4  # CPUs used: each of them runs a canary
 _WIDTH: Final = 108  # minimum width of the tables
-_QUICK_SECONDS: Final = 3.0
+_RATES_HZ: Final = [OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512)]
+_PRIORITY: Final = 80  # SCHED_FIFO of the server, or what is in its place
 _LATENCY: Final = Path("/dev/cpu_dma_latency")
 _BLOCK: Final = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-_ON_PAGE: Final = {"comparison": False, **{name: mode.page for name, mode in MODES.items() if mode.page}}
+_ON_PAGE: Final = ("comparison", "load")
+_LOOPS_ON_PAGE: Final = 4
 
 
 def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> None:
@@ -51,26 +54,23 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
             "idle CPUs may halt (no access to /dev/cpu_dma_latency): samples are older than as root"
         )
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:MOST_CPUS]))
-    if options.rt_priority and not may_be_real_time():
+    priority, ros = _PRIORITY if may_be_real_time() else 0, find_spec("rclpy") is not None
+    if not priority:
         console.print("no real-time scheduling here (CAP_SYS_NICE): everything runs with ordinary scheduling")
-        options.rt_priority = 0
-    if options.ros and find_spec("rclpy") is None:
+    if not ros:
         console.print("no ROS 2 here (rclpy): only up to a TCP client")
-        options.ros = False
-    wanted = {options.mode: options.argument}
-    if options.page:
-        wanted = {**_ON_PAGE, **wanted}
+    wanted = dict.fromkeys((*_ON_PAGE, options.mode) if options.page else (options.mode,))
     began = time.monotonic()
-    results = {name: measure(name, argument, options) for name, argument in wanted.items()}
+    results = {name: measure(name, options, priority, ros=ros) for name in wanted}
     for name, rows in results.items():
-        console.print(table(MODES[name], rows))
+        console.print(table(name, rows))
     content = {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "kernel": platform.release(),
         "cpus_used": len(os.sched_getaffinity(0)),
         "python": platform.python_version(),
         "idle_states": idle_states,
-        "rt_priority": options.rt_priority,
+        "rt_priority": priority,
         **results,
     }
     options.json.parent.mkdir(parents=True, exist_ok=True)
@@ -82,37 +82,41 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
     print(f"{time.monotonic() - began:.0f} s; written: {', '.join(map(str, written))}")
 
 
-def measure(name: str, argument: Any, options: argparse.Namespace) -> list[Figures]:
-    """The rows of a mode, of all configurations."""
-    mode, first = MODES[name], 1 if options.quick else None
-    seconds = options.seconds or (_QUICK_SECONDS if options.quick else mode.seconds)
-    asked = options.sensors if name == options.mode else None
-    return [
-        row
-        for rate in options.rates or mode.rates[:first]
-        for sensors in asked or mode.sensors[:first]
-        for row in mode.measure(Setup(rate, sensors, seconds, options.rt_priority, options.ros), argument)
-    ]
+def measure(name: str, options: argparse.Namespace, priority: int, *, ros: bool) -> list[Figures]:
+    """The rows of a table, of all configurations."""
+    if name == "path":
+        return path.measure()
+    whole = name == "comparison" and not options.quick
+    seconds = options.seconds or (3.0 if options.quick else 6.0)
+    rows = []
+    for rate in options.rates or ((800, 1600) if whole else (800,)):
+        for sensors in (1, 2) if whole else (1,):
+            setup = Setup(rate, sensors, seconds, priority, ros)
+            if name == "load":
+                rows += load(setup, options.load or _LOOPS_ON_PAGE)
+            else:
+                rows += compare(setup, options.vendor)
+    return rows
 
 
-def cells(mode: Mode, rows: Sequence[Figures]) -> list[list[str]]:
+def cells(name: str, rows: Sequence[Figures]) -> list[list[str]]:
     """The rows of a table."""
-    return [[shown(row) for shown in mode.columns.values()] for row in rows]
+    return [[shown(row) for shown in TABLES[name].values()] for row in rows]
 
 
-def table(mode: Mode, rows: Sequence[Figures]) -> Table:
+def table(name: str, rows: Sequence[Figures]) -> Table:
     """For a terminal."""
     made = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
-    for at, name in enumerate(mode.columns):
-        made.add_column(name, justify="right" if at > 1 else "left")
-    for line in cells(mode, rows):
+    for at, heading in enumerate(TABLES[name]):
+        made.add_column(heading, justify="right" if at > 1 else "left")
+    for line in cells(name, rows):
         made.add_row(*line)
     return made
 
 
-def markdown(mode: Mode, rows: Sequence[Figures]) -> str:
+def markdown(name: str, rows: Sequence[Figures]) -> str:
     """For the page."""
-    lines = [list(mode.columns), ["---"] * len(mode.columns), *cells(mode, rows)]
+    lines = [list(TABLES[name]), ["---"] * len(TABLES[name]), *cells(name, rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -137,7 +141,7 @@ def renew(path: Path, content: Mapping[str, Any]) -> None:
 
     def measured(match: re.Match[str]) -> str:
         name = match[2]
-        text = markdown(MODES[name], content[name])
+        text = markdown(name, content[name])
         if name == "comparison":
             text = "\n\n".join((answer(content[name]), text, where))
         return f"{match[1]}{text}\n{match[3]}"
@@ -158,35 +162,18 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--page", type=Path, metavar="FILE.md",
                         help="measure all that this page has (docs/benchmark.md), and renew it")  # fmt: skip
     parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver, too")
-    rates = [OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512)]
-    for name, metavar, what, among in (
-        ("--rates", "HZ,...", "sample rates (800,1600)", rates),
-        ("--sensors", "N,...", "sensors on the bus (1,2)", range(1, 17)),
-    ):
-        parser.add_argument(name, type=_numbers(among), metavar=metavar, help=what)
+    parser.add_argument("--rates", type=int, nargs="+", choices=_RATES_HZ, metavar="HZ",
+                        help="sample rates (800 1600)")  # fmt: skip
     only = parser.add_mutually_exclusive_group()
-    for name, mode in list(MODES.items())[1:]:
-        only.add_argument(f"--{name}", help=mode.help, **(mode.argument or {"action": "store_true"}))
-    parser.add_argument("--no-ros", dest="ros", action="store_false", help="TCP only")
-    parser.add_argument("--rt-priority", type=int, choices=range(97), default=80, metavar="N",
-                        help="SCHED_FIFO priority; 0 = ordinary scheduling (%(default)s)")  # fmt: skip
+    only.add_argument("--load", type=int, choices=range(1, 65), metavar="N",
+                      help="only ages beside N endless loops, ordinary and real-time")  # fmt: skip
+    only.add_argument("--path", action="store_true",
+                      help="only a sample's source lines, calls and system calls in the server")  # fmt: skip
     options = parser.parse_args(argv)
-    asked = {name: getattr(options, name, None) for name in MODES}
-    chosen = {name: value for name, value in asked.items() if value is not None and value is not False}
-    options.mode, options.argument = next(iter(chosen.items()), ("comparison", options.vendor))
+    options.mode = "load" if options.load else "path" if options.path else "comparison"
     here = Path(os.environ.get("CALLED_FROM") or Path.cwd())
     options.json, options.page = here / options.json, options.page and here / options.page
     return options
-
-
-def _numbers(allowed: Sequence[int]) -> Callable[[str], list[int]]:
-    def numbers(text: str) -> list[int]:
-        found = [int(word) for word in text.split(",")]
-        if not set(found) <= set(allowed):
-            raise ValueError
-        return found
-
-    return typed(numbers, f"among {', '.join(map(str, sorted(allowed)))}")
 
 
 def _benchmark() -> int:

@@ -79,13 +79,6 @@ def may_be_real_time() -> bool:
     return True
 
 
-def sleep_until(due_ns: int) -> int:
-    """Sleep until CLOCK_MONOTONIC is `due_ns`; the time then."""
-    if (left := due_ns - time.monotonic_ns()) > 0:
-        time.sleep(left * 1e-9)
-    return time.monotonic_ns()
-
-
 def connect(port: int = PORT) -> socket.socket:
     """Connect to a program on this machine as soon as it listens."""
     while True:

@@ -1,6 +1,6 @@
 """Becomes the C program of yardstick.c, with which the server is compared, for one client.
 
-Arguments: FILE IFACE RATE_HZ PROGRAM PRIORITY. pysoem brings the sensors to OP.
+Arguments: IFACE RATE_HZ PROGRAM PRIORITY. pysoem brings the sensors to OP.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def operational_master(ifname: str) -> Any:
     raise ScriptError(f"the sensor on {ifname} does not reach OP")
 
 
-def main(path: str, ifname: str, rate_hz: str, program: str, priority: str) -> None:
+def main(ifname: str, rate_hz: str, program: str, priority: str) -> None:
     """Wait for the client, bring the sensors to OP, hand both over to the C program."""
     with socket.create_server(("127.0.0.1", PORT)) as listener:
         client, _ = listener.accept()
@@ -62,7 +62,7 @@ def main(path: str, ifname: str, rate_hz: str, program: str, priority: str) -> N
         os.set_inheritable(descriptor, True)
     outputs = sum(len(slave.output) for slave in master.slaves)
     numbers = (raw, client.fileno(), rate_hz, priority, outputs, len(master.slaves))
-    os.execv(program, [program, "master", *map(str, numbers), path])  # noqa: S606 - built here
+    os.execv(program, [program, "master", *map(str, numbers)])  # noqa: S606 - built here
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from typing import Final
 import bota_driver  # type: ignore[import-not-found]
 
 from ethercat_server.virtual_sensor.signals import decode_clock
-from scripts.benchmarks.records import Recording, sleep_until, steady
+from scripts.benchmarks.records import Recording, steady
 
 _ATTEMPTS: Final = 5
 
@@ -72,7 +72,7 @@ def record(driver: bota_driver.BotaDriver, recording: Recording, period_ns: int)
     """Note everything that is returned until the time is over; when, before anything is decoded."""
     due = time.monotonic_ns()
     while True:
-        sleep_until(due)
+        time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
         frame = driver.read_frame()
         now = time.monotonic_ns()
         if not frame.status.invalid:

@@ -1,11 +1,11 @@
 // The yardstick: the least that a C program can do to pass a sensor's samples on, and the least that can take them.
 //
-//   yardstick master RAW CLIENT RATE_HZ PRIORITY OUTPUTS SENSORS FILE
+//   yardstick master RAW CLIENT RATE_HZ PRIORITY OUTPUTS SENSORS
 //   yardstick client PORT FILE WARM_UP_S SECONDS
 //
 // `master` takes over two descriptors, an AF_PACKET socket to sensors in OP and a TCP connection. For each sample it
 // exchanges one LRW, at the sample's own instant, which the signal `clock` tells: it needs to estimate nothing. New
-// samples go out as DATA messages. At SIGTERM it writes pairs of wake-up lateness and exchange time.
+// samples go out as DATA messages.
 // `client` subscribes, at the master or at ethercat-server, and writes what arrives, as records.py has it.
 #define _GNU_SOURCE
 #include <arpa/inet.h>
@@ -31,9 +31,6 @@ static const int64_t kPatience = 5000000;  // ns until an answer is lost
 
 struct Sample { int64_t number, instant; };
 struct Records { int64_t *values; size_t count, room; };
-
-static volatile sig_atomic_t stopping;
-static void stop(int number) { (void)number; stopping = 1; }
 
 static void fail(const char *what) {
     perror(what);
@@ -98,8 +95,6 @@ static void master(char **argument) {
     if (priority && sched_setscheduler(0, SCHED_FIFO, &param)) fail("priority");
     if (priority) mlockall(MCL_CURRENT);  // where allowed
     if (!priority) prctl(PR_SET_TIMERSLACK, 1000);
-    struct sigaction action = {.sa_handler = stop};
-    sigaction(SIGTERM, &action, NULL);
     signal(SIGPIPE, SIG_IGN);
     const int yes = 1;
     const struct timeval patience = {.tv_usec = kPatience / 1000};
@@ -107,30 +102,27 @@ static void master(char **argument) {
     setsockopt(raw, SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
     fcntl(raw, F_SETFL, fcntl(raw, F_GETFL) & ~O_NONBLOCK);
 
-    struct Records records = {0};
     struct Sample newest[MOST_SENSORS] = {0};
     int64_t period[MOST_SENSORS], next[MOST_SENSORS] = {0};
     uint64_t sequence[MOST_SENSORS] = {0};
     for (unsigned i = 0; i < sensors; ++i) period[i] = nominal, newest[i].number = -1;
-    while (!stopping) {
-        int64_t due = next[0], woke = now_ns(CLOCK_MONOTONIC), late = 0;
+    for (;;) {
+        int64_t due = next[0], woke = now_ns(CLOCK_MONOTONIC);
         for (unsigned i = 1; i < sensors; ++i) due = next[i] < due ? next[i] : due;
         if (due > woke) {
             const struct timespec at = {due / kSecond, due % kSecond};
             clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &at, NULL);
             woke = now_ns(CLOCK_MONOTONIC);
-            late = woke - due;
         }
         ++frame[17];
         send(raw, frame, size < 60 ? 60 : size, 0);
         int got = 0;
         int64_t back = woke;
-        while (!got && !stopping && back - woke < kPatience) {
+        while (!got && back - woke < kPatience) {
             got = recv(raw, answer, sizeof answer, 0) >= (ssize_t)size && answer[17] == frame[17];
             back = now_ns(CLOCK_MONOTONIC);
         }
         if (!got) continue;
-        keep(&records, late), keep(&records, back - woke);
         uint8_t messages[MESSAGE * MOST_SENSORS];
         size_t filled = 0;
         for (unsigned i = 0; i < sensors; ++i) {
@@ -148,9 +140,8 @@ static void master(char **argument) {
             put(messages + filled, sequence[i]++, back, i, wkc, input);
             filled += MESSAGE;
         }
-        if (filled && send(client, messages, filled, 0) < 0) break;
+        if (filled && send(client, messages, filled, 0) < 0) return;
     }
-    write_records(&records, argument[6]);
 }
 
 static int connected(int port) {
@@ -204,7 +195,7 @@ static void client(char **argument) {
 }
 
 int main(int count, char **argument) {
-    if (count == 9 && !strcmp(argument[1], "master"))
+    if (count == 8 && !strcmp(argument[1], "master"))
         master(argument + 2);
     else if (count == 6 && !strcmp(argument[1], "client"))
         client(argument + 2);
