@@ -16,7 +16,6 @@ import re
 import shlex
 import socket
 import struct
-import time
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -89,8 +88,6 @@ class Machine:
     asked: str = ""  # the name on the command line if it differs: virtual
     facts: dict[str, Any] = field(default_factory=dict)  # those that are known, or why they are not
     root: Path = Path("/")
-    # Of CLOCK_MONOTONIC's timers.
-    timer_resolution_s: float = field(default_factory=lambda: time.clock_getres(time.CLOCK_MONOTONIC))
     release: str = field(default_factory=lambda: os.uname().release)
     rt_priority: int = 80  # the server's
     cpu: int | None = None  # likewise

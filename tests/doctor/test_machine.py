@@ -26,7 +26,7 @@ SKIP, FINE, NOTE, LOOK, BAD = Level.NOT_POSSIBLE, Level.GOOD, Level.NOTE, Level.
 
 
 class Case(NamedTuple):
-    """A machine that is good but for `files`, `facts` and `more`, and the only finding of a check there."""
+    """A machine that is good but for `files` and `facts`, and the only finding of a check there."""
 
     check: str
     level: Level
@@ -37,7 +37,6 @@ class Case(NamedTuple):
     commands: Sequence[str] | None = None
     values: Mapping[str, Any] = {}
     """Among those of the finding."""
-    more: Mapping[str, Any] = {}
 
 
 def config(*options: str) -> bytes:
@@ -88,18 +87,9 @@ KERNEL = [
          commands=["sudo pro attach && sudo pro enable realtime-kernel"]),
     Case("preemption", LOOK, {**FIXED, "/etc/os-release": "ID=debian\n"}, commands=[DEBIANS]),
     Case("preemption", NOTE, {**FIXED, **OLD}, values={"model": "full"}),
-    Case("tick", FINE, values={"hz": 1000}),
-    Case("tick", BAD, said="4 ms", more={"timer_resolution_s": 0.004}),
-    Case("tick", FINE, {"/proc/config.gz": b"no gzip"}, values={"hz": None}),
     Case("clock source", FINE),
     Case("clock source", LOOK, HPET, commands=[f"echo tsc | sudo tee {CLOCKS}/current_clocksource"]),
     Case("clock source", NOTE, {**HPET, f"{CLOCKS}/available_clocksource": "hpet acpi_pm"}),
-    *(
-        Case("real-time throttling", level, {"/proc/sys/kernel/sched_rt_runtime_us": runtime}, said=share,
-             commands=[] if level is FINE else ["sudo sysctl kernel.sched_rt_runtime_us=950000"])
-        for runtime, level, share in (("950000", FINE, "95 %"), ("-1", NOTE, "off"), ("0", BAD, "0 %"),
-                                      ("100000", BAD, "10 %"))
-    ),
 ]  # fmt: skip
 
 # -- rights and processors
@@ -154,7 +144,6 @@ VETH = {"kind": "veth", "parent": ""}
 HELD = {"rx_coalesce_usecs": 3, "tx_coalesce_usecs": 0, "use_adaptive_rx_coalesce": 0}
 OFFLOADS = {"generic-receive-offload": True, "tcp-segmentation-offload": True, "rx-checksumming": True}
 ELSEWHERE = {"/proc/irq/130/effective_affinity_list": "0"}
-BELOW = {"/proc/77/stat": "77 (irq/130-ens5) S " + " ".join(["0"] * 36) + " 50 1 0\n"}
 
 
 def counted(**counters: int) -> Facts:
@@ -221,11 +210,6 @@ INTERFACE = [
             ("NMI: 0 ens5", False),
         )
     ),
-    Case("interrupt threads", FINE, values={"threads": {77: 85}}),
-    Case("interrupt threads", FINE, {"/proc/interrupts": ""}, but(link=VETH)),
-    Case("interrupt threads", NOTE, BELOW, commands=["sudo chrt -f -p 85 77"]),
-    Case("interrupt threads", FINE, BELOW, more={"rt_priority": 40}),
-    Case("interrupt threads", FINE, {"/proc/77/comm": None}, said="not threaded"),
 ]  # fmt: skip
 
 # -- other software
@@ -276,7 +260,7 @@ def faults(findings: Sequence[Finding]) -> list[Finding]:
 
 @pytest.mark.parametrize("case", [*KERNEL, *PROCESSORS, *INTERFACE, *SOFTWARE], ids=lambda case: case.check)
 def test_what_is_said(case: Case, tmp_path: Path) -> None:
-    (found,) = looks(case.check, machine(tmp_path, case.files, case.facts, **case.more))
+    (found,) = looks(case.check, machine(tmp_path, case.files, case.facts))
     assert found.level is case.level
     assert case.said in f"{found.found}\n{found.why}"
     assert case.commands is None or [*found.commands] == case.commands
