@@ -60,27 +60,21 @@ def examine_machine(machine: Machine) -> Iterator[Finding]:
 
 
 _SWITCH: Final = "/sys/kernel/debug/sched/preempt"
-# Preemption models and the kernel option that makes each the default.
-_MODELS: Final = {
-    "none": "PREEMPT_NONE", "voluntary": "PREEMPT_VOLUNTARY", "full": "PREEMPT", "lazy": "PREEMPT_LAZY",
-}  # fmt: skip
+_MODELS: Final = ("none", "voluntary", "full", "lazy")  # of preemption
 _GOOD_CLOCKS: Final = frozenset(
     {"tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "xen"}
 )
 
 
 def _preemption(machine: Machine) -> Finding:
-    version = machine.text("/proc/version", "")
+    version = machine.text("/proc/version")
     if machine.text("/sys/kernel/realtime", "") == "1" or "PREEMPT_RT" in version:
         return ok("fully preemptible (PREEMPT_RT)", model="rt")
-    dynamic = "PREEMPT_DYNAMIC" in version or "PREEMPT_DYNAMIC" in machine.config
+    dynamic = "PREEMPT_DYNAMIC" in version
     switched = re.search(r"\((\w+)\)", machine.text(_SWITCH, ""))
     asked = re.findall(rf"\bpreempt=({'|'.join(_MODELS)})\b", machine.text("/proc/cmdline", "") * dynamic)
-    built = (model for model, option in _MODELS.items() if option in machine.config)
-    usual = "full" if dynamic or "PREEMPT" in version.split() else "voluntary" if version else None
-    model = switched[1] if switched else next(iter((*asked, *built, usual)))
-    if model is None:
-        raise CannotLookError("neither /proc/version nor the kernel's configuration can be read")
+    usual = "full" if "PREEMPT" in version.split() else "voluntary"  # what distributions build
+    model = switched[1] if switched else next(iter((*asked, usual)))
     sure = bool(switched or asked or not dynamic)
     real_time_kernel = "sudo apt install linux-image-rt-amd64"
     if re.search(r"^ID=\"?ubuntu", machine.text("/etc/os-release", ""), re.MULTILINE):
@@ -223,46 +217,6 @@ def _isolation(machine: Machine) -> Finding:
         why=f"the server's --cpu {max(apart, default=0)} uses it",
         online=len(online), isolated=apart, nohz_full=tickless,
     )  # fmt: skip
-
-
-def _virtualization(machine: Machine) -> Iterator[Finding]:
-    container, virtual = _container(machine), _virtual_machine(machine)
-    if container:
-        yield note(
-            f"in a container ({container})",
-            "privileges (real-time priority, raw sockets) and parts of /sys may be missing: run it with "
-            "--cap-add NET_RAW,NET_ADMIN,SYS_NICE,IPC_LOCK and the interface, or on the host",
-            container=container,
-        )
-    if virtual:
-        yield warning(
-            f"a virtual machine ({virtual})",
-            "the host may suspend it for milliseconds at any time: use a physical machine, or pin its "
-            "processors and pass the network card through",
-            virtual_machine=virtual,
-        )
-    if not container and not virtual:
-        yield ok("neither a virtual machine nor a container", container="", virtual_machine="")
-
-
-def _container(machine: Machine) -> str:
-    environment = machine.text("/proc/1/environ", "").split("\0")
-    named = [text.partition("=")[2] for text in environment if text.startswith("container=")]
-    named.append(machine.text("/run/systemd/container", ""))
-    marks = {"/.dockerenv": "docker", "/run/.containerenv": "podman"}
-    named += [name for mark, name in marks.items() if machine.path(mark).exists()]
-    return next(filter(None, named), "")
-
-
-def _virtual_machine(machine: Machine) -> str:
-    if hypervisor := machine.text("/sys/hypervisor/type", ""):
-        return hypervisor
-    names = (machine.text(f"/sys/class/dmi/id/{name}", "") for name in ("sys_vendor", "product_name"))
-    product = " ".join(filter(None, names))
-    flags = re.search(r"^flags\s*:(.*)$", machine.text("/proc/cpuinfo", ""), re.MULTILINE)
-    if flags and "hypervisor" in flags[1].split():
-        return product or "hypervisor unknown"
-    return product if re.search(r"QEMU|KVM|VMware|VirtualBox|Virtual Machine", product) else ""
 
 
 _ETHERCAT_SPEED: Final = 100
@@ -520,8 +474,7 @@ def _membership(machine: Machine) -> Finding:
 _BY_SUBJECT: Final[Mapping[str, Mapping[str, Look]]] = {
     "kernel": {"preemption": _preemption, "clock source": _clock_source},
     "rights": {"capabilities": _capabilities},
-    "processors": {"governor": _governor, "idle states": _idle_states, "isolation": _isolation,
-                   "virtualization": _virtualization},
+    "processors": {"governor": _governor, "idle states": _idle_states, "isolation": _isolation},
     "interface": {"link": _link_state, "speed": _speed, "driver": _driver, "coalescing": _coalescing,
                   "offloads": _offloads, "EEE": _energy_efficient_ethernet, "counters": _card_counters,
                   "interrupts": _affinity},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,6 @@ Files = Mapping[str, str | bytes | None]
 GOOD: Files = {
     "/proc/version": "Linux version 6.12.0-rt-amd64 (x@y) #1 SMP PREEMPT_RT Debian",
     "/proc/cmdline": "quiet isolcpus=3",
-    "/proc/config.gz": gzip.compress(b"CONFIG_PREEMPT_RT=y\n"),
     "/proc/self/status": "Name:\tpython\nCapEff:\t000001ffffffffff\n",
     "/proc/cpuinfo": "flags\t\t: fpu vme de\n",
     "/proc/interrupts": " 0: 9 IO-APIC timer\n 130: 1 2 IR-PCI-MSI-0000:00:1f.6 0-edge ens5\n 131: 7 xhci\n",
@@ -62,7 +60,7 @@ def write(root: Path, files: Files) -> None:
 def machine(root: Path, files: Files | None = None, facts: Facts = FACTS) -> Machine:
     """The good machine but for these files (None: not there), which are below `root`, and facts."""
     write(root, {**GOOD, **(files or {})})
-    return Machine("ens5", facts=dict(facts), root=root, release="6.12.0-rt-amd64")
+    return Machine("ens5", facts=dict(facts), root=root)
 
 
 def but(**changes: Any) -> Facts:
