@@ -110,7 +110,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def named(finding: Finding, subject: str = "kernel", check: str = "tick") -> Finding:
+def named(finding: Finding, subject: str = "kernel", check: str = "clock source") -> Finding:
     return replace(finding, subject=subject, check=check)
 
 
@@ -145,7 +145,7 @@ def test_the_end_repeats_what_matters_for_the_rest_scrolls_away(monkeypatch: pyt
     assert len(end) < 24
     assert max(len(line) for line in end[1:]) <= 80
     assert "Trouble" in end[0]
-    assert end[1] == "  bad      bus, tick: gone"
+    assert end[1] == "  bad      bus, clock source: gone"
     assert end[-1] == "  and 2 more above"
 
 
@@ -182,7 +182,7 @@ def test_the_worst_finding_counts() -> None:
 def test_json_has_it_all() -> None:
     found = json.loads(as_json({"interface": "ens5"}, [named(warning("b", "c", "d", n=1))]))
     assert (found["interface"], found["verdict"], found["worst"]) == ("ens5", "look", "warning")
-    where = {"subject": "kernel", "check": "tick", "level": "warning"}
+    where = {"subject": "kernel", "check": "clock source", "level": "warning"}
     expected = {**where, "found": "b", "why": "c", "commands": ["d"], "values": {"n": 1}}
     assert found["findings"] == [expected]
 
