@@ -71,7 +71,7 @@ def _preemption(machine: Machine) -> Finding:
     switched = re.search(r"\((\w+)\)", switch)
     asked = dynamic and re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline", ""))
     if not (model := switched[1] if switched else asked[1] if asked else built):
-        raise CannotLookError(f"{_SWITCH} cannot be read: run with sudo")
+        raise CannotLookError(f"{_SWITCH} cannot be read: it needs root and debugfs")
     real_time_kernel = "sudo apt install linux-image-rt-amd64"
     if re.search(r"^ID=\"?ubuntu", machine.text("/etc/os-release", ""), re.MULTILINE):
         real_time_kernel = "sudo pro attach && sudo pro enable realtime-kernel"

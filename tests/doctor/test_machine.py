@@ -65,7 +65,7 @@ KERNEL = [
     # Where the switch is hidden, the command line or the build tells, or nothing.
     Case("preemption", LOOK, {**ORDINARY, "/proc/cmdline": "preempt=none"},
          values={"model": "none", "dynamic": True}),
-    Case("preemption", SKIP, ORDINARY, said=f"{SWITCH} cannot be read: run with sudo"),
+    Case("preemption", SKIP, ORDINARY, said=f"{SWITCH} cannot be read: it needs root and debugfs"),
     Case("preemption", LOOK, UBUNTU, commands=["sudo pro attach && sudo pro enable realtime-kernel"]),
     Case("preemption", LOOK, FIXED, commands=["sudo apt install linux-image-rt-amd64"]),
     Case("preemption", NOTE, {**FIXED, "/proc/version": "Linux version 5.4 #1 SMP PREEMPT"},
