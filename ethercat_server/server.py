@@ -42,7 +42,7 @@ class Server:
         others: the slaves that are no sensors.
         recovery: what brings lost sensors back.
         jobs: what clients asked for and is under way.
-        actions: what acts on the sensors for clients, and for a reload.
+        actions: what acts on the sensors for clients.
         cycle: the loop.
     """
 

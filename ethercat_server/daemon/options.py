@@ -44,7 +44,6 @@ class ServerSetting(NamedTuple):
     parse_argument: Callable[[str], Any]  # ArgumentTypeError says what a value must be
     default: Any
     many: bool = False  # takes several values: a repeatable flag, a list in the file
-    at_once: bool = False  # a reload (SIGHUP) applies a change; others need a restart
 
     @property
     def flag(self) -> str:
@@ -96,10 +95,10 @@ _ROWS: Final = (
     ServerSetting(
         "control_users", "NAME", "user who may configure the sensors and shut the server down, besides root, "
         "the server's own user and the user who ran sudo",
-        _NAME, (), many=True, at_once=True,
+        _NAME, (), many=True,
     ),
     ServerSetting(
-        "control_groups", "NAME", "group whose members may do so as well", _NAME, (), many=True, at_once=True,
+        "control_groups", "NAME", "group whose members may do so as well", _NAME, (), many=True,
     ),
     ServerSetting(
         "user", "NAME", "user that a server started by root becomes before it serves clients (default: who "
@@ -109,7 +108,7 @@ _ROWS: Final = (
     ServerSetting(
         "unset_settings", "WHAT", f"what settings that nobody set become at start: '{DEFAULTS}' writes the "
         f"server's, '{KEEP}' leaves the sensor's",
-        _UNSET, DEFAULTS, at_once=True,
+        _UNSET, DEFAULTS,
     ),
     ServerSetting(
         "rt_priority", "N", "SCHED_FIFO priority, if permitted; 0 for ordinary scheduling",
@@ -118,11 +117,11 @@ _ROWS: Final = (
     ServerSetting("cpu", "N", "pin the server to this CPU, if permitted", _whole(0, 4095), None),
     ServerSetting(
         "stall_timeout_s", "S", "timeout in seconds for a client that does not read what is queued for it",
-        _SECONDS, 10.0, at_once=True,
+        _SECONDS, 10.0,
     ),
     ServerSetting(
         "idle_timeout_s", "S", "timeout in seconds for a client that is not subscribed and sends no request",
-        _SECONDS, 300.0, at_once=True,
+        _SECONDS, 300.0,
     ),
 )  # fmt: skip
 
@@ -205,8 +204,7 @@ class ServerOptions:
     port: int
     sensor_name: str | None = None
     virtual_arguments: str = ""
-    config: Path | None = None  # the configuration file
-    file: ConfigFile = EMPTY  # its content
+    file: ConfigFile = EMPTY  # the configuration file's content
     force: bool = False  # whether to take over a bus that is in use
     allow_ip: bool = False  # whether to use an interface of the machine's network
     server: Mapping[str, Any] = field(default_factory=_defaults)  # by the names of SERVER_SETTINGS
@@ -328,7 +326,7 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
         if (value := getattr(parsed, name)) is not None
     }
     options = ServerOptions(
-        parsed.ifname, parsed.port, parsed.sensor_name, parsed.virtual, parsed.config, file,
+        parsed.ifname, parsed.port, parsed.sensor_name, parsed.virtual, file,
         force=parsed.force,
         allow_ip=parsed.allow_ip,
         server=_defaults() | file.server | given,

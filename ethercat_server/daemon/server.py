@@ -9,13 +9,15 @@ import os
 from collections.abc import Sequence
 
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
-from ethercat_server.daemon.service import Notifier, Policy, Service
+from ethercat_server.daemon.service import Notifier
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.process.privileges import User, become, user_to_become
 from ethercat_server.process.signals import Signals
 from ethercat_server.server import Server
+from ethercat_server.serving.connection import Limits
 from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.permissions import controlling_uids, local_names
 from ethercat_server.serving.transport import SocketTransport
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 
@@ -26,7 +28,8 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
     """Start up, stream until asked to stop, shut down; ServerError says what failed."""
     options = parse_options(argv)
     user = user_to_become(options.server["user"])
-    policy, notifier = Policy(options), Notifier()
+    control_uids = controlling_uids(options.server["control_users"], options.server["control_groups"])
+    names, notifier = local_names(), Notifier()
     with contextlib.ExitStack() as cleanup:
         hub = Hub(SocketTransport(options.server["hosts"], options.port))
         cleanup.callback(hub.close)
@@ -38,13 +41,14 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         bus = cleanup.enter_context(open_bus(ifname, allow_ip=options.allow_ip))
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
         _give_up_root(user, options)
-        policy.apply(hub)
+        hub.permissions.control_uids = control_uids | {os.geteuid()}
+        hub.permissions.names = names
+        hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
         server = Server(
             bus, hub, options, signals.check, watchdog=notifier, extra={"interface": options.ifname}
         )
-        service = Service(argv, policy, server, notifier)
-        server.cycle.every_second = service.every_second
-        signals.call(server.stop, service.reload)
+        server.cycle.every_second = lambda: notifier.update(server)
+        signals.call(server.stop)
         for sensor in server.sensors:
             log.info(
                 "sensor %d: %s, serial %d, firmware %s, %d bytes at %d Hz",
@@ -55,7 +59,8 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
             if not ipaddress.ip_address(host).is_loopback:
                 log.warning("listening on %s: every machine that can reach it may read the sensors", host)
         log.info("streaming %s on port %d", ifname, options.port)
-        service.ready()
+        notifier.send("READY=1")
+        notifier.update(server)
         try:
             server.run()
         finally:
@@ -71,5 +76,3 @@ def _give_up_root(user: User | None, options: ServerOptions) -> None:
         return
     become(user)
     log.info("running as user %s from here on, without privileges", user)
-    if options.config is not None and not os.access(options.config, os.R_OK):
-        log.warning("user %s cannot read the configuration %s: a reload will fail", user, options.config)

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM stop the server, SIGHUP reloads its configuration."""
+"""SIGINT and SIGTERM stop the server, and so does SIGHUP, unless it is started with nohup."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ class Signals:
         self._received = False
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_stop)
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until there is something to reload
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            signal.signal(signal.SIGHUP, self._on_stop)
 
     def check(self) -> None:
         """StopRequestedError if a signal has arrived."""
         if self._received:
             raise StopRequestedError("stopped during start-up")
 
-    def call(self, stop: Callable[[], None], reload: Callable[[], None]) -> None:
-        """From now on a signal calls `stop` or `reload`."""
+    def call(self, stop: Callable[[], None]) -> None:
+        """From now on a signal calls `stop`."""
         self._stop = stop
-        signal.signal(signal.SIGHUP, lambda *_: reload())
         if self._received:
             stop()
 

@@ -8,7 +8,6 @@ from typing import Any, Final
 from bota_ethercat.control import ErrorCode, Event, Request, error_reply, event, reply
 from bota_ethercat.errors import RequestError, SettingError
 from bota_ethercat.sensor_choice import SensorChoice
-from bota_ethercat.settings import SettingValue
 from ethercat_server.acquisition.jobs import Done, Jobs, refusal
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import SensorStream
@@ -161,21 +160,13 @@ class SensorActions:
         self._start_change(sensor.number, steps, self._answering(connection, request))
 
     def _configure(self, connection: Connection, request: Request) -> None:
-        values, done = request.values, self._answering(connection, request)
-        self.configure(values["sensor"], values["settings"], save_too=values["save"], done=done)
-
-    def configure(
-        self, number: int, settings: Mapping[str, SettingValue], *, save_too: bool, done: Done
-    ) -> None:
-        """Change settings of the sensor `number`, save them if `save_too`; `done` gets the result.
-
-        RequestError refuses it at once.
-        """
+        number, save_too = request.values["sensor"], request.values["save"]
+        done = self._answering(connection, request)
         self._check_unchanging(number)
         self._jobs.check_present(number)
         sensor = self.sensors[number]
         try:
-            change = Change(sensor, settings)
+            change = Change(sensor, request.values["settings"])
         except SettingError as error:
             raise RequestError(ErrorCode.BAD_REQUEST, f"the key 'settings' is refused: {error}") from None
         if not change.needs_preop:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
-from rich.live import Live
 from rich.table import Table
 
 from bota_clients.arguments import number
@@ -35,13 +34,10 @@ from scripts.demonstration.measure import FULL_RATE, Measurement, Summary, verdi
 
 TOPIC: Final = "/sensone_sensor_data"
 _RATE_HZ: Final = 800  # the virtual sensor's
-_TABLE_WIDTH: Final = 66  # a narrower terminal gets a line a second: a truncated number is a wrong one
-_ROWS: Final = (
-    ("Force", "force", "N", 2),
-    ("Torque", "torque", "Nm", 3),
-    ("Acceleration", "acceleration", "m/s²", 3),
-    ("Angular rate", "angular_rate", "rad/s", 4),
-)
+_SHOW_S: Final = 1.0
+_VECTORS: Final = (
+    ("force", "N", 2), ("torque", "Nm", 3), ("acceleration", "m/s²", 3), ("angular_rate", "rad/s", 4),
+)  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -88,45 +84,24 @@ def listening(client: Client, measurement: Measurement, lock: threading.Lock) ->
 
 
 class Screen:
-    """Shows the measurement as it grows: a live table on a terminal, else a line a second."""
+    """Shows the measurement as it grows: a line a second."""
 
     def __init__(self, sensor: Mapping[str, Any]) -> None:
-        self._title = f"{sensor['name']}, serial {sensor['serial']}, {sensor['rate_hz']} Hz, virtual"
-        console = Console()
-        fits = console.is_terminal and not console.is_dumb_terminal and console.width >= _TABLE_WIDTH
-        self.live = Live(console=console, auto_refresh=False) if fits else None
-        self.period_s = 0.25 if self.live else 1.0
-        if not fits:
-            print(self._title, flush=True)
-        self._messages, self._at_s, self._rate_hz = 0, time.monotonic(), 0.0
+        print(f"{sensor['name']}, serial {sensor['serial']}, {sensor['rate_hz']} Hz, virtual", flush=True)
+        self._messages, self._at_s = 0, time.monotonic()
 
     def show(self, measurement: Measurement) -> None:
         """Show the state now; hold the measurement's lock."""
         now_s = time.monotonic()
-        if now_s - self._at_s >= 0.9:
-            self._rate_hz = (measurement.messages - self._messages) / (now_s - self._at_s)
-            self._messages, self._at_s = measurement.messages, now_s
-        lost, age = measurement.lost + measurement.lost_before, f"{measurement.age_ns / 1e6:.2f} ms"
-        rows = [
-            (name, unit, [f"{value:+.{digits}f}" for value in getattr(measurement.latest, vector)])
-            for name, vector, unit, digits in _ROWS
-        ]
-        if self.live is None:
-            values = "  ".join(f"{unit} {' '.join(xyz)}" for _, unit, xyz in rows)
-            figures = f"{self._rate_hz:7.1f} Hz  age {age}  lost {lost}  repeated {measurement.repeated}"
-            print(f"{figures}  {values}", flush=True)
-            return
-        table = Table(title=self._title, title_justify="left", caption="Ctrl-C ends it")
-        table.add_column("", min_width=22)
-        for axis in "xyz":
-            table.add_column(axis, justify="right", min_width=10)
-        for name, unit, xyz in rows:
-            table.add_row(f"{name}, {unit}", *xyz)
-        table.add_section()
-        table.add_row("Messages a second", f"{self._rate_hz:.1f}")
-        table.add_row("Age at the subscriber", age)
-        table.add_row("Lost, repeated", str(lost), str(measurement.repeated))
-        self.live.update(table, refresh=True)
+        rate_hz = (measurement.messages - self._messages) / (now_s - self._at_s)
+        self._messages, self._at_s = measurement.messages, now_s
+        lost, age = measurement.lost + measurement.lost_before, measurement.age_ns / 1e6
+        values = "  ".join(
+            f"{unit} {' '.join(f'{value:+.{digits}f}' for value in getattr(measurement.latest, vector))}"
+            for vector, unit, digits in _VECTORS
+        )
+        figures = f"{rate_hz:7.1f} Hz  age {age:.2f} ms  lost {lost}  repeated {measurement.repeated}"
+        print(f"{figures}  {values}", flush=True)
 
 
 def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
@@ -175,10 +150,10 @@ def run(seconds: float | None) -> int:
             with lock:
                 measurement.begin()
             screen = Screen(sensor)
-            with contextlib.suppress(Stopped), screen.live or contextlib.nullcontext():
+            with contextlib.suppress(Stopped):
                 end = time.monotonic() + (seconds or float("inf"))
                 while (left := end - time.monotonic()) > 0:
-                    chain.sleep(min(screen.period_s, left))
+                    chain.sleep(min(_SHOW_S, left))
                     with lock:
                         screen.show(measurement)
             ignore_signals()

@@ -241,18 +241,6 @@ def test_only_the_loop_has_real_time_priority(running: tuple[Server, Path]) -> N
 
 @needs_another_user
 @on_a_bus
-def test_a_file_that_its_user_cannot_read_is_known_and_refused_later(running: tuple[Server, Path]) -> None:
-    found, config = running
-    assert f"user nobody cannot read the configuration {config}: a reload will fail" in found.said()
-    found.signal(signal.SIGHUP)
-    found.wait_for("reload failed, the configuration is unchanged: cannot read the configuration")
-    with found.connect() as client:
-        client.ask("subscribe")
-        assert len(client.fresh(50)) == 50
-
-
-@needs_another_user
-@on_a_bus
 @pytest.mark.parametrize("stuck", [False, True])
 def test_the_virtual_sensor_becomes_the_same_user_and_goes_with_the_server(stuck: bool) -> None:
     """A stopped process does not end by itself; that of another user could not be killed."""

@@ -225,22 +225,6 @@ def test_systemd_is_told_and_the_watchdog_is_fed(shared: Shared) -> None:
         wait("1 clients")
 
 
-def test_sighup_reloads_the_configuration(shared: Shared) -> None:
-    """A real signal, and a thread beside the loop."""
-    running = shared.running
-    with running.connect() as client:
-        client.ask("subscribe")
-        shared.config.write_text(CONFIG + "imu_active = 3\n[server]\nidle_timeout_s = 299\n")
-        applied, before = "sensor 1: applied imu_active = 3", len(running.said())
-        while applied not in running.said():
-            at = len(running.said())
-            running.signal(signal.SIGHUP)
-            # Again if a starved sensor was away in this very moment.
-            wait_until(lambda n=at: "imu_active = 3" in running.said()[n:], applied)  # type: ignore[misc]
-        assert "changed idle_timeout_s" in running.said()[before:]
-        assert len(client.fresh(10)) == 10
-
-
 def test_killed_and_started_again_at_once_on_the_same_port_beside_another(shared: Shared) -> None:
     """What the kernel does with the processes, interfaces and sockets that a killed server leaves."""
     with contextlib.ExitStack() as stack:
