@@ -321,7 +321,7 @@ def test_a_tool_that_is_accelerated_is_no_contact(stages: Stages, server: Server
         ("tool_center_of_gravity", [0.0, 0.0], "it must be 3 numbers from -10 to 10"),
         ("gravity", [0, 0, 0], "must be at least 0.1 m/s² long"),
         ("gravity_source", "accelerometer", "it must be none or imu or topic_pose"),
-        ("bias_directory", "", "it must be text that is not empty"),
+        ("identify.file", "", "it must be text that is not empty"),
         ("frame_id", "other", "read-only"),
     ],
 )

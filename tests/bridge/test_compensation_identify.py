@@ -21,8 +21,9 @@ def server() -> Server:
 
 
 @pytest.fixture
-def node(server: Server, tmp_path: Path) -> Iterator[Node]:
-    with Node(server, **QUICK, bias_directory=tmp_path / "deeper") as started:
+def node(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    with Node(server, **QUICK) as started:
         yield started
 
 
@@ -52,7 +53,7 @@ def test_from_poses_to_the_contact_force(started: Node, take: Take, server: Serv
     text = take(*AXES)
     assert "pose 6 taken (up is -1.00, 0.00, 0.00 in the sensor's frame)" in text
     assert "the poses suffice" in text
-    path = tmp_path / "deeper" / "sensor-1-payload.yaml"
+    path = tmp_path / "bota-ethercat-bridge" / "sensor-1-payload.yaml"
     started.do(
         "identify/solve", "mass 0.8000 ± ", "center of gravity (4.0", "Bias Fx 3.0000 Fy -1.5000 Fz 7.2500",
         "95 % confidence", "Residuals by pose, 1: ", "Condition 1.",
@@ -82,7 +83,7 @@ def test_the_accelerometers_offset_is_found_and_subtracted(
         started.do("identify/add_pose")
     started.do("identify/solve", "Accelerometer: offset x 0.196 ± ")
     offset = [0.02 * STANDARD_GRAVITY, -0.015 * STANDARD_GRAVITY, 0.0]
-    written = written_parameters(tmp_path / "deeper" / "sensor-1-payload.yaml")
+    written = written_parameters(tmp_path / "bota-ethercat-bridge" / "sensor-1-payload.yaml")
     assert written["accelerometer.offset"] == pytest.approx(offset, abs=2e-3)
     started.do("identify/apply")
     found, scale = started.parameters("accelerometer.offset", "accelerometer.scale")
@@ -101,10 +102,17 @@ def test_the_accelerometers_offset_is_found_and_subtracted(
     stages.at((-2, 1, 1), bias=BIAS, **off, wanted=ZERO6, within=1e-2)
 
 
-def test_the_file_is_one_that_the_node_starts_with(started: Node, take: Take, tmp_path: Path) -> None:
+def test_the_file_is_one_that_the_node_starts_with(
+    started: Node, take: Take, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     take(*AXES)
     started.set("identify.file", "/proc/no/such.yaml")
     started.do("identify/solve", "Not written: ", "/proc/no")  # the answer stands
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_STATE_HOME", "relative")  # which does not count
+    started.set("identify.file", "auto")
+    default = tmp_path / ".local" / "state" / "bota-ethercat-bridge" / "sensor-1-payload.yaml"
+    started.do("identify/solve", f"Written to {default}")
     path = tmp_path / "mine.yaml"
     started.set("identify.file", str(path))
     started.do("identify/solve")

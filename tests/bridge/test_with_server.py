@@ -200,7 +200,7 @@ def test_a_server_that_starts_again(node: Node, server: WholeServer) -> None:
 def test_from_poses_to_the_force_of_the_environment(tmp_path: Path) -> None:
     """Identification and compensation as a user does them; the accelerometer is the only source."""
     server = WholeServer(SensorOptions(signal="poses"))
-    with Node(server, bias_directory=tmp_path) as node:
+    with Node(server, **{"identify.file": tmp_path / "payload.yaml"}) as node:
         node.run(0.1)
         node.do("identify/start")
         taken = 0
