@@ -122,25 +122,6 @@ def test_the_file_is_one_that_the_node_starts_with(
     assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
 
 
-def test_the_answer_names_a_pose_in_which_the_tool_was_touched(
-    started: Node, take: Take, server: Server
-) -> None:
-    take(*AXES[:3])
-    server.hold((1, 1, 1), bias=BIAS, force_x=2.0)
-    started.do("identify/add_pose")
-    take(*AXES[3:], (1, -1, 1), (-1, 1, -1))
-    started.do("identify/solve", "pose 4 ", "if something touched the tool, take it again")
-
-
-def test_the_answer_names_a_drift_of_the_bias(started: Node, server: Server) -> None:
-    """By 0.5 N a minute; a pose takes half a minute."""
-    for number, up in enumerate((*AXES, (1, -1, 1), AXES[0])):
-        server.hold(up, bias=BIAS, force_z=0.25 * number)
-        started.run(29.7)
-        started.do("identify/add_pose")
-    started.do("identify/solve", "the bias drifted by 0.5 N and ", " Nm a minute")
-
-
 def test_poses_that_do_not_suffice_are_refused_with_what_is_missing(started: Node, take: Take) -> None:
     started.refuse("identify/solve", "there is no pose yet")
     take(UP, UP, UP, UP)

@@ -156,17 +156,12 @@ def test_a_sensor_that_is_replaced_while_a_tare_waits(sensor: Sensor, node: Node
     assert node.trigger("tare") == (False, words)
 
 
-def test_the_node_ends_while_a_tare_waits(sensor: Sensor, node: Node, stages: Stages) -> None:
+def test_the_node_ends_while_a_tare_waits(sensor: Sensor, node: Node) -> None:
     node.set("rest.duration", 30.0)
-    arrays = node.hear("/diagnostics")
-    arrays.clear()
-    stages.forget()
     began_ns = sensor.monotonic_ns()
     node.at(3.0, lambda: node.node.finish(0))
     assert node.trigger("tare") == (False, "the node ends")
     assert sensor.monotonic_ns() - began_ns < 3.2e9  # not the 30 s
-    assert len(stages.final) >= 299, "the stream does not wait for it"
-    assert len(arrays) >= 2, "nor do the diagnostics"
 
 
 def test_a_limit_to_the_rate_leaves_out_no_sample_of_a_tare(node: Node, stages: Stages) -> None:

@@ -74,7 +74,11 @@ def test_what_is_taken_and_what_else_is_said() -> None:
     values: tuple[Any, ...] = ([1, 2, 3], array("d", [1, 2, 3]), [0.5] * 9, [-0.5] * 9)
     for value in values:
         assert ROWS["orientation_covariance"].check(value) == tuple(map(float, value))
-    for name, wrong, words in (("bias", [1.0], "it must be 6 numbers from -1e\\+06 to 1e\\+06"),):
+    for name, wrong, words in (
+        ("bias", [1.0], "it must be 6 numbers from -1e\\+06 to 1e\\+06"),
+        ("identify.file", "", "it must be text that is not empty"),
+        ("gravity_source", "accelerometer", "it must be none or imu or topic_pose"),
+    ):
         with pytest.raises(ParameterError, match=words):
             ROWS[name].check(wrong)
 

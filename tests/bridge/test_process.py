@@ -17,13 +17,12 @@ from typing import Any
 
 import pytest
 import rclpy
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
 from bridge import process
 from bridge.client import PROFILES, use_own_profiles
-from bridge.spinning import PartExecutor, Spinner
+from bridge.spinning import Spinner
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import DEFAULTS
@@ -166,19 +165,6 @@ def test_a_callback_that_raises_ends_it_and_is_told(executor: SingleThreadedExec
     with pytest.raises(LookupError, match="of the callback"):
         spinner.run()
     spinner.stop()
-
-
-def test_what_waits_for_no_others_has_an_executor_of_its_own(node: Any) -> None:
-    own = node.create_timer(60.0, lambda: None, MutuallyExclusiveCallbackGroup())
-    common = node.create_timer(60.0, lambda: None)
-    prompt = PartExecutor(node)
-    ordinary = PartExecutor(node, prompt)
-    (mine,), (others,) = prompt.get_nodes(), ordinary.get_nodes()
-    assert (mine.timers, others.timers) == ([own], [common])
-    assert not mine.services
-    assert others.services == list(node.services) != []
-    prompt.shutdown()
-    ordinary.shutdown()
 
 
 # The profile for Fast DDS.

@@ -91,15 +91,6 @@ def test_a_sample_with_an_impossible_time_is_not_published(
     assert f"a sample with the impossible time {impossible_ns} ns was not published" in node.log
 
 
-def test_after_a_stall_nothing_old_is_published(node: Node, quiet: Server) -> None:
-    begin = quiet.monotonic_ns()
-    stream = [quiet.frame(number, monotonic_ns=begin + number * PERIOD_NS) for number in range(1000)]
-    feed(node, quiet, stream[0])
-    quiet.now_ns += 960 * PERIOD_NS  # when the node goes on, 959 frames are waiting
-    assert feed(node, quiet, b"".join(stream[1:960]), *stream[960:]) == [0.0, *range(959, 1000)]
-    assert node.node.reader.counts.stale == 958
-
-
 def test_what_is_not_finite_is_counted_and_logged_now_and_then(node: Node, quiet: Server) -> None:
     for value in (math.nan, math.inf, -math.inf):
         assert feed(node, quiet, quiet.frame(0, process_data=encode(61, {"torque.y": value}))) == []
