@@ -317,17 +317,6 @@ def test_settings_of_the_sensor_that_do_not_go_with_it(stages: Stages, server: S
     node.until(compensation="ok", sensor="ok")
 
 
-def test_without_a_server(stages: Stages, server: Server, node: Node) -> None:
-    server.listens = False
-    server.drop()
-    node.until(link="error", compensation="stale")
-    node.refuse("tare", "there is no server at localhost:")
-    node.do("clear_tare")
-    server.listens = True
-    stages.settle(ZERO6)
-    node.until(compensation="ok")
-
-
 # What would mislead is said: settings that change what the wrench means.
 
 

@@ -106,14 +106,6 @@ def stages(node: Node) -> Stages:
     return stages
 
 
-def test_before_anything_has_come(robot: Robot, node: Node) -> None:
-    robot.sending = False
-    topic = node.name.replace("bridge", "arm/pose")
-    node.hear("wrench_compensated")
-    node.until(f"no orientation from topic {topic}: nothing has come", compensation="error")
-    node.refuse("tare", "nothing has come")
-
-
 @pytest.mark.parametrize(
     ("source", "message_type"),
     [("topic_quaternion", QuaternionStamped), ("topic_imu", Imu), ("topic_pose", PoseStamped)],

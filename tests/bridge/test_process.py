@@ -104,19 +104,14 @@ def test_a_refusal_is_a_warning_and_no_change(
 
     monkeypatch.setattr(process, "make_real_time", refuse)
     lines = Log(None)
+    process.prepare(0, -1, lines)  # nothing is asked for
+    assert not lines.lines
     process.prepare(40, 1, lines)
     assert asked == [(40, 1, stream.native_id)]
     assert lines.warnings == [
         "the stream has ordinary scheduling; not granted: SCHED_FIFO 40 (a remedy); samples may be late on a "
         "busy machine"
     ]
-
-
-@pytest.mark.usefixtures("stream")
-def test_nothing_is_said_where_nothing_was_asked_for() -> None:
-    lines = Log(None)
-    process.prepare(0, -1, lines)
-    assert not lines.lines
 
 
 def test_a_thread_that_fails_says_so() -> None:

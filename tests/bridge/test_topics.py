@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-import struct
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -12,7 +11,6 @@ from typing import Any
 import pytest
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Temperature
 
 from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.pdo import encode
@@ -184,15 +182,6 @@ def test_every_length_of_text_before_the_numbers(frame_id: str) -> None:
         message = packed.pack(stamp_ns, *numbers)
         assert deserialize_message(message, WrenchStamped) == wanted
         assert len(message) == len(serialize_message(wanted))  # bytes of padding may be anything
-
-
-def test_what_is_packed_without_ros() -> None:
-    packed = StampedNumbers("", 2)
-    assert deserialize_message(packed.pack(0, 5, 1), Temperature) == Temperature(
-        temperature=5.0, variance=1.0
-    )
-    with pytest.raises(struct.error):
-        packed.pack(0, 5)
 
 
 # Filtered, and in other frames: configured, subscribed, changed while it runs.
