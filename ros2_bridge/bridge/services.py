@@ -7,6 +7,7 @@ Each blocks the executor, and never the stream: until the server has answered or
 from __future__ import annotations
 
 import json
+import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,6 @@ from std_srvs.srv import Trigger
 
 from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import Vector3
-from bridge.compensating.bias_keeper import directory_of, expand
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.declare import SettingsParameters
 from bridge.parameters.table import AUTO
@@ -132,20 +132,14 @@ class BiasServices:
                 "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds in "
                 "this orientation only"
             )
-        return self._done(f"bias of {means.samples} samples: {wrench_text(control.bias)}; {weight}")
+        return f"bias of {means.samples} samples: {wrench_text(control.bias)}; {weight}"
 
     def _clear_tare(self) -> str:
         self._control.set_bias(NO_WRENCH, "cleared")
-        return self._done("the bias is zero")
+        return "the bias is zero"
 
     def _undo_tare(self) -> str:
-        return self._done(f"back to the bias before: {wrench_text(self._control.undo_bias())}")
-
-    def _done(self, text: str) -> str:
-        problem = self._control.keeper.problem
-        if not self._control.parameters.bias_keep:
-            return text
-        return text + (f"; not kept: {problem}" if problem else "; kept for the next start")
+        return f"back to the bias before: {wrench_text(self._control.undo_bias())}"
 
 
 class IdentifyServices:
@@ -207,12 +201,10 @@ class IdentifyServices:
             raise CompensationError("there is no result to apply: call identify/solve first")
         accelerometer = result.accelerometer.calibration if result.accelerometer else None
         self._control.set_payload(result.payload, result.bias, accelerometer)
-        not_kept = self._control.keeper.problem
         return (
             f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias"
             + (", accelerometer.offset and accelerometer.scale" if accelerometer else "")
             + "; to keep the tool, start the node with the file"
-            + (f"; the bias is not kept: {not_kept}" if not_kept else "")
         )
 
     def _cancel(self) -> str:
@@ -247,11 +239,20 @@ class IdentifyServices:
         return f"Written to {path}"
 
     def _path(self) -> Path:
-        parameters, info = self._control.parameters, self._control.link.info
-        if parameters.identify_file != AUTO:
-            return expand(parameters.identify_file, "identify.file")
-        serial = info.serial if info.serial.isalnum() else "unknown"
-        return directory_of(parameters.bias_directory) / f"sensor-{serial}-payload.yaml"
+        path = self._control.parameters.identify_file
+        if path == AUTO:
+            state = os.environ.get("XDG_STATE_HOME", "")
+            # The XDG specification says that a relative path is to be ignored.
+            directory = state if Path(state).is_absolute() else "~/.local/state"
+            serial = self._control.link.info.serial
+            name = f"sensor-{serial if serial.isalnum() else 'unknown'}-payload.yaml"
+            path = f"{directory}/bota-ethercat-bridge/{name}"
+        try:
+            return Path(path).expanduser()
+        except RuntimeError:
+            raise CompensationError(
+                f"there is no home directory for {path}: give identify.file in full"
+            ) from None
 
 
 def details(result: Identified) -> list[str]:

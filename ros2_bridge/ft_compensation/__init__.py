@@ -1,5 +1,5 @@
 """Bias, tool and payload of a force/torque sensor: NumPy, no ROS.
 
 `compensator` subtracts, `bias` and `specific_force` tell what, `stationary` whether the sensor
-is at rest, `store` keeps the bias, `identification` finds the payload. docs/compensation.md.
+is at rest, `identification` finds the payload. docs/compensation.md.
 """

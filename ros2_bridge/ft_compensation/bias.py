@@ -135,10 +135,10 @@ class BiasRamp:
     Times are of the samples, s on any one clock. `at` may run in one thread while others change it.
     """
 
-    def __init__(self, bias: Wrench = NO_WRENCH, seconds: float = 0.0, taken: Taken = _OF_NO_TARE) -> None:
+    def __init__(self, bias: Wrench = NO_WRENCH, seconds: float = 0.0) -> None:
         """`seconds` is how long a change takes; 0 = at once."""
         self.seconds = seconds
-        self._course = _Course(bias, bias, 0.0, 0.0, taken)
+        self._course = _Course(bias, bias, 0.0, 0.0, _OF_NO_TARE)
         self._before: tuple[Wrench, Taken] | None = None
         self._lock = threading.RLock()
 

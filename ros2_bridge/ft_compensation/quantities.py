@@ -15,7 +15,7 @@ _NORM_TOLERANCE: Final = 0.01
 
 
 class CompensationError(Exception):
-    """Something cannot be estimated, identified or kept; the text is one sentence for people."""
+    """Something cannot be estimated or identified; the text is one sentence for people."""
 
 
 Turning = tuple[Vector3, Vector3]  # angular rate, rad/s, and angular acceleration, rad/s²

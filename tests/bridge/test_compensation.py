@@ -14,7 +14,7 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 
 from bota_ethercat.framing import DataFlag
-from bota_ethercat.pdo import STANDARD_GRAVITY, encode, layout_for
+from bota_ethercat.pdo import encode, layout_for
 from bota_ethercat.settings import SettingValue
 from ft_compensation.bias import force_bound_95
 from ft_compensation.identification.weighted import Array
@@ -304,33 +304,6 @@ def test_without_a_source_nothing_with_weight_is_compensated(stages: Stages, nod
     stages.settle(weight(UP))  # nothing to turn: the bias alone needs no orientation
 
 
-def test_a_tool_that_is_accelerated_is_no_contact(stages: Stages, server: Server) -> None:
-    """By 1 m/s² along x: its mass pulls the other way."""
-    pulled: dict[str, Any] = {"force_x": -TOOL.mass, "torque_y": -TOOL.mass * TOOL.center[2]}
-    pulled["torque_z"] = TOOL.mass * TOOL.center[1]
-    stages.at(UP, acceleration_x=1 / STANDARD_GRAVITY, **pulled)
-    inertia = [pulled["force_x"], 0.0, 0.0, 0.0, pulled["torque_y"], pulled["torque_z"]]
-    assert is_near(stages.tool[-1], [a + b for a, b in zip(weight(UP), inertia, strict=True)])
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "words"),
-    [
-        ("tool_mass", "heavy", "Wrong parameter type"),
-        ("tool_mass", 1001.0, "tool_mass"),
-        ("tool_center_of_gravity", [0.0, 0.0], "it must be 3 numbers from -10 to 10"),
-        ("gravity", [0, 0, 0], "must be at least 0.1 m/s² long"),
-        ("gravity_source", "accelerometer", "it must be none or imu or topic_pose"),
-        ("bias_directory", "", "it must be text that is not empty"),
-        ("frame_id", "other", "read-only"),
-    ],
-)
-def test_a_wrong_value_is_refused(stages: Stages, node: Node, name: str, value: Any, words: str) -> None:
-    before = node.parameters(name)
-    node.refuse_value(name, value, words)
-    assert node.parameters(name) == before
-
-
 def test_settings_of_the_sensor_that_do_not_go_with_it(stages: Stages, server: Server, node: Node) -> None:
     for changed, words, sensor in (
         ({"inertia_compensation": True}, "the sensor takes gravity off itself", "ok"),
@@ -342,17 +315,6 @@ def test_settings_of_the_sensor_that_do_not_go_with_it(stages: Stages, server: S
         node.refuse("tare", words)
     server.reconfigure()
     node.until(compensation="ok", sensor="ok")
-
-
-def test_without_a_server(stages: Stages, server: Server, node: Node) -> None:
-    server.listens = False
-    server.drop()
-    node.until(link="error", compensation="stale")
-    node.refuse("tare", "there is no server at localhost:")
-    node.do("clear_tare")
-    server.listens = True
-    stages.settle(ZERO6)
-    node.until(compensation="ok")
 
 
 # What would mislead is said: settings that change what the wrench means.

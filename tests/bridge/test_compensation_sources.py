@@ -17,11 +17,10 @@ from sensor_msgs.msg import Imu
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
-from bridge.compensating.sources import ImuSource, Oriented, RobotSource, multiply
+from bridge.compensating.sources import ImuSource, Oriented, RobotSource
 from bridge.node import StartError
 from bridge.parameters.table import PARAMETERS, gather
 from bridge.stream.link import SensorInfo
-from ft_compensation.quantities import length, unit_quaternion
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import (
     DEFAULTS,
@@ -105,14 +104,6 @@ def stages(node: Node) -> Stages:
     stages = Stages(node)
     stages.settle(ZERO6)
     return stages
-
-
-def test_before_anything_has_come(robot: Robot, node: Node) -> None:
-    robot.sending = False
-    topic = node.name.replace("bridge", "arm/pose")
-    node.hear("wrench_compensated")
-    node.until(f"no orientation from topic {topic}: nothing has come", compensation="error")
-    node.refuse("tare", "nothing has come")
 
 
 @pytest.mark.parametrize(
@@ -336,22 +327,6 @@ def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque()
     assert felt(20) == pytest.approx(21 - (15 - 1.94) / 10)
     LINK.info = SensorInfo(settings={**known, "chop": True}, rate_hz=100)
     assert felt() == 22.0, "how long CHOP delays is not known"
-
-
-def test_a_clock_that_goes_back_does_not_stop_a_source_for_ever() -> None:
-    source = RobotSource(DEFAULTS, "topic /pose", LINK)
-    source.latest = Oriented(UPRIGHT, 5_000 * 10**9)
-    assert source.specific_force(sample(), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, 9.80665))
-    source.latest = Oriented(TILTED, 100 * 10**9)
-    assert source.specific_force(sample(), 100.0, 100.0) == pytest.approx((9.80665, 0.0, 0.0))
-
-
-def test_rotations_multiply_in_the_order_that_is_said() -> None:
-    both = multiply(TILTED, (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))
-    assert length(both[:3]) ** 2 + both[3] ** 2 == pytest.approx(1.0)
-    assert multiply(UPRIGHT, TILTED) == multiply(TILTED, UPRIGHT) == pytest.approx(TILTED)
-    assert unit_quaternion((0.0, 0.0, 0.0, 0.995)) == UPRIGHT
-    assert weight(UP)[2] < 0
 
 
 @pytest.mark.parametrize("set_by_s", [0.0, -3600.0, -0.05, 0.05, 3600.0])

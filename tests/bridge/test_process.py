@@ -17,13 +17,12 @@ from typing import Any
 
 import pytest
 import rclpy
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
 from bridge import process
 from bridge.client import PROFILES, use_own_profiles
-from bridge.spinning import PartExecutor, Spinner
+from bridge.spinning import Spinner
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import DEFAULTS
@@ -105,19 +104,14 @@ def test_a_refusal_is_a_warning_and_no_change(
 
     monkeypatch.setattr(process, "make_real_time", refuse)
     lines = Log(None)
+    process.prepare(0, -1, lines)  # nothing is asked for
+    assert not lines.lines
     process.prepare(40, 1, lines)
     assert asked == [(40, 1, stream.native_id)]
     assert lines.warnings == [
         "the stream has ordinary scheduling; not granted: SCHED_FIFO 40 (a remedy); samples may be late on a "
         "busy machine"
     ]
-
-
-@pytest.mark.usefixtures("stream")
-def test_nothing_is_said_where_nothing_was_asked_for() -> None:
-    lines = Log(None)
-    process.prepare(0, -1, lines)
-    assert not lines.lines
 
 
 def test_a_thread_that_fails_says_so() -> None:
@@ -166,19 +160,6 @@ def test_a_callback_that_raises_ends_it_and_is_told(executor: SingleThreadedExec
     with pytest.raises(LookupError, match="of the callback"):
         spinner.run()
     spinner.stop()
-
-
-def test_what_waits_for_no_others_has_an_executor_of_its_own(node: Any) -> None:
-    own = node.create_timer(60.0, lambda: None, MutuallyExclusiveCallbackGroup())
-    common = node.create_timer(60.0, lambda: None)
-    prompt = PartExecutor(node)
-    ordinary = PartExecutor(node, prompt)
-    (mine,), (others,) = prompt.get_nodes(), ordinary.get_nodes()
-    assert (mine.timers, others.timers) == ([own], [common])
-    assert not mine.services
-    assert others.services == list(node.services) != []
-    prompt.shutdown()
-    ordinary.shutdown()
 
 
 # The profile for Fast DDS.

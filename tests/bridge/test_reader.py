@@ -91,15 +91,6 @@ def test_a_sample_with_an_impossible_time_is_not_published(
     assert f"a sample with the impossible time {impossible_ns} ns was not published" in node.log
 
 
-def test_after_a_stall_nothing_old_is_published(node: Node, quiet: Server) -> None:
-    begin = quiet.monotonic_ns()
-    stream = [quiet.frame(number, monotonic_ns=begin + number * PERIOD_NS) for number in range(1000)]
-    feed(node, quiet, stream[0])
-    quiet.now_ns += 960 * PERIOD_NS  # when the node goes on, 959 frames are waiting
-    assert feed(node, quiet, b"".join(stream[1:960]), *stream[960:]) == [0.0, *range(959, 1000)]
-    assert node.node.reader.counts.stale == 958
-
-
 def test_what_is_not_finite_is_counted_and_logged_now_and_then(node: Node, quiet: Server) -> None:
     for value in (math.nan, math.inf, -math.inf):
         assert feed(node, quiet, quiet.frame(0, process_data=encode(61, {"torque.y": value}))) == []
@@ -204,22 +195,15 @@ def test_a_stall_gives_nothing_until_the_stream_is_fresh() -> None:
     assert alone.of([101], 101 * PERIOD_NS + FRESH_NS) == [101]
 
 
-@pytest.mark.parametrize("offset_ns", [-(10**15), 10**15])
-def test_clocks_that_differ_make_ages_relative(offset_ns: int) -> None:
-    selecting = Selecting(same_clock=False)
-    for i in range(1000):
-        assert selecting.of([i], offset_ns + i * PERIOD_NS + (i * 7919 % 1000) * 1000) == [i]
-    now_ns = offset_ns + 3000 * PERIOD_NS
-    assert selecting.of(range(1000, 2000), now_ns) == []
-    assert selecting.of(range(2000, 3000), now_ns) == [2999]
-
-
-@pytest.mark.parametrize("same_clock", [True, False])
+@pytest.mark.parametrize("offset_ns", [0, -(10**15), 10**15])
 @pytest.mark.parametrize("age_ns", [0, 5_000_000, 30_000_000])
-def test_a_stall_costs_no_more_than_itself(same_clock: bool, age_ns: int) -> None:
-    """Whatever is usual on this connection: what is queued after 60 ms gives one sample, the next passes."""
-    selecting = Selecting(same_clock=same_clock)
-    age_ns -= 0 if same_clock else 10**15
+def test_a_stall_costs_no_more_than_itself(offset_ns: int, age_ns: int) -> None:
+    """Whatever is usual on this connection: what is queued after 60 ms gives one sample, the next passes.
+
+    Between clocks that differ by `offset_ns` ages are relative.
+    """
+    selecting = Selecting(same_clock=not offset_ns)
+    age_ns += offset_ns
     assert selecting.one_by_one(0, 8, age_ns) == list(range(8))
     for begin in (8, 1008):  # and again: nothing has changed for the rest of the connection
         now = begin + 48

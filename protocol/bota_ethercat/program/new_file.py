@@ -28,8 +28,7 @@ class NewFile:
     directly.
     """
 
-    def __init__(self, path: Path, *, force: bool, mode: int = 0o666) -> None:
-        """`mode`: its permissions, less the umask."""
+    def __init__(self, path: Path, *, force: bool) -> None:
         self._path, self._force = path, force
         with self._errors():
             refuse_existing(path, force=force)
@@ -39,13 +38,7 @@ class NewFile:
                 self._target = Path(os.path.realpath(path))  # a symbolic link stays one
                 self._beside = self._target.with_name(f".unfinished-{secrets.token_hex(4)}")
             self._in_place = self._beside == self._target
-            self._file = open(  # noqa: SIM115 - Path.open has no opener
-                self._beside,
-                "w" if self._in_place else "x",
-                encoding="utf-8",
-                newline="\n",
-                opener=lambda name, flags: os.open(name, flags, mode),
-            )
+            self._file = self._beside.open("w" if self._in_place else "x", encoding="utf-8", newline="\n")
 
     def write(self, text: str) -> None:
         """Add text."""

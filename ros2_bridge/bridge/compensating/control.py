@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from rclpy.node import Node
 
-from bridge.compensating.bias_keeper import FROM_PARAMETER, BiasKeeper, OwnOffset
+from bridge.compensating.own_offset import OwnOffset
 from bridge.compensating.sources import IMU_IS_OFF, SourceChoice
 from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import LiveParameters
@@ -22,15 +22,16 @@ from bridge.stream.reader import Reader
 from ft_compensation.bias import BiasRamp, Taken, force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.motion_error import MotionError
+from ft_compensation.outputs import cutoff_problem
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
 
+_FROM_PARAMETER: Final = "parameter"
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
-_KEPT: Final = ("bias", "payload", "bias_keep", "bias_directory")  # what the file of the bias depends on
 _NOTHING_CURRENT: Final = "no current orientation"
 _MOTION_S: Final = 1.0  # how often it is looked up what motion leaves
 _LEAST_TOLD_N: Final = 0.2  # about the noise of a force
-_LOOKING_UP: Final = "the bias of this sensor is being looked up"
+_ANOTHER_SENSOR: Final = "the bias may be another sensor's"
 
 
 class CompensationControl:
@@ -47,13 +48,14 @@ class CompensationControl:
         """ParameterError if the parameters cannot be had here."""
         self.parameters, self.output = parameters, output
         self.reader, self.link, self._live = reader, reader.link, live
-        self.origin = FROM_PARAMETER  # where the bias in force comes from
+        self.origin = _FROM_PARAMETER  # where the bias in force comes from
         self._log = node.get_logger()
         self.choice = SourceChoice(node, self.link)
-        self.keeper = BiasKeeper(self._log)
+        # Of the sensor that the bias in force is for, for any thread; None until there was one.
+        self._serial: str | None = None
         self.own_offset = OwnOffset(self.link)
         # Origin of the bias that is being put in force, and what it was taken with if by a tare.
-        self._next: tuple[str, Taken | None] = (FROM_PARAMETER, None)
+        self._next: tuple[str, Taken | None] = (_FROM_PARAMETER, None)
         self.choice.check(parameters)
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
         self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
@@ -73,11 +75,11 @@ class CompensationControl:
         """There is another connection, or none; for the reader's thread."""
         if not self._is_same_sensor():
             # Not one sample of this sensor with what may be another's bias.
-            self.output.hold = _LOOKING_UP
+            self.output.hold = _ANOTHER_SENSOR
             self._guard.trigger()
         else:
             self._follow_offset()
-            if self.output.hold is not _LOOKING_UP:
+            if self.output.hold is not _ANOTHER_SENSOR:
                 self._hold()
 
     @property
@@ -113,7 +115,6 @@ class CompensationControl:
                 "bias": _numbers(bias.values),
                 "bias_from": self.origin,
                 "bias_ramping": not self._ramp.arrived(output.time_s),
-                "bias_keep": parameters.bias_keep,
                 "subscribed": has_subscribers,
                 "compensated": output.published,
                 "withheld": output.withheld,
@@ -122,7 +123,6 @@ class CompensationControl:
             doubtful=self.conflict()
             or self.own_offset.doubt()
             or self._ramp.taken.doubt(payload)
-            or self.keeper.problem
             or (self._payload_watch.finding if self._payload_watch is not None else "")
             or _vibration(motion, bound),
             follows_imu=source.is_imu and payload.mass > 0.0,
@@ -177,7 +177,7 @@ class CompensationControl:
         return f"wrench_compensated has stopped: {why}"
 
     def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
-        """Put a bias in force, `taken` by a tare, and keep it if that is asked for."""
+        """Put a bias in force, `taken` by a tare."""
         self.own_offset.begin(bias, is_measured=origin in _MEASURED)
         self._put(origin, taken, bias=[*bias.values])
 
@@ -205,16 +205,15 @@ class CompensationControl:
         try:
             self._live.put(**values)
         finally:
-            self._next = FROM_PARAMETER, None
+            self._next = _FROM_PARAMETER, None
 
     def _check(self, wanted: Parameters) -> None:
         """ParameterError if they cannot be had here."""
         self.choice.check(wanted)
         if self.link.is_connected and (rate_hz := self.link.info.rate_hz):
-            known = self.parameters.filter.problems(rate_hz)
-            for problem in wanted.filter.problems(rate_hz):
-                if problem not in known:
-                    raise ParameterError(problem)
+            cutoff_hz = wanted.filter_cutoff
+            if cutoff_hz != self.parameters.filter_cutoff and (problem := cutoff_problem(cutoff_hz, rate_hz)):
+                raise ParameterError(problem)
 
     def apply(self, wanted: Parameters) -> None:
         """Take other parameters."""
@@ -237,10 +236,8 @@ class CompensationControl:
             if warning := self._ramp.taken.warning(self.bias.plus(before, -1.0), wanted.payload):
                 self._log.warning(warning)
             self._guard.trigger()  # the parameter follows
-        if self.output.hold is not _LOOKING_UP:
+        if self.output.hold is not _ANOTHER_SENSOR:
             self._hold()
-        if is_wish or any(getattr(was, name) != getattr(wanted, name) for name in _KEPT):
-            self.keeper.keep(self._ramp, wanted, self.own_offset.to_keep)
 
     def _open_source(self) -> None:
         try:
@@ -250,7 +247,7 @@ class CompensationControl:
 
     def _make_plan(self) -> None:
         payload, rest = self.parameters.payload, self.parameters.rest
-        watched = payload, self.bias, self.keeper.serial
+        watched = payload, self.bias, self._serial
         if watched != self._watched:
             self._watched = watched
             self._payload_watch = PayloadWatch(payload, self._log.warning, rest) if payload.mass else None
@@ -258,31 +255,28 @@ class CompensationControl:
         self.output.plan = Plan(source, Compensator(payload), self._ramp, has_tool, self._payload_watch)
 
     def _is_same_sensor(self) -> bool:
-        return not self.link.is_connected or self.link.info.serial == self.keeper.serial
+        return not self.link.is_connected or self.link.info.serial == self._serial
 
     def _follow_sensor(self) -> None:
-        """Find the bias of the connected sensor."""
+        """The bias, and what was before it, are not another sensor's; a fixed one stays."""
         while not self._is_same_sensor():
-            is_another = self.keeper.serial is not None
-            offset = self.own_offset.begin(self.bias)
             serial = self.link.info.serial
-            begin = self.keeper.take(serial, self.bias, self.origin, self.parameters, offset)
-            if begin is not None:
-                self.own_offset.has_bias = begin.is_one
-                problem = self.keeper.problem
-                self._ramp = BiasRamp(begin.bias, self.parameters.bias_ramp_time, begin.taken)
-                self._put(begin.origin, bias=[*begin.bias.values])
-                self.origin, self.keeper.problem = begin.origin, problem
-            elif is_another:
-                # What was before in its history was the other's too.
-                self._ramp = BiasRamp(self.bias, self.parameters.bias_ramp_time)
+            if self._serial is not None:
+                bias = self.bias
+                if self.origin != _FROM_PARAMETER:
+                    self._log.warning(
+                        f"another sensor is there now, serial number {serial}: the bias was the other's and "
+                        "is zero now; tare"
+                    )
+                    bias, self.origin = NO_WRENCH, _FROM_PARAMETER
+                self._ramp = BiasRamp(bias, self.parameters.bias_ramp_time)
+            self.own_offset.begin(self.bias)
+            self._serial = serial
             self._open_source()
             self._make_plan()
-            if not self.keeper.problem and self.bias != NO_WRENCH:
-                self.keeper.keep(self._ramp, self.parameters, self.own_offset.to_keep)
         self._follow_offset()
         if self.bias != self.parameters.bias:
-            self._live.put(bias=[*self.bias.values])  # shifted
+            self._live.put(bias=[*self.bias.values])  # shifted, or zero again
         self._hold()
         if not self._is_same_sensor():
             self.link_changed()

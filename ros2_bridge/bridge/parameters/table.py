@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.client.real_time import HIGHEST_PRIORITY
 from bota_ethercat.health.verdict import LIMITS, Limits
 from bota_ethercat.pdo import ImuUnits, Vector3
-from ft_compensation.outputs import LEAST_CUTOFF_HZ, LEAST_NOTCH_HZ, FilterSettings, WrenchTransform
+from ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
 from ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
@@ -157,9 +157,6 @@ PARAMETERS: Final = (
     Row("bias", (0.0,) * 6,
         "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6, lengths=(6,)),
     Row("bias_ramp_time", 0.5, "Seconds in which a new bias replaces the old one; 0 = at once", 0, 60),
-    Row("bias_keep", False, "Whether the bias is kept across restarts, by the sensor's serial number"),
-    Row("bias_directory", AUTO,
-        "Where it is kept; auto = bota-ethercat-bridge in $XDG_STATE_HOME or ~/.local/state"),
     Row("imu_position", ZERO,
         "Position in frame_id of the IMU that gravity_source names, m; zeros = that of the sensor's model",
         0, 1, lengths=(3,)),
@@ -198,12 +195,9 @@ PARAMETERS: Final = (
     Row("rest.acceleration_drift", _REST.acceleration_drift,
         "Largest drift of the mean at rest, m/s²", 0, 100),
     Row("filter.cutoff", 0.0, "Low-pass of wrench_filtered, -3 dB, Hz; 0 = no such topic", 0, 1000),
-    Row("filter.notch", 0.0, "Center of its notch, Hz; 0 = none", 0, 1000),
-    Row("filter.notch_width", 5.0, "Width of the notch between -3 dB points, Hz", 0.1, 1000),
-    Row("filter.dead_band_force", 0.0, "Subtracted from the magnitude of its force, N; 0 = none", 0, 1e6),
-    Row("filter.dead_band_torque", 0.0, "Subtracted from the magnitude of its torque, Nm; 0 = none", 0, 1e6),
     Row("identify.file", AUTO,
-        "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bias_directory"),
+        "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bota-ethercat-bridge "
+        "of $XDG_STATE_HOME or ~/.local/state"),
 )  # fmt: skip
 
 
@@ -239,8 +233,6 @@ class Parameters(NamedTuple):
     gravity: Vector3
     bias: Wrench
     bias_ramp_time: float
-    bias_keep: bool
-    bias_directory: str
     imu_position: Vector3
     on_saturation: str
     gravity_source: str
@@ -251,8 +243,8 @@ class Parameters(NamedTuple):
     accelerometer: Accelerometer
     rest_duration: float
     rest: StationaryLimits
+    filter_cutoff: float
     identify_file: str
-    filter: FilterSettings
 
 
 def gather(given: Mapping[str, Any]) -> Parameters:
@@ -281,11 +273,11 @@ def gather(given: Mapping[str, Any]) -> Parameters:
         values["orientation.mounting"] = unit_quaternion(mounting)
     except ValueError as error:
         raise ParameterError(f"parameter orientation.mounting is {list(mounting)}: {error}") from None
-    for name, least in (("filter.cutoff", LEAST_CUTOFF_HZ), ("filter.notch", LEAST_NOTCH_HZ)):
-        if 0.0 < values[name] < least:
-            raise ParameterError(
-                f"parameter {name} is {values[name]:g}: it must be 0, for none, or at least {least:g} Hz"
-            )
+    if 0.0 < (cutoff_hz := values["filter.cutoff"]) < LEAST_CUTOFF_HZ:
+        raise ParameterError(
+            f"parameter filter.cutoff is {cutoff_hz:g}: it must be 0, for none, or at least "
+            f"{LEAST_CUTOFF_HZ:g} Hz"
+        )
 
     def group(prefix: str) -> dict[str, Any]:
         return {name.removeprefix(prefix): values.pop(name) for name in given if name.startswith(prefix)}
@@ -302,7 +294,6 @@ def gather(given: Mapping[str, Any]) -> Parameters:
         "accelerometer": Accelerometer(**group("accelerometer.")),
         "rest_duration": rest.pop("duration"),
         "rest": StationaryLimits(**rest),
-        "filter": FilterSettings(**group("filter.")),
     }
     return Parameters(**groups, **{name.replace(".", "_"): value for name, value in values.items()})
 

@@ -24,7 +24,7 @@ from bridge.parameters.table import Parameters, WrenchFrame
 from bridge.publishing.messages import Stamps, Topic
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
-from ft_compensation.outputs import FilterSettings, WrenchFilter, WrenchTransform
+from ft_compensation.outputs import WrenchFilter, WrenchTransform
 from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError
 from ft_compensation.stationary import StationaryWindow, triple
@@ -161,18 +161,18 @@ class FilteredTopic:
         self.problem = ""
         self._topic: WrenchTopic | None = None
         self._filter = WrenchFilter()
-        self._designed: tuple[FilterSettings, float] | None = None
+        self._designed: tuple[float, float] | None = None
         self.configure(parameters)
 
     def configure(self, parameters: Parameters) -> None:
         """Take other settings from the next sample on; for the executor's thread."""
-        self._settings = parameters.filter
-        if self._settings.cutoff and self._topic is None:
+        self._cutoff_hz = parameters.filter_cutoff
+        if self._cutoff_hz and self._topic is None:
             self._topic = WrenchTopic(self._node, "wrench_filtered", self._frame_id, self._stamps)
 
     def is_wanted(self) -> bool:
         """Whether it is configured and anybody has subscribed."""
-        if self._topic is None or not self._settings.cutoff:
+        if self._topic is None or not self._cutoff_hz:
             return False
         wanted = self._topic.is_wanted()
         if not wanted and self._rate_hz():
@@ -181,26 +181,25 @@ class FilteredTopic:
 
     def _is_ready(self) -> bool:
         """Whether there is a filter for the current settings and sampling rate."""
-        settings, rate_hz = wanted = self._settings, self._rate_hz()
+        cutoff_hz, rate_hz = wanted = self._cutoff_hz, self._rate_hz()
         if wanted != self._designed:
             self._designed = wanted
             try:
-                self._design(settings, rate_hz)
+                self._design(cutoff_hz, rate_hz)
                 self.problem = ""
             except CompensationError as error:
                 self.problem = f"wrench_filtered has stopped: {error}"
                 self._node.get_logger().warning(self.problem)
         return not self.problem
 
-    def _design(self, settings: FilterSettings, rate_hz: float) -> None:
-        if not settings.cutoff or not rate_hz:
-            why = "the server does not report the sampling rate" if settings.cutoff else "filter.cutoff is 0"
+    def _design(self, cutoff_hz: float, rate_hz: float) -> None:
+        if not cutoff_hz or not rate_hz:
+            why = "the server does not report the sampling rate" if cutoff_hz else "filter.cutoff is 0"
             raise CompensationError(why)
-        self._filter.design(settings, rate_hz)
-        notch = f", notch {settings.notch:g} Hz" if settings.notch else ""
+        self._filter.design(cutoff_hz, rate_hz)
         self._node.get_logger().info(
             f"wrench_filtered is delayed by {self._filter.delay_s * 1e3:.1f} ms: cut-off "
-            f"{settings.cutoff:g} Hz{notch}, sampling rate {rate_hz:g} Hz"
+            f"{cutoff_hz:g} Hz, sampling rate {rate_hz:g} Hz"
         )
 
     def note(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:

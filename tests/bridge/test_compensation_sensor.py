@@ -1,0 +1,175 @@
+"""The bias as the sensor, or its own offset, becomes another, also while a tare waits; in simulated time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from ft_compensation.quantities import NO_PAYLOAD, Wrench
+from tests.bridge.simulated_node import QUICK, UP, ZERO6, Node, Server, Stages, six
+from tests.compensation.making import BIAS
+
+
+class Sensor(Server):
+    """Upright and without a tool, and its bias is BIAS."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.set_offset([0.0] * 6)
+
+    def replace(self, serial: int) -> None:
+        """Another sensor is there."""
+        self.description["sensors"][0]["serial"] = serial
+        self.drop()
+
+    def set_offset(self, offset: list[float] | None, *, tell: bool = False) -> None:
+        """As another client's tare does it: the sensor adds that from now on; `tell`: the server says so."""
+        if tell:
+            self.send_json({"event": "offset_changed", "sensor": 0, "offset": offset})
+        self.hold(UP, payload=NO_PAYLOAD, bias=BIAS.plus(Wrench.of(offset or ZERO6)))
+        self.description["sensors"][0]["offset"] = offset
+
+
+@pytest.fixture
+def sensor() -> Sensor:
+    return Sensor()
+
+
+@pytest.fixture
+def node(sensor: Sensor) -> Iterator[Node]:
+    with Node(sensor, **QUICK) as started:
+        started.run(0.1)
+        yield started
+
+
+@pytest.fixture
+def stages(node: Node) -> Stages:
+    return Stages(node)
+
+
+def test_nothing_of_one_sensor_is_used_for_another(sensor: Sensor, node: Node, stages: Stages) -> None:
+    node.do("tare")
+    sensor.drop()  # the same sensor comes back: its bias stays
+    stages.forget()
+    assert stages.first() == pytest.approx(ZERO6, abs=1e-3)
+    assert sensor.connections == 2
+    node.do("identify/start")
+    node.do("identify/add_pose")
+    sensor.replace(2)
+    stages.forget()
+    assert stages.first() == pytest.approx(BIAS.values, abs=1e-3)
+    assert "another sensor is there now, serial number 2: the bias was the other's" in node.log
+    assert list(node.parameters("bias")[0]) == ZERO6
+    assert node.trigger("undo_tare") == (False, "there is no change of the bias to undo")
+    node.refuse("identify/add_pose", "another sensor is there now, so the previous poses were dropped")
+    node.refuse("identify/add_pose", "no identification was started")
+    # A bias that is given is any sensor's.
+    node.set("bias", [*BIAS.values])
+    sensor.replace(3)
+    stages.settle(ZERO6)
+
+
+def test_a_change_of_the_sensors_own_offset_shifts_the_bias(
+    sensor: Sensor, node: Node, stages: Stages
+) -> None:
+    new = [-1.5, 2.25, 9.75, 0.5, 0.25, -0.125]
+    node.do("tare")
+    stages.settle(ZERO6)
+    stages.forget()
+    sensor.set_offset(new, tell=True)
+    node.run(0.2)
+    worst = max(abs(value) for message in stages.final for value in six(message))
+    assert len(stages.final) == 20
+    assert worst < 1e-3, "in no sample"
+    shifted = [b + o for b, o in zip(BIAS.values, new, strict=True)]
+    assert list(node.parameters("bias")[0]) == pytest.approx(shifted, abs=1e-4)
+    assert "the sensor's own offset was changed by Fx -1.5000 Fy 2.2500" in node.log
+    node.until(compensation="ok")
+    sensor.set_offset([1.0] * 6)  # while the node is away, too
+    sensor.drop()
+    stages.settle(ZERO6)
+    # What a client that does not ask the server has done is not known.
+    sensor.send_json({"event": "sensor_back", "sensor": 0, "offset": None})
+    node.until("the sensor's own offset is no longer known", compensation="warn")
+    sensor.send_json({"event": "sensor_back", "sensor": 0, "offset": [1.0] * 6})
+    node.until(compensation="ok")
+
+
+def test_an_offset_that_was_not_known_puts_the_bias_in_doubt(sensor: Sensor, node: Node) -> None:
+    """As of a server that was too old to tell it."""
+    sensor.set_offset(None, tell=True)
+    node.run(0.1)
+    node.do("tare")
+    node.until(compensation="ok")
+    sensor.set_offset([0.0] * 6)
+    sensor.drop()
+    node.until("was unknown when the bias was taken", compensation="warn")
+    node.do("tare")
+    node.until(compensation="ok")
+
+
+def test_no_bias_is_not_shifted(sensor: Sensor, node: Node, stages: Stages) -> None:
+    """Nor is what ~/clear_tare leaves; ~/undo_tare goes back to none."""
+
+    def check(offset: float) -> None:
+        sensor.set_offset([offset] * 6, tell=True)
+        stages.settle([b + offset for b in BIAS.values])
+        assert list(node.parameters("bias")[0]) == ZERO6
+
+    check(1.0)
+    node.do("tare")
+    node.do("clear_tare")
+    check(2.0)
+    node.do("tare")
+    sensor.set_offset([3.0] * 6, tell=True)
+    stages.settle(ZERO6)
+    node.do("undo_tare")
+    check(3.0)
+
+
+def test_a_zero_that_was_measured_is_a_bias(sensor: Sensor, node: Node, stages: Stages) -> None:
+    """The sensor's tare and then the node's, or a shift, may leave a bias of exactly 0."""
+    sensor.set_offset([-b for b in BIAS.values], tell=True)
+    node.run(0.1)
+    node.do("tare")
+    assert list(node.parameters("bias")[0]) == pytest.approx(ZERO6, abs=1e-9)
+    sensor.set_offset([0.0] * 6, tell=True)
+    stages.settle(ZERO6)
+
+
+# While a tare waits for its samples, as the executor, which would look at the sensor, does.
+
+
+def test_an_offset_that_changes_while_a_tare_waits(sensor: Sensor, node: Node) -> None:
+    node.do("identify/start")
+    node.at(0.1, lambda: sensor.set_offset([1e-3] * 6, tell=True))
+    assert node.trigger("tare") == (False, "the sensor's own offset was changed meanwhile: call again")
+    node.refuse("identify/add_pose", "the sensor's own offset was changed, so the previous poses")
+
+
+def test_a_sensor_that_is_replaced_while_a_tare_waits(sensor: Sensor, node: Node) -> None:
+    node.at(0.2, lambda: sensor.replace(2))
+    node.set("rest.duration", 1.0)
+    words = "the sensor was replaced by another meanwhile: call again"
+    assert node.trigger("tare") == (False, words)
+
+
+def test_the_node_ends_while_a_tare_waits(sensor: Sensor, node: Node) -> None:
+    node.set("rest.duration", 30.0)
+    began_ns = sensor.monotonic_ns()
+    node.at(3.0, lambda: node.node.finish(0))
+    assert node.trigger("tare") == (False, "the node ends")
+    assert sensor.monotonic_ns() - began_ns < 3.2e9  # not the 30 s
+
+
+def test_a_limit_to_the_rate_leaves_out_no_sample_of_a_tare(node: Node, stages: Stages) -> None:
+    node.set("publishing_frequency", 10.0)
+    node.set("rest.duration", 1.0)
+    stages.forget()
+    text = node.do("tare")
+    assert len(stages.final) <= 12
+    found = re.match(r"bias of (\d+) samples", text)
+    assert found is not None
+    assert int(found[1]) in range(99, 102)
