@@ -131,8 +131,8 @@ class Player:
 
     def _items(self) -> Iterator[DataMessage | Description | Event]:
         for number, recording in enumerate(self._recordings):
-            if number and recording.metadata.get("part", "0") == "0":
-                self._timeline.begin_again()  # a new recording, not the next part of one
+            if number:
+                self._timeline.begin_again()
             yield from recording.everything()
 
     def _has_subscriber(self) -> bool:
