@@ -67,11 +67,8 @@ def parse(argv: Sequence[str] | None) -> Options:
     )
     add_server(made)
     add = made.add_argument
-    add(
-        "--once",
-        action="store_true",
-        help="observe for a second, print a table and exit; so does output that is no terminal",
-    )
+    add("--once", action="store_true",
+        help="observe for a second, print a table and exit, as it does without a terminal")  # fmt: skip
     add("--json", action="store_true", help="print one JSON object per second; with --once, just one")
     add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
     add_imu_units(made)
