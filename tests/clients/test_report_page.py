@@ -89,7 +89,7 @@ def test_it_can_be_read_without_seeing_it(page: str) -> None:
     reader = Reader(page)
     assert "`" not in "".join(reader.words), "commands are set as code"
     plots = reader.of("svg")
-    assert len(plots) == 8
+    assert len(plots) == 7
     for plot in plots:
         assert plot["role"] == "img"
         assert set(str(plot["aria-labelledby"]).split()) <= set(reader.identifiers)
