@@ -32,7 +32,7 @@ from tests.clients.recordings import frame, record
 from tests.clients.running import Recorder, RecorderProcess, Replay, frames_in, signalled
 from tests.ended import run_here
 from tests.served_simulation import served
-from tests.server.running import PATIENCE_S, free_port, wait_until
+from tests.server.running import PATIENCE_S, wait_until
 
 SECOND = 800
 """Frames of one sensor in a second."""
@@ -356,7 +356,7 @@ def test_a_refusal_is_one_sentence_and_leaves_no_file(endless: Replay, out: Path
         (2, ("x.mcap", "--sensor", "300"), "a position on the bus"),
         *((2, ("x.mcap", f"--for={text}"), "it must be a time such as 30s, 5min or 2h")
           for text in ("0s", "-1s", "30x", "s", "nan", "1e3s")),
-        (1, ("x.mcap", "--server", "localhost:1"), "start ethercat-server, or use --wait"),
+        (1, ("x.mcap", "--server", "localhost:1"), "start ethercat-server"),
         (1, ("/no/x.mcap",), "there is no folder"),
     ],
 )  # fmt: skip
@@ -375,20 +375,6 @@ def test_what_cannot_be_done_is_said(
 )
 def test_a_recording_for_a_time(text: str, seconds: float) -> None:
     assert cli.parse_options(["x.mcap", "--for", text]).seconds == seconds
-
-
-def test_it_waits_for_a_server_if_it_is_told_to_until_it_is_stopped(
-    source: Path, out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    port = free_port()
-    with Recorder(out, port, "--wait", "--no-reconnect") as recorder:
-        wait_until(lambda: "waiting for a server" in capsys.readouterr().err, "a word")
-        with Replay("--speed", "max", source, port=port):
-            assert recorder.wait() == 0
-    assert len(read(out)) == SECOND
-    with Recorder(out.with_name("no.mcap"), free_port(), "--wait") as recorder:
-        assert recorder.stop() == 0
-    assert "nothing was recorded" in capsys.readouterr().err
 
 
 # -- with a server

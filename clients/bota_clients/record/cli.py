@@ -25,7 +25,6 @@ class RecordOptions(argparse.Namespace):
     sensors: list[int] | None  # positions on the bus, ascending; None for all
     seconds: float | None
     force: bool
-    wait: bool
     reconnect: bool
     until_eof: bool
 
@@ -53,7 +52,6 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add("--for", "--seconds", type=typed(_duration, "a time such as 30s, 5min or 2h"), dest="seconds",
         metavar="TIME", help="stop after this time: 30, 30s, 5min, 2h")  # fmt: skip
     add_force(made)
-    add("--wait", action="store_true", help="wait for the server to start")
     add("--no-reconnect", action="store_false", dest="reconnect",
         help="stop when the connection ends, instead of reconnecting")  # fmt: skip
     add("--until-eof", action="store_true",

@@ -26,11 +26,10 @@ from bota_clients.record.cli import RecordOptions
 from bota_clients.record.recorder import BATCH_S, Batch, Recorder, Source, check_path
 from bota_clients.recording.file_format import FORMAT_VERSION
 from bota_clients.recording.reader import Event
-from bota_ethercat.errors import ConnectionFailedError, RefusedError, UnreachableError
+from bota_ethercat.errors import RefusedError, UnreachableError
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import printable
 
-_WAIT_S: Final = 0.2
 _NAME: Final = f"ethercat-record {VERSION}"
 
 _say = partial(say, "ethercat-record")
@@ -43,33 +42,12 @@ def run(options: RecordOptions, signals: Signals) -> int:
     with contextlib.closing(Source(options.address, options.sensors)) as source:
         try:
             check_path(options.path, overwrite=options.force)
-            connected = _connect(source, options, signals)
+            source.connect()
         except UnreachableError as error:
-            raise RecordingError(f"{error.at(options.address)}, or use --wait") from None
+            raise RecordingError(error.at(options.address)) from None
         except RefusedError as error:
             raise RecordingError(f"the server refused: {error}") from None
-        if not connected:
-            _say("stopped before the server started; nothing was recorded")
-            return 0
         return _record(source, options, signals)
-
-
-def _connect(source: Source, options: RecordOptions, signals: Signals) -> bool:
-    """False if it was stopped before."""
-    waiting = False
-    while True:
-        try:
-            source.connect()
-            return True
-        except ConnectionFailedError:
-            if not options.wait:
-                raise
-        if not waiting:
-            _say(f"waiting for a server at {options.address}")
-            waiting = True
-        if signals.asked:
-            return False
-        time.sleep(_WAIT_S)
 
 
 def _record(source: Source, options: RecordOptions, signals: Signals) -> int:
