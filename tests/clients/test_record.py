@@ -20,9 +20,8 @@ import pytest
 from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
-from bota_clients.errors import DiskError
 from bota_clients.record import cli, recorder
-from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch, Parts, Source, Tally
+from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch, Source, Tally
 from bota_clients.recording.file_format import FORMAT_VERSION, frame_topic
 from bota_clients.recording.reader import Description, open_recording
 from bota_ethercat.address import Address
@@ -33,7 +32,7 @@ from tests.clients.recordings import frame, record
 from tests.clients.running import Recorder, RecorderProcess, Replay, frames_in, signalled
 from tests.ended import run_here
 from tests.served_simulation import served
-from tests.server.running import PATIENCE_S, free_port, wait_until
+from tests.server.running import PATIENCE_S, wait_until
 
 SECOND = 800
 """Frames of one sensor in a second."""
@@ -90,18 +89,13 @@ def is_whole(frames: list[DataMessage]) -> bool:
 # -- what it records
 
 
-@pytest.mark.parametrize("stamps", [(), ("--original-stamps",)])
-def test_record_replay_record_gives_the_same_frames(source: Path, out: Path, stamps: tuple[str, ...]) -> None:
-    with Replay(*stamps, "--speed", "max", source) as served:
+def test_record_replay_record_gives_the_same_frames(source: Path, out: Path) -> None:
+    with Replay("--speed", "max", source) as served:
         code, said = run(out, served.port, "--no-reconnect")
         assert served.wait() == 0
     assert code == 0, said
     assert "nothing was lost" in said
-    original, again = read(source), read(out)
-    if not stamps:
-        original, again = (
-            [f._replace(stamp_ns=0, monotonic_ns=0) for f in part] for part in (original, again)
-        )
+    original, again = ([f._replace(stamp_ns=0, monotonic_ns=0) for f in read(path)] for path in (source, out))
     assert original == again
 
 
@@ -229,7 +223,7 @@ def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
 
 
 def new_recorder(out: Path) -> recorder.Recorder:
-    return recorder.Recorder(Parts(out, None, None, overwrite=False), "test", {"format": FORMAT_VERSION})
+    return recorder.Recorder(out, "test", {"format": FORMAT_VERSION}, overwrite=False)
 
 
 def test_frames_get_into_the_file_before_it_ends(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -327,71 +321,6 @@ def test_a_full_disk_ends_it_with_what_was_written_whole(
 # -- files
 
 
-def test_rotation_loses_nothing_between_the_files(
-    endless: Replay, out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Not even if a file that is finished is taken away."""
-    monkeypatch.setattr(
-        recorder, "time", SimpleNamespace(monotonic=lambda: 10 * time.monotonic(), time_ns=time.time_ns)
-    )
-    first = out.with_name("out_0.mcap")
-    with Recorder(out, endless.port, "--rotate-seconds", "1") as running:
-        wait_until(out.with_name("out_1.mcap").exists, "the second file")
-        first.rename(out.with_name("moved"))
-        wait_until(out.with_name("out_3.mcap").exists, "the fourth file")
-        assert running.stop() == 0
-    said = capsys.readouterr().err
-    assert not out.exists()
-    frames: list[DataMessage] = []
-    for number, part in enumerate([out.with_name("moved"), *sorted(out.parent.glob("out_*.mcap"))]):
-        with open_recording(part) as opened:
-            assert (opened.metadata["part"], opened.cut_off) == (str(number), None)
-            assert [sensor.serial for sensor in opened.sensors] == [100, 101]
-            frames += opened.frames()
-    assert is_whole(frames)
-    assert f"{len(frames)} frames" in said
-
-
-def parts(path: Path, size: float | None = 1000, *, overwrite: bool = False) -> Parts:
-    return Parts(path, size, None, overwrite=overwrite)
-
-
-def test_files_have_the_name_that_was_given_or_numbers(tmp_path: Path) -> None:
-    one = parts(tmp_path / "a.mcap", None)
-    one.open().close()
-    assert [path.name for path in one.made] == ["a.mcap"]
-    assert not one.is_full(10**12)
-    row = parts(tmp_path / "a.mcap")
-    for _ in range(3):
-        row.open().close()
-    assert [path.name for path in row.made] == ["a_0.mcap", "a_1.mcap", "a_2.mcap"]
-    assert [row.is_full(size) for size in (999, 1000)] == [False, True]
-
-
-def test_a_row_is_not_mixed_with_an_older_one(tmp_path: Path) -> None:
-    for number in range(4):
-        (tmp_path / f"a_{number}.mcap").write_text("old")
-    (tmp_path / "a_b.mcap").write_text("other")
-    with pytest.raises(DiskError, match="exists"):
-        parts(tmp_path / "a.mcap").check()
-    made = parts(tmp_path / "a.mcap", overwrite=True)
-    made.check()
-    made.open().close()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a_0.mcap", "a_b.mcap"]
-
-
-def test_a_row_that_is_being_written_is_not_replaced(tmp_path: Path) -> None:
-    first = parts(tmp_path / "a.mcap")
-    first.open().close()
-    writing = first.open()
-    with pytest.raises(DiskError, match=r"a_1.mcap .* another ethercat-record is writing to it"):
-        parts(tmp_path / "a.mcap", overwrite=True).open()
-    assert [path.exists() for path in first.made] == [True, True], "none is gone"
-    writing.close()
-    parts(tmp_path / "a.mcap", overwrite=True).open().close()
-    assert [path.exists() for path in first.made] == [True, False]
-
-
 def test_nothing_is_overwritten_unasked_or_by_two(endless: Replay, out: Path) -> None:
     out.write_text("precious")
     code, said = run(out, endless.port, "--seconds", "0.3")
@@ -409,16 +338,13 @@ def test_nothing_is_overwritten_unasked_or_by_two(endless: Replay, out: Path) ->
 # -- arguments and servers that are not there
 
 
-@pytest.mark.parametrize("rotate", [(), ("--rotate-size", "1M")])
-def test_a_refusal_is_one_sentence_and_leaves_no_file(
-    endless: Replay, out: Path, rotate: tuple[str, ...]
-) -> None:
-    code, said = run(out, endless.port, "--sensor", "3", "--seconds", "30", *rotate)
+def test_a_refusal_is_one_sentence_and_leaves_no_file(endless: Replay, out: Path) -> None:
+    code, said = run(out, endless.port, "--sensor", "3", "--seconds", "30")
     assert code == 1
     assert said.splitlines()[-1] == "ethercat-record: the server has no sensor 3 (it has: 0, 1)"
     assert "nothing was lost" not in said
     assert not list(out.parent.glob("out*.mcap"))
-    assert run(out, endless.port, "--sensor", "1", "--seconds", "0.3", *rotate)[0] == 0
+    assert run(out, endless.port, "--sensor", "1", "--seconds", "0.3")[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -426,14 +352,11 @@ def test_a_refusal_is_one_sentence_and_leaves_no_file(
     [
         (2, (), "required"),
         (2, ("x.mcap", "localhost:99999"), "99999 is no port: it must be from 1 to 65535"),
-        (2, ("x.mcap", "--seconds", "-1"), "a number of seconds"),
-        (2, ("x.mcap", "--seconds", "nan"), "a number of seconds"),
-        (2, ("x.mcap", "--rotate-size", "10"), "at least 100k"),
-        (2, ("x.mcap", "--rotate-seconds", "0.1"), "at least 1 s"),
+        (2, ("x.mcap", "--seconds", "-1"), "it must be a time such as"),
         (2, ("x.mcap", "--sensor", "300"), "a position on the bus"),
         *((2, ("x.mcap", f"--for={text}"), "it must be a time such as 30s, 5min or 2h")
           for text in ("0s", "-1s", "30x", "s", "nan", "1e3s")),
-        (1, ("x.mcap", "--server", "localhost:1"), "start ethercat-server, or use --wait"),
+        (1, ("x.mcap", "--server", "localhost:1"), "start ethercat-server"),
         (1, ("/no/x.mcap",), "there is no folder"),
     ],
 )  # fmt: skip
@@ -452,20 +375,6 @@ def test_what_cannot_be_done_is_said(
 )
 def test_a_recording_for_a_time(text: str, seconds: float) -> None:
     assert cli.parse_options(["x.mcap", "--for", text]).seconds == seconds
-
-
-def test_it_waits_for_a_server_if_it_is_told_to_until_it_is_stopped(
-    source: Path, out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    port = free_port()
-    with Recorder(out, port, "--wait", "--no-reconnect") as recorder:
-        wait_until(lambda: "waiting for a server" in capsys.readouterr().err, "a word")
-        with Replay("--speed", "max", source, port=port):
-            assert recorder.wait() == 0
-    assert len(read(out)) == SECOND
-    with Recorder(out.with_name("no.mcap"), free_port(), "--wait") as recorder:
-        assert recorder.stop() == 0
-    assert "nothing was recorded" in capsys.readouterr().err
 
 
 # -- with a server

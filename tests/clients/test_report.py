@@ -191,8 +191,6 @@ def test_the_share_of_lost_samples_is_told() -> None:
     assert lost / (lost + examination.series.count) == pytest.approx(0.02, abs=0.006)
     assert lost + examination.series.count == pytest.approx(20 * 100, abs=10), "none is counted twice"
     assert "All of them never reached the server" in check_of(examination, "Lost samples").found
-    assert examination.spectrum is not None
-    assert examination.spectrum.filled == pytest.approx(lost, abs=5)
 
 
 def test_a_sensor_that_never_gave_anything_new_is_no_healthy_one() -> None:
@@ -347,20 +345,6 @@ def test_a_rate_that_chop_divides_is_that_of_the_report() -> None:
         "sampling rate 400 Hz",
         "force and torque: cut-off not in the table, delay unknown: CHOP",
     ]
-
-
-def test_the_spectrum_is_a_density_over_the_frequency(healthy: Subject) -> None:
-    time = np.arange(len(healthy.columns)) / 400
-    noise = np.random.default_rng(1).normal(scale=2.0, size=len(time))
-    force = np.column_stack([noise, noise + 30 * np.sin(2 * np.pi * 60 * time) + 5 * time, 0 * time])
-    spectrum = Examination(changed(healthy, force=force)).spectrum
-    assert spectrum is not None
-    assert spectrum.frequency[-1] == pytest.approx(200, rel=1e-3)
-    power = spectrum.density[:, :3] ** 2 * spectrum.resolution_hz
-    assert power[:, 0].sum() == pytest.approx(noise.var(), rel=0.04), "its integral is the variance"
-    assert power[:, 1].sum() == pytest.approx(noise.var() + 450, rel=0.04), "the line is subtracted"
-    assert spectrum.frequency[power[:, 1].argmax()] == pytest.approx(60, abs=spectrum.resolution_hz)
-    assert np.isnan(power[:, 2]).all(), "of a constant there is none"
 
 
 def test_limits_are_botas_at_the_published_lengths_and_between_them_in_between() -> None:

@@ -1,4 +1,4 @@
-"""`ethercat-monitor`: command line, and the view that it asks for: live, lines, once, JSON, or a page.
+"""`ethercat-monitor`: command line, and the view that it asks for: live, a table, JSON, or a page.
 
 Exit codes: 0 fine, 1 not, 2 wrong usage.
 """
@@ -16,10 +16,10 @@ from collections.abc import Sequence
 from typing import Final
 
 from bota_clients.arguments import add_imu_units, add_server, address, parser, seconds, server_of
-from bota_clients.monitor.model import Model, clock_text
+from bota_clients.monitor.model import Model
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.web.hub import is_loopback
-from bota_clients.monitor.words import json_line, trouble, verdict
+from bota_clients.monitor.words import json_line, verdict
 from bota_clients.program import discard_output, interrupt_on_signals, not_installed
 from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.health.verdict import Level
@@ -67,8 +67,8 @@ def parse(argv: Sequence[str] | None) -> Options:
     )
     add_server(made)
     add = made.add_argument
-    add("old", nargs="?", help=argparse.SUPPRESS)  # HOST:PORT without --server
-    add("--once", action="store_true", help="observe for a second, print a table and exit")
+    add("--once", action="store_true",
+        help="observe for a second, print a table and exit, as it does without a terminal")  # fmt: skip
     add("--json", action="store_true", help="print one JSON object per second; with --once, just one")
     add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
     add_imu_units(made)
@@ -77,7 +77,7 @@ def parse(argv: Sequence[str] | None) -> Options:
         help=f"show it in a browser instead, on this port of this machine (default {DEFAULT_WEB.port})",
     )  # fmt: skip
     options = made.parse_args(argv, Options())
-    options.address = server_of(made, options.server, options.old)
+    options.address = server_of(made, options.server)
     if options.once and options.seconds is not None:
         made.error("--seconds cannot be combined with --once")
     if options.web is not None and (options.once or options.json):
@@ -104,6 +104,7 @@ def run(options: Options) -> int:
         sys.stdin.isatty() and sys.stdout.isatty() and os.environ.get("TERM", "dumb") not in {"", "dumb"}
     )
     live = terminal and not options.once and not options.json
+    options.once = options.once or not (live or options.json)
     if live:
         import bota_clients.monitor.app  # noqa: PLC0415
     else:
@@ -156,22 +157,10 @@ def _live(options: Options, model: Model) -> int:
 
 
 def _each_second(options: Options, model: Model) -> int:
-    """An object, or a line per sensor; trouble with the server is reported once."""
-    from bota_clients.monitor.screen import line  # noqa: PLC0415
-
-    was_wrong = False
     for _ in itertools.count() if options.seconds is None else range(math.ceil(options.seconds)):
         time.sleep(_PERIOD_S)
-        state, now = model.state(time.monotonic()), clock_text()
-        wrong = trouble(state.server)
-        if options.json:
-            _say(json_line(state, time.time()))
-            model.reset()  # peaks and warnings of the next line are those of its own second
-        elif wrong is None:
-            _say(*(line(sensor, now) for sensor in state.sensors))
-        elif not was_wrong:
-            _say(f"{now}  server {wrong}")
-        was_wrong = wrong is not None
+        _say(json_line(model.state(time.monotonic()), time.time()))
+        model.reset()  # peaks and warnings of the next line are those of its own second
     return 0
 
 

@@ -102,23 +102,6 @@ def table(state: State) -> list[str]:
     return [*lines, "", f"{level.words.capitalize()}: {what}."]
 
 
-def line(sensor: SensorState, now: str) -> str:
-    """One sensor in one line, at this time of day."""
-    parts = [now, f"sensor {sensor.position}"]
-    sample = sensor.sample
-    if sample is None:
-        parts.append("no sample yet")
-    else:
-        for name, unit, values in zip("FM", sensor.units, (sample.force, sample.torque), strict=True):
-            shown = " ".join(numbers.quantity(value, words.DIGITS[unit]) for value in values)
-            parts.append(f"{name} {shown} {unit}")
-        parts.append(f"{sample.temperature:.1f} °C")
-    parts += [words.rate(sensor), f"age {words.times(sensor.age_us)}"]
-    parts.append(f"lost {words.count(sensor.lost_on_bus)}+{sensor.missed} repeated {sensor.repeated}")
-    parts += [f"{alert.level.words}: {alert.text}" for alert in sensor.alerts if alert.ago_s is None]
-    return "  ".join(parts)
-
-
 def _help() -> list[Text]:
     rows = [Text.assemble((f"  {key}  ", VALUE), (name.ljust(8), LABEL), what) for key, name, what in KEYS]
     return [*rows, *map(Text, _HELP.splitlines())]

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
-from bota_clients.arguments import add_force, add_server, number, parser, position, seconds, server_of, typed
+from bota_clients.arguments import add_force, add_server, parser, position, server_of, typed
 from bota_clients.program import Signals, start
 from bota_ethercat.address import Address
 from bota_ethercat.program.server_choice import is_address
+
+_UNITS_S: Final = {"": 1, "s": 1, "min": 60, "h": 3600}
 
 
 class RecordOptions(argparse.Namespace):
@@ -22,36 +24,16 @@ class RecordOptions(argparse.Namespace):
     address: Address
     sensors: list[int] | None  # positions on the bus, ascending; None for all
     seconds: float | None
-    rotate_size: float | None  # bytes
-    rotate_seconds: float | None
     force: bool
-    wait: bool
     reconnect: bool
     until_eof: bool
 
 
-def _scaled(
-    form: str, units: Mapping[str, int], low: float, high: float, what: str
-) -> Callable[[str], float]:
-    """The type of an argument that is a number with a unit."""
-
-    def convert(text: str) -> float:
-        match = re.fullmatch(form, text, re.ASCII)
-        if match and low <= (value := float(match[1]) * units[match[2]]) <= high:
-            return value
-        raise ValueError
-
-    return typed(convert, what)
-
-
-_duration = _scaled(
-    r"([0-9]+(?:\.[0-9]+)?) ?(s|min|h|)", {"": 1, "s": 1, "min": 60, "h": 3600},
-    1e-9, 1e9, "a time such as 30s, 5min or 2h",
-)  # fmt: skip
-_size = _scaled(
-    r"([0-9]+(?:\.[0-9]+)?)([kMG]?)B?", {"": 1, "k": 10**3, "M": 10**6, "G": 10**9},
-    100_000, math.inf, "a size such as 100M, at least 100k",
-)  # fmt: skip
+def _duration(text: str) -> float:
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?(s|min|h|)", text, re.ASCII)
+    if match and 1e-9 <= (value := float(match[1]) * _UNITS_S[match[2]]) <= 1e9:
+        return value
+    raise ValueError
 
 
 def parse_options(argv: Sequence[str] | None) -> RecordOptions:
@@ -59,7 +41,7 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     made = parser(
         "ethercat-record",
         "Records the unmodified stream of ethercat-server into an MCAP file.",
-        "Ctrl-C ends the recording. SIZE is in bytes, or such as 500k, 100M, 2G.",
+        "Ctrl-C ends the recording.",
         usage="%(prog)s [options] OUT.mcap",
     )
     add = made.add_argument
@@ -67,13 +49,9 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add_server(made)
     add("--sensor", type=position, action="append", dest="sensors", metavar="N",
         help="record only the sensor at this position on the bus; repeatable")  # fmt: skip
-    add("--for", type=_duration, dest="seconds", metavar="TIME", help="stop after this time: 30s, 5min, 2h")
-    add("--seconds", type=seconds, metavar="S", help="the same in seconds")
-    add("--rotate-size", type=_size, metavar="SIZE", help="start a new file when one reaches this size")
-    add("--rotate-seconds", type=number(1, 1e9, "at least 1 s"), metavar="S",
-        help="start a new file every S seconds")  # fmt: skip
+    add("--for", "--seconds", type=typed(_duration, "a time such as 30s, 5min or 2h"), dest="seconds",
+        metavar="TIME", help="stop after this time: 30, 30s, 5min, 2h")  # fmt: skip
     add_force(made)
-    add("--wait", action="store_true", help="wait for the server to start")
     add("--no-reconnect", action="store_false", dest="reconnect",
         help="stop when the connection ends, instead of reconnecting")  # fmt: skip
     add("--until-eof", action="store_true",

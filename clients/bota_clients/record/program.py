@@ -23,14 +23,13 @@ from bota_clients.errors import RecordingError
 from bota_clients.numbers import count, duration
 from bota_clients.program import Signals, say
 from bota_clients.record.cli import RecordOptions
-from bota_clients.record.recorder import BATCH_S, Batch, Parts, Recorder, Source
+from bota_clients.record.recorder import BATCH_S, Batch, Recorder, Source, check_path
 from bota_clients.recording.file_format import FORMAT_VERSION
 from bota_clients.recording.reader import Event
-from bota_ethercat.errors import ConnectionFailedError, RefusedError, UnreachableError
+from bota_ethercat.errors import RefusedError, UnreachableError
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import printable
 
-_WAIT_S: Final = 0.2
 _NAME: Final = f"ethercat-record {VERSION}"
 
 _say = partial(say, "ethercat-record")
@@ -40,46 +39,24 @@ def run(options: RecordOptions, signals: Signals) -> int:
     """Record; returns the exit code."""
     if options.until_eof:
         _stop_at_eof(signals)
-    parts = Parts(options.path, options.rotate_size, options.rotate_seconds, overwrite=options.force)
     with contextlib.closing(Source(options.address, options.sensors)) as source:
         try:
-            parts.check()
-            connected = _connect(source, options, signals)
+            check_path(options.path, overwrite=options.force)
+            source.connect()
         except UnreachableError as error:
-            raise RecordingError(f"{error.at(options.address)}, or use --wait") from None
+            raise RecordingError(error.at(options.address)) from None
         except RefusedError as error:
             raise RecordingError(f"the server refused: {error}") from None
-        if not connected:
-            _say("stopped before the server started; nothing was recorded")
-            return 0
-        return _record(source, options, parts, signals)
+        return _record(source, options, signals)
 
 
-def _connect(source: Source, options: RecordOptions, signals: Signals) -> bool:
-    """False if it was stopped before."""
-    waiting = False
-    while True:
-        try:
-            source.connect()
-            return True
-        except ConnectionFailedError:
-            if not options.wait:
-                raise
-        if not waiting:
-            _say(f"waiting for a server at {options.address}")
-            waiting = True
-        if signals.asked:
-            return False
-        time.sleep(_WAIT_S)
-
-
-def _record(source: Source, options: RecordOptions, parts: Parts, signals: Signals) -> int:
-    recorder = Recorder(parts, _NAME, _notes(options, source))
+def _record(source: Source, options: RecordOptions, signals: Signals) -> int:
+    recorder = Recorder(options.path, _NAME, _notes(options, source), overwrite=options.force)
     console = Console(stderr=True, highlight=False)
     show = partial(console.print, markup=False, soft_wrap=True)
     began, reason = time.monotonic(), "asked to stop"
     with console.status("") as status:
-        show(f"recording {options.address} to {parts.made[0]}; Ctrl-C ends it")
+        show(f"recording {options.address} to {options.path}; Ctrl-C ends it")
         while True:
             batch = source.batch()
             recorder.put(batch)
@@ -102,8 +79,7 @@ def _record(source: Source, options: RecordOptions, parts: Parts, signals: Signa
         recorder.stop(reason)
     if recorder.error is not None:
         _say(str(recorder.error))
-    files = str(parts.made[0]) if len(parts.made) == 1 else f"{parts.made[0]} to {parts.made[-1].name}"
-    _say(f"{files}: {duration(passed_s)}, {_so_far(recorder)}")
+    _say(f"{options.path}: {duration(passed_s)}, {_so_far(recorder)}")
     return int(recorder.error is not None)
 
 

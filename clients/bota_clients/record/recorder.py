@@ -1,9 +1,8 @@
-"""Takes everything that the server sends, in order and across reconnects, counts it and writes it into files.
+"""Takes all that the server sends, in order and across reconnects, counts it and writes it into a file.
 
 In batches, because waking up for each frame would cost more than all other work on it; and writing has a
 thread of its own, so that a slow disk does not delay reading. The queue in between is bounded. What does not
-fit is counted, and an event marks where it is missing. With rotation there are several files, `run_0.mcap`,
-`run_1.mcap`, ...
+fit is counted, and an event marks where it is missing.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import contextlib
 import json
 import math
 import queue
-import re
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,7 +22,7 @@ from bota_clients.errors import DiskError
 from bota_clients.numbers import count
 from bota_clients.recording.file_format import RECORDER
 from bota_clients.recording.reader import Description, Event
-from bota_clients.recording.writer import DiskFile, RecordingWriter, remove
+from bota_clients.recording.writer import DiskFile, RecordingWriter
 from bota_ethercat.accounting import StreamAccounting, StreamCounts
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client, Connected, Disconnected
@@ -144,77 +142,35 @@ class Tally:
         return ", ".join(found) or "nothing was lost"
 
 
-class Parts:
-    """Names and opens the files, and decides when to start the next."""
-
-    def __init__(self, path: Path, size: float | None, seconds: float | None, *, overwrite: bool) -> None:
-        """A new file after `size` bytes or `seconds`, whichever is first; one file if both are None."""
-        self.path = path
-        self.made: list[Path] = []
-        self._rotate = (size, seconds) != (None, None)
-        self._size = math.inf if size is None else size
-        self._seconds = math.inf if seconds is None else seconds
-        self._overwrite = overwrite
-        self._opened = 0.0
-
-    def check(self) -> None:
-        """DiskError if a file exists and may not be overwritten, or the folder does not exist."""
-        if not self.path.parent.is_dir():
-            raise DiskError(f"{self.path} cannot be created: there is no folder {self.path.parent}")
-        if self.path.is_dir():
-            raise DiskError(f"{self.path} is a folder: name a file in it")
-        found = self._existing()
-        if found and not self._overwrite:
-            raise DiskError(f"{found[0]} {EXISTS}")
-
-    def open(self) -> DiskFile:
-        """The next file; DiskError."""
-        path = self.path
-        if self._rotate:
-            if not self.made:
-                # Leftover files of an older, longer recording would seem to belong to this one.
-                remove(self._existing())
-            path = path.with_name(f"{path.stem}_{len(self.made)}{path.suffix}")
-        disk = DiskFile(path, overwrite=self._overwrite)
-        self.made.append(path)
-        self._opened = time.monotonic()
-        return disk
-
-    def is_full(self, size: int) -> bool:
-        """Whether the file, of `size` bytes, is full."""
-        return size >= self._size or time.monotonic() - self._opened >= self._seconds
-
-    def _existing(self) -> list[Path]:
-        if not self._rotate:
-            return [self.path] if self.path.exists() else []
-        name = re.compile(f"{re.escape(self.path.stem)}_[0-9]+{re.escape(self.path.suffix)}", re.ASCII)
-        return sorted(path for path in self.path.parent.iterdir() if name.fullmatch(path.name))
+def check_path(path: Path, *, overwrite: bool) -> None:
+    """DiskError if the file exists and may not be overwritten, or its folder does not exist."""
+    if not path.parent.is_dir():
+        raise DiskError(f"{path} cannot be created: there is no folder {path.parent}")
+    if path.is_dir():
+        raise DiskError(f"{path} is a folder: name a file in it")
+    if path.exists() and not overwrite:
+        raise DiskError(f"{path} {EXISTS}")
 
 
 class Recorder:
-    """Records batches into files until it is stopped or a file cannot be written.
+    """Records batches into a file until it is stopped or the file cannot be written.
 
     Attributes:
         tally: counters of what was recorded and lost.
         error: why nothing more can be written, or None.
-        saved: number of frames in the files, including the next flush.
+        saved: number of frames in the file, including the next flush.
     """
 
-    def __init__(self, parts: Parts, library: str, notes: Mapping[str, str]) -> None:
-        """Create the first file; DiskError. `notes` become its metadata."""
+    def __init__(self, path: Path, library: str, notes: Mapping[str, str], *, overwrite: bool) -> None:
+        """Create the file; DiskError. `notes` become its metadata."""
         self.tally = Tally()
         self.error: DiskError | None = None
         self.saved = 0
-        self._parts = parts
-        self._library = library
-        self._notes = notes
         self._queue: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
         self._backlog = self._overflow = 0
-        self._description: Description | None = None
-        self._finished_bytes = self._unflushed = 0
-        self._disk: DiskFile
-        self._writer: RecordingWriter
-        self._open_part()
+        self._unflushed = 0
+        self._disk = DiskFile(path, overwrite=overwrite)
+        self._writer = RecordingWriter(self._disk, library, notes)
         self._reason = ""
         self._end_by = math.inf
         self._thread = threading.Thread(target=self._run, name="recorder")
@@ -227,8 +183,8 @@ class Recorder:
 
     @property
     def bytes_written(self) -> int:
-        """Size of all files."""
-        return self._finished_bytes + self._writer.size
+        """Size of the file."""
+        return self._writer.size
 
     def put(self, batch: Batch) -> None:
         """Queue a batch; never blocks."""
@@ -262,7 +218,7 @@ class Recorder:
     def _run(self) -> None:
         try:
             self._record()
-            self._end_part(self._reason)
+            self._finish()
         except DiskError as error:
             self.error = error
             # The failed flush was truncated; of a file that was removed nothing is left.
@@ -294,10 +250,6 @@ class Recorder:
                 flush_at = time.monotonic() + FLUSH_S
                 self._writer.flush()
                 self._unflushed = 0
-                if self._parts.is_full(self._writer.size):
-                    self._end_part("rotated")
-                    self._finished_bytes += self._writer.size
-                    self._open_part()
 
     def _write(self, item: DataMessage | Description | Event) -> None:
         writer = self._writer
@@ -307,7 +259,6 @@ class Recorder:
             self.tally.take(item)
             writer.frame(item)
         elif isinstance(item, Description):
-            self._description = item
             writer.describe(item.stamp_ns, item.reply)
         else:
             if item.by_recorder and item.name == "lost":
@@ -316,18 +267,10 @@ class Recorder:
                 self.tally.start_again()
             writer.event(item.stamp_ns, item.event)
 
-    def _open_part(self) -> None:
-        self._disk = self._parts.open()
-        notes = {**self._notes, "part": str(len(self._parts.made) - 1)}
-        self._writer = RecordingWriter(self._disk, self._library, notes)
-        if self._description is not None:
-            self._writer.describe(time.time_ns(), self._description.reply)
-
-    def _end_part(self, reason: str) -> None:
+    def _finish(self) -> None:
         counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self.tally.sensors.items()}
         dropped = str(self.tally.dropped)
-        self._writer.finish({"reason": reason, "dropped": dropped, "sensors": json.dumps(counts)})
-        self._unflushed = 0
+        self._writer.finish({"reason": self._reason, "dropped": dropped, "sensors": json.dumps(counts)})
 
 
 def _frames_in(batch: Iterable[object]) -> int:

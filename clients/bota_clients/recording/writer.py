@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any, Final, cast
 
@@ -34,32 +34,18 @@ _U32: Final = 0xFFFFFFFF
 
 
 def _open_locked(path: Path, flags: int) -> int:
-    """A descriptor of the file, which is locked until it is closed, and empty if it may be new; OSError."""
+    """A descriptor of the file, which is locked until it is closed, and empty; OSError."""
     fd = os.open(path, flags, 0o666)
     try:
         if _LOCKS:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if flags & os.O_CREAT:
-            os.ftruncate(fd, 0)
+        os.ftruncate(fd, 0)
     except OSError as error:
         os.close(fd)
         if isinstance(error, BlockingIOError):
             raise OSError(error.errno, "another ethercat-record is writing to it") from None
         raise
     return fd
-
-
-def remove(paths: Iterable[Path]) -> None:
-    """Remove these files, or none if one of them is in use (on Windows, those before it); DiskError."""
-    for really in (False, True):
-        for path in paths:
-            try:
-                if _LOCKS:
-                    os.close(_open_locked(path, os.O_RDONLY | os.O_NONBLOCK))
-                if really:
-                    path.unlink()
-            except OSError as error:
-                raise DiskError(f"{path} cannot be replaced: {error.strerror}") from None
 
 
 class DiskFile:

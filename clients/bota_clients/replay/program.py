@@ -68,7 +68,7 @@ class Player:
         self._recordings = recordings
         self._options = options
         self._signals = signals
-        self._timeline = Timeline(options.speed, original=options.original)
+        self._timeline = Timeline(options.speed)
         self._passes = 0  # how often the end of the recordings was reached
         self._serve_by = 0
 
@@ -111,7 +111,6 @@ class Player:
             "recorded_version": first.get("server_version", "?"),
             "pace": "max" if math.isinf(options.speed) else options.speed,
             "loop": options.loop,
-            "stamps": "original" if options.original else "moved",
         }
 
     def _play_once(self) -> bool:
@@ -131,8 +130,8 @@ class Player:
 
     def _items(self) -> Iterator[DataMessage | Description | Event]:
         for number, recording in enumerate(self._recordings):
-            if number and recording.metadata.get("part", "0") == "0":
-                self._timeline.begin_again()  # a new recording, not the next part of one
+            if number:
+                self._timeline.begin_again()
             yield from recording.everything()
 
     def _has_subscriber(self) -> bool:

@@ -3,9 +3,8 @@
 - The time between frames is that of their `monotonic_ns`, divided by the speed, never negative.
 - Where the recorder reconnected, the server may have another monotonic clock: the time between the frames
   before and after is that of their `stamp_ns`.
-- Moved stamps: the first frame's are now, and the others keep their distance to it, exactly at speed 1.
+- Stamps are moved: the first frame's are now, and the others keep their distance to it, exactly at speed 1.
   Sequence numbers continue when the recording starts again.
-- Original stamps: frames are sent as recorded.
 """
 
 from __future__ import annotations
@@ -32,14 +31,11 @@ class Timeline:
     def __init__(
         self,
         speed: float,
-        *,
-        original: bool,
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
         realtime_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """`speed` 1 is the original timing; `original` keeps sequence numbers and stamps."""
+        """`speed` 1 is the original timing."""
         self._speed = speed
-        self._original = original
         self._monotonic_ns = monotonic_ns
         self._realtime_ns = realtime_ns
         self._begun = self._reconnected = False
@@ -63,8 +59,6 @@ class Timeline:
 
     def now(self, frame: DataMessage) -> DataMessage:
         """The frame as it is sent now, whenever it was due."""
-        if self._original:
-            return frame
         return self._numbered(frame, self._realtime_ns(), self._monotonic_ns())
 
     def due(self, frame: DataMessage) -> Due:
@@ -88,8 +82,6 @@ class Timeline:
             self._step_ns = self._scaled(since_ns)
         moment_ns = self._first_at_ns + self._scaled(frame.monotonic_ns - self._base_ns)
         self._last_at_ns = max(self._last_at_ns, moment_ns)
-        if self._original:
-            return Due(self._last_at_ns, frame)
         stamp_ns = self._moved_stamp_ns + self._scaled(frame.stamp_ns - self._first_stamp_ns)
         return Due(self._last_at_ns, self._numbered(frame, stamp_ns, moment_ns))
 

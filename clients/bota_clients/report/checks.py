@@ -21,7 +21,6 @@ from bota_clients.report.measure import (
     FEWEST_WINDOWS,
     Noise,
     measure_noise,
-    measure_spectrum,
 )
 from bota_clients.report.series import CHANNELS, Series, Subject, bits
 from bota_ethercat.health.judge import SATURATIONS, Observation, judge
@@ -46,7 +45,6 @@ class Examination:
         self.subject = subject
         self.series = Series(subject)
         self.noise = measure_noise(self.series)
-        self.spectrum = measure_spectrum(self.series)
         # Of the judge of all programs; the checks beyond it are this report's own.
         self.stream = judge(_observe(self.series))
         self.checks = [check for each in _CHECKS if (check := _made(each, self)) is not None]
@@ -346,7 +344,7 @@ _FEWEST: Final = 100  # samples to judge their intervals by
 _SATURATED: Final = {f"warning {int(row.flag)}" for row in SATURATIONS}
 _CHECKS: Final = (
     _Kind("Lost samples", ["lost"], _FEWEST, _losses,
-          "A controller acts on stale data; spectra and derivatives are wrong there.", good="None."),
+          "A controller acts on stale data; derivatives are wrong there.", good="None."),
     _Kind("Silent or stuck sensor", ["silence", "invalid", "repeated"], 0, _silence,
           "What is published in the meantime is stale."),
     _Kind("Stuck values", [], 1, _stuck, "The channel does not measure.",

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bota_clients.arguments import add_force, add_imu_units, add_server, number, parser, server_of
+from bota_clients.arguments import add_force, add_imu_units, add_server, number, parser, server_of, typed
 from bota_clients.errors import ReportError
 from bota_clients.program import discard_output, interrupt_on_signals, say, start
 from bota_ethercat.address import Address
@@ -61,7 +61,7 @@ def parse_options(argv: Sequence[str] | None) -> ReportOptions:
     add("-o", "--output", type=Path, metavar="REPORT.html",
         help="where to write the page (default: beside the recording, or report.html)")  # fmt: skip
     add_force(made)
-    add("--sensor", type=_choice, metavar="S", help=f"only this sensor: {MEANING}")
+    add("--sensor", type=typed(SensorChoice.parse, MEANING), metavar="S", help=f"only this sensor: {MEANING}")
     add_imu_units(made)
     add("--note", default="", metavar="TEXT", help="a remark for the head of the page")
     add("--json", action="store_true", help="print the checks as JSON")
@@ -80,13 +80,6 @@ def parse_options(argv: Sequence[str] | None) -> ReportOptions:
     if recording is not None and options.output.absolute() == recording.absolute():
         made.error("the report would overwrite the recording: give another name with -o")
     return options
-
-
-def _choice(text: str) -> SensorChoice:
-    try:
-        return SensorChoice.parse(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} must be {error}") from None
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""What is measured of a sensor beside its stream: noise and spectra.
+"""What is measured of a sensor beside its stream: its noise.
 
 Noise is compared with a healthy sensor although the sensor may move and touch things: docs/report.md says
 how. The range of the cubics of force and torque tells contacts and quick motion; if the accelerometer shows
@@ -13,7 +13,6 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from matplotlib import mlab
 
 from bota_clients.recording.columns import Floats, Ints
 from bota_clients.report.series import CHANNELS, Bools, Series, noise_limit
@@ -103,49 +102,3 @@ def _window(time: Floats, values: Floats, usable: Bools) -> Floats:
     deviation[(values == values[0]).all(axis=0)] = 0.0  # the fit leaves rounding errors
     rough = np.median(np.abs(np.diff(values, 2, axis=0)), axis=0) * _TO_DEVIATION
     return np.where(good, [deviation, np.ptp(trend, axis=0), rough], np.nan)
-
-
-_RESOLUTION_S: Final = 2.0  # length of a segment: a resolution of half a hertz
-_SHORTEST: Final = 64  # samples
-_MOST_FILLED: Final = 3  # longest run of missing samples that is interpolated
-
-
-class Spectrum(NamedTuple):
-    """Amplitude spectral density of all channels, by Welch's method from the longest uninterrupted part."""
-
-    frequency: Floats  # (k,) Hz, without 0
-    density: Floats  # (k, 12) unit/√Hz; NaN for a channel that is constant or has no finite values
-    segments: int  # half-overlapping ones, averaged
-    span_s: float  # duration of the part
-    filled: int  # missing samples that were interpolated
-    resolution_hz: float
-
-
-def measure_spectrum(series: Series) -> Spectrum | None:
-    """The spectra; None if no uninterrupted part is long enough."""
-    gap = series.silent | (series.missing > _MOST_FILLED) | (series.intervals <= 0)
-    gap |= series.intervals > (_MOST_FILLED + 1.5) * series.period
-    edges = np.concatenate(([0], np.flatnonzero(gap) + 1, [series.count]))
-    longest = int(np.argmax(np.diff(edges)))
-    part = slice(edges[longest], edges[longest + 1])
-    # On a regular grid, with missing samples interpolated.
-    indices = np.cumsum(np.append(0, 1 + series.missing[part][: part.stop - part.start - 1]))
-    count = int(indices[-1]) + 1
-    values, good = series.values[part], series.finite[part]
-    usable = [n for n in range(len(CHANNELS))
-              if np.count_nonzero(good[:, n]) >= _SHORTEST and np.ptp(values[good[:, n], n]) > 0]  # fmt: skip
-    if not usable:
-        return None
-    # A power of two near the resolution; a short stretch is still averaged a few times.
-    wanted = 2 ** round(np.log2(max(_SHORTEST, _RESOLUTION_S / series.period)))
-    length = max(_SHORTEST, min(wanted, 2 ** int(np.log2(max(1, count // 4)))))
-    density = np.full((length // 2, len(CHANNELS)), np.nan)
-    window = np.hanning(length + 1)[:-1]
-    for n in usable:
-        even = np.interp(np.arange(count), indices[good[:, n]], values[good[:, n], n])
-        power = np.asarray(mlab.psd(even, length, 1 / series.period, "linear", window, length // 2)[0])
-        density[:, n] = np.sqrt(np.maximum(power[1:], np.finfo(float).tiny))  # never 0: the scale is a log
-    resolution_hz = 1 / (length * series.period)
-    frequency = np.arange(1, length // 2 + 1) * resolution_hz
-    segments = 1 + (count - length) // (length // 2)
-    return Spectrum(frequency, density, segments, count * series.period, count - len(values), resolution_hz)

@@ -66,8 +66,8 @@ def _view(examination: Examination) -> dict[str, Any]:
             if (value := subject.settings.get(setting)) is not None
         ],
         "meaning": "; ".join(meaning(subject.settings, rate_hz).lines()),
-        "groups": [(group, bool(series.saturated[:, 3 * at : 3 * at + 3].any()),
-                    plots.cutoffs(series).get(group.name)) for at, group in enumerate(groups)],
+        "groups": [(group, bool(series.saturated[:, 3 * at : 3 * at + 3].any()))
+                   for at, group in enumerate(groups)],
         "noise_rows": _noise_rows(examination),
         "deviations": ", ".join(
             f"{figure(value * 1e6)} µs"

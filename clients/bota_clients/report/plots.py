@@ -16,17 +16,14 @@ import matplotlib as mpl
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from bota_clients.numbers import count, seconds
 from bota_clients.numbers import figure as number
 from bota_clients.recording.columns import Floats, Ints
-from bota_clients.report.measure import Spectrum
 from bota_clients.report.series import GROUPS, Group, Series
 from bota_ethercat.framing import DataFlag
-from bota_ethercat.sensor.meaning import meaning
 
 _VARIABLES: Final = {
     f"#0101{number}": f"--{name}"
@@ -34,7 +31,6 @@ _VARIABLES: Final = {
 }
 INK, MUTED, GRID, X, Y, Z, BAD, LIMIT, PLAIN = _VARIABLES
 AXES: Final = (X, Y, Z)
-DASHES: Final = ("-", "--", ":")  # of x, y and z, so that nothing depends on color
 
 STYLE: Final[dict[str, Any]] = {
     "svg.fonttype": "none",
@@ -51,8 +47,6 @@ STYLE: Final[dict[str, Any]] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.linewidth": 0.6,
-    "axes.titlesize": 9,
-    "axes.titlelocation": "left",
     "axes.formatter.useoffset": False,
     "figure.facecolor": "none",
     "figure.figsize": (9.0, 4.3),  # inches
@@ -62,7 +56,6 @@ STYLE: Final[dict[str, Any]] = {
     "ytick.color": MUTED,
     "xtick.labelcolor": INK,
     "ytick.labelcolor": INK,
-    "legend.frameon": False,
     "lines.linewidth": 1.0,
     "path.simplify_threshold": 0.2,
 }
@@ -126,18 +119,6 @@ def _panels(figure: Figure, series: Series) -> list[Axes]:
         panel.yaxis.set_label_coords(-0.072, 0.5)
     panels[-1].set(xlim=(0, series.width), xlabel="time, s")
     return panels
-
-
-def _axis(panel: Axes, axis: int, time: Floats, values: Floats, width: float) -> None:
-    """The line of x, y or z among others."""
-    panel.plot(time, values, DASHES[axis], color=AXES[axis], linewidth=width, label="xyz"[axis])
-
-
-def _plain_numbers(*axes: Axis) -> None:
-    """Label the decades of logarithmic axes with plain numbers instead of exponents."""
-    for axis in axes:
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter("")
 
 
 BINS: Final = 640  # about the width of a page in points
@@ -205,46 +186,6 @@ def over_time(figure: Figure, series: Series, group: Group) -> str:
     return f"{group.title} in {group.unit} over {seconds(series.duration)}: {', '.join(texts) or 'nothing'}."
 
 
-def cutoffs(series: Series) -> dict[str, float]:
-    """The cut-off frequency of each group's filter, Hz, where it is known."""
-    filters = meaning(series.subject.settings, round(series.subject.rate_hz))
-    imu = {"acceleration": filters.acceleration, "angular_rate": filters.angular_rate}
-    found = {group: float(row.bandwidth_hz) for group, row in imu.items() if row is not None}
-    if filters.cutoff_hz is not None:
-        found["force"] = found["torque"] = float(filters.cutoff_hz)
-    return found
-
-
-def spectra(figure: Figure, series: Series, spectrum: Spectrum) -> str:
-    """Four panels, one for each group; the three axes in it and the cut-off frequency of its filter."""
-    cuts, marked = cutoffs(series), []
-    lowest, highest = float(spectrum.frequency[0]), float(spectrum.frequency[-1])
-    figure.set_figheight(5.4)
-    _margins(figure, top_in=0.25, wspace=0.17)
-    panels = figure.subplots(2, 2, sharex=True).ravel()
-    for index, (group, panel) in enumerate(zip(GROUPS, panels, strict=True)):
-        panel.set(
-            xscale="log", yscale="log", xlim=(lowest, highest), title=f"{group.title}, {group.unit}/√Hz"
-        )
-        for axis, density in enumerate(spectrum.density[:, 3 * index : 3 * index + 3].T):
-            if np.isfinite(density).any():
-                _axis(panel, axis, spectrum.frequency, density, 0.8)
-        _plain_numbers(panel.xaxis, panel.yaxis)
-        if panel.lines:
-            panel.legend(loc="lower left", ncols=3, handlelength=2.2, columnspacing=1.2)
-        if (cut := cuts.get(group.name, np.inf)) < highest:
-            marked.append(f"{group.title}: {cut:g} Hz")
-            panel.axvline(cut, color=LIMIT, linestyle="-.", linewidth=1.2)
-            panel.text(cut, 0.97, f"cut-off {cut:g} Hz ", color=LIMIT, ha="right", va="top",
-                       transform=panel.get_xaxis_transform())  # fmt: skip
-        if index >= 2:
-            panel.set_xlabel("frequency, Hz")
-    return (
-        f"Amplitude spectral density from {number(lowest)} to {number(highest)} Hz. "
-        f"Cut-off marked at {', '.join(marked) or 'no frequency'}."
-    )
-
-
 def temperature(figure: Figure, series: Series) -> str:
     """The mean of each bin."""
     time, low, high, mean = envelope(series.time, series.samples.temperature, series.width)
@@ -277,7 +218,8 @@ def intervals(figure: Figure, series: Series) -> str:
     lower.axvline(0, color=LIMIT, linestyle="--", linewidth=1)
     typical = f"interval minus the typical one of {number(series.period * 1e3, 5)} ms, µs"
     lower.set(xlim=(-reach, reach), xlabel=typical, ylabel="samples")
-    _plain_numbers(lower.yaxis)
+    lower.yaxis.set_major_formatter("{x:g}")  # instead of exponents
+    lower.yaxis.set_minor_formatter("")
     return (
         f"{count(len(deviations), 'interval')} without a loss; the standard deviation is "
         f"{number(deviations.std())} µs, the greatest deviation {number(off.max())} µs; "

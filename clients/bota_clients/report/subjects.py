@@ -16,7 +16,7 @@ import numpy as np
 
 from bota_clients.errors import ReportError
 from bota_clients.numbers import count, listing, moment
-from bota_clients.record.recorder import Parts, Recorder, Source
+from bota_clients.record.recorder import Recorder, Source
 from bota_clients.recording.columns import Columns, columns
 from bota_clients.recording.file_format import FORMAT_VERSION
 from bota_clients.recording.reader import (
@@ -176,7 +176,7 @@ def of_server(
     with TemporaryDirectory() as folder, contextlib.closing(Source(address, None)) as source:
         source.connect()
         path = Path(folder, "live.mcap")
-        recorder = Recorder(Parts(path, None, None, overwrite=False), "", {"format": FORMAT_VERSION})
+        recorder = Recorder(path, "", {"format": FORMAT_VERSION}, overwrite=False)
         begin = time.monotonic()
         while (passed := time.monotonic() - begin) < seconds:
             show(completed=passed)
