@@ -33,9 +33,11 @@ SOL_PACKET, PACKET_AUXDATA, ETH_P_ALL = 263, 8, 3
 
 
 @pytest.fixture
-def bench(veth: tuple[str, str], start: Start) -> Iterator[Bench]:
+def bench(veth: tuple[str, str], start: Start, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     """Starts a virtual sensor with these arguments, and opens a master on the other end."""
     master = pysoem.Master()
+    # SOEM takes a frame for lost after 2 ms, in which a busy machine may not let the sensor's process run.
+    monkeypatch.setattr(pysoem.settings.timeouts, "ret", 500_000)
 
     def made(*arguments: str) -> tuple[VirtualSensor, Any]:
         sensor = start(veth[0], *arguments)
