@@ -8,7 +8,6 @@ found.
 from __future__ import annotations
 
 import contextlib
-import struct
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
@@ -79,7 +78,6 @@ class Slave(NamedTuple):
 
     looked: scan.Slave  # without its SII if another master has the bus
     errors: bytes = bytes(reg.ERROR_COUNTERS_SIZE)  # the registers of its ErrorCounters
-    links: tuple[bool, ...] = (True, False, False, False)  # which ports have one
     watchdogs: int = 0  # number of expired process data watchdogs
     left_alone: bool = False  # its SII was not read, for another master has the bus
 
@@ -87,11 +85,9 @@ class Slave(NamedTuple):
     def look_at(cls, bus: Bus, position: int, *, in_use: bool) -> Slave:
         """The slave at `position`; BusError if it does not answer. `in_use`: another master has the bus."""
         looked = scan.look_at(bus, position)
-        (links,) = struct.unpack("<H", bus.read_surely_at(position, reg.DL_STATUS, 2))
         return cls(
             looked if in_use else scan.with_sii(bus, looked),
             _read_errors(bus, position),
-            tuple(bool(links >> (4 + port) & 1) for port in range(MOST_PORTS)),
             bus.read_surely_at(position, reg.WATCHDOG_COUNTER, 1)[0],
             left_alone=in_use,
         )
@@ -144,21 +140,6 @@ def any_sensor(slaves: Sequence[Slave]) -> Iterator[Finding]:
     may_be = (slave.looked.is_sensor or slave.left_alone or slave.looked.problem for slave in slaves)
     if slaves and not any(may_be):
         yield bad("no Bota Gen-0 sensor", "connect one, or name the interface that it is connected to")
-
-
-def cabling(slaves: Sequence[Slave]) -> Iterator[Finding]:
-    """Whether a connected device does not answer: each cable has two ends, one of them at the interface."""
-    linked = [
-        f"port {port} of slave {slave.looked.position}"
-        for slave in slaves for port, on in enumerate(slave.links) if on
-    ]  # fmt: skip
-    more = len(linked) > 2 * len(slaves) - 1
-    if slaves:
-        yield graded(
-            f"more links than slaves: {', '.join(linked)}" if more else "every link leads to a slave",
-            (more, note, "a device there does not answer: not an EtherCAT slave, or still starting"),
-            links=[list(slave.links) for slave in slaves],
-        )
 
 
 def al_state(slave: Slave) -> Finding:
@@ -559,5 +540,4 @@ def _slaves(machine: Machine, bus: Bus, found: list[Slave]) -> Generator[Finding
             yield from examine("bus", f"slave {position} errors", error_counters, found[-1], count)
     if len(found) == count:
         yield from examine("bus", "sensors", any_sensor, found)
-        yield from examine("bus", "line", cabling, found)
     return count

@@ -11,13 +11,10 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
-import os
 import re
 import shlex
 import socket
 import struct
-import time
-import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -89,9 +86,6 @@ class Machine:
     asked: str = ""  # the name on the command line if it differs: virtual
     facts: dict[str, Any] = field(default_factory=dict)  # those that are known, or why they are not
     root: Path = Path("/")
-    # Of CLOCK_MONOTONIC's timers.
-    timer_resolution_s: float = field(default_factory=lambda: time.clock_getres(time.CLOCK_MONOTONIC))
-    release: str = field(default_factory=lambda: os.uname().release)
     rt_priority: int = 80  # the server's
     cpu: int | None = None  # likewise
     allow_ip: bool = False  # whether an interface of the machine's network may be used
@@ -161,18 +155,6 @@ class Machine:
             return sorted(entry.name for entry in self.path(name).iterdir())
         except OSError:
             return []
-
-    @cached_property
-    def config(self) -> dict[str, str]:
-        """The kernel's build options without CONFIG_; empty if unknown."""
-        try:
-            # Bounded: a made-up file could unpack to anything.
-            unpacking = zlib.decompressobj(16 + zlib.MAX_WBITS)
-            unpacked = unpacking.decompress(self._read("/proc/config.gz"), _MOST_BYTES)
-            text = unpacked.decode("utf-8", errors="replace")
-        except (OSError, zlib.error):
-            text = self.text(f"/boot/config-{self.release}", "")
-        return dict(re.findall(r"^CONFIG_(\w+)=(.*)$", text, re.MULTILINE))
 
     @cached_property
     def processors(self) -> list[int]:

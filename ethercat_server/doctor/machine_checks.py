@@ -60,29 +60,21 @@ def examine_machine(machine: Machine) -> Iterator[Finding]:
 
 
 _SWITCH: Final = "/sys/kernel/debug/sched/preempt"
-# Preemption models and the kernel option that makes each the default.
-_MODELS: Final = {
-    "none": "PREEMPT_NONE", "voluntary": "PREEMPT_VOLUNTARY", "full": "PREEMPT", "lazy": "PREEMPT_LAZY",
-}  # fmt: skip
+_MODELS: Final = ("none", "voluntary", "full", "lazy")  # of preemption
 _GOOD_CLOCKS: Final = frozenset(
     {"tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "xen"}
 )
-_USUAL_RUNTIME_PERCENT: Final = 95
-_FINE_S: Final = 1e-6
 
 
 def _preemption(machine: Machine) -> Finding:
-    version = machine.text("/proc/version", "")
+    version = machine.text("/proc/version")
     if machine.text("/sys/kernel/realtime", "") == "1" or "PREEMPT_RT" in version:
         return ok("fully preemptible (PREEMPT_RT)", model="rt")
-    dynamic = "PREEMPT_DYNAMIC" in version or "PREEMPT_DYNAMIC" in machine.config
+    dynamic = "PREEMPT_DYNAMIC" in version
     switched = re.search(r"\((\w+)\)", machine.text(_SWITCH, ""))
     asked = re.findall(rf"\bpreempt=({'|'.join(_MODELS)})\b", machine.text("/proc/cmdline", "") * dynamic)
-    built = (model for model, option in _MODELS.items() if option in machine.config)
-    usual = "full" if dynamic or "PREEMPT" in version.split() else "voluntary" if version else None
-    model = switched[1] if switched else next(iter((*asked, *built, usual)))
-    if model is None:
-        raise CannotLookError("neither /proc/version nor the kernel's configuration can be read")
+    usual = "full" if "PREEMPT" in version.split() else "voluntary"  # what distributions build
+    model = switched[1] if switched else next(iter((*asked, usual)))
     sure = bool(switched or asked or not dynamic)
     real_time_kernel = "sudo apt install linux-image-rt-amd64"
     if re.search(r"^ID=\"?ubuntu", machine.text("/etc/os-release", ""), re.MULTILINE):
@@ -103,20 +95,6 @@ def _preemption(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _tick(machine: Machine) -> Finding:
-    rate, resolution_s = machine.config.get("HZ"), machine.timer_resolution_s
-    coarse = resolution_s > _FINE_S
-    timers = f"timers resolve {resolution_s * 1e3:.3g} ms" if coarse else "high-resolution timers"
-    return graded(
-        f"{f'tick {rate} Hz' if rate else 'tick rate unknown'}, {timers}",
-        (coarse, bad,
-         "every wake-up is late by up to that: remove highres=off and nohz=off from the kernel command "
-         "line, or use a kernel with CONFIG_HIGH_RES_TIMERS"),
-        why="wake-ups do not depend on the tick",
-        hz=int(rate) if rate and rate.isdecimal() else None, resolution_s=resolution_s,
-    )  # fmt: skip
-
-
 def _clock_source(machine: Machine) -> Finding:
     folder = "/sys/devices/system/clocksource/clocksource0"
     source = machine.text(f"{folder}/current_clocksource")
@@ -131,21 +109,6 @@ def _clock_source(machine: Machine) -> Finding:
         (True, note, f"{slow}; {log}"),
         source=source,
     )
-
-
-def _throttling(machine: Machine) -> Finding:
-    runtime = machine.number("/proc/sys/kernel/sched_rt_runtime_us")
-    period = machine.number("/proc/sys/kernel/sched_rt_period_us")
-    if period <= 0:
-        raise CannotLookError("/proc/sys/kernel/sched_rt_period_us is not positive")
-    mend = f"sudo sysctl kernel.sched_rt_runtime_us={_USUAL_RUNTIME_PERCENT * period // 100}"
-    share = f"real-time programs may use {100 * runtime / period:.0f} % of the CPU time"
-    return graded(
-        "off" if runtime < 0 else share,
-        (runtime < 0, note, "a real-time program in an endless loop blocks its processor", mend),
-        (runtime < period // 2, bad, "the server is suspended for the rest of it", mend),
-        why="more than the server needs", runtime_us=runtime, period_us=period,
-    )  # fmt: skip
 
 
 _NEEDED: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
@@ -254,46 +217,6 @@ def _isolation(machine: Machine) -> Finding:
         why=f"the server's --cpu {max(apart, default=0)} uses it",
         online=len(online), isolated=apart, nohz_full=tickless,
     )  # fmt: skip
-
-
-def _virtualization(machine: Machine) -> Iterator[Finding]:
-    container, virtual = _container(machine), _virtual_machine(machine)
-    if container:
-        yield note(
-            f"in a container ({container})",
-            "privileges (real-time priority, raw sockets) and parts of /sys may be missing: run it with "
-            "--cap-add NET_RAW,NET_ADMIN,SYS_NICE,IPC_LOCK and the interface, or on the host",
-            container=container,
-        )
-    if virtual:
-        yield warning(
-            f"a virtual machine ({virtual})",
-            "the host may suspend it for milliseconds at any time: use a physical machine, or pin its "
-            "processors and pass the network card through",
-            virtual_machine=virtual,
-        )
-    if not container and not virtual:
-        yield ok("neither a virtual machine nor a container", container="", virtual_machine="")
-
-
-def _container(machine: Machine) -> str:
-    environment = machine.text("/proc/1/environ", "").split("\0")
-    named = [text.partition("=")[2] for text in environment if text.startswith("container=")]
-    named.append(machine.text("/run/systemd/container", ""))
-    marks = {"/.dockerenv": "docker", "/run/.containerenv": "podman"}
-    named += [name for mark, name in marks.items() if machine.path(mark).exists()]
-    return next(filter(None, named), "")
-
-
-def _virtual_machine(machine: Machine) -> str:
-    if hypervisor := machine.text("/sys/hypervisor/type", ""):
-        return hypervisor
-    names = (machine.text(f"/sys/class/dmi/id/{name}", "") for name in ("sys_vendor", "product_name"))
-    product = " ".join(filter(None, names))
-    flags = re.search(r"^flags\s*:(.*)$", machine.text("/proc/cpuinfo", ""), re.MULTILINE)
-    if flags and "hypervisor" in flags[1].split():
-        return product or "hypervisor unknown"
-    return product if re.search(r"QEMU|KVM|VMware|VirtualBox|Virtual Machine", product) else ""
 
 
 _ETHERCAT_SPEED: Final = 100
@@ -442,9 +365,6 @@ def _counted(found: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in found.items())
 
 
-_PRIORITY_FIELD: Final = 39  # of /proc/PID/stat, counted from 0: the real-time priority
-
-
 def _affinity(machine: Machine) -> Finding:
     numbers, apart = _interrupts(machine), machine.isolated
     if not numbers and machine.link.kind:
@@ -470,28 +390,6 @@ def _affinity(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _threads(machine: Machine) -> Finding:
-    numbers = _interrupts(machine)
-    if not numbers:
-        return ok("not applicable: no interrupts", threads={})
-    found = {}
-    for pid, name in machine.commands_running().items():
-        match = re.match(r"irq/(\d+)-", name)
-        if match and int(match[1]) in numbers:
-            found[pid] = _priority(machine, pid)
-    if not found:
-        return ok("not threaded", threads={})
-    lowest, wanted = min(found.values()), machine.rt_priority
-    scheduling = f"SCHED_FIFO {lowest}" if lowest else "ordinary scheduling"
-    return graded(
-        f"threads of {scheduling}, the server has {wanted}",
-        (lowest < wanted, note,
-         "the server waits for the card, so the card's interrupt should have the higher priority",
-         *(f"sudo chrt -f -p {min(99, wanted + 5)} {pid}" for pid in found)),
-        threads=found,
-    )  # fmt: skip
-
-
 def _interrupts(machine: Machine) -> list[int]:
     """The numbers of the interface's interrupts, which have its name, or that of a device of its own."""
     names = {machine.ifname, machine.link.parent} - {""}
@@ -506,13 +404,6 @@ def _interrupts(machine: Machine) -> list[int]:
         int(head) for head, _, rest in rows
         if head.strip().isdecimal() and any(map(about.match, rest.replace(",", " ").split()))
     )  # fmt: skip
-
-
-def _priority(machine: Machine, pid: int) -> int:
-    # The name, in brackets, may hold spaces.
-    fields = machine.text(f"/proc/{pid}/stat", "").rpartition(")")[2].split()
-    at = _PRIORITY_FIELD - 2
-    return int(fields[at]) if len(fields) > at and fields[at].isdecimal() else 0
 
 
 _DHCP_CLIENTS: Final = frozenset({"dhclient", "dhcpcd", "udhcpc", "connmand", "wicked"})
@@ -581,14 +472,12 @@ def _membership(machine: Machine) -> Finding:
 
 
 _BY_SUBJECT: Final[Mapping[str, Mapping[str, Look]]] = {
-    "kernel": {"preemption": _preemption, "tick": _tick, "clock source": _clock_source,
-               "real-time throttling": _throttling},
+    "kernel": {"preemption": _preemption, "clock source": _clock_source},
     "rights": {"capabilities": _capabilities},
-    "processors": {"governor": _governor, "idle states": _idle_states, "isolation": _isolation,
-                   "virtualization": _virtualization},
+    "processors": {"governor": _governor, "idle states": _idle_states, "isolation": _isolation},
     "interface": {"link": _link_state, "speed": _speed, "driver": _driver, "coalescing": _coalescing,
                   "offloads": _offloads, "EEE": _energy_efficient_ethernet, "counters": _card_counters,
-                  "interrupts": _affinity, "interrupt threads": _threads},
+                  "interrupts": _affinity},
     "other software": {"managers": _managers, "addresses": _addresses, "membership": _membership},
 }  # fmt: skip
 CHECKS: Final = tuple(

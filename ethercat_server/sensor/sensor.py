@@ -34,19 +34,18 @@ class Identity(NamedTuple):
 
 
 class Found(NamedTuple):
-    """A sensor that was found, or another slave."""
+    """A sensor that was found."""
 
     number: int
     identity: Identity
-    what: str = "sensor"
 
     def __str__(self) -> str:
         """Its description in messages."""
-        return f"{self.what} {self.number}: {self.identity.name}, serial {self.identity.serial}"
+        return f"sensor {self.number}: {self.identity.name}, serial {self.identity.serial}"
 
     def as_json(self) -> dict[str, Any]:
         """Its JSON form."""
-        return {self.what: self.number, **self.identity._asdict()}
+        return {"sensor": self.number, **self.identity._asdict()}
 
 
 class SensorState(Enum):

@@ -66,7 +66,7 @@ def _look(row: Adapter) -> dict[str, Any]:
         if row.holder is not None and row.holder.address is not None:
             where = f" (through the server at {row.holder.address}, {row.holder})"
             with contextlib.closing(Sensors.through(row.holder.address)) as server:
-                for number, who, _ in server.sensors:
+                for number, who in server.sensors:
                     sensors.append({"sensor": number, "name": who.name, "serial": who.serial})
         elif why := used or row.unfit:
             return found | {"found": f"left alone: {why}"}

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NoReturn
 
-from bota_ethercat.program.completion import OPTION, add_completion
+from bota_ethercat.program.completion import add_completion
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server import __version__
 from ethercat_server.process import command_line
@@ -58,17 +58,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("command", choices=list(COMMANDS), metavar="COMMAND", help="see below")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    add_completion(parser, _build_whole_parser)
+    add_completion(parser)
     return parser
-
-
-def _build_whole_parser() -> argparse.ArgumentParser:
-    """All subcommands in one, for the shell's completion."""
-    whole = _Parser(prog=_PROGRAM)
-    commands = whole.add_subparsers()
-    for command in COMMANDS.values():
-        command.add_arguments(commands.add_parser(command.name, help=command.summary))
-    return whole
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -78,10 +69,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     # The subcommand has a parser of its own, with options and arguments in any order.
     _Parser.as_json = "--json" in arguments
     parser = build_parser()
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+    named = bool(arguments) and not arguments[0].startswith("-")
+    if named and arguments[0] not in COMMANDS:
         guess = did_you_mean(arguments[0], COMMANDS)
         parser.error(f"no command {arguments[0]!r}: there are {', '.join(COMMANDS)}{guess}")
-    command = COMMANDS[parser.parse_args(arguments[: 2 if arguments[:1] == [OPTION] else 1]).command]
+    command = COMMANDS[parser.parse_args(arguments[:1] if named else arguments).command]
     description = f"{command.summary[0].upper()}{command.summary[1:]}."
     parser = _Parser(prog=f"{_PROGRAM} {command.name}", description=description, epilog=_EXIT_CODES)
     command.add_arguments(parser)

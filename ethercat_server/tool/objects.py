@@ -9,16 +9,10 @@ from typing import Any, Final
 
 from bota_ethercat.pdo import INPUT_OBJECT
 from bota_ethercat.sensor.meaning import value_meaning
-from ethercat_server.access.private_server import open_interface
-from ethercat_server.access.sensors import find_server, note
+from ethercat_server.access.sensors import note
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError, UsageError
-from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.datagrams import ByPosition
-from ethercat_server.ethercat.slave import registers as reg
-from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.slave.coe import MailboxSdo, Sdo, Steps, finish
+from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
 from ethercat_server.process.command_line import FAILED
-from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import (
     FACTORY_CALIBRATION,
     KNOWN_OBJECTS,
@@ -26,8 +20,7 @@ from ethercat_server.sensor.objects.dictionary import (
     find_objects,
     similar_names,
 )
-from ethercat_server.sensor.scan import look_safely
-from ethercat_server.sensor.sensor import Found, Identity
+from ethercat_server.sensor.sensor import Found
 from ethercat_server.sensor.set_up import read_sinc
 from ethercat_server.tool.command import (
     DONE,
@@ -43,7 +36,6 @@ from ethercat_server.tool.command import (
 )
 
 _MOST_SILENT: Final = 3  # number of consecutive timeouts after which the other objects are skipped
-_STANDARD: Final = range(0x1000, 0x1019)  # objects that a slave of any vendor may have
 _HEAD: Final = ("object", "name", "value", "access", "meaning")
 
 
@@ -93,31 +85,6 @@ def _read_objects(sdo: Sdo, found: Found, rows: Sequence[ObjectEntry]) -> dict[s
     return {**found.as_json(), "objects": objects}
 
 
-def _open_slave(bus: Bus, wanted: str) -> tuple[Found, GuardedSdo]:
-    """The slave POSITION:NAME and its objects, through the mailboxes that its own master has set up.
-
-    Nothing is written but its mailbox. UsageError if there is no such slave, BusError if it is in INIT.
-    """
-    place, _, name = wanted.partition(":")
-    slaves = look_safely(bus, lambda: None)
-    there = "; ".join(f"{slave.position}:{slave.name}" for slave in slaves)
-    slave = next((each for each in slaves if (str(each.position), each.name) == (place, name)), None)
-    if slave is None:
-        raise UsageError(f"no slave is {wanted!r}, as POSITION:NAME: there are {there}")
-    if not slave.has_coe:
-        raise UsageError(f"slave {wanted} has no CoE mailbox, and so no objects")
-    if slave.status.state in (AlState.INIT, AlState.BOOT):
-        raise BusError(
-            f"slave {wanted} is in {slave.status.state.name}, where its objects cannot be read: have its own "
-            "master take it to PREOP"
-        )
-    rows = bus.read_surely_at(slave.position, reg.SYNC_MANAGER, 2 * reg.SYNC_MANAGER_SIZE)
-    out, back = struct.unpack_from("<HH", rows), struct.unpack_from("<HH", rows, reg.SYNC_MANAGER_SIZE)
-    serial = slave.sii["serial"] if slave.sii else 0
-    found = Found(slave.position, Identity(slave.name, serial, "", ""), "slave")
-    return found, GuardedSdo(MailboxSdo(ByPosition(bus), slave.position, (out, back)))
-
-
 def _read(args: argparse.Namespace) -> int:
     names: list[str] = args.names
     if args.server is None and args.iface is None and not find_objects(names[0]):
@@ -141,32 +108,16 @@ def _read(args: argparse.Namespace) -> int:
 def _objects(args: argparse.Namespace) -> int:
     # Calibration last: 87 rows that nobody sets.
     rows = sorted(KNOWN_OBJECTS, key=lambda row: row.index == FACTORY_CALIBRATION)
-    if args.slave is not None:
-        rows = [row for row in rows if row.index in _STANDARD]
-    return _show(args, rows, slave=args.slave)
+    return _show(args, rows)
 
 
-def _show(
-    args: argparse.Namespace,
-    rows: Sequence[ObjectEntry],
-    *,
-    all_wanted: bool = False,
-    slave: str | None = None,
-) -> int:
+def _show(args: argparse.Namespace, rows: Sequence[ObjectEntry], *, all_wanted: bool = False) -> int:
     """`all_wanted`: an object that cannot be read is a failure, also where the firmware does not have it."""
-    if slave is not None:
-        if find_server(args.iface, args.server) is not None:
-            raise UsageError("a server reads the objects of sensors only: stop it to read those of a slave")
-        used = f"the interface {args.iface}"
-        with open_interface(args.iface, allow_ip=args.allow_ip) as bus:
-            only, sdo = _open_slave(bus, slave)
-            found, sensors = [only], [_read_objects(sdo, only, rows)]
-    else:
-        with sensors_of(args) as opened:
-            used, found = opened.used, chosen(opened, args)
-            if any(row.index == INPUT_OBJECT for row in rows):
-                opened.wait_settled([each.number for each in found])
-            sensors = [_read_objects(opened.sdo(each.number), each, rows) for each in found]
+    with sensors_of(args) as opened:
+        used, found = opened.used, chosen(opened, args)
+        if any(row.index == INPUT_OBJECT for row in rows):
+            opened.wait_settled([each.number for each in found])
+        sensors = [_read_objects(opened.sdo(each.number), each, rows) for each in found]
     failed = [sensor["error"] for sensor in sensors if "error" in sensor]
     if len(failed) == len(sensors):
         raise BusError(failed[0])
@@ -203,13 +154,9 @@ def _line(row: dict[str, Any]) -> tuple[str, ...]:
 
 
 _SENSORS: Final = sensor_arguments(all_if_none=True)
-_SLAVE: Final = "the standard objects of a slave that is no sensor, such as 1:EL3102, in the state it is in"
 _NAME: Final = "object: a name such as 'Sampling rate' or 'Force/Torque Offset', a setting, or 0x8006:1"
 COMMANDS: Final = (
-    Command(
-        "objects", "read and decode every object of the dictionary",
-        (*_SENSORS, argument("--slave", _SLAVE, metavar="POSITION:NAME")), _objects,
-    ),
+    Command("objects", "read and decode every object of the dictionary", _SENSORS, _objects),
     Command(
         "read", "read and decode some objects by name",
         (*_SENSORS, argument("names", _NAME, nargs="+", metavar="NAME")), _read,

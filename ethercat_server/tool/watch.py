@@ -1,10 +1,9 @@
-"""`watch`: live values in SI units per block of samples: a table on a terminal, else one line per block."""
+"""`watch`: live values in SI units and a line per block of samples."""
 
 from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
@@ -26,15 +25,13 @@ from ethercat_server.tool.command import (
     Command,
     argument,
     chosen,
-    columns,
     say,
     say_json,
     sensor_arguments,
     sensors_of,
 )
 
-_TERMINAL_INTERVAL_S: Final = 0.25
-_LINE_INTERVAL_S: Final = 1.0
+_INTERVAL_S: Final = 1.0
 # Name, letter, unit, digits.
 _VECTORS: Final = (
     ("force", "F", "N", 3), ("torque", "M", "Nm", 4), ("acceleration", "A", "m/s²", 3),
@@ -132,19 +129,17 @@ class _Watch:
         self._opened, self._args = opened, args
         self._sensors = {sensor.number: sensor for sensor in chosen(opened, args)}
         self._blocks = {number: Block() for number in self._sensors}
-        self._on_terminal = sys.stdout.isatty() and not args.json
-        usual = _TERMINAL_INTERVAL_S if self._on_terminal else _LINE_INTERVAL_S
-        self._interval_s = args.interval or usual
-        self._began_ns, self._height = opened.clock.monotonic_ns(), 0
+        self._began_ns = opened.clock.monotonic_ns()
 
     def run(self) -> None:
         """Until it is over, or KeyboardInterrupt."""
-        if not self._args.json and not self._on_terminal:
+        if not self._args.json:
             say("\n".join(f"{sensor} (mean of each block)" for sensor in self._sensors.values()))
         opened, most = self._opened, self._args.samples or math.inf
         opened.wait_settled(self._sensors)
         self._began_ns = opened.clock.monotonic_ns()
-        end, show = (Deadline(opened.clock, s) for s in (self._args.seconds or _FOREVER_S, self._interval_s))
+        end = Deadline(opened.clock, self._args.seconds or _FOREVER_S)
+        show = Deadline(opened.clock, self._args.interval)
         awaited = set[int]()
         for frames, events in opened.stream(sensors=list(self._sensors)):
             settling = {event["sensor"] for event in events if self._tell(event)}
@@ -158,7 +153,7 @@ class _Watch:
             opened.wait_settled(settling)
             awaited = settling  # their samples that came meanwhile are in the next batch
             if show.passed:
-                show = Deadline(opened.clock, self._interval_s)
+                show = Deadline(opened.clock, self._args.interval)
                 self.show()
 
     def _tell(self, event: JsonObject) -> bool:
@@ -173,19 +168,13 @@ class _Watch:
 
     def show(self) -> None:
         """Show all blocks and start new ones."""
-        found = {number: row for number, block in self._blocks.items() if (row := block.finish())}
-        if not self._on_terminal:
-            for number, row in found.items():
-                if self._args.json:
-                    say_json({**self._sensors[number].as_json(), **row}, indent=None)
-                else:
-                    say(f"sensor {number}  {_line(row)}")
-        elif found:
-            text = "\n".join(f"{self._sensors[number]}\n{_table(row)}" for number, row in found.items())
-            # Cursor to the first line of the previous table, then clear from there.
-            sys.stdout.write((f"\x1b[{self._height}F" if self._height else "") + "\x1b[J")
-            self._height = text.count("\n") + 1
-            say(text)
+        for number, block in self._blocks.items():
+            if (row := block.finish()) is None:
+                continue
+            if self._args.json:
+                say_json({**self._sensors[number].as_json(), **row}, indent=None)
+            else:
+                say(f"sensor {number}  {_line(row)}")
 
     def finish(self) -> int:
         """Say how many samples there were, and which sensor sent none; the exit code."""
@@ -203,35 +192,16 @@ class _Watch:
         return FAILED
 
 
-def _counts(row: dict[str, Any]) -> str:
-    rate = f"{row['rate_hz']:7.1f} Hz" if row["rate_hz"] else "     -- Hz"
-    text = f"{row['samples']:5d} samples {rate}"
-    return text + "".join(f"  {key} {row[key]}" for key in ("invalid", "repeated", "gaps") if row[key])
-
-
-def _warnings(row: dict[str, Any]) -> list[str]:
-    return [f"{warning['severity']}: {warning['meaning']}" for warning in row["warnings"]]
-
-
 def _line(row: dict[str, Any]) -> str:
-    parts = [_counts(row)]
+    rate = f"{row['rate_hz']:7.1f} Hz" if row["rate_hz"] else "     -- Hz"
+    parts = [f"{row['samples']:5d} samples {rate}"]
+    parts += [f"{key} {row[key]}" for key in ("invalid", "repeated", "gaps") if row[key]]
     if "force" in row:
         for name, letter, unit, digits in _VECTORS:
             parts.append(f"{letter} " + " ".join(f"{v:+.{digits}f}" for v in row[name]) + f" {unit}")
         parts.append(f"{row['temperature']:.1f} °C")
-    return "  ".join([*parts, *_warnings(row)])
-
-
-def _table(row: dict[str, Any]) -> str:
-    rows: list[tuple[str, ...]] = [("", "x", "y", "z", "", "standard deviation")]
-    for name, _, unit, digits in _VECTORS if "force" in row else ():
-        means = [f"{v:+{digits + 6}.{digits}f}" for v in row[name]]
-        deviations = " ".join(f"{v:.{digits}f}" for v in row["deviation"][name])
-        rows.append((name.replace("_", " "), *means, unit, deviations))
-    lines = [f"  {_counts(row)}", columns(rows, indent=2)]
-    if "force" in row:
-        lines.append(f"  temperature {row['temperature']:.1f} °C")
-    return "\n".join([*lines, *(f"  {text}" for text in _warnings(row) or ["no warnings"])])
+    parts += [f"{warning['severity']}: {warning['meaning']}" for warning in row["warnings"]]
+    return "  ".join(parts)
 
 
 def _positive(text: str) -> float:
@@ -258,7 +228,6 @@ def _watch(args: argparse.Namespace) -> int:
         return watch.finish()
 
 
-_LENGTH: Final = f"length of a block (default {_LINE_INTERVAL_S:g}, on a terminal {_TERMINAL_INTERVAL_S:g})"
 COMMANDS: Final = (
     Command(
         "watch", "show live values until Ctrl-C",
@@ -266,7 +235,10 @@ COMMANDS: Final = (
             *sensor_arguments(all_if_none=True),
             argument("--samples", "stop after N samples of each sensor", type=int, metavar="N"),
             argument("--seconds", "stop after S seconds", type=_positive, metavar="S"),
-            argument("--interval", _LENGTH, type=_positive, metavar="S"),
+            argument(
+                "--interval", "length of a block (default %(default)g)", type=_positive, metavar="S",
+                default=_INTERVAL_S,
+            ),
         ),
         _watch,
     ),

@@ -27,48 +27,29 @@ class LocalClock:
     """The local clock: ns since power-on, of a crystal of its own that may be steered.
 
     It tells local time at any instant of the machine's clock since the latest change. Whatever changes, the
-    time goes on from what it is, but for `jump`; rounding errors do not accumulate.
+    time goes on from what it is, but for `set`; rounding errors do not accumulate.
     """
 
     def __init__(self, now: int) -> None:
         self._anchor = now
         self._local = 0  # at the anchor, times the scale
-        self._rate = 0  # at the anchor: deviation of the crystal, and what steers it
+        self._rate = 0  # deviation of the crystal, and what steers it
         self._steered = 0
-        self._change, self._ramp = 0, 0  # of the rate, in so many ns from the anchor on
-        self._stopped = False
 
     def at(self, instant: int) -> int:
         """Local time at an instant."""
-        if self._ramp or self._stopped:
-            return self._scaled(instant) // RATE_SCALE
-        return (self._local + (instant - self._anchor) * (RATE_SCALE + self._rate)) // RATE_SCALE
+        return self._scaled(instant) // RATE_SCALE
 
     def _scaled(self, instant: int) -> int:
-        if self._stopped:
-            return self._local
-        elapsed = instant - self._anchor
-        scaled = self._local + elapsed * (RATE_SCALE + self._rate)
-        if self._ramp and elapsed > 0:
-            part = min(elapsed, self._ramp)
-            scaled += self._change * part * part // (2 * self._ramp) + self._change * (elapsed - part)
-        return scaled
+        return self._local + (instant - self._anchor) * (RATE_SCALE + self._rate)
 
     def _go_on_from(self, now: int) -> None:
-        self._local = self._scaled(now)
-        if self._ramp and not self._stopped:
-            part = min(now - self._anchor, self._ramp)
-            done = self._change * part // self._ramp
-            self._rate += done
-            self._change, self._ramp = self._change - done, self._ramp - part
-        self._anchor = now
+        self._local, self._anchor = self._scaled(now), now
 
-    def set_ppm(self, now: int, ppm: float, ramp_ns: int = 0) -> None:
-        """Set the error of its crystal, positive for a fast one, at once or within a time."""
+    def set_ppm(self, now: int, ppm: float) -> None:
+        """Set the error of its crystal, positive for a fast one."""
         self._go_on_from(now)
-        self._change, self._ramp = round(ppm * 1e6) + self._steered - self._rate, ramp_ns
-        if not ramp_ns:
-            self._rate += self._change
+        self._rate = round(ppm * 1e6) + self._steered
 
     def steer(self, now: int, rate: int) -> None:
         """Run at this rate in addition to the crystal's."""
@@ -76,15 +57,9 @@ class LocalClock:
         self._rate += rate - self._steered
         self._steered = rate
 
-    def jump(self, now: int, ns: int) -> None:
-        """Jump forward, or back if negative."""
-        self._go_on_from(now)
-        self._local += ns * RATE_SCALE
-
-    def stop(self, now: int, stopped: bool) -> None:
-        """Stand still, or run on from there."""
-        self._go_on_from(now)
-        self._stopped = stopped
+    def set(self, now: int, ns: int) -> None:
+        """Set local time."""
+        self._anchor, self._local = now, ns * RATE_SCALE
 
 
 _LOCAL_IS_NOT_LESS: Final = 1 << 31
@@ -108,14 +83,6 @@ def _counter(rate: float, start: int) -> int:
     return round((math.sqrt(1 + 100 * rate * rate * (start + 2) ** 2) - 1) / (10 * rate))
 
 
-def scattered(number: int, seed: int = 0) -> int:
-    """64 random bits that are always the same for a number and a seed (splitmix64)."""
-    word = (number + 1 + (seed << 20)) * 0x9E3779B97F4A7C15 & _U64
-    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 & _U64
-    word = (word ^ word >> 27) * 0x94D049BB133111EB & _U64
-    return word ^ word >> 31
-
-
 class EventTimes:
     """When frames and firmware exchanged the buffers of sync managers, in local time.
 
@@ -136,10 +103,7 @@ class EventTimes:
     def repair(self) -> None:
         """End all that is wrong with the times of writes."""
         self.stuck = False  # no further end of a write is shown
-        self.shows_start = False  # instead of the end of a write its start is shown
-        self.previous = False  # the write before the newest one is shown
         self.shift = 0  # added to the times of writes
-        self.jitter = 0  # a random time up to this, and down to its negative, is added too
 
     def take_away(self) -> None:
         """Be a controller without these registers."""
@@ -167,26 +131,18 @@ class EventTimes:
         number = newest_at(now)
         if number != self._completed and not (self.stuck and self._any_shown):
             self._completed = number
-            end = self._end(number)
+            end = self._end_of(number)
             if end >= since:
                 self._any_shown = True
-                shown = end - self._write_ns if self.shows_start else end
-                self._show(reg.DC_PDI_CHANGE_EVENT, shown, number)
+                self._show(reg.DC_PDI_CHANGE_EVENT, end)
         if starts and (begun := newest_at(now + self._write_ns)) != self._begun:
             self._begun = begun
-            start = self._end(begun) - self._write_ns
+            start = self._end_of(begun) - self._write_ns
             if start >= since:
-                self._show(reg.DC_PDI_START_EVENT, start, begun)
+                self._show(reg.DC_PDI_START_EVENT, start)
 
-    def _end(self, number: int) -> int:
-        end = self._end_of(number)
-        return self._end_of(self._newest_at(end - 1)) if self.previous and self._newest_at else end
-
-    def _show(self, register: int, instant: int, number: int) -> None:
-        off = self.shift
-        if self.jitter:  # the same for both registers
-            off += scattered(number) % (2 * self.jitter + 1) - self.jitter
-        _U32.pack_into(self._memory, register, self._local.at(instant) + off & _MASK)
+    def _show(self, register: int, instant: int) -> None:
+        _U32.pack_into(self._memory, register, self._local.at(instant) + self.shift & _MASK)
 
     def taken(self, now: int, *registers: int) -> None:
         """Show this time, of a frame that exchanged a buffer or of the firmware that has read the outputs."""
@@ -210,7 +166,6 @@ class DistributedClock:
         memory[reg.DC_FILTERS : reg.DC_FILTERS + 2] = bytes((_DEPTH, _SPEED_DEPTH))
         self._reset_loop()
         self.events = EventTimes(memory, self.local)
-        self.stuck_at: int | None = None  # the system time stands still in its register
 
     def take_away(self) -> None:
         """Be a controller without a distributed clock."""
@@ -287,8 +242,7 @@ class DistributedClock:
 
     def show_system_time(self) -> None:
         """The system time is about to be read."""
-        shown = self.system_time() if self.stuck_at is None else self.stuck_at
-        _TIME.pack_into(self._memory, reg.DC_SYSTEM_TIME, shown)
+        _TIME.pack_into(self._memory, reg.DC_SYSTEM_TIME, self.system_time())
 
     def settle(self) -> int:
         """Something is about to change: keep what has happened. Returns the time."""
@@ -297,41 +251,18 @@ class DistributedClock:
         return now
 
 
-def _repair(clock: DistributedClock, now: int) -> None:
-    clock.local.stop(now, False)
-    clock.stuck_at = None
-    clock.events.repair()
-
-
-def _event(name: str, scale: int = 0) -> Callable[..., None]:
-    """Sets an attribute of the event times: true, or a value times `scale`."""
-    return lambda clock, _, us=0.0: setattr(clock.events, name, round(us * scale) if scale else True)
-
-
-_PPM, _US = real(-100_000, 100_000), real(0, 1e6)
-
 CLOCK_WORDS: Final = (
-    Command("ok", "nothing is wrong; rate and time stay", _repair),
+    Command("ok", "nothing is wrong; rate and time stay", lambda c, _: c.events.repair()),
     Command("none", "no DC: no feature bit, registers read zero", lambda c, _: c.take_away()),
     Command("32-bit", "system and local time have 32 bits", lambda c, _: c.narrow()),
     Command("no-events", "no 0x09F0, 0x09F8, 0x09FC: they read zero", lambda c, _: c.events.take_away()),
-    Command("stuck", "0x09FC stands still", _event("stuck")),
-    Command("start", "0x09FC has the start of the write, as 0x09F8", _event("shows_start")),
-    Command("previous", "0x09F8 and 0x09FC lag by one sample", _event("previous")),
-    Command("late US", "0x09F8 and 0x09FC are too late by this", _event("shift", 1000), (_US,)),
-    Command("early US", "they are too early by this", _event("shift", -1000), (_US,)),
-    Command("jitter US", "they are off by up to this, at random", _event("jitter", 1000), (_US,)),
-    Command("time-stuck", "0x0910 stands still, event times do not",
-            lambda c, _: setattr(c, "stuck_at", c.system_time())),
-    Command("stopped", "the local clock stands still", lambda c, now: c.local.stop(now, True)),
-    Command("jump NS", "the local clock jumps, once",
-            lambda c, now, ns: c.local.jump(now, round(ns)), (real(-(2.0**62), 2.0**62),)),
+    Command("stuck", "0x09FC stands still", lambda c, _: setattr(c.events, "stuck", True)),
+    Command("late US", "0x09F8 and 0x09FC are too late by this, too early if negative",
+            lambda c, _, us: setattr(c.events, "shift", round(us * 1000)), (real(-1e6, 1e6),)),
     Command("at NS", "the local clock jumps to this time",
-            lambda c, now, ns: c.local.jump(now, round(ns) - c.local.at(now)), (real(0, 2.0**62),)),
+            lambda c, now, ns: c.local.set(now, round(ns)), (real(0, 2.0**62),)),
     Command("ppm X", "rate of the local clock, without a jump of the time",
-            lambda c, now, ppm: c.local.set_ppm(now, ppm), (_PPM,)),
-    Command("ramp X S", "the same, linearly within S seconds",
-            lambda c, now, ppm, s: c.local.set_ppm(now, ppm, round(s * 1e9)), (_PPM, real(0, 1e6))),
+            lambda c, now, ppm: c.local.set_ppm(now, ppm), (real(-100_000, 100_000),)),
 )  # fmt: skip
 _FROM_POWER_ON: Final = ("none", "32-bit")  # which cannot come about while the controller runs
 

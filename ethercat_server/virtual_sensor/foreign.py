@@ -1,8 +1,7 @@
 """Slaves of other vendors on the virtual bus, and chains as other masters leave them.
 
 Vendor, product code and process data of the Beckhoff slaves are public; the drive is nobody's. It has the
-objects of the CiA 402 drive profile (IEC 61800-7-201), but is enabled and disabled in one step, and its motor
-follows the target velocity at once.
+objects of the CiA 402 drive profile (IEC 61800-7-201) that say whether its motor turns.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import struct
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from enum import IntEnum
 from typing import Any, Final
 
 from ethercat_server.ethercat.slave.al import AlState
@@ -30,10 +28,8 @@ from ethercat_server.virtual_sensor.options import (
 )
 
 _RO, _RW = Access.RO, Access.RW
-_ERROR_CODE = ObjectEntry(0x603F, 0, "Error code", ObjectType.U16, _RO)
 _CONTROLWORD = ObjectEntry(0x6040, 0, "Controlword", ObjectType.U16, _RW)
 _STATUSWORD = ObjectEntry(0x6041, 0, "Statusword", ObjectType.U16, _RO)
-_POSITION = ObjectEntry(0x6064, 0, "Position actual value", ObjectType.I32, _RO)  # increments
 _VELOCITY = ObjectEntry(0x60FF, 0, "Target velocity", ObjectType.I32, _RW)  # increments per second
 
 
@@ -48,7 +44,7 @@ def _channel(number: int, value: int) -> Pdo:
 _DRIVE: Final = Device(
     "DRIVE", "Servo drives", 0x7E57, 402, 1, 0,
     (Pdo(0x1600, "Outputs", (_CONTROLWORD, _VELOCITY)),),
-    (Pdo(0x1A00, "Inputs", (_STATUSWORD, _POSITION)),),
+    (Pdo(0x1A00, "Inputs", (_STATUSWORD,)),),
     MailboxProtocol.CoE, watchdog=True, device_type=0x00020192,
 )  # fmt: skip
 _DEVICES: Final = (
@@ -74,94 +70,46 @@ def _objects_of(device: Device) -> ObjectTable:
         ObjectEntry(0x1018, 4, "Serial number", u32, _RO, device.serial),
         *device.output_entries,
         *device.input_entries,
-        *((_ERROR_CODE,) if device is _DRIVE else ()),
     ]
     entries = entries_of(device, rows)
     return ObjectTable(entries, {a: row.type.pack(row.default) for a, row in entries.items()})
 
 
 _ENABLE: Final = 0x000F  # controlword in normal operation
-_FAULT_RESET: Final = 0x80
-_REMOTE: Final = 0x0200
-_COMMUNICATION_LOST: Final = 0x8130
-
-
-class DriveState(IntEnum):
-    """States, as bits of the statusword."""
-
-    SWITCH_ON_DISABLED = 0x0040
-    OPERATION_ENABLED = 0x0037
-    FAULT = 0x0008
+# Statuswords: remote, with switch-on disabled and with operation enabled.
+_DISABLED, _ENABLED = 0x0240, 0x0237
 
 
 class Drive(Application):
-    """A servo drive: its state and position."""
+    """A servo drive, which the controlword enables in one step, and the end of process data disables."""
 
     def __init__(self, clock: Callable[[], int], eeprom_ms: float) -> None:
-        self.drive_state = DriveState.SWITCH_ON_DISABLED
-        self._error = self._controlword = self._velocity = 0
-        self._position = 0.0
-        self._since = clock()
         super().__init__(_DRIVE, clock, _objects_of(_DRIVE), eeprom_ms)
+
+    @property
+    def enabled(self) -> bool:
+        """Whether the controlword has enabled it."""
+        return int(self.objects.number(_CONTROLWORD.address)) & _ENABLE == _ENABLE
 
     @property
     def turning(self) -> bool:
         """Whether the motor moves."""
-        return self.drive_state is DriveState.OPERATION_ENABLED and self._velocity != 0
-
-    def take_outputs(self, data: bytes) -> None:
-        """See `Application`."""
-        super().take_outputs(data)
-        self._obey()
-
-    def write(self, index: int, subindex: int, data: bytes) -> None:
-        """See `Application`."""
-        super().write(index, subindex, data)
-        self._obey()
-
-    def _obey(self) -> None:
-        self._move()
-        controlword, self._velocity = (int(self.objects.number(o.address)) for o in (_CONTROLWORD, _VELOCITY))
-        reset = controlword & ~self._controlword & _FAULT_RESET
-        self._controlword = controlword
-        if reset:
-            self._error = 0
-        if reset or self.drive_state is not DriveState.FAULT:
-            enabled = controlword & _ENABLE == _ENABLE
-            self.drive_state = DriveState.OPERATION_ENABLED if enabled else DriveState.SWITCH_ON_DISABLED
+        return self.enabled and self.objects.number(_VELOCITY.address) != 0
 
     def state_changed(self) -> None:
-        """The motor stops when process data ends, with an error if the master did not say so."""
-        if self.state is AlState.OP:
-            return
-        self._move()
-        if self.error and self.drive_state is DriveState.OPERATION_ENABLED:
-            self.drive_state, self._error = DriveState.FAULT, _COMMUNICATION_LOST
-        elif self.drive_state is not DriveState.FAULT:
-            self.drive_state = DriveState.SWITCH_ON_DISABLED
+        """See `Application`."""
+        if self.state is not AlState.OP:
+            self.objects.values[_CONTROLWORD.address] = bytes(2)
 
     def work(self) -> None:
         """Be at work in OP: the other master has enabled it, and it turns."""
         self.take_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
 
     def read(self, index: int, subindex: int) -> bytes:
-        """See `Application`; some objects the drive itself changes."""
-        self._move()
-        live = {
-            _ERROR_CODE.address: self._error,
-            _STATUSWORD.address: self.drive_state | _REMOTE,
-            _POSITION.address: (round(self._position) + 2**31) % 2**32 - 2**31,
-        }
-        value = live.get((index, subindex))
-        if value is None:
-            return super().read(index, subindex)
-        return self.objects.entry(index, subindex).type.pack(value)
-
-    def _move(self) -> None:
-        now = self.clock()
-        if self.drive_state is DriveState.OPERATION_ENABLED:
-            self._position += self._velocity * (now - self._since) * 1e-9
-        self._since = now
+        """See `Application`."""
+        if (index, subindex) == _STATUSWORD.address:
+            return _STATUSWORD.type.pack(_ENABLED if self.enabled else _DISABLED)
+        return super().read(index, subindex)
 
 
 _WRITES_REMEMBERED: Final = 1000
@@ -214,7 +162,7 @@ class ForeignSlave:
         return {
             "kind": self.options.kind,
             **al_statistics(self.life),
-            "drive": self.life.drive_state.name if isinstance(self.life, Drive) else None,
+            "turning": self.turning,
             "write_count": self.write_count,
         }
 

@@ -14,7 +14,6 @@ from bota_ethercat.pdo import layout_for
 from bota_ethercat.sensor.warnings_register import WarningFlag
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 from ethercat_server.virtual_sensor.dictionary import Dictionary
-from ethercat_server.virtual_sensor.distributed_clock import scattered
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.signals import FORMULAS, MOTIONS, Formula, Reading, Scene, reading_of
 
@@ -87,6 +86,17 @@ def _measured(
     return (max(-limit, min(limit, x)), max(-limit, min(limit, y)), max(-limit, min(limit, z))), bits
 
 
+_U64: Final = 2**64 - 1
+
+
+def _scattered(number: int, seed: int = 0) -> int:
+    """64 random bits that are always the same for a number and a seed (splitmix64)."""
+    word = (number + 1 + (seed << 20)) * 0x9E3779B97F4A7C15 & _U64
+    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 & _U64
+    word = (word ^ word >> 27) * 0x94D049BB133111EB & _U64
+    return word ^ word >> 31
+
+
 class Sampler:
     """Computes samples from power-on to power-off, with the settings in the dictionary.
 
@@ -126,7 +136,7 @@ class Sampler:
         """Number of the newest sample at an instant that is not skipped."""
         number = self.clock.number_at(instant)
         if self._skipped:
-            while number > self._skip_after and scattered(number, self._seed) % _SKIP_STEPS < self._skipped:
+            while number > self._skip_after and _scattered(number, self._seed) % _SKIP_STEPS < self._skipped:
                 number -= 1
         return number
 

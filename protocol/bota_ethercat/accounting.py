@@ -55,7 +55,10 @@ class StreamCounts:
 class StreamAccounting:
     """Classifies and counts the frames of one sensor."""
 
-    __slots__ = ("_every", "_fresh_only", "_monotonic_ns", "_sequence", "counts", "new_ns", "rate_hz")
+    __slots__ = (
+        "_every", "_fresh_only", "_missed", "_missed_since", "_monotonic_ns", "_sequence",
+        "counts", "new_ns", "rate_hz",
+    )  # fmt: skip
 
     def __init__(
         self, counts: StreamCounts | None = None, *, every: int = 1, fresh_only: bool = True
@@ -71,6 +74,7 @@ class StreamAccounting:
     def begin(self) -> None:
         """A new subscription begins: nothing before its first frame counts as missing, unless it has GAP."""
         self._sequence = self._monotonic_ns = self.new_ns = -1
+        self._missed = self._missed_since = 0  # missing already, since there were so many new frames
 
     @property
     def has_begun(self) -> bool:
@@ -118,7 +122,9 @@ class StreamAccounting:
             return
         counts.gaps += 1
         lost = 0 if jump > skipped else 1
+        missed = jump + (self._missed if self._missed_since == counts.new else 0)
         if self.new_ns >= 0 and self.rate_hz:
             room = round((monotonic_ns - self.new_ns) * self.rate_hz / 1e9) - 1
-            lost = max(lost, room - jump)
+            lost = max(lost, room - missed)
         counts.lost += lost
+        self._missed, self._missed_since = missed + lost, counts.new

@@ -1,73 +1,108 @@
-"""Brings the specific force to the instant and the bandwidth of force and torque before they are subtracted.
+"""What brings the IMU's samples to the instant and the bandwidth of force and torque.
 
 The sensor's filters delay force and torque by 0.9 ms (SINC 32) to 120 ms (SINC 512 with FIR), what its
-accelerometer measures by 1.9 ms (`bota_ethercat.sensor.response`). The specific force is delayed by the
-difference: with FIR off between two samples, with FIR on by the same window, so that both pass the same
-frequencies. An IMU that is later than the force is used as it comes: nobody wants the wrench later.
+accelerometer measures by 1.9 ms and its gyroscope by 2.9 ms (`bota_ethercat.sensor.response`). A polynomial
+through the latest samples is evaluated at the instant that force and torque are of: mostly between two
+samples, by at most 2 ms after the newest where the IMU is later than the force. With FIR on, the IMU passes
+the same window too. Angular acceleration is the slope of a parabola, 1.5 ms before the newest sample at the
+latest: nearer, and with a shorter one, noise grows steeply. By default it is 2.5 ms late for that.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bota_ethercat.pdo import Vector3
-from bota_ethercat.sensor.response import FIR_TAPS, force_lag_s, kaiser
+from bota_ethercat.sensor.response import (
+    FIR_TAPS,
+    acceleration_response,
+    angular_rate_response,
+    force_lag_s,
+    kaiser,
+)
 from bota_ethercat.settings import SettingValue
 
-# Differences below this part of a sample period are left.
-_NEGLIGIBLE: Final = 0.1
-# Samples that were lost in a row for which the one before stands; after more, the history begins anew.
-_MOST_LOST: Final = 4
-NOT_DELAYED: Final = (1.0,)
+Array = NDArray[np.float64]
+
+_UNKNOWN_HZ: Final = 1600.0  # taken for a rate that is unknown: samples that are fewer are interpolated
+_NEGLIGIBLE: Final = 0.1  # of a sample period
+_PARABOLA_S, _LINE_S = 0.014, 0.0025  # lengths of the fits
+_LATEST_SLOPE_S: Final = 0.0015
+_FURTHEST_S: Final = 0.002
+# Over lost samples the IMU's are interpolated: with FIR on, as its window is longer, for so long; else an
+# angular acceleration would be too late by half of the gap.
+_LONGEST_GAP_S: Final = 0.1
+_GAP_S, _GAP_PERIODS = 0.008, 2.5
 
 
-def alignment_taps(settings: Mapping[str, SettingValue], rate_hz: float) -> tuple[float, ...]:
-    """The weights of the newest specific force and those before it; NOT_DELAYED if a delay is unknown."""
-    lag = (force_lag_s(settings, rate_hz) or 0.0) * rate_hz  # in sample periods
-    if lag < _NEGLIGIBLE:
-        return NOT_DELAYED
-    if not settings.get("fir"):
-        whole, part = divmod(lag, 1.0)
-        return (0.0,) * int(whole) + (1.0 - part, part)
+class Alignment(NamedTuple):
+    """Weights of the IMU's latest samples, the oldest first."""
+
+    period_s: float
+    taps: Array  # (3, n): to acceleration, angular rate and angular acceleration
+    lag_s: float | None  # by which force and torque are later than the accelerometer; None: unknown
+    gap_s: float  # samples further apart do not belong together
+    lead: int  # so many samples after a gap tell nothing of the instant that force and torque are of
+    settings: Mapping[str, SettingValue]
+
+
+def align(
+    settings: Mapping[str, SettingValue], rate_hz: float = 0.0, lag_s: float | None = None
+) -> Alignment:
+    """For these settings and sampling rate; `lag_s` as `ethercat-identify delay` has measured it.
+
+    Where the lag is unknown, acceleration is used as it comes.
+    """
+    known_s = force_lag_s(settings, rate_hz or None) if lag_s is None else lag_s
+    is_known, rate_hz = rate_hz > 0.0, rate_hz or _UNKNOWN_HZ
+    delays_s = [response(settings).delay_s for response in (acceleration_response, angular_rate_response)]
+    accelerometer_s, gyroscope_s = (delay_s or 0.0 for delay_s in delays_s)
+    at_s = min(-(known_s or 0.0), _FURTHEST_S)  # after the newest sample
+    turned_s = min(at_s + gyroscope_s - accelerometer_s, _FURTHEST_S)
+    gap_s = _LONGEST_GAP_S
+    if settings.get("fir") and known_s is not None:
+        window = _window(-at_s * rate_hz)
+        slope = np.convolve(_window(-turned_s * rate_hz - 1.0), (0.5 * rate_hz, 0.0, -0.5 * rate_hz))
+        rows = [window, _window(-turned_s * rate_hz), slope]
+    else:
+        if is_known:
+            gap_s = max(_GAP_S, _GAP_PERIODS / rate_hz)
+        count = max(3, round(_PARABOLA_S * rate_hz) + 1)
+        slope_at = min(turned_s, -_LATEST_SLOPE_S) * rate_hz
+        rows = [
+            _value(at_s * rate_hz, max(2, round(_LINE_S * rate_hz) + 1)),
+            _fit(2, count, turned_s * rate_hz)[0],
+            _fit(2, count, slope_at)[1] * rate_hz,
+        ]
+    taps = np.zeros((3, max(map(len, rows))))
+    for row, weights in zip(taps, rows, strict=True):
+        row[len(row) - len(weights) :] = weights[::-1]
+    lead = 1 + math.floor(max(-at_s, 0.0) * rate_hz)
+    return Alignment(1.0 / rate_hz, taps, known_s, gap_s, lead, settings)
+
+
+def _value(at: float, count: int) -> Array:
+    """Of the newest sample and those before it, at `at` sample periods after the newest."""
+    if abs(at) < _NEGLIGIBLE:
+        return np.ones(1)
+    if at > 0.0:
+        return np.asarray(_fit(1, count, at)[0])
+    whole, part = divmod(-at, 1.0)
+    return np.array([0.0] * int(whole) + [1.0 - part, part])
+
+
+def _fit(order: int, count: int, at: float) -> Array:
+    """Value, slope, ... at this instant of the polynomial through so many samples, by least squares."""
+    fitted: Array = np.linalg.pinv(np.vander(-np.arange(count) - at, order + 1, increasing=True))
+    return fitted
+
+
+def _window(center: float) -> Array:
+    """The FIR filter's, that many sample periods before the newest sample."""
     half = (FIR_TAPS - 1) / 2
-    window = [kaiser((k - lag) / half) for k in range(math.floor(lag + half) + 1)]
-    return tuple(value / sum(window) for value in window)
-
-
-class Alignment:
-    """Of the samples of one sensor, each to be passed to `follow` once."""
-
-    def __init__(self, taps: tuple[float, ...] = NOT_DELAYED, period_s: float = 0.0) -> None:
-        """`taps` as `alignment_taps` gives them; samples are `period_s` apart."""
-        self._count, self._period_s = len(taps), period_s
-        self._taps = np.array(taps[::-1])  # the oldest first, as in `_history`
-        self._history = np.zeros((2 * self._count, 3))  # each row twice, so that the newest are in one piece
-        self._at = self._filled = 0
-        self._time_s = -math.inf
-
-    def follow(self, value: Vector3, time_s: float) -> Vector3:
-        """`value` as it was when force and torque of this sample were; of finite numbers."""
-        count = self._count
-        if count == 1:
-            return value
-        lost = round((time_s - self._time_s) / self._period_s) - 1 if self._filled else 0
-        self._time_s = time_s
-        if not 0 <= lost <= _MOST_LOST:
-            self._filled = lost = 0
-        for _ in range(lost + 1):
-            self._at = at = (self._at + 1) % count
-            self._history[at] = self._history[at + count] = value
-        self._filled += lost + 1
-        end = at + count + 1
-        if self._filled >= count:
-            x, y, z = (self._taps @ self._history[end - count : end]).tolist()
-            return x, y, z
-        taps = self._taps[-self._filled :]
-        if not (total := float(taps.sum())) > 0.0:
-            return value
-        x, y, z = (taps @ self._history[end - self._filled : end] / total).tolist()
-        return x, y, z
+    window = np.array([kaiser((k - center) / half) for k in range(max(1, math.floor(center + half) + 1))])
+    return np.asarray(window / window.sum())

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.compensator import Compensator
+from ft_compensation.motion_error import MotionError
 from ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
@@ -41,14 +42,20 @@ def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.
         )
 
 
-def force_bound_95(payload: Payload, accelerometer: Accelerometer) -> float:
-    """N: in 95 % of cases the accelerometer's own offset and scale show as less force than this.
+def force_bound_95(
+    payload: Payload, accelerometer: Accelerometer, motion: MotionError | None = None
+) -> float:
+    """N: in 95 % of cases what is not known of the accelerometer, and of `motion`, shows as less force.
 
-    A tare with the tool on takes the offset's part off.
+    A tare with the tool on takes the part of the accelerometer's offset off.
     """
-    intervals = zip(accelerometer.offset_interval, accelerometer.scale_interval, strict=True)
-    halves = [math.hypot(offset, STANDARD_GRAVITY * scale) for offset, scale in intervals]
-    return payload.mass * _ABOUT_THREE_AXES * max(halves)
+    cross = accelerometer.cross_axis_interval
+    per_axis = zip(
+        accelerometer.offset_interval, accelerometer.scale_interval, cross[::2], cross[1::2], strict=True
+    )
+    halves = [math.hypot(offset, STANDARD_GRAVITY * max(parts)) for offset, *parts in per_axis]
+    bound = payload.mass * _ABOUT_THREE_AXES * max(halves)
+    return bound if motion is None else math.hypot(bound, NORMAL_95 * motion.filters) + motion.out_of_range
 
 
 def estimate_bias(means: StationaryMeans, payload: Payload, specific_force: Vector3) -> Wrench:
@@ -91,7 +98,7 @@ class Taken(NamedTuple):
         """Why the bias may not fit this payload, a sentence; empty if it does."""
         if self.specific_force is not None or payload == self.payload:
             return ""
-        (was, (ax, ay, az)), (mass, (bx, by, bz)) = self.payload, payload
+        (was, (ax, ay, az), _), (mass, (bx, by, bz), _) = self.payload, payload
         moved = mass * bx - was * ax, mass * by - was * ay, mass * bz - was * az
         return (
             f"the bias was taken with {self.payload}, and in which pose is not known: with {payload} it may "

@@ -18,6 +18,10 @@ class CompensationError(Exception):
     """Something cannot be estimated, identified or kept; the text is one sentence for people."""
 
 
+Turning = tuple[Vector3, Vector3]  # angular rate, rad/s, and angular acceleration, rad/s²
+STILL: Final[Turning] = (ZERO, ZERO)
+
+
 class Wrench(NamedTuple):
     """A load that acts on the sensor, at the sensor's wrench origin and in its frame."""
 
@@ -44,18 +48,22 @@ NO_WRENCH: Final = Wrench(ZERO, ZERO)
 
 
 class Payload(NamedTuple):
-    """What hangs on the sensor's tool side, taken for a point mass."""
+    """What hangs on the sensor's tool side."""
 
     mass: float = 0.0  # kg
     center: Vector3 = ZERO  # center of gravity in the sensor's frame, m from the wrench origin
+    # Ixx Iyy Izz Ixy Ixz Iyz about the center of gravity, in axes parallel to the sensor's, kg m²: diagonal
+    # and off-diagonal elements of the tensor (Ixy is minus the integral of xy), as in URDF. A point mass: 0.
+    inertia: tuple[float, ...] = (0.0,) * 6
 
     @classmethod
-    def of(cls, mass: object, center: object) -> Self:
-        """ValueError, a sentence, if `mass` is not a number >= 0 or `center` not three numbers."""
+    def of(cls, mass: object, center: object, inertia: object = (0.0,) * 6) -> Self:
+        """ValueError, a sentence, if these are not a number >= 0, three and six numbers."""
         (kilograms,) = _finite((mass,), 1, "a mass")
         if kilograms < 0.0:
             raise ValueError(f"a mass cannot be negative: {kilograms:g} kg")
-        return cls(kilograms, vector(center, "a center of gravity"))
+        tensor = tuple(_finite(inertia, 6, "an inertia tensor"))
+        return cls(kilograms, vector(center, "a center of gravity"), tensor)
 
     def __str__(self) -> str:
         """For people."""
@@ -72,25 +80,40 @@ def wrench_text(wrench: Wrench) -> str:
 NO_PAYLOAD: Final = Payload()
 # m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered.
 OFFSET_PRIOR: Final = 0.4
-SCALE_PRIOR: Final = 0.005  # likewise of an axis' sensitivity, relative; local gravity is within it
+# Likewise of an axis' sensitivity, relative (local gravity is within it), and of what it has of another axis.
+SCALE_PRIOR: Final = 0.005
 NORMAL_95: Final = 1.96  # half of a 95 % interval, in standard deviations
+_SCALE_95: Final = NORMAL_95 * SCALE_PRIOR
+CROSS_AXES: Final = ("xy", "xz", "yx", "yz", "zx", "zy")  # reading's axis, true axis
+Six = tuple[float, float, float, float, float, float]
 
 
 class Accelerometer(NamedTuple):
     """What an accelerometer reads: `scale` times the truth, axis by axis, plus `offset`.
 
-    Every `..._interval` is half the width of the 95 % interval; of what is typical, unless it was identified.
+    The axes are not quite orthogonal, nor quite parallel to those of the wrench: of each axis, parts of the
+    others are subtracted. Every `..._interval` is half the width of the 95 % interval; of what is typical,
+    unless it was identified.
     """
 
     offset: Vector3 = ZERO  # m/s²
     scale: Vector3 = (1.0, 1.0, 1.0)
     offset_interval: Vector3 = (NORMAL_95 * OFFSET_PRIOR,) * 3  # m/s²
-    scale_interval: Vector3 = (NORMAL_95 * SCALE_PRIOR,) * 3
+    scale_interval: Vector3 = (_SCALE_95,) * 3
+    cross_axis: Six = (0.0,) * 6  # in the order of CROSS_AXES
+    cross_axis_interval: Six = (_SCALE_95,) * 6
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether there is nothing to correct."""
+        return self[:2] == EXACT[:2] and not any(self.cross_axis)
 
     def correct(self, acceleration: Vector3) -> Vector3:
         """The truth, m/s², of what was read."""
         (x, y, z), (ox, oy, oz), (sx, sy, sz) = acceleration, self.offset, self.scale
-        return (x - ox) / sx, (y - oy) / sy, (z - oz) / sz
+        x, y, z = (x - ox) / sx, (y - oy) / sy, (z - oz) / sz
+        xy, xz, yx, yz, zx, zy = self.cross_axis
+        return x - xy * y - xz * z, y - yx * x - yz * z, z - zx * x - zy * y
 
 
 EXACT: Final = Accelerometer()

@@ -20,39 +20,75 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
-from bota_ethercat.pdo import Vector3
-from ft_compensation.quantities import DEFAULT_GRAVITY, EXACT, ZERO, Accelerometer, Quaternion
+import numpy as np
 
-# Angular acceleration is the slope of the angular rate over this time, and so half of it late.
-_SLOPE_S: Final = 0.005
-_GAP_S: Final = 0.1  # samples further apart say nothing of the slope between them
-_MOST: Final = 64
+from bota_ethercat.pdo import Vector3
+from ft_compensation.alignment import Alignment, Array, align
+from ft_compensation.motion_error import MotionError, motion_error
+from ft_compensation.quantities import DEFAULT_GRAVITY, EXACT, STILL, ZERO, Accelerometer, Quaternion
+
+_TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
+_KEPT_S: Final = 1.0  # of samples, for `error`
+Row = tuple[float, ...]
 _MOST_RATES: Final = 4096  # remembered for orientations that come late: 2.5 s at 1600 Hz
 
 
 class ImuSpecificForce:
-    """From the sensor's accelerometer and gyroscope, sample by sample."""
+    """From the sensor's accelerometer and gyroscope, sample by sample.
 
-    def __init__(self, lever: Vector3 = ZERO, accelerometer: Accelerometer = EXACT) -> None:
+    Of the latest second it keeps the samples, with those that were lost interpolated, in a ring that has
+    every row twice, so that the newest are in one piece.
+    """
+
+    def __init__(
+        self, lever: Vector3 = ZERO, accelerometer: Accelerometer = EXACT, alignment: Alignment | None = None
+    ) -> None:
         """`lever` is d, m; `accelerometer` corrects what it reads."""
         self.lever = lever
-        self._correct = None if accelerometer[:2] == EXACT[:2] else accelerometer.correct
-        self._rates: deque[tuple[float, Vector3]] = deque(maxlen=_MOST)
+        # Angular rate (rad/s) and acceleration (rad/s²) of the latest sample, at force and torque's instant.
+        self.turning = STILL
+        self._correct = None if accelerometer.is_exact else accelerometer.correct
+        self.align(alignment or align({}))
+
+    def align(self, alignment: Alignment) -> None:
+        """Bring what follows to the instant of force and torque so."""
+        self.alignment = alignment
+        self._count = alignment.taps.shape[1]
+        self._size = max(self._count, round(_KEPT_S / alignment.period_s))
+        self._ring = np.zeros((2 * self._size, 6))
+        self._at = self._filled = 0
+        self._time_s = -math.inf
 
     def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
-        """m/s² at the center of gravity, of this sample (m/s², rad/s); None if it is not finite."""
+        """m/s² at the center of gravity, when force and torque of this sample were (m/s², rad/s).
+
+        None if it is not finite, or if the sensor turns and what was before the sample, and so how fast it
+        spins up, is not known.
+        """
         if self._correct is not None:
             acceleration = self._correct(acceleration)
-        ax, ay, az = acceleration
-        wx, wy, wz = angular_rate
-        total = ax + ay + az + wx + wy + wz
+        row = (*acceleration, *angular_rate)
+        total = sum(row)
         if total - total != 0.0:  # NaN or infinity
-            self._rates.clear()
+            self._time_s = -math.inf
             return None
+        passed_s, self._time_s = time_s - self._time_s, time_s
         dx, dy, dz = self.lever
-        if not (dx or dy or dz):
-            return acceleration
-        tx, ty, tz = self._slope(angular_rate, time_s)
+        if 0.0 < passed_s <= self.alignment.gap_s:
+            if self._filled == 1 or passed_s > 1.5 * self.alignment.period_s:
+                self._bridge(row, passed_s)
+            self._append(row)
+        else:
+            self._filled = 1
+            self._ring[:] = row
+        if self._filled <= self.alignment.lead and (dx or dy or dz):
+            wx, wy, wz = angular_rate
+            if wx * wx + wy * wy + wz * wz > _TURNING * _TURNING:
+                return None
+        end = self._at + self._size + 1
+        found = self.alignment.taps.dot(self._ring[end - self._count : end]).tolist()
+        (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = found
+        self.turning = (wx, wy, wz), (tx, ty, tz)
         vx, vy, vz = wy * dz - wz * dy, wz * dx - wx * dz, wx * dy - wy * dx
         return (
             ax + ty * dz - tz * dy + wy * vz - wz * vy,
@@ -60,19 +96,30 @@ class ImuSpecificForce:
             az + tx * dy - ty * dx + wx * vy - wy * vx,
         )
 
-    def _slope(self, rate: Vector3, time_s: float) -> Vector3:
-        """Angular acceleration, rad/s²; zero until there are two samples."""
-        rates = self._rates
-        if rates and not 0.0 < time_s - rates[-1][0] <= _GAP_S:
-            rates.clear()
-        rates.append((time_s, rate))
-        while len(rates) > 2 and time_s - rates[1][0] >= _SLOPE_S:
-            rates.popleft()
-        before_s, (x, y, z) = rates[0]
-        passed_s = time_s - before_s
-        if passed_s <= 0.0:
-            return ZERO
-        return (rate[0] - x) / passed_s, (rate[1] - y) / passed_s, (rate[2] - z) / passed_s
+    def _bridge(self, row: Row, passed_s: float) -> None:
+        """What precedes a sample that comes so long after the one before."""
+        ring, size = self._ring, self._size
+        periods = round(passed_s / self.alignment.period_s)
+        if self._filled == 1:  # of two samples only, the slope is that between them
+            before = ring[self._at].copy()
+            step = (np.array(row) - before)[3:] / max(periods, 1)
+            turned = before[3:] - step * np.arange(size)[::-1, np.newaxis]
+            self._at = size - 1
+            ring[:size, 3:] = ring[size:, 3:] = turned
+        if periods > 1:
+            before = ring[self._at].copy()
+            for lost in range(1, periods):
+                self._append(before + lost / periods * (row - before))
+
+    def _append(self, row: Row | Array) -> None:
+        self._filled += 1
+        self._at = at = (self._at + 1) % self._size
+        self._ring[at] = self._ring[at + self._size] = row
+
+    def error(self, mass: float) -> MotionError | None:
+        """What the latest second of motion leaves of this mass, kg, as far as that is known."""
+        end, count = self._at + self._size + 1, min(self._filled, self._size)
+        return motion_error(self._ring[end - count : end].copy(), self.alignment, self.lever, mass)
 
 
 class QuaternionGravity:

@@ -52,6 +52,7 @@ class StationaryMeans(NamedTuple):
     samples: int
     seconds: float
     acceleration_spread: Vector3 = ZERO  # m/s²
+    time_s: float | None = None  # of its middle, by the samples' clock
 
 
 class StationaryWindow:
@@ -98,7 +99,8 @@ class StationaryWindow:
                 f"only {self.count} new samples came in {seconds:.2g} s, at least "
                 f"{self.limits.least_samples} are needed"
             )
-        return stationary_means(np.array(self._rows), seconds, self.limits)
+        means = stationary_means(np.array(self._rows), seconds, self.limits)
+        return means._replace(time_s=self._last_s - 0.5 * seconds)
 
 
 def stationary_means(rows: Array, seconds: float, limits: StationaryLimits) -> StationaryMeans:

@@ -43,6 +43,7 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 ROLLED = (1.0, 0.0, 0.0, 0.0)  # half a turn about x: what was up is down
 # A quarter of a turn about -y: the sensor's x axis points up.
 TILTED = (0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5))
+LINK: Any = SimpleNamespace(info=SensorInfo())
 POSE: dict[str, Any] = {
     "tool_mass": TOOL.mass,
     "tool_center_of_gravity": [*TOOL.center],
@@ -209,7 +210,7 @@ def test_an_imu_beside_the_tool_is_moved_to_its_center_of_gravity() -> None:
     """While the sensor turns by 2 rad/s about z: 0.4 m/s² towards the axis, 0.1 m from it."""
     values = {row.name: row.default for row in PARAMETERS}
     given = gather(values | {"tool_center_of_gravity": (0.0, 0.0, 0.05), "imu_position": (-0.1, 0.0, 0.05)})
-    source = RobotSource(given, "topic /imu")
+    source = RobotSource(given, "topic /imu", LINK)
     for step in range(20):
         t = step * 0.01
         source.latest = Oriented(UPRIGHT, round(t * 1e9) + 10**9, (0.0, 0.0, -STANDARD_GRAVITY))
@@ -320,8 +321,7 @@ def test_the_source_tf(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque() -> None:
-    link: Any = SimpleNamespace(info=SensorInfo())
-    source, number = ImuSource(DEFAULTS, link), itertools.count(1)
+    source, number = ImuSource(DEFAULTS, LINK), itertools.count(1)
 
     def felt(count: int = 1) -> float:
         found = None
@@ -332,14 +332,14 @@ def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque()
 
     assert felt() == 1.0, "nothing is known of them"
     known: dict[str, SettingValue] = {"sinc_length": 512, "fir": False, "acceleration_filter": 1}
-    link.info = SensorInfo(settings=known, rate_hz=100)
+    LINK.info = SensorInfo(settings=known, rate_hz=100)
     assert felt(20) == pytest.approx(21 - (15 - 1.94) / 10)
-    link.info = SensorInfo(settings={**known, "chop": True}, rate_hz=100)
+    LINK.info = SensorInfo(settings={**known, "chop": True}, rate_hz=100)
     assert felt() == 22.0, "how long CHOP delays is not known"
 
 
 def test_a_clock_that_goes_back_does_not_stop_a_source_for_ever() -> None:
-    source = RobotSource(DEFAULTS, "topic /pose")
+    source = RobotSource(DEFAULTS, "topic /pose", LINK)
     source.latest = Oriented(UPRIGHT, 5_000 * 10**9)
     assert source.specific_force(sample(), 5000.0, 5000.0) == pytest.approx((0.0, 0.0, 9.80665))
     source.latest = Oriented(TILTED, 100 * 10**9)
@@ -358,7 +358,7 @@ def test_rotations_multiply_in_the_order_that_is_said() -> None:
 def test_an_orientation_of_a_topic_is_carried_on_to_the_sample(set_by_s: float) -> None:
     """The robot turns by 2 rad/s about x and tells its pose 20 ms late, twenty times a second; meanwhile the
     wall clock, by which poses are stamped, is set."""
-    source, speed, begin_s, wall_s = RobotSource(DEFAULTS, "topic /pose"), 2.0, 1000.0, 1e9
+    source, speed, begin_s, wall_s = RobotSource(DEFAULTS, "topic /pose", LINK), 2.0, 1000.0, 1e9
     for step in range(100):
         t = step * 0.01
         if step == 50:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from ft_compensation.identification.poses import Pose
 from ft_compensation.quantities import Payload, Wrench
 
+SEED = int(os.environ.get("TEST_SEED", "0"))  # another one in every long run
 TOOL = Payload(0.8, (0.004, -0.006, 0.055))
 BIAS = Wrench((3.0, -1.5, 7.25), (0.2, -0.05, 0.125))
 # The six directions that may point up.

@@ -6,6 +6,7 @@ is felt follows from them by differences on a grid that is fine enough.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -22,7 +23,11 @@ from bota_ethercat.sensor.response import (
     fir_taps,
 )
 from bota_ethercat.settings import SettingValue
-from ft_compensation.quantities import Payload
+from ft_compensation.alignment import Alignment
+from ft_compensation.compensator import Compensator
+from ft_compensation.motion_error import MotionError
+from ft_compensation.quantities import EXACT, OFFSET_PRIOR, SCALE_PRIOR, Accelerometer, Payload
+from ft_compensation.specific_force import ImuSpecificForce
 
 Array = NDArray[np.float64]
 # Times (n,), s, to position (n, 3), m, and three angles (n, 3), rad.
@@ -40,6 +45,25 @@ class Imperfection(NamedTuple):
     rate_offset: float = 0.02  # rad/s, on each axis
     acceleration_offset: Vector3 = (0.0, 0.0, 0.0)  # m/s²
     scale: Vector3 = (1.0, 1.0, 1.0)
+    cross_axis: tuple[float, ...] = (0.0,) * 6  # what is to be subtracted: xy xz yx yz zx zy
+
+    @property
+    def known(self) -> Accelerometer:
+        """As a perfect identification finds it."""
+        nothing = (1e-6,) * 3
+        x, y, u, v, w, z = self.cross_axis
+        return Accelerometer(
+            self.acceleration_offset, self.scale, nothing, nothing, (x, y, u, v, w, z), nothing + nothing
+        )
+
+
+def imperfect(seed: int) -> Imperfection:
+    """A healthy one: offsets as of any accelerometer, 0.5 % of scale and of each other axis."""
+    draw = np.random.default_rng(seed)
+    x, y, z = draw.normal(0.0, OFFSET_PRIOR, 3).tolist()
+    a, b, c = (1.0 + SCALE_PRIOR * draw.normal(size=3)).tolist()
+    crossed = tuple((SCALE_PRIOR * draw.normal(size=6)).tolist())
+    return Imperfection(acceleration_offset=(x, y, z), scale=(a, b, c), cross_axis=crossed)
 
 
 class Felt(NamedTuple):
@@ -54,7 +78,7 @@ class Felt(NamedTuple):
 
 HEALTHY: Final = Imperfection()
 PERFECT: Final = Imperfection(0.0, 0.0, 0.0)
-_FINER: Final = 16
+_FINER: Final = 8
 
 
 def feel(
@@ -84,14 +108,25 @@ def feel(
 
     draw = np.random.default_rng(seed)
     force = -tool.mass * at(tool.center)
-    acceleration = at(IMU) * imu.scale + imu.acceleration_offset
+    xx, yy, zz, xy, xz, yz = tool.inertia
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    torque = np.cross(tool.center, force) - spin @ inertia - np.cross(rate, rate @ inertia)
+    crossed = np.eye(3)
+    crossed[~np.eye(3, dtype=bool)] = -np.array(imu.cross_axis)
+    acceleration = at(IMU) @ np.linalg.inv(crossed).T * imu.scale + imu.acceleration_offset
     acceleration += draw.normal(scale=imu.acceleration_noise, size=acceleration.shape)
     measured = rate + imu.rate_offset + draw.normal(scale=imu.rate_noise, size=rate.shape)
-    return Felt(times, force, np.cross(tool.center, force), acceleration, measured)
+    return Felt(times, force, torque, acceleration, measured)
 
 
 def filtered(
-    path: Path, tool: Payload, seconds: float, settings: Mapping[str, SettingValue], *, seed: int = 0
+    path: Path,
+    tool: Payload,
+    seconds: float,
+    settings: Mapping[str, SettingValue],
+    *,
+    seed: int = 0,
+    imu: Imperfection = HEALTHY,
 ) -> Felt:
     """The same as a sensor with these settings gives it.
 
@@ -100,20 +135,79 @@ def filtered(
     rate_hz = 51200 / settings["sinc_length"]
     start_s = (SINC_ORDER + FIR_TAPS) / rate_hz  # until the filters are full
     early_s = SINC_ORDER / 2 / _FINER / rate_hz  # by which averages over steps are early
-    fine = feel(_later(path, start_s + early_s), tool, seconds + start_s, _FINER * rate_hz, imu=PERFECT)
+    fine = feel(later(path, start_s + early_s), tool, seconds + start_s, _FINER * rate_hz, imu=PERFECT)
     second = np.zeros(_FINER * (FIR_TAPS - 1) + 1)
     second[::_FINER] = fir_taps()
     load = np.concatenate([fine.force, fine.torque], axis=1)
     for taps in [np.full(_FINER, 1 / _FINER)] * SINC_ORDER + [second] * bool(settings["fir"]):
         load = np.stack([np.convolve(column, taps)[: len(load)] for column in load.T], axis=1)
     late = [response(settings).delay_s or 0.0 for response in (acceleration_response, angular_rate_response)]
-    accelerometer, gyroscope = (feel(_later(path, by_s), tool, seconds, rate_hz, seed=seed) for by_s in late)
+    accelerometer, gyroscope = (
+        feel(later(path, by_s), tool, seconds, rate_hz, seed=seed, imu=imu) for by_s in late
+    )
     load = load[round(start_s * rate_hz) * _FINER :: _FINER][: len(gyroscope.times)]
     return Felt(gyroscope.times, load[:, :3], load[:, 3:], accelerometer.acceleration, gyroscope.rate)
 
 
-def _later(path: Path, by_s: float) -> Path:
+def later(path: Path, by_s: float) -> Path:
+    """The same motion, so much later."""
     return lambda t: path(t - by_s)
+
+
+def settings(sinc_length: int = 64, fir: bool = False, **others: SettingValue) -> dict[str, SettingValue]:
+    """Those of the sensor that the filters go by."""
+    return {
+        "sinc_length": sinc_length,
+        "fir": fir,
+        "acceleration_filter": 1,
+        "angular_rate_filter": 3,
+        "acceleration_range_g": 2,
+        "angular_rate_range_dps": 250,
+        **others,
+    }
+
+
+class Left(NamedTuple):
+    """What compensation leaves."""
+
+    times: Array  # (n,) s
+    force: Array  # (n, 3) N
+    torque: Array  # (n, 3) Nm
+    error: MotionError | None  # what it says of the last second itself
+
+    @property
+    def size(self) -> Array:
+        """(n,) N."""
+        return np.asarray(np.linalg.norm(self.force, axis=1))
+
+    @property
+    def rms(self) -> float:
+        """N."""
+        return math.sqrt(float((self.size**2).mean()))
+
+    def percentile(self, share: float) -> float:
+        """N."""
+        return float(np.quantile(self.size, share))
+
+
+def left_over(
+    felt: Felt,
+    tool: Payload,
+    alignment: Alignment | None = None,
+    accelerometer: Accelerometer = EXACT,
+    settling_s: float = -math.inf,
+) -> Left:
+    """Of these samples, with no contact and no bias; samples that are withheld are missing."""
+    x, y, z = (center - imu for center, imu in zip(tool.center, IMU, strict=True))
+    imu, compensator = ImuSpecificForce((x, y, z), accelerometer, alignment), Compensator(tool)
+    rows = []
+    for time_s, force, torque, acceleration, rate in zip(*(part.tolist() for part in felt), strict=True):
+        specific = imu.follow((*acceleration,), (*rate,), time_s)
+        if specific is not None and time_s >= settling_s:
+            final = compensator.compensate((*force,), (*torque,), specific, imu.turning).final
+            rows.append((time_s, *final.values))
+    found = np.array(rows)
+    return Left(found[:, 0], found[:, 1:4], found[:, 4:], imu.error(tool.mass))
 
 
 def rotations(angles: Array) -> Array:

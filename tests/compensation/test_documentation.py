@@ -28,11 +28,9 @@ TARED = np.array(BIAS.values) + np.hstack([WEIGHT[0], WEIGHT_TORQUE[0]])
 MISTAKES: dict[str, dict[str, object]] = {
     "none": {},
     "bias not subtracted": {"bias": np.zeros(6)},
-    "bias added instead of subtracted": {"bias": -np.array(BIAS.values)},
     "tare with the tool on, no gravity compensation": {"bias": TARED, "mass": 0.0},
     "tare with the tool on, and gravity compensation": {"bias": TARED},
     "mass 25 % too small": {"mass": 0.75 * TOOL.mass},
-    "gravity with the wrong sign": {"gravity": -GRAVITY},
     "rotation the wrong way round": {"gravity": equations.gravity_in_sensor(BASE_R_SENSOR, DEFAULT_GRAVITY)},
     "frame turned by 90° about z": {"gravity": GRAVITY[:, [1, 0, 2]] * (1, -1, 1)},
     "center of gravity wrong": {"center": (0.0, 0.0, 0.1)},

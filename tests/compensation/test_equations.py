@@ -14,10 +14,12 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from ethercat_server.virtual_sensor import signals
+from ft_compensation.alignment import align
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import ZERO, Payload, Wrench
 from ft_compensation.specific_force import ImuSpecificForce
 from tests.compensation import equations
+from tests.compensation.motion import settings
 
 CASES = 10_000 if "TEST_SEED" in os.environ else 2_000  # all of them in long runs
 
@@ -86,14 +88,15 @@ def test_what_is_no_payload_is_a_sentence(mass: object, center: object, message:
 
 def test_compensation_is_quick() -> None:
     """Far below the 20 us that a sample may cost, where adding up a thousand integers takes 10 us."""
-    compensator, imu = Compensator(Payload(1.0, (0.1, 0.2, 0.3))), ImuSpecificForce((0.1, 0.2, 0.3))
-    v, times = (1.0, 2.0, 3.0), itertools.count()
+    compensator, alignment = Compensator(Payload(1.0, (0.1, 0.2, 0.3))), align(settings(), 800.0)
+    imu = ImuSpecificForce((0.1, 0.2, 0.3), alignment=alignment)
+    v, still, times = (1.0, 2.0, 3.0), ZERO, itertools.count()
 
     def cost(call: Callable[[], object]) -> float:
         return min(timeit.repeat(call, timer=time.thread_time, number=200, repeat=20))
 
     def compensate() -> None:
-        felt = imu.follow(v, v, next(times) / 800)
+        felt = imu.follow(v, still, next(times) / 800)
         assert felt is not None
         compensator.compensate(v, v, felt)
 

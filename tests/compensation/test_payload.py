@@ -20,10 +20,11 @@ from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import IdentificationError, identify, summary
 from ft_compensation.identification.poses import Pose, coverage, pose_of
 from ft_compensation.identification.weighted import Array, two_sided
-from ft_compensation.quantities import CompensationError, Payload, Wrench
+from ft_compensation.quantities import NO_WRENCH, SCALE_PRIOR, CompensationError, Payload, Wrench
 from ft_compensation.stationary import StationaryMeans
 from tests.compensation import equations
-from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, pose, written_parameters
+from tests.compensation.making import AXES, BIAS, SEED, TOOL, gravity_for, load, pose, written_parameters
+from tests.simulation import more_if_long
 
 Up = tuple[float, float, float]
 NOISE: Final = np.array([0.02] * 3 + [0.0004] * 3)  # N, Nm: of the mean of a window
@@ -35,9 +36,9 @@ def circle(count: int = 8, tilt: float = 0.0) -> list[Up]:
     return [(tilt, math.sin(turn), math.cos(turn)) for turn in turns]
 
 
-def refusal(poses: list[Pose], *, one_axis: bool = False) -> str:
+def refusal(poses: list[Pose]) -> str:
     with pytest.raises(IdentificationError) as caught:
-        identify(poses, one_axis=one_axis)
+        identify(poses)
     text = str(caught.value)
     assert "\n" not in text
     return text
@@ -118,14 +119,15 @@ def test_the_summary_and_the_condition() -> None:
 class Reading:
     """Poses as an accelerometer with an offset and wrong sensitivities sees them."""
 
-    def __init__(self, seed: int, length: float = 0.2, scale: float = 0.005) -> None:
+    def __init__(self, seed: int, length: float = 0.2, scale: float = 0.005, crossed: float = 0.0) -> None:
         self.draw = np.random.default_rng(seed)
         offset = self.draw.normal(size=3)
         self.offset = offset * length / np.linalg.norm(offset)
         self.scale = 1.0 + scale * self.draw.uniform(-1.0, 1.0, size=3)
+        self.straight = np.eye(3) + crossed * self.draw.normal(size=(3, 3))
 
     def acceleration(self, up: Up) -> Up:
-        x, y, z = (-self.scale * np.array(gravity_for(up)) + self.offset).tolist()
+        x, y, z = (-self.scale * (self.straight @ gravity_for(up)) + self.offset).tolist()
         return x, y, z
 
     def pose(self, up: Up) -> Pose:
@@ -160,8 +162,8 @@ def test_an_offset_no_longer_passes_for_a_bias() -> None:
         measured = pose(up, noise=noise).wrench
         poses.append(reading.pose(up)._replace(wrench=measured))
     found, blind = identify(poses), identify([each._replace(acceleration=None) for each in poses])
-    assert found.force_rms == pytest.approx(0.02, rel=0.3)
-    assert blind.force_rms > 0.045
+    assert found.force_fit.rms == pytest.approx(0.02, rel=0.3)
+    assert blind.force_fit.rms > 0.045
     assert math.dist(blind.bias.force, BIAS.force) > math.hypot(*blind.bias_interval.force)
     assert math.dist(found.bias.force, BIAS.force) < math.hypot(*found.bias_interval.force)
 
@@ -181,7 +183,7 @@ def test_an_offset_that_the_poses_do_not_determine_stays_open_and_the_result_say
     """Turned about x only: an offset along x tilts every pose alike, as a bias would."""
     reading, noise = Reading(2, length=0.3), random.Random(1)
     poses = [reading.pose(up)._replace(wrench=pose(up, noise=noise).wrench) for up in circle()]
-    found = identify(poses, one_axis=True)
+    found = identify(poses)
     assert found.accelerometer is not None
     assert found.accelerometer.undetermined == "x"
     x, y, z = found.accelerometer.calibration.offset_interval
@@ -237,15 +239,12 @@ def test_residuals_are_judged_by_the_noise_of_the_windows() -> None:
     assert identify([pose(up) for up in AXES]).torque_fit.chi_square is None
 
 
-def test_small_tilts_and_torques_that_do_not_fit_are_refused() -> None:
-    # 20° to every side sees two axes, but hardly the third.
-    tilts = [(0.34 * x, 0.34 * y, 0.94) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-    assert "along the sensor's z axis" in refusal([pose(up) for up in [*tilts, (0, 0, 1)]])
+def test_torques_that_do_not_fit_are_refused() -> None:
     poses = [pose(up) for up in AXES]
     x, y, z = poses[4].wrench.torque
     poses[4] = poses[4]._replace(wrench=Wrench(poses[4].wrench.force, (x + 0.6, y, z)))
     text = refusal(poses)
-    assert re.search(r"residual is 0\.\d+ Nm, the limit 0\.\d+ Nm; pose \d fits worst", text)
+    assert re.search(r"residual is 0\.\d+ Nm, the limit 0\.\d+ Nm; .*pose 5 fits worst", text)
 
 
 # Refusals.
@@ -266,9 +265,7 @@ UPWARD, DOWNWARD = (0, 0, 1), (0, 0, -1)
             "only along the sensor's z axis, so the center of gravity along it is unseen",
         ),
         ([(1, 1, 0), (-1, -1, 0)] * 3, r"only along the direction .0.71, 0.71, 0.00. of the sensor's frame"),
-        ([UPWARD, (0, 1, 0), (1, 0, 0)], "about one axis only"),
-        (circle(), "about one axis only: gravity never changed along the sensor's x axis"),
-        (circle(tilt=0.5), r"never changed along the sensor's x axis.*so that its [+-]x axis points up"),
+        ([UPWARD, (0, 1, 0), (1, 0, 0)], "there are 3 of at least 4 poses"),
     ],
 )
 def test_poses_that_do_not_suffice_are_refused_with_what_is_unseen(ups: list[Up], words: str) -> None:
@@ -276,14 +273,46 @@ def test_poses_that_do_not_suffice_are_refused_with_what_is_unseen(ups: list[Up]
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5])
-def test_one_axis_is_taken_on_request(tilt: float) -> None:
-    found = identify([pose(up) for up in circle(tilt=tilt)], one_axis=True)
+def test_poses_about_one_axis_are_taken_with_a_note(tilt: float) -> None:
+    found = identify([pose(up) for up in circle(tilt=tilt)])
     assert found.payload.mass == pytest.approx(TOOL.mass)
     assert found.payload.center == pytest.approx(TOOL.center)
     assert found.bias.values == pytest.approx(BIAS.values)
-    two = [pose(UPWARD), pose((0, 1, 0))] * 4
-    assert "center of gravity along it is unseen" in refusal(two, one_axis=True)
-    identify([pose(up) for up in (UPWARD, (0, 1, 0), (1, 0, 0), DOWNWARD)])
+    assert re.search("hardly changed along the sensor's x axis.*[+-]x axis points up", found.notes[-1])
+
+
+def cone(draw: np.random.Generator) -> list[Up]:
+    """Twelve poses within 30 to 45° of upright."""
+    tilts, turns = np.radians(draw.uniform(30, 45, 12)), draw.uniform(0, math.tau, 12)
+    rows = np.stack([np.sin(tilts) * np.cos(turns), np.sin(tilts) * np.sin(turns), np.cos(tilts)], axis=1)
+    return [(x, y, z) for x, y, z in rows.tolist()]
+
+
+def anywhere(draw: np.random.Generator) -> list[Up]:
+    """Six poses."""
+    return [(x, y, z) for x, y, z in draw.normal(size=(6, 3)).tolist()]
+
+
+@pytest.mark.parametrize("ups", [cone, anywhere])
+@pytest.mark.parametrize("seed", more_if_long(range(10), range(100)))
+def test_poses_are_judged_by_the_intervals_that_result(
+    ups: Callable[[np.random.Generator], list[Up]], seed: int
+) -> None:
+    draw, noise = np.random.default_rng([seed, SEED]), random.Random(seed)
+    reading = Reading(seed)
+    poses = [reading.pose(up)._replace(wrench=pose(up, noise=noise).wrench) for up in ups(draw)]
+    found = identify(poses)
+    assert abs(found.payload.mass - TOOL.mass) < min(0.02, 2 * found.mass_interval)
+    assert math.dist(found.payload.center, TOOL.center) < 0.002
+
+
+def test_poses_that_leave_wide_intervals_are_refused_with_them() -> None:
+    """Within 2° of upright, with the noise of a short window."""
+    noise = random.Random(1)
+    poses = [pose((0.05 * x, 0.05 * y, 1), noise=noise, deviation=0.3) for x, y, _ in AXES for _ in (0, 1)]
+    assert re.search(
+        r"do not suffice: mass \S+ ± \S+ kg, .* mm; turn|cannot be told from zero", refusal(poses)
+    )
 
 
 @pytest.mark.parametrize(
@@ -312,18 +341,45 @@ def pushed(poses: list[Pose], number: int, force: Up) -> list[Pose]:
 
 
 def test_a_pose_in_which_something_touched_the_tool_is_named() -> None:
-    """Refused if it was held, a note if it was touched lightly."""
+    """Refused if it was held, a note if it was touched lightly: whichever of six it is."""
     text = refusal(pushed([pose(up) for up in AXES], 3, (0.0, 15.0, 0.0)))
     assert re.search("do not fit one payload.*pose 3 fits worst", text)
     noise = random.Random(4)
-    poses = [pose(up, noise=noise) for up in [*AXES, (1, 1, 1), (-1, -1, 1), (1, -1, -1), (-1, 1, -1)]]
-    notes = identify(pushed(poses, 5, (0.0, 0.0, 1.5))).notes
-    assert any("pose 5 fits worse than the others" in note for note in notes)
+    for number in range(1, 7):
+        poses = timed([pose(up, noise=noise) for up in AXES])
+        found = identify(pushed(poses, number, (0.0, 0.3, 1.0)))
+        assert (found.touched, found.drift) == (number - 1, None)
+        assert f"pose {number} does not fit the others, by 1" in found.notes[0]
+
+
+def timed(poses: list[Pose], drift: Wrench = NO_WRENCH) -> list[Pose]:
+    """A pose in 12 s; `drift` of the bias a minute."""
+    return [
+        each._replace(time_s=7e5 + 12 * n, wrench=each.wrench.plus(drift, 0.2 * n))
+        for n, each in enumerate(poses)
+    ]
+
+
+def test_a_drift_of_the_bias_is_fitted_and_told_in_newtons_a_minute() -> None:
+    noise, drift = random.Random(3), Wrench((0.0, -0.5, 0.3), (0.0, 0.01, 0.0))
+    poses = timed([pose(up, noise=noise) for up in AXES], drift)
+    found = identify(poses)
+    assert found.drift is not None
+    assert found.drift.force == pytest.approx(drift.force, abs=0.15)
+    assert f"drifted by {math.hypot(*found.drift.force):.2g} N" in found.notes[0]
+    assert "take the first pose again at the end" in found.notes[0]
+    assert found.payload.mass == pytest.approx(TOOL.mass, abs=0.01)
+    now = BIAS.plus(drift)
+    assert found.bias.force == pytest.approx(now.force, abs=0.15), "the bias is that of the last pose"
+    again = identify(timed([pose(up, noise=noise) for up in (*AXES, AXES[0])], drift))
+    assert "again" not in again.notes[0]
+    assert identify(timed([pose(up, noise=noise) for up in AXES])).drift is None
+    assert identify([each._replace(time_s=None) for each in poses]).drift is None
 
 
 def test_a_wide_interval_is_a_note() -> None:
     noise = random.Random(7)
-    notes = identify([pose(up, Payload(0.2, TOOL.center), noise=noise, deviation=0.7) for up in AXES]).notes
+    notes = identify([pose(up, Payload(0.2, TOOL.center), noise=noise, deviation=0.5) for up in AXES]).notes
     assert re.search(r"mass is known to ± \d+ % only.*gravity is known to ± \d+ mm only", " ".join(notes))
 
 
@@ -432,7 +488,10 @@ def simulate(runs: int, poses: int, ratio: float, offset: float | None) -> tuple
         return estimate(wrench, gravity), None
     offsets = draw.normal(size=(runs, 3))
     offsets *= offset / np.linalg.norm(offsets, axis=-1, keepdims=True)
-    read = -gravity + offsets[:, np.newaxis] + READING_NOISE * draw.normal(size=up.shape)
+    crossed = np.eye(3) + SCALE_PRIOR * draw.normal(
+        size=(runs, 3, 3)
+    )  # scale, and axes that are not quite theirs
+    read = -gravity @ crossed + offsets[:, np.newaxis] + READING_NOISE * draw.normal(size=up.shape)
     seen = -STANDARD_GRAVITY * read / np.linalg.norm(read, axis=-1, keepdims=True)
     return estimate(wrench, seen, acceleration=read, acceleration_variance=READING_NOISE**2), offsets
 
@@ -459,10 +518,13 @@ CASES: Final = ((6, 1, None), (6, 10, None), (12, 3, None), (24, 10, None), (6, 
 
 @pytest.mark.parametrize(("poses", "ratio", "offset"), CASES)
 def test_the_intervals_cover_93_to_97_percent(poses: int, ratio: float, offset: float | None) -> None:
-    """300 runs tell a share of 95 % to ± 1.3 % (standard deviation), three axes together to 0.7 %."""
+    """300 runs tell a share of 95 % to ± 1.3 % (standard deviation), three axes together to 0.7 %.
+
+    More where the accelerometer is identified too: what is assumed of it is more than few poses can tell.
+    """
     for name, shares in covered(simulate(300, poses, ratio, offset)[0]).items():
-        allowed = 0.02 if len(shares) > 1 else 0.03
-        assert shares.mean() == pytest.approx(0.95, abs=allowed), name
+        assert shares.mean() > (0.93 if len(shares) > 1 else 0.92), name
+        assert offset or shares.mean() < (0.97 if len(shares) > 1 else 0.98), name
 
 
 @pytest.mark.long
@@ -470,9 +532,34 @@ def test_the_intervals_cover_93_to_97_percent(poses: int, ratio: float, offset: 
 @pytest.mark.parametrize("ratio", [1, 3, 10])
 @pytest.mark.parametrize("offset", [None, 0.0, 0.3])
 def test_the_intervals_cover_the_truth_axis_by_axis(poses: int, ratio: float, offset: float | None) -> None:
-    for name, shares in covered(simulate(3000, poses, ratio, offset)[0]).items():
-        assert shares.min() >= 0.93, f"{name}: {shares}"
-        assert shares.max() <= 0.97, f"{name}: {shares}"
+    runs = 3000 if offset is None else 800
+    for name, shares in covered(simulate(runs, poses, ratio, offset)[0]).items():
+        assert shares.min() >= (0.93 if offset is None else 0.92), f"{name}: {shares}"
+        assert offset is not None or shares.max() <= 0.97, f"{name}: {shares}"
+
+
+@pytest.mark.parametrize("poses", [6, 12])
+def test_under_drift_and_crossed_axes_the_intervals_stay_honest(poses: int) -> None:
+    """Of the mass and the center of gravity, with 0.5 N in all and 0.5 % of each other axis; any tool."""
+    draw, inside, runs = np.random.default_rng([poses, SEED]), [], 25
+    for run in range(runs):
+        tool = Payload(draw.uniform(0.5, 2.1), tuple(draw.uniform(-0.02, 0.08, 3).tolist()))
+        reading, noise = Reading(run, crossed=0.005), random.Random(run)
+        minutes = 0.2 * (poses - 1)
+        drift = Wrench(tuple((draw.choice((-1, 1), 3) * 0.3 / minutes).tolist()), (0.0, 0.01, 0.0))
+        ups = [*AXES, *map(tuple, draw.normal(size=(poses - 6, 3)).tolist())]
+        draw.shuffle(ups)
+        measured = timed([pose(up, tool, noise=noise) for up in ups], drift)
+        found = identify(
+            [
+                reading.pose(up)._replace(wrench=each.wrench, time_s=each.time_s)
+                for up, each in zip(ups, measured, strict=True)
+            ]
+        )
+        inside.append(abs(found.payload.mass - tool.mass) <= found.mass_interval)
+        centers = zip(found.payload.center, tool.center, found.centre_interval, strict=True)
+        inside += [abs(value - truth) <= half for value, truth, half in centers]
+    assert np.mean(inside) > 0.9
 
 
 def test_the_interval_of_an_offset_holds_it_and_shrinks_with_more_poses() -> None:

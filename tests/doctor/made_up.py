@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,16 +28,11 @@ Files = Mapping[str, str | bytes | None]
 GOOD: Files = {
     "/proc/version": "Linux version 6.12.0-rt-amd64 (x@y) #1 SMP PREEMPT_RT Debian",
     "/proc/cmdline": "quiet isolcpus=3",
-    "/proc/config.gz": gzip.compress(b"CONFIG_HZ=1000\nCONFIG_PREEMPT_RT=y\n"),
-    "/proc/sys/kernel/sched_rt_runtime_us": "950000\n",
-    "/proc/sys/kernel/sched_rt_period_us": "1000000\n",
     "/proc/self/status": "Name:\tpython\nCapEff:\t000001ffffffffff\n",
     "/proc/cpuinfo": "flags\t\t: fpu vme de\n",
     "/proc/interrupts": " 0: 9 IO-APIC timer\n 130: 1 2 IR-PCI-MSI-0000:00:1f.6 0-edge ens5\n 131: 7 xhci\n",
     "/proc/irq/130/smp_affinity_list": "0-3\n",
     "/proc/irq/130/effective_affinity_list": "3\n",
-    "/proc/77/comm": "irq/130-ens5\n",
-    "/proc/77/stat": "77 (irq/130-ens5) S " + " ".join(["0"] * 36) + " 85 1 0\n",
     "/sys/kernel/realtime": "1\n",
     "/sys/devices/system/clocksource/clocksource0/current_clocksource": "tsc\n",
     "/sys/devices/system/clocksource/clocksource0/available_clocksource": "tsc hpet acpi_pm\n",
@@ -63,10 +57,10 @@ def write(root: Path, files: Files) -> None:
             path.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def machine(root: Path, files: Files | None = None, facts: Facts = FACTS, **more: Any) -> Machine:
+def machine(root: Path, files: Files | None = None, facts: Facts = FACTS) -> Machine:
     """The good machine but for these files (None: not there), which are below `root`, and facts."""
     write(root, {**GOOD, **(files or {})})
-    return Machine("ens5", facts=dict(facts), root=root, release="6.12.0-rt-amd64", **more)
+    return Machine("ens5", facts=dict(facts), root=root)
 
 
 def but(**changes: Any) -> Facts:

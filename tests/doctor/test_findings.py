@@ -62,7 +62,6 @@ def test_who_it_is(changes: dict[str, Any], level: Level, named: str) -> None:
 
 
 COUPLER, BUSY = slave(vendor=2, name="EK1100"), slave(sii_problem="busy")
-ALONE, LINKED = (True, False, False, False), (True, True, False, False)
 
 
 @pytest.mark.parametrize(
@@ -71,11 +70,6 @@ ALONE, LINKED = (True, False, False, False), (True, True, False, False)
         (bus_checks.any_sensor([COUPLER]), BAD, "no Bota Gen-0 sensor"),
         (bus_checks.any_sensor([COUPLER, slave()]), None, ""),
         (bus_checks.any_sensor([COUPLER, BUSY]), None, ""),  # it may be one
-        (bus_checks.cabling([slave(links=ALONE)]), FINE, ""),
-        (bus_checks.cabling([slave(links=LINKED), slave(position=1, links=ALONE)]), FINE, ""),
-        (bus_checks.cabling([slave(links=LINKED), slave(position=1, links=LINKED)]), NOTE,
-         "port 0 of slave 1, port 1 of slave 1"),
-        (bus_checks.cabling([]), None, ""),
     ],
 )  # fmt: skip
 def test_a_bus_as_a_whole(found: Iterable[Finding], level: Level | None, said: str) -> None:

@@ -42,7 +42,7 @@ from tests.server.running import PATIENCE_S
         (["ens5", "--seconds", "-1"], "from 0 to 3600"),
         (["ens5", "--seconds", "nan"], "from 0 to 3600"),
         (["ens5", "--cpu", "4000"], "--cpu 4000: this machine has the processors 0 to"),
-        (["ens5", "--rt-priority", "100"], "--rt-priority: '100' must be a whole number from 0 to 99"),
+        (["ens5", "--rt-priority", "100"], "--rt-priority: must be a whole number from 0 to 99, not '100'"),
         (["a-name-that-is-too-long"], "is not an interface name"),
         (["../lo"], "is not an interface name"),
         ([""], "is not an interface name"),
@@ -110,7 +110,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def named(finding: Finding, subject: str = "kernel", check: str = "tick") -> Finding:
+def named(finding: Finding, subject: str = "kernel", check: str = "clock source") -> Finding:
     return replace(finding, subject=subject, check=check)
 
 
@@ -145,7 +145,7 @@ def test_the_end_repeats_what_matters_for_the_rest_scrolls_away(monkeypatch: pyt
     assert len(end) < 24
     assert max(len(line) for line in end[1:]) <= 80
     assert "Trouble" in end[0]
-    assert end[1] == "  bad      bus, tick: gone"
+    assert end[1] == "  bad      bus, clock source: gone"
     assert end[-1] == "  and 2 more above"
 
 
@@ -182,7 +182,7 @@ def test_the_worst_finding_counts() -> None:
 def test_json_has_it_all() -> None:
     found = json.loads(as_json({"interface": "ens5"}, [named(warning("b", "c", "d", n=1))]))
     assert (found["interface"], found["verdict"], found["worst"]) == ("ens5", "look", "warning")
-    where = {"subject": "kernel", "check": "tick", "level": "warning"}
+    where = {"subject": "kernel", "check": "clock source", "level": "warning"}
     expected = {**where, "found": "b", "why": "c", "commands": ["d"], "values": {"n": 1}}
     assert found["findings"] == [expected]
 

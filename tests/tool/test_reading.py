@@ -232,23 +232,6 @@ def test_a_drive_at_work_is_not_touched(
         assert bus.stats_of_foreign(1)["write_count"] == 0
 
 
-def test_the_standard_objects_of_a_foreign_slave_in_the_state_it_is_in() -> None:
-    with simulated_bus("--chain", "EK1100,DRIVE:PREOP,DRIVE") as bus:
-        before, sent = [state(each) for each in registers(bus.backend)], writes(bus.backend)
-        (slave,) = told("objects", bus.near, "--slave", "1:DRIVE")["sensors"]
-        assert (slave["slave"], slave["name"]) == (1, "DRIVE")
-        found = {(row["index"], row["subindex"]): row.get("value") for row in slave["objects"]}
-        assert (found["0x1018", 1], found["0x1018", 2]) == (0x7E57, 402)
-        assert [state(each) for each in registers(bus.backend)] == before
-        assert len({address for _, address in sent} - SII_ACCESS) == 1, "its mailbox"
-        for wanted, why in (
-            ("1", "there are 0:EK1100; 1:DRIVE; 2:DRIVE"), ("0:DRIVE", "no slave is '0:DRIVE'"),
-            ("0:EK1100", "has no CoE mailbox"),
-        ):  # fmt: skip
-            assert why in refused("objects", bus.near, "--slave", wanted, code=2)
-        assert "is in INIT" in refused("objects", bus.near, "--slave", "2:DRIVE")
-
-
 def state(registers: bytes) -> bytes:
     """What its own master has set up: station address, AL state, FMMUs, sync managers' layout."""
     managers = registers[reg.SYNC_MANAGER : reg.SYNC_MANAGER + 4 * reg.SYNC_MANAGER_SIZE]

@@ -62,20 +62,15 @@ def test_a_frame_has_one_time_in_all_its_datagrams_and_slaves() -> None:
 
 def test_the_rate_changes_without_a_jump_of_the_time() -> None:
     clock = LocalClock(1000)
-    clock.jump(1000, 2**32 - 10)
+    clock.set(1000, 2**32 - 10)
     clock.set_ppm(1000, 100.0)
     assert clock.at(1000 + 10 * MS) == 2**32 - 10 + 10 * MS + 1000
-    clock.set_ppm(1000 + 10 * MS, -50.0, ramp_ns=10 * MS)
+    clock.set_ppm(1000 + 10 * MS, -50.0)
     before = clock.at(1000 + 10 * MS)
     assert before == 2**32 - 10 + 10 * MS + 1000
-    assert clock.at(1000 + 20 * MS) == before + 10 * MS + 250, "25 ppm in the mean"
-    assert clock.at(1000 + 30 * MS) == before + 20 * MS + 250 - 500
+    assert clock.at(1000 + 20 * MS) == before + 10 * MS - 500
     clock.steer(1000 + 15 * MS, 10**6)
-    assert clock.at(1000 + 20 * MS) == before + 10 * MS + 250 + 5
-    clock.stop(1000 + 20 * MS, True)
-    assert clock.at(10**12) == before + 10 * MS + 255
-    clock.stop(10**12, False)
-    assert clock.at(10**12 + MS) == before + 11 * MS + 255 - 50 + 1
+    assert clock.at(1000 + 20 * MS) == before + 10 * MS - 500 + 5
     clock = LocalClock(0)
     for number in range(1000):
         clock.steer(number * 1000, 333_333)
@@ -233,14 +228,11 @@ def test_faults_of_the_event_times() -> None:
         return start + WRITE - (instant - START), change - (instant - START)
 
     for fault, found in (
-        ("late 50.5", (50_500, 50_500)), ("early 7", (-7000, -7000)), ("start", (0, -WRITE)),
-        ("previous", (-PERIOD, -PERIOD)),
-    ):  # fmt: skip
+        ("late 50.5", (50_500, 50_500)),
+        ("late -7", (-7000, -7000)),
+    ):
         assert off(fault) == found
         assert off("ok") == (0, 0)
-    scattered = {off("jitter 20") for _ in range(10)}
-    assert all(start == end and abs(end) <= 20_000 for start, end in scattered)
-    assert len(scattered) == 10
     assert [off(fault) for fault in ("ok", "stuck", "stuck", "ok")] == [
         (0, 0), (0, -2 * PERIOD), (0, -4 * PERIOD), (0, 0)
     ]  # fmt: skip
@@ -255,25 +247,15 @@ def test_faults_of_the_event_times() -> None:
 def test_faults_of_the_local_clock() -> None:
     master = prepared()
     master.wait(3 * MS)
-    _, system, _, _, change = look(master)
-    do(master, "dc jump 123456")
+    *_, change = look(master)
+    do(master, "dc at 5000000000")
     later = look(master)
     assert later[3:] == (change - WRITE, change), "of the time before the jump"
-    assert later[1] - system - 123_456 in range(1000, 10_000)
-    master.wait(PERIOD)
-    assert look(master)[4] == change + PERIOD + 123_456
-    do(master, "dc time-stuck")
-    stuck = [(frame[1], frame[4]) for frame in looks(master, 3, PERIOD)]
-    assert len({system for system, _ in stuck}) == 1
-    assert len({change for _, change in stuck}) == 3
-    do(master, "dc ok", "dc stopped")
-    assert len({frame[1:3] for frame in looks(master, 3, PERIOD)}) == 1
-    do(master, "dc ok", "dc at 5000000000")
-    assert abs(look(master)[1] - (5_000_000_000 & 0xFFFFFFFF)) < 10_000
+    assert abs(later[1] - (5_000_000_000 & 0xFFFFFFFF)) < 10_000
     do(master, "dc ppm 100")
     first, second = looks(master, 2, 10 * MS - 1000)
     assert second[1] - first[1] in range(10 * MS + 1000, 10 * MS + 12_000)
-    do(master, "dc ramp 0 1.5", "power cycle 0")
+    do(master, "power cycle 0")
     master.wait(1)
     assert not any(look(master)[2:]), "all is as in the options again"
 

@@ -28,7 +28,6 @@ class IdentifyOptions(argparse.Namespace):
     least_seconds: float
     limits: StationaryLimits
     confidence: float
-    one_axis: bool
     yaml: Path | None
     force: bool
     json: bool
@@ -54,8 +53,6 @@ def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
         help=f"change a limit of what counts as stationary: {', '.join(_LIMITS)}")  # fmt: skip
     add("--confidence", type=number(0.5, 0.9999), default=0.95, metavar="P",
         help="confidence level of the intervals (default 0.95)")  # fmt: skip
-    add("--one-axis", action="store_true",
-        help="accept poses that turn about one axis only; the result along it is unchecked")  # fmt: skip
     add("--yaml", type=Path, metavar="OUT", help="write the result as parameters of the ROS 2 node")
     add_force(made)
     add("--json", action="store_true", help="print everything as JSON instead of a table")

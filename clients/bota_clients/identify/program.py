@@ -22,7 +22,7 @@ from bota_ethercat.program.new_file import refuse_existing
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
-from ft_compensation.quantities import CompensationError, length
+from ft_compensation.quantities import CROSS_AXES, CompensationError, length
 
 _WIDTH: Final = 80  # every table fits
 Poses = Sequence[tuple[StationaryPeriod, Pose]]
@@ -66,8 +66,9 @@ def show_result(console: Console, result: Identified) -> None:
         found = result.accelerometer.calibration
         rows.append(("accelerometer offset", found.offset, found.offset_interval, 3, "m/s²"))
         rows.append(("accelerometer scale", found.scale, found.scale_interval, 4, ""))
+        rows.append(("accelerometer cross-axis", found.cross_axis, found.cross_axis_interval, 4, ""))
     for name, values, halves, digits, unit in rows:
-        for axis, *numbers in zip("xyz", values, halves, strict=True):
+        for axis, *numbers in zip("xyz" if len(values) == 3 else CROSS_AXES, values, halves, strict=True):
             table.add_row(f"{name} {axis}", *(f"{number:.{digits}f}" for number in numbers), unit)
     console.print(table)
     console.print(
@@ -109,11 +110,13 @@ def as_json(
         "bias": result.bias.values,
         "bias_interval": result.bias_interval.values,
         "confidence": result.confidence,
-        "force_rms": result.force_rms,
-        "torque_rms": result.torque_rms,
+        "force_rms": result.force_fit.rms,
+        "torque_rms": result.torque_fit.rms,
         "force_fit": result.force_fit._asdict(),
         "torque_fit": result.torque_fit._asdict(),
         "accelerometer": fit and {**fit.calibration._asdict(), "undetermined": fit.undetermined},
+        "drift": result.drift and result.drift.values,
+        "touched": result.touched,
         "condition": result.condition,
         "gravity": result.gravity,
         "notes": result.notes,
@@ -200,7 +203,6 @@ def _solve(
     if not poses:
         return poses, None, error
     try:
-        confidence, one_axis = options.confidence, options.one_axis
-        return poses, identify([pose for _, pose in poses], confidence=confidence, one_axis=one_axis), None
+        return poses, identify([pose for _, pose in poses], confidence=options.confidence), None
     except CompensationError as refusal:
         return poses, None, str(refusal)

@@ -67,7 +67,10 @@ def find_stationary_periods(
             except NotStationaryError as error:
                 rejected.append(f"{times[first]:.1f} s to {times[last - 1]:.1f} s: {error}")
             else:
-                periods.append(StationaryPeriod(float(times[first]), seconds, means))
+                middle_s = float(times[first]) + 0.5 * seconds
+                periods.append(
+                    StationaryPeriod(float(times[first]), seconds, means._replace(time_s=middle_s))
+                )
     return periods, rejected
 
 

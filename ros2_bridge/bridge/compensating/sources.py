@@ -20,11 +20,13 @@ from sensor_msgs.msg import Imu
 
 from bota_ethercat.pdo import Sample, Vector3
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
+from bota_ethercat.sensor.response import force_torque_response
 from bota_ethercat.settings import SettingValue
 from bridge.parameters.table import TOPIC_SOURCES, ParameterError, Parameters
 from bridge.stream.link import Link
-from ft_compensation.alignment import NOT_DELAYED, Alignment, alignment_taps
-from ft_compensation.quantities import Quaternion, unit_quaternion, vector
+from ft_compensation.alignment import align
+from ft_compensation.motion_error import MotionError
+from ft_compensation.quantities import STILL, Quaternion, Turning, unit_quaternion, vector
 from ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
 
 IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
@@ -56,6 +58,7 @@ class Source:
     describe = "none"  # its name for people
     is_imu = False  # whether it is the sensor's own
     has_inertia = False  # whether it has the tool's acceleration in it; else it is minus gravity
+    turning: Turning = STILL  # of the latest sample, where it has
 
     def __init__(self, why: str = "gravity_source is none") -> None:
         """`why` there is none."""
@@ -80,6 +83,10 @@ class Source:
         """How old the robot's orientation is; infinite where there is none."""
         return math.inf
 
+    def error(self, mass: float) -> MotionError | None:  # noqa: ARG002
+        """What the latest second of motion leaves of this mass, kg; None where it is not known."""
+        return None
+
 
 class ImuSource(Source):
     """The sensor's own accelerometer and gyroscope, at the instant of its force and torque."""
@@ -94,25 +101,27 @@ class ImuSource(Source):
         if not any(position):  # as the drawings of the model have it
             position = 0.0, 0.0, IMU_HEIGHTS.get(link.info.name[4:8], 0.0)
         self._imu = ImuSpecificForce(_lever(parameters, position), parameters.accelerometer)
-        self._link, self._alignment = link, Alignment()
+        self._link = link
         self._settings: Mapping[str, SettingValue] | None = None  # those of the alignment
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         """Of this sample."""
         if self._link.info.settings is not self._settings:
-            self._settings, rate_hz = self._link.info.settings, self._link.info.rate_hz
-            taps = alignment_taps(self._settings, rate_hz) if rate_hz else NOT_DELAYED
-            self._alignment = Alignment(taps, 1 / rate_hz if rate_hz else 0.0)
+            self._settings = self._link.info.settings
+            self._imu.align(align(self._settings, self._link.info.rate_hz))
         found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
-        if found is None or not any(sample.acceleration):
-            return None
-        return self._alignment.follow(found, time_s)
+        self.turning = self._imu.turning
+        return found if any(sample.acceleration) else None
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """The IMU is off or broken."""
         if not any(sample.acceleration):
             return IMU_IS_OFF
         return "" if sample.is_finite else "the IMU sends NaN or infinity: see the status stream"
+
+    def error(self, mass: float) -> MotionError | None:
+        """As far as it is known."""
+        return self._imu.error(mass)
 
 
 class Oriented(NamedTuple):
@@ -130,14 +139,16 @@ class RobotSource(Source):
     `take` is for the subscriber's thread; `latest` and `problem` are replaced, never changed in place.
     """
 
-    def __init__(self, parameters: Parameters, describe: str) -> None:
+    def __init__(self, parameters: Parameters, describe: str, link: Link) -> None:
+        """`link` knows the sensor's filters."""
         super().__init__()
-        self.describe = describe
+        self.describe, self._link = describe, link
         self.latest: Oriented | None = None
         self.problem = "nothing has come yet"  # why the latest message is unusable; empty if it is not
         self._gravity, self._limit_s = parameters.gravity, parameters.orientation_stale_after
         self._turn = QuaternionGravity(stale_after_s=self._limit_s)
-        self._lever = ImuSpecificForce(_lever(parameters, parameters.imu_position))
+        self._imu = ImuSpecificForce(_lever(parameters, parameters.imu_position))
+        self._settings: Mapping[str, SettingValue] | None = None  # those of its alignment
         self._taken: Oriented | None = None
 
     @property
@@ -170,7 +181,14 @@ class RobotSource(Source):
         x, y, z = found
         if latest.apparent_gravity is None:
             return -x, -y, -z
-        return self._lever.follow((-x, -y, -z), sample.angular_rate, time_s)
+        if self._link.info.settings is not self._settings:
+            self._settings, rate_hz = self._link.info.settings, self._link.info.rate_hz
+            # The robot's accelerometer is taken to have no delay.
+            filters = {name: value for name, value in self._settings.items() if name != "acceleration_filter"}
+            self._imu.align(align(filters, rate_hz, force_torque_response(filters, rate_hz or None).delay_s))
+        felt = self._imu.follow((-x, -y, -z), sample.angular_rate, time_s)
+        self.turning = self._imu.turning
+        return felt
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         """Nothing has come, it stopped, it is of no use, or its stamps are of another time."""
@@ -261,10 +279,10 @@ def follow_tf(node: Node, group: CallbackGroup, look: Callable[[LookUp], object]
     return close
 
 
-def open_tf(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSource:
+def open_tf(node: Node, wanted: Parameters, group: CallbackGroup, link: Link) -> RobotSource:
     """A source that looks up the orientation of the sensor in TF."""
     base, frame = wanted.orientation_base_frame, wanted.frame_id
-    source = RobotSource(wanted, f"TF from {base} to {frame}")
+    source = RobotSource(wanted, f"TF from {base} to {frame}", link)
 
     def read(look_up: LookUp) -> Oriented:
         _, rotation, stamp = look_up(base, frame)
@@ -274,11 +292,11 @@ def open_tf(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSource
     return source
 
 
-def open_topic(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSource:
+def open_topic(node: Node, wanted: Parameters, group: CallbackGroup, link: Link) -> RobotSource:
     """A source that listens to `orientation.topic`; ParameterError if ROS refuses to listen there."""
     kind, _ = TOPIC_KINDS[wanted.gravity_source]
     topic = node.resolve_topic_name(wanted.orientation_topic)
-    source = RobotSource(wanted, f"topic {topic}")
+    source = RobotSource(wanted, f"topic {topic}", link)
     source.problem = "nothing has come on it yet"
     profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -373,9 +391,9 @@ class SourceChoice:
             if wanted.gravity_source == "imu":
                 self.source = ImuSource(wanted, self._link)
             elif wanted.gravity_source == "tf":
-                self.source = open_tf(self._node, wanted, self._group)
+                self.source = open_tf(self._node, wanted, self._group, self._link)
             elif wanted.gravity_source in TOPIC_SOURCES:
-                self.source = open_topic(self._node, wanted, self._group)
+                self.source = open_topic(self._node, wanted, self._group, self._link)
         except ParameterError as error:
             self.source = Source(str(error))
             raise

@@ -18,6 +18,7 @@ from ft_compensation.outputs import LEAST_CUTOFF_HZ, LEAST_NOTCH_HZ, FilterSetti
 from ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
+    NO_PAYLOAD,
     ZERO,
     Accelerometer,
     Payload,
@@ -149,6 +150,8 @@ PARAMETERS: Final = (
     Row("diagnostics.temperature_error", LIMITS.temperature_error, "Error: temperature, °C", -40, 200),
     Row("tool_mass", 0.0, "Mass of what hangs on the sensor, kg; 0 = it is not compensated", 0, 1000),
     Row("tool_center_of_gravity", ZERO, "Its center of gravity in frame_id, m", 0, 10, lengths=(3,)),
+    Row("tool_inertia", NO_PAYLOAD.inertia,
+        "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = a point mass", 0, 1e3, lengths=(6,)),
     Row("gravity", DEFAULT_GRAVITY,
         "Gravity, m/s², in the base frame: that of the orientations", 0, 100, lengths=(3,)),
     Row("bias", (0.0,) * 6,
@@ -178,6 +181,10 @@ PARAMETERS: Final = (
         "Half of the 95 % interval of its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
     Row("accelerometer.scale_interval", EXACT.scale_interval,
         "Half of the 95 % interval of its scale; ~/identify finds it", 0, 1, lengths=(3,)),
+    Row("accelerometer.cross_axis", EXACT.cross_axis,
+        "Parts of other axes to subtract: xy xz yx yz zx zy; ~/identify finds them", 0, 1, lengths=(6,)),
+    Row("accelerometer.cross_axis_interval", EXACT.cross_axis_interval,
+        "Half of their 95 % intervals; ~/identify finds them", 0, 1, lengths=(6,)),
     Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
     Row("rest.force_deviation", _REST.force_deviation, "Largest standard deviation at rest, N", 0, 1e3),
     Row("rest.torque_deviation", _REST.torque_deviation, "Largest standard deviation at rest, Nm", 0, 1e3),
@@ -288,7 +295,9 @@ def gather(given: Mapping[str, Any]) -> Parameters:
         "limits": LIMITS._replace(**group("diagnostics.")),
         "imu_units": ImuUnits(values.pop("imu_raw_units")),
         "wrench_frames": parse_frames(values.pop("wrench_frames")),
-        "payload": Payload(values.pop("tool_mass"), values.pop("tool_center_of_gravity")),
+        "payload": Payload(
+            *(values.pop(f"tool_{name}") for name in ("mass", "center_of_gravity", "inertia"))
+        ),
         "bias": Wrench.of(values.pop("bias")),
         "accelerometer": Accelerometer(**group("accelerometer.")),
         "rest_duration": rest.pop("duration"),

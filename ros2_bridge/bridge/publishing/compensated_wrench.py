@@ -347,4 +347,4 @@ class CompensatedOutput:
     def _stages(plan: Plan, sample: Sample, specific_force: Vector3, time_s: float) -> Stages:
         compensator = plan.compensator
         compensator.bias = plan.ramp.at(time_s)
-        return compensator.compensate(sample.force, sample.torque, specific_force)
+        return compensator.compensate(sample.force, sample.torque, specific_force, plan.source.turning)

@@ -2,7 +2,8 @@
 
 Nothing touches the tool, so the force is a linear function of what the IMU felt some time before: of the
 specific force, the angular acceleration and the products of the angular rates. The lag with the least sum of
-squares is taken. Its interval is the wider of two: that of the lags of eight parts of the recording, which
+squares is taken: the axes of the two need not be the same, nor their gains exact, and a trend of the bias is
+taken out first. Its interval is the wider of two: that of the lags of eight parts of the recording, which
 covers what the model leaves out (a cable, a tool that bends), and what the residuals' noise gives.
 """
 
@@ -26,7 +27,9 @@ _EARLIEST_S, _LATEST_S = -0.1, 0.2
 _EXPLAINED: Final = 0.5
 _WIDEST_S: Final = 0.005
 _LEAST_S: Final = 4.0
-_SMOOTHED_S: Final = 0.04
+_SHORTEST_S, _LONGEST_S = 0.04, 0.5  # of the window that smooths
+_TREND: Final = 3  # coefficients of the polynomial that the bias may follow
+_SMOOTHED: Final = 1.0  # times the ratio of the force's motion to its rate of change
 
 
 class Lag(NamedTuple):
@@ -47,26 +50,37 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
     seconds = float(times[-1] - times[0]) if len(times) else 0.0
     if seconds < _LEAST_S:
         raise CompensationError(f"{seconds:.1f} s are too few: shake the sensor for 10 s")
+    # On an even grid, so that stamps that jitter do not shake the derivative of the angular rate.
     period = float(np.median(np.diff(times)))
-    # All alike: else noise would be least, and fit best, between two samples.
-    window = np.hanning(max(3, round(_SMOOTHED_S / period) | 1) + 2)[1:-1]
-    window /= window.sum()
-    force, acceleration, rate = (_smoothed(columns, window) for columns in (force, acceleration, rate))
-    products = (rate[:, :, None] * rate[:, None]).reshape(-1, 9)
-    turned = np.concatenate([np.gradient(rate, times, axis=0), products], axis=1)
-    looks = np.arange(times[0] + _LATEST_S, times[-1] + _EARLIEST_S, _SMOOTHED_S / 4)
-    force = _at(looks, times, force)
+    stamps, times = times, np.arange(times[0], times[-1], period)
+    force, acceleration, rate = (_at(times, stamps, columns) for columns in (force, acceleration, rate))
+    products = (rate[:, :, None] * rate[:, None]).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    turned = np.concatenate([np.gradient(rate, period, axis=0), products], axis=1)
+    # All alike, and so long that little noise is left in what the motion is regressed on: that would pull the
+    # lag. Noise would be least, and fit best, between two samples, too.
+    slow = _smoothed(force, _window(_SHORTEST_S, period))
+    pace = float(np.linalg.norm(slow - slow.mean(axis=0)) / np.linalg.norm(np.gradient(slow, period, axis=0)))
+    seconds = min(max(_SMOOTHED * pace, _SHORTEST_S), _LONGEST_S)
+    window = _window(seconds, period)
+    force, acceleration, turned = (_smoothed(columns, window) for columns in (force, acceleration, turned))
+    looks = np.arange(times[0] + _LATEST_S + seconds, times[-1] + _EARLIEST_S - seconds, seconds / 4)
+    trend = np.linalg.qr(np.vander(looks - looks.mean(), _TREND))[0]  # a bias that drifts
+
+    def drawn(columns: Array) -> Array:
+        return np.asarray(columns - trend @ (trend.T @ columns))
+
+    force = drawn(_at(looks, times, force))
 
     def moved(lag: float) -> Array:
         felt = _at(looks - lag, times, acceleration), _at(looks - lag + gyroscope_s, times, turned)
-        return np.concatenate(felt, axis=1)
+        return drawn(np.concatenate(felt, axis=1))
 
     def left(lag: float) -> float:
         rows = moved(lag)
         return float(((force - rows @ np.linalg.lstsq(rows, force, rcond=None)[0]) ** 2).sum())
 
-    coarse = np.arange(_EARLIEST_S, _LATEST_S, max(period, 0.002))
-    best = _lowest(left, float(coarse[np.argmin([left(lag) for lag in coarse])]), max(period, 0.002))
+    coarse = np.arange(_EARLIEST_S, _LATEST_S, max(period, 0.005))
+    best = _lowest(left, float(coarse[np.argmin([left(lag) for lag in coarse])]), max(period, 0.005))
     rows = moved(best)
     tool = np.linalg.lstsq(rows, force, rcond=None)[0]
     total = float((force**2).sum())
@@ -85,16 +99,22 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
         lags.append(-float(((part - part.mean(axis=0)) * rest).sum()) / max(steepness, 1e-30))
     step = max(period, 0.002)
     curve = max(left(best - step) - 2 * left(best) + left(best + step), 1e-300) / step**2
-    degrees = max(3 * (looks[-1] - looks[0]) / _SMOOTHED_S - 3 * rows.shape[1], 1.0)
+    degrees = max(3 * (looks[-1] - looks[0]) / seconds - 3 * rows.shape[1], 1.0)
     interval = _T_95 * max(
         float(np.std(lags, ddof=1)) / math.sqrt(_PARTS), math.sqrt(2 * left(best) / (curve * degrees))
     )
     if not interval < _WIDEST_S:
         raise CompensationError(
-            f"the motion is too slow to tell (± {interval * 1e3:.0f} ms): shake the sensor faster, two to "
-            "five times a second in all directions"
+            f"the motion is too slow to tell ({best * 1e3:.0f} ± {interval * 1e3:.0f} ms): shake the sensor "
+            "faster, two to five times a second in all directions"
         )
     return Lag(best, interval, explained)
+
+
+def _window(seconds: float, period: float) -> Array:
+    """Weights of a Hann window that is so long."""
+    window = np.hanning(max(3, round(seconds / period) | 1) + 2)[1:-1]
+    return np.asarray(window / window.sum())
 
 
 def _smoothed(columns: Array, window: Array) -> Array:
@@ -102,10 +122,8 @@ def _smoothed(columns: Array, window: Array) -> Array:
 
 
 def _at(looks: Array, times: Array, columns: Array) -> Array:
-    """Columns at other times, less their means."""
-    found = np.stack([np.interp(looks, times, column) for column in columns.T], axis=1)
-    centered: Array = found - found.mean(axis=0)
-    return centered
+    """Columns at other times."""
+    return np.stack([np.interp(looks, times, column) for column in columns.T], axis=1)
 
 
 def _lowest(left: Callable[[float], float], start: float, step: float) -> float:

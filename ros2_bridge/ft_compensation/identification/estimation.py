@@ -1,10 +1,11 @@
 """The equations of the poses and their answer, with intervals.
 
 In every pose: force = m g + bias force, torque = c x g + bias torque, with c = m times the center of gravity.
-Each axis of force and torque has a variance of its own. Where gravity is from the accelerometer, its offset
-and sensitivities are unknowns too: with g = -G u / |u| and u = (a - offset) / scale, |u| = G is one more
-equation a pose, and the directions enter force and torque. Of these six, what is typical of such an
-accelerometer is assumed in advance: what the poses do not determine stays near zero with a wide interval.
+Each axis of force and torque has a variance of its own. Where gravity is from the accelerometer, its offset,
+sensitivities and cross-axis terms are unknowns too: with g = -G u / |u| and u = (1 - K) (a - offset) / scale,
+|u| = G is one more equation a pose, and the directions enter force and torque. Of these twelve, what is
+typical of such an accelerometer is assumed in advance: what the poses do not determine stays near zero, its
+interval wide. A regressor (time, or the indicator of one pose) may shift each axis of force and torque.
 
 Leading axes of the arrays, shown as `...`, are independent problems.
 """
@@ -22,13 +23,14 @@ from ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
 _LENGTH_DEVIATION: Final = 0.002
 _LENGTH_DEGREES: Final = 6.0  # ... as if it were estimated from so many residuals.
 # N, Nm, m/s²: standard deviations below which nothing is believed, where equations of all kinds meet.
-_FLOOR: Final = np.array([1e-6] * 3 + [1e-7] * 3 + [1e-6])
+_FLOOR: Final = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4])
 _FLOOR_ALONE: Final = 1e-12
 # Of an axis' variance at the offset that the lengths alone give: six poses could be made to fit one axis
 # perfectly by an offset that they hardly determine.
 _LEAST_SHARE: Final = 0.3
 _NOTHING: Final = 1e-9  # kg: no mass at all has its center anywhere
-_FEW: Final = 3
+_OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
+_ROW, _OTHER = np.nonzero(~np.eye(3, dtype=bool))  # of the cross-axis terms, as CROSS_AXES
 _LENGTH_ROUNDS: Final = 3
 _ROUNDS: Final = 9
 _CONVERGED: Final = 1e-7
@@ -49,6 +51,8 @@ class Estimate(NamedTuple):
     bias: Value  # (6,), N and Nm
     offset: Value | None  # (3,), m/s², of the accelerometer; None where gravity is not from it
     scale: Value | None  # (3,): what its axes read per m/s²
+    cross_axis: Value | None  # (6,)
+    shift: Value | None  # (6,), N and Nm for each unit of the regressor
     gravity: Array  # (n, 3), m/s²: as far as known now
     residuals: Array  # (n, 6), N and Nm: measured minus modelled
     degrees: Array  # (6,): degrees of freedom of the residuals of each axis
@@ -60,19 +64,27 @@ def estimate(
     confidence: float = 0.95,
     acceleration: Array | None = None,
     acceleration_variance: Array | float = 0.0,
+    regressor: Array | None = None,
 ) -> Estimate:
     """Solve the poses: wrench (..., n, 6), N and Nm, and gravity (..., n, 3), in the sensor's frame, m/s².
 
     Also `acceleration` (..., n, 3), m/s², if gravity is from it, with `acceleration_variance` (...,) of its
-    means by the sensor's noise, (m/s²)². LinAlgError if the equations leave an unknown open.
+    means by the sensor's noise, (m/s²)²; and the `regressor` (..., n). LinAlgError if the equations leave an
+    unknown open.
     """
+    if regressor is not None:  # of several regressors, each is a problem
+        many = regressor.shape[:-1]
+        wrench = np.broadcast_to(wrench, (*many, *wrench.shape[-2:]))
+        gravity = np.broadcast_to(gravity, (*many, *gravity.shape[-2:]))
+        acceleration = None if acceleration is None else np.broadcast_to(acceleration, gravity.shape)
     measured = np.swapaxes(wrench, -1, -2)
-    scale = offset = None
-    if acceleration is None or measured.shape[-1] <= _FEW:
-        acceleration = None
-        solution = _alone(gravity, measured)
+    scale = offset = cross_axis = shift = None
+    if acceleration is None:
+        solution = _alone(gravity, measured, regressor)
     else:
-        gravity, solution = _with_accelerometer(measured, acceleration, gravity, acceleration_variance)
+        gravity, solution = _with_accelerometer(
+            measured, acceleration, gravity, acceleration_variance, regressor
+        )
     answer, unknowns = solution.answer, solution.answer.shape[-1]
     mass = answer[..., :1]
     divisor = np.where(np.abs(mass) < _NOTHING, _NOTHING, mass)
@@ -83,102 +95,113 @@ def estimate(
     rows[..., 4:7, 0] = -center / divisor
     deviation, degrees = solution.student(rows)
     half = two_sided(confidence, degrees) * deviation
+    linear = 10
+    if regressor is not None:
+        linear = 16
+        shift = Value(answer[..., 10:16], half[..., 10:16])
     if acceleration is not None:
-        offset = Value(answer[..., 10:13], half[..., 10:13])
-        scale = Value(1.0 + answer[..., 13:], half[..., 13:])
-    degrees_of_axes = solution.degrees[..., :6]
-    if solution.degrees.shape[-1] == 2:
-        degrees_of_axes = np.repeat(solution.degrees / 3.0, 3, axis=-1)
+        first, second, third = (
+            slice(linear + begin, linear + end) for begin, end in ((0, 3), (3, 6), (6, 12))
+        )
+        offset = Value(answer[..., first], half[..., first])
+        scale = Value(1.0 + answer[..., second], half[..., second])
+        cross_axis = Value(answer[..., third], half[..., third])
     return Estimate(
         Value(mass, half[..., :1]),
         Value(center, half[..., 4:7]),
         Value(answer[..., [1, 2, 3, 7, 8, 9]], half[..., [1, 2, 3, 7, 8, 9]]),
         offset,
         scale,
+        cross_axis,
+        shift,
         gravity,
-        wrench - np.swapaxes(_times(_design(gravity), answer[..., :10]), -1, -2),
-        degrees_of_axes,
+        wrench - np.swapaxes(_times(_design(gravity, regressor), answer[..., :linear]), -1, -2),
+        solution.degrees[..., :6],
     )
 
 
-def _alone(gravity: Array, measured: Array, floor: float = _FLOOR_ALONE) -> Solution:
-    """The ten unknowns of force and torque where gravity is known.
-
-    Three poses leave too little for a variance of each axis: force has one then, and torque.
-    """
-    groups = 6 if measured.shape[-1] > _FEW else 2
-    shape = (*measured.shape[:-2], groups, 6 // groups * measured.shape[-1])
-    design = _design(gravity).reshape(*shape, 10)
-    return solve(design, measured.reshape(shape), Known(np.zeros((10, 10)), np.full(groups, floor**2)))
+def _alone(gravity: Array, measured: Array, regressor: Array | None, floor: float = _FLOOR_ALONE) -> Solution:
+    """The unknowns of force and torque where gravity is known."""
+    design = _design(gravity, regressor)
+    unknowns = design.shape[-1]
+    return solve(design, measured, Known(np.zeros((unknowns, unknowns)), np.full(6, floor**2)))
 
 
 class _Linear(NamedTuple):
-    """The equations of the accelerometer about an offset and scale."""
+    """The equations of the accelerometer about a calibration."""
 
     gravity: Array  # (..., n, 3)
-    turn: Array  # (..., n, 3, 6): change of gravity by offset and scale
-    stretch: Array  # (..., 1, n, 6): change of the length of u
+    turn: Array  # (..., n, 3, 12): change of gravity by the calibration
+    stretch: Array  # (..., 1, n, 12): change of the length of u
     excess: Array  # (..., 1, n): by how much gravity is longer than u
 
 
 def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:
-    """About `calibration` (..., 6): offset, scale - 1. `size` (..., n) is the magnitude of gravity."""
-    scale = 1.0 + calibration[..., np.newaxis, 3:]
-    u = (acceleration - calibration[..., np.newaxis, :3]) / scale
+    """About `calibration` (..., 12). `size` (..., n) is the magnitude of gravity."""
+    offset, scale = calibration[..., np.newaxis, :3], 1.0 + calibration[..., np.newaxis, 3:6]
+    crossed = np.zeros((*calibration.shape[:-1], 3, 3))
+    crossed[..., _ROW, _OTHER] = calibration[..., 6:]
+    straight = (np.eye(3) - crossed)[..., np.newaxis, :, :]
+    v = (acceleration - offset) / scale
+    u = (straight @ v[..., np.newaxis])[..., 0]
     length = np.linalg.norm(u, axis=-1)
     up = u / length[..., np.newaxis]
-    # Of each component of u by the offset and the scale of its own axis.
-    change = np.concatenate([np.broadcast_to(-1.0 / scale, u.shape), -u / scale], axis=-1)
-    across = np.eye(3) - up[..., :, np.newaxis] * up[..., np.newaxis, :]
-    turn = np.concatenate([across, across], axis=-1) * change[..., np.newaxis, :]
+    change = np.zeros((*u.shape, _OF_CALIBRATION))
+    change[..., :3] = -straight / scale[..., np.newaxis, :]
+    change[..., 3:6] = -straight * (v / scale)[..., np.newaxis, :]
+    change[..., _ROW, 6 + np.arange(6)] = -v[..., _OTHER]
+    along = (up[..., np.newaxis, :] @ change)[..., 0, :]
+    across = change - up[..., np.newaxis] * along[..., np.newaxis, :]
     return _Linear(
         -size[..., np.newaxis] * up,
-        -(size / length)[..., np.newaxis, np.newaxis] * turn,
-        (np.concatenate([up, up], axis=-1) * change)[..., np.newaxis, :, :],
+        -(size / length)[..., np.newaxis, np.newaxis] * across,
+        along[..., np.newaxis, :, :],
         (size - length)[..., np.newaxis, :],
     )
 
 
 def _with_accelerometer(
-    measured: Array, acceleration: Array, gravity: Array, noise: Array | float
+    measured: Array, acceleration: Array, gravity: Array, noise: Array | float, regressor: Array | None
 ) -> tuple[Array, Solution]:
-    """Gravity (..., n, 3) and sixteen unknowns: ten as before, offset, scale - 1; by Gauss and Newton.
+    """Gravity (..., n, 3) and the unknowns, those of the calibration last; by Gauss and Newton.
 
     The lengths alone come first: the errors of an uncorrected direction would pass for noise.
     """
     size = np.linalg.norm(gravity, axis=-1)
-    prior = np.diag([OFFSET_PRIOR**-2] * 3 + [SCALE_PRIOR**-2] * 3)
+    prior = np.diag([OFFSET_PRIOR**-2] * 3 + [SCALE_PRIOR**-2] * 9)
     assumed = np.zeros((*measured.shape[:-2], 7))
     assumed[..., 6] = _LENGTH_DEVIATION**2 + noise
     degrees = np.array([0.0] * 6 + [_LENGTH_DEGREES])
     lengths = Known(prior, _FLOOR[6:] ** 2, degrees[6:], assumed[..., 6:])
-    calibration = np.zeros((*measured.shape[:-2], 6))
+    calibration = np.zeros((*measured.shape[:-2], _OF_CALIBRATION))
     for _ in range(_LENGTH_ROUNDS):
         at = _linearize(acceleration, size, calibration)
         only = solve(at.stretch, at.excess + _times(at.stretch, calibration), lengths)
         calibration = only.answer
     at = _linearize(acceleration, size, calibration)
-    first = _alone(at.gravity, measured, _FLOOR[3])
+    first = _alone(at.gravity, measured, regressor, _FLOOR[3])
+    linear = first.answer.shape[-1]
     answer = np.concatenate([first.answer, calibration], axis=-1)
     variances = np.concatenate([first.variances, only.variances], axis=-1)
-    information = np.zeros((16, 16))
-    information[10:, 10:] = prior
+    unknowns = answer.shape[-1]
+    information = np.zeros((unknowns, unknowns))
+    information[linear:, linear:] = prior
     known = Known(information, np.maximum(_LEAST_SHARE * variances, _FLOOR**2), degrees, assumed)
     for _ in range(_ROUNDS):
-        design = np.zeros((*measured.shape[:-2], 7, measured.shape[-1], 16))
-        design[..., :6, :, :10] = _design(at.gravity)
+        design = np.zeros((*measured.shape[:-2], 7, measured.shape[-1], unknowns))
+        design[..., :6, :, :linear] = _design(at.gravity, regressor)
         turn = np.moveaxis(at.turn, -2, -3)
-        design[..., :3, :, 10:] = answer[..., 0, np.newaxis, np.newaxis, np.newaxis] * turn
+        design[..., :3, :, linear:] = answer[..., 0, np.newaxis, np.newaxis, np.newaxis] * turn
         moment = answer[..., 4:7]
-        design[..., 3:6, :, 10:] = np.cross(moment[..., :, np.newaxis, np.newaxis], turn, axis=-3)
-        design[..., 6:, :, 10:] = at.stretch
-        # Gravity has the present offset and scale in it already, and the linear equations add them.
-        twice = _times(design[..., 10:], answer[..., 10:])
+        design[..., 3:6, :, linear:] = np.cross(moment[..., :, np.newaxis, np.newaxis], turn, axis=-3)
+        design[..., 6:, :, linear:] = at.stretch
+        # Gravity has the present calibration in it already, and the linear equations add it.
+        twice = _times(design[..., linear:], answer[..., linear:])
         target = np.concatenate([measured, at.excess], axis=-2) + twice
         solution = solve(design, target, known, variances)
-        moved = np.abs(solution.answer - answer)[..., 10:].max()
+        moved = np.abs(solution.answer - answer)[..., linear:].max()
         answer, variances = solution.answer, solution.variances
-        at = _linearize(acceleration, size, answer[..., 10:])
+        at = _linearize(acceleration, size, answer[..., linear:])
         if moved <= _CONVERGED:
             break
     return at.gravity, solution
@@ -189,13 +212,17 @@ def _times(design: Array, answer: Array) -> Array:
     return (design @ answer[..., np.newaxis, :, np.newaxis])[..., 0]
 
 
-def _design(gravity: Array) -> Array:
-    """(..., 6, n, 10): m, bias force, c, bias torque, for each axis of force and torque."""
-    design = np.zeros((*gravity.shape[:-2], 6, gravity.shape[-2], 10))
+def _design(gravity: Array, regressor: Array | None = None) -> Array:
+    """(..., 6, n, 10): m, bias force, c, bias torque, for each axis of force and torque; 16 with shifts."""
+    unknowns = 10 if regressor is None else 16
+    design = np.zeros((*gravity.shape[:-2], 6, gravity.shape[-2], unknowns))
     for axis, after, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         design[..., axis, :, 0] = gravity[..., axis]
         design[..., axis, :, 1 + axis] = 1.0
         design[..., 3 + axis, :, 4 + after] = gravity[..., last]
         design[..., 3 + axis, :, 4 + last] = -gravity[..., after]
         design[..., 3 + axis, :, 7 + axis] = 1.0
+    if regressor is not None:
+        for axis in range(6):
+            design[..., axis, :, 10 + axis] = regressor
     return design

@@ -23,7 +23,10 @@ def write_yaml(path: Path, result: Identified, comment: str = "", gravity: Vecto
     if gravity is not None:
         rows.append(("gravity", gravity, "m/s², in the base frame"))
     if result.accelerometer is not None:
-        units = "m/s², subtracted", "divided by, after that", "m/s², half of 95 %", "half of 95 %"
+        units = (
+            "m/s², subtracted", "divided by, after that", "m/s², half of 95 %", "half of 95 %",
+            "xy xz yx yz zx zy: parts of the second axis, subtracted from the first", "half of 95 %",
+        )  # fmt: skip
         parts = zip(result.accelerometer.calibration._asdict().items(), units, strict=True)
         rows += [(f"accelerometer.{name}", part, unit) for (name, part), unit in parts]
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]

@@ -1,6 +1,9 @@
 """Payload identification: mass, center of gravity, bias and the accelerometer's offset from static poses.
 
-Checks what is given, has `estimation` solve it, and judges how well the poses fit one payload.
+Checks what is given, has `estimation` solve it, and judges how well the poses fit one payload. Two things are
+looked for that no noise explains: a bias that drifts, linear in the time of the poses, and a single pose in
+which something touched the tool. Each shifts the axes of force and torque, and so it is found: by Student's
+t of these shifts, once that time or the pose's indicator is one more regressor.
 """
 
 from __future__ import annotations
@@ -11,8 +14,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from bota_ethercat.pdo import Vector3
-from ft_compensation.identification.estimation import Value, estimate
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from ft_compensation.identification.estimation import Estimate, estimate
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
 from ft_compensation.identification.weighted import Array
 from ft_compensation.quantities import (
@@ -29,13 +32,18 @@ from ft_compensation.stationary import triple
 LARGEST_MASS: Final = 500.0  # kg: no sensor of the family carries more
 LARGEST_CENTRE: Final = 2.0  # m
 _LARGEST_MISFIT: Final = 0.1
-# N: residuals are refused beyond this plus a tenth of the weight; torques at the arm of the weight.
+# N: residuals and intervals are refused beyond this plus a tenth of the weight; of torques at its arm.
 _FORGIVEN_MISFIT: Final = 1.0
 # Of the interval before anything is measured: an offset no better known than so is not determined.
 _UNKNOWN: Final = 0.5
 
 ARM: Final = 0.05  # m: what makes a torque of a force where the center of gravity is nearer
-_SUSPICIOUS: Final = 3.0
+_CHANCE: Final = 0.01  # of seeing drift, or a touch, where there is none
+_SUSPECTS: Final = 12  # poses with the largest residuals
+_SAME_POSE: Final = 0.97  # cosine
+_FEWEST_IN_TIME: Final = 6  # poses: fewer leave nothing to tell drift from a payload
+_SECONDS_A_MINUTE: Final = 60.0
+_TINY: Final = 1e-12
 _NEGLIGIBLE: Final = 0.01  # of the weight: a residual below it is not worth a word
 _RARE: Final = 3.09  # standard deviations that noise exceeds once in a thousand times
 
@@ -75,8 +83,6 @@ class Identified(NamedTuple):
     # Of the intervals: 0.95 as a rule. Student's t; each axis has the variance that its residuals show.
     confidence: float
     residuals: tuple[Wrench, ...]  # what the answer leaves of each pose, in order: measured minus modelled
-    force_rms: float  # of the residuals, with the degrees of freedom taken into account, N
-    torque_rms: float  # likewise, Nm
     # Of the problem with each unknown in a unit of its own size: 1.2 is ideal, beyond 10 is bad.
     condition: float
     coverage: Coverage
@@ -84,17 +90,18 @@ class Identified(NamedTuple):
     force_fit: Fit
     torque_fit: Fit
     accelerometer: OffsetFit | None  # None where gravity is not from it: it is not touched then
+    # Of the bias, a minute; None if time explains nothing. `bias` is that of the last pose then.
+    drift: Wrench | None = None
+    touched: int | None = None  # index of the pose that does not fit the others
 
 
-def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool = False) -> Identified:
+def identify(poses: Sequence[Pose], *, confidence: float = 0.95) -> Identified:
     """Mass, center of gravity and bias from `poses`.
 
-    At least four, whose directions of gravity do not lie in one plane; six with each axis of the sensor once
-    up and once down are best. If every pose has its `acceleration`, the accelerometer's offset and
-    sensitivities are found too. IdentificationError, a sentence, where the poses do not suffice.
-
-    `one_axis` takes poses that turn about one axis only, if there are three or more. The equations have an
-    answer then, but nothing contradicts an error in the direction that never changed.
+    At least four, with gravity in directions that do not lie on one line; six with each axis of the sensor
+    once up and once down are best. If every pose has its `acceleration`, the accelerometer is identified too;
+    if every one has its time, a drift of the bias. IdentificationError, a sentence, where the poses do not
+    suffice: by the intervals that result.
     """
     if len(poses) > MOST_POSES:
         raise IdentificationError(f"{len(poses)} poses are more than the {MOST_POSES} that are taken")
@@ -102,69 +109,156 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95, one_axis: bool 
         np.isfinite([*pose.wrench.values, *pose.gravity, *(pose.acceleration or ())]).all() for pose in poses
     ):
         raise IdentificationError("a pose has numbers that are not finite")
-    seen = coverage(poses, one_axis=one_axis)
+    seen = coverage(poses)
     if seen.missing is not None:
         raise IdentificationError(f"the poses do not suffice: {seen.missing}; {seen.next_pose}")
-    gravity = np.array([pose.gravity for pose in poses])
-    wrench = np.array([pose.wrench.values for pose in poses])
-    read = [pose.acceleration for pose in poses if pose.acceleration is not None]
-    noise = float(np.mean([length(pose.acceleration_spread) ** 2 / 3.0 / pose.samples for pose in poses]))
+    equations = _Equations(poses)
     try:
-        found = estimate(
-            wrench, gravity, confidence, np.array(read) if len(read) == len(poses) else None, noise
-        )
+        found, drift, touched = _explained(equations, confidence)
     except np.linalg.LinAlgError:
         raise IdentificationError("the poses do not suffice: their equations leave an unknown open") from None
     mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
     _check_mass(mass, mass_interval)
     payload = Payload(mass, triple(found.center.value))
-    weight = mass * float(np.linalg.norm(gravity, axis=1).mean())
+    centre_interval = triple(found.center.half)
+    gravity = float(np.linalg.norm(equations.gravity, axis=1).mean())
+    weight = mass * gravity
     moment = weight * max(ARM, length(payload.center))
     forces, torques = found.residuals[:, :3], found.residuals[:, 3:]
     force = judge(poses, forces, found.degrees[:3], "force", weight)
     torque = judge(poses, torques, found.degrees[3:], "torque", moment)
-    _check_fit(force, forces, _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight, "N")
+    most_force = _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight
+    most_torque = _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment
+    _check_fit(force, touched, most_force, "N")
     if length(payload.center) > LARGEST_CENTRE:
         raise IdentificationError(
             f"the center of gravity would be {length(payload.center):.2g} m from the sensor with a mass of "
             f"{mass:.3g} kg, which cannot be: something held or touched the tool, or there is no tool"
         )
-    _check_fit(torque, torques, _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment, "Nm")
-    residuals = tuple(map(Wrench.of, found.residuals.tolist()))
-    centre_interval = triple(found.center.half)
-    accelerometer = _accelerometer(found.offset, found.scale)
+    _check_fit(torque, touched, most_torque, "Nm")
+    if mass_interval * gravity > most_force or length(centre_interval) * weight > most_torque:
+        raise IdentificationError(
+            f"the poses do not suffice: mass {mass:.2g} ± {mass_interval:.2g} kg, center of gravity "
+            f"{_millimeters(payload.center, centre_interval)}; "
+            f"{seen.next_pose if touched is None else touched}"
+        )
+    accelerometer = _accelerometer(found)
     undetermined = accelerometer.undetermined if accelerometer else ""
     return Identified(
         payload,
         Wrench.of(found.bias.value.tolist()),
-        float(np.linalg.norm(gravity, axis=1).mean()),
+        gravity,
         mass_interval,
         centre_interval,
         Wrench.of(found.bias.half.tolist()),
         confidence,
-        residuals,
-        force.rms,
-        torque.rms,
-        _condition(gravity),
+        tuple(map(Wrench.of, found.residuals.tolist())),
+        _condition(equations.gravity),
         seen,
         (
-            *_fit_notes(poses, forces, force, "force", "N", weight),
-            *_fit_notes(poses, torques, torque, "torque", "Nm", moment),
-            *_other_notes(mass, mass_interval, length(centre_interval), undetermined),
+            *_misfit_notes(poses, drift, touched),
+            *_fit_notes(force, "force", "N"),
+            *_fit_notes(torque, "torque", "Nm"),
+            *_other_notes(mass, mass_interval, length(centre_interval), undetermined, seen),
         ),
         force,
         torque,
         accelerometer,
+        drift,
+        None if touched is None else touched.pose,
     )
 
 
-def _accelerometer(offset: Value | None, scale: Value | None) -> OffsetFit | None:
-    if offset is None or scale is None:
+class _Equations:
+    """Those of some poses, in arrays."""
+
+    def __init__(self, poses: Sequence[Pose]) -> None:
+        self.wrench = np.array([pose.wrench.values for pose in poses])
+        self.gravity = np.array([pose.gravity for pose in poses])
+        read = [pose.acceleration for pose in poses if pose.acceleration is not None]
+        self._acceleration = np.array(read) if len(read) == len(poses) else None
+        self._noise = float(
+            np.mean([length(pose.acceleration_spread) ** 2 / 3.0 / pose.samples for pose in poses])
+        )
+        times = [pose.time_s for pose in poses if pose.time_s is not None]
+        # Minutes before the last pose; None if they say nothing.
+        self.minutes: Array | None = None
+        if len(times) == len(poses) >= _FEWEST_IN_TIME and np.ptp(times) > 0.0:
+            self.minutes = (np.array(times) - times[-1]) / _SECONDS_A_MINUTE
+
+    def solve(self, confidence: float, regressor: Array | None = None) -> Estimate:
+        """The estimate; of several regressors (k, n), each for itself."""
+        return estimate(self.wrench, self.gravity, confidence, self._acceleration, self._noise, regressor)
+
+
+class _Touched(NamedTuple):
+    """A pose that does not fit the others."""
+
+    pose: int  # its index
+    force: float  # N: by which it is off
+    torque: float  # Nm
+
+    def __str__(self) -> str:
+        """For people."""
+        return (
+            f"pose {self.pose + 1} does not fit the others, by {self.force:.2g} N and {self.torque:.2g} Nm: "
+            "if something touched the tool, take it again"
+        )
+
+
+def _explained(equations: _Equations, confidence: float) -> tuple[Estimate, Wrench | None, _Touched | None]:
+    """The answer, the drift of the bias a minute, and the pose that does not fit, if there are such."""
+    found, count = equations.solve(confidence), len(equations.wrench)
+    if count < _FEWEST_IN_TIME:
+        return found, None, None
+    suspects = np.argsort(np.abs(found.residuals / _rms(found.residuals)).max(axis=1))[-_SUSPECTS:]
+    without = equations.solve(confidence, np.eye(count)[suspects])
+    chances = _chance(found, without) * count
+    which = int(chances.argmin())
+    if equations.minutes is not None:
+        drifting = equations.solve(confidence, equations.minutes)
+        assert drifting.shift is not None
+        chance = float(_chance(found, drifting))
+        if chance < min(_CHANCE, float(chances[which])):
+            return drifting, Wrench.of(drifting.shift.value.tolist()), None
+    assert without.shift is not None
+    off = without.shift.value[which]
+    force, torque = float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
+    weight = float(found.mass.value[0]) * STANDARD_GRAVITY
+    if chances[which] < _CHANCE and force + torque / ARM > _NEGLIGIBLE * weight:
+        return found, None, _Touched(int(suspects[which]), force, torque)
+    return found, None, None
+
+
+def _rms(residuals: Array) -> Array:
+    return np.asarray(np.sqrt((residuals**2).mean(axis=-2, keepdims=True)) + _TINY)
+
+
+def _chance(before: Estimate, after: Estimate) -> Array:
+    """How probably shifts of the six axes that mean nothing lessen the residuals so much.
+
+    By an F test with 6 degrees of freedom; the axes of force have one variance, and those of torque.
+    """
+    gain = freedom = np.zeros(())
+    for axes in (slice(0, 3), slice(3, 6)):
+        degrees = np.maximum(after.degrees[..., axes].sum(axis=-1), 1.0)
+        left = (after.residuals[..., axes] ** 2).sum(axis=(-1, -2)) + _TINY
+        gain = gain + degrees * ((before.residuals[..., axes] ** 2).sum() / left - 1.0)
+        freedom = freedom + degrees
+    share, half = freedom / (freedom + np.maximum(gain, 0.0)), 0.5 * freedom
+    rest = 1.0 - share
+    return np.asarray(share**half * (1.0 + half * rest * (1.0 + 0.5 * (half + 1.0) * rest)))
+
+
+def _accelerometer(found: Estimate) -> OffsetFit | None:
+    parts = found.offset, found.scale, found.cross_axis
+    if found.offset is None or found.scale is None or found.cross_axis is None:
         return None
     limit = _UNKNOWN * NORMAL_95 * OFFSET_PRIOR
-    open_axes = "".join(axis for axis, half in zip("xyz", offset.half, strict=True) if half > limit)
-    values = offset.value, scale.value, offset.half, scale.half
-    return OffsetFit(Accelerometer(*map(triple, values)), open_axes)
+    open_axes = "".join(axis for axis, half in zip("xyz", found.offset.half, strict=True) if half > limit)
+    values = (tuple(each.tolist()) for part in parts if part is not None for each in (part.value, part.half))
+    offset, offset_half, scale, scale_half, cross, cross_half = values
+    return OffsetFit(Accelerometer(offset, scale, offset_half, scale_half, cross, cross_half), open_axes)
 
 
 def _condition(gravity: Array) -> float:
@@ -199,13 +293,12 @@ def _check_mass(mass: float, interval: float) -> None:
         )
 
 
-def _check_fit(fit: Fit, residuals: Array, limit: float, unit: str) -> None:
+def _check_fit(fit: Fit, touched: _Touched | None, limit: float, unit: str) -> None:
     if fit.rms > limit:
-        worst = int(np.linalg.norm(residuals, axis=1).argmax())
+        again = "take all again" if touched is None else f"pose {touched.pose + 1} fits worst: take it again"
         raise IdentificationError(
             f"the poses do not fit one payload: the residual is {fit.rms:.2g} {unit}, the limit {limit:.2g} "
-            f"{unit}; pose {worst + 1} fits worst; something touched the tool, or it moved: take that pose "
-            "again"
+            f"{unit}; something touched the tool, or it moved; {again}"
         )
 
 
@@ -225,27 +318,32 @@ def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, we
     return Fit(rms, freedom, chi_square, "small" if rms <= _NEGLIGIBLE * weight else "large")
 
 
-def _fit_notes(
-    poses: Sequence[Pose], residuals: Array, fit: Fit, name: str, unit: str, weight: float
-) -> Iterator[str]:
-    """A pose that fits worse than the others, or residuals that noise does not explain; as for `judge`."""
-    sizes = np.linalg.norm(residuals, axis=1)
-    worst = int(sizes.argmax())
-    others = float(np.sqrt(np.mean(np.delete(sizes, worst) ** 2)))
-    by_chance = length(getattr(poses[worst], f"{name}_spread")) / poses[worst].samples ** 0.5
-    if sizes[worst] > max(_SUSPICIOUS * others, _SUSPICIOUS * by_chance, _NEGLIGIBLE * weight):
+def _misfit_notes(poses: Sequence[Pose], drift: Wrench | None, touched: _Touched | None) -> Iterator[str]:
+    """What was found that no noise explains."""
+    if drift is not None:
+        first, last = poses[0].up, poses[-1].up
+        is_checked = sum(a * b for a, b in zip(first, last, strict=True)) > _SAME_POSE
+        check = "" if is_checked else ", and take the first pose again at the end"
         yield (
-            f"pose {worst + 1} fits worse than the others: {sizes[worst]:.2g} {unit} of residual {name}; if "
-            "something touched the tool, take it again"
+            f"the bias drifted by {length(drift.force):.2g} N and {length(drift.torque):.2g} Nm a minute, "
+            f"which was fitted, and the bias is that of the last pose: let the sensor warm up{check}"
         )
-    elif fit.verdict == "large" and fit.chi_square is not None:
+    if touched is not None:
+        yield str(touched)
+
+
+def _fit_notes(fit: Fit, name: str, unit: str) -> Iterator[str]:
+    """Residuals that noise does not explain."""
+    if fit.verdict == "large" and fit.chi_square is not None:
         yield (
             f"the residual {name}, {fit.rms:.2g} {unit}, is {math.sqrt(fit.chi_square):.0f} times what the "
-            "noise explains: a cable pulls, the tool moves, or the orientation is not exact"
+            "noise explains: the bias drifts, a cable pulls, the tool moves, or the orientation is not exact"
         )
 
 
-def _other_notes(mass: float, mass_half: float, centre_half: float, undetermined: str) -> Iterator[str]:
+def _other_notes(
+    mass: float, mass_half: float, centre_half: float, undetermined: str, seen: Coverage
+) -> Iterator[str]:
     """Of wide intervals, kg and m, and of axes, as in "xz", whose offset of the accelerometer is open."""
     more = "take more poses, or longer ones"
     if mass_half > 0.05 * mass:
@@ -257,17 +355,25 @@ def _other_notes(mass: float, mass_half: float, centre_half: float, undetermined
             f"the poses do not determine the accelerometer's offset along {' and '.join(undetermined)}, so "
             "nearly none is assumed there: take poses with that axis once up and once down"
         )
+    elif seen.unchecked:
+        yield (
+            f"gravity hardly changed along {seen.unchecked}, so nothing checks the answer in that direction: "
+            f"{seen.next_pose}"
+        )
+
+
+def _millimeters(center: Vector3, half: Vector3) -> str:
+    axes = zip(center, half, strict=True)
+    return f"({', '.join(f'{1e3 * value:.2f} ± {1e3 * part:.2f}' for value, part in axes)}) mm"
 
 
 def summary(result: Identified) -> str:
     """The answer in one sentence with its confidence interval, and the notes as further ones."""
-    x, y, z = (1000.0 * part for part in result.payload.center)
-    ix, iy, iz = (1000.0 * part for part in result.centre_interval)
     text = (
-        f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity ({x:.2f} ± "
-        f"{ix:.2f}, {y:.2f} ± {iy:.2f}, {z:.2f} ± {iz:.2f}) mm ({100 * result.confidence:g} % confidence) "
-        f"from {result.coverage.poses} poses; residual {result.force_rms:.2g} N "
-        f"({result.force_fit.verdict}), {result.torque_rms:.2g} Nm ({result.torque_fit.verdict})"
+        f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity "
+        f"{_millimeters(result.payload.center, result.centre_interval)} ({100 * result.confidence:g} % "
+        f"confidence) from {result.coverage.poses} poses; residual {result.force_fit.rms:.2g} N "
+        f"({result.force_fit.verdict}), {result.torque_fit.rms:.2g} Nm ({result.torque_fit.verdict})"
     )
     return ". ".join([text, *result.notes])
 
@@ -275,8 +381,14 @@ def summary(result: Identified) -> str:
 def accelerometer_text(fit: OffsetFit) -> str:
     """Offset and sensitivities of the accelerometer with their confidence intervals, a sentence."""
     found = fit.calibration
-    axes = zip("xyz", found.offset, found.offset_interval, strict=True)
-    offset = ", ".join(f"{axis} {value:.3f} ± {half:.3f}" for axis, value, half in axes)
-    axes = zip("xyz", found.scale, found.scale_interval, strict=True)
-    scale = ", ".join(f"{axis} {value:.4f} ± {half:.4f}" for axis, value, half in axes)
-    return f"Accelerometer: offset {offset} m/s², scale {scale}"
+    offset = _with_intervals(found.offset, found.offset_interval, 3)
+    scale = _with_intervals(found.scale, found.scale_interval, 4)
+    return (
+        f"Accelerometer: offset {offset} m/s², scale {scale}, cross-axis terms up to "
+        f"{max(map(abs, found.cross_axis)):.4f} ± {max(found.cross_axis_interval):.4f}"
+    )
+
+
+def _with_intervals(values: Vector3, halves: Vector3, digits: int) -> str:
+    axes = zip("xyz", values, halves, strict=True)
+    return ", ".join(f"{axis} {value:.{digits}f} ± {half:.{digits}f}" for axis, value, half in axes)

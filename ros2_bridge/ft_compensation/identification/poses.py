@@ -18,7 +18,8 @@ from ft_compensation.stationary import Array, StationaryMeans, triple
 
 _LEAST_POSES: Final = 4
 MOST_POSES: Final = 1000
-_LEAST_SPREAD: Final = 0.1  # of the directions of gravity, in g: less along an axis counts as not seen
+# Of the directions of gravity, in g: less is one direction, or one line; less along an axis is worth a note.
+_LEAST_SPREAD, _UNCHECKED_SPREAD = 0.02, 0.1
 _SAME_POSE: Final = 0.97  # cosine: directions nearer than 14° are the same pose
 _LARGEST_OFFSET: Final = 1.5  # m/s²: of an accelerometer whose offset is yet to be found
 
@@ -34,6 +35,7 @@ class Pose(NamedTuple):
     # What the accelerometer read, m/s², where `gravity` is from it; None where it is from something else.
     acceleration: Vector3 | None = None
     acceleration_spread: Vector3 = ZERO  # standard deviation of single samples, m/s²
+    time_s: float | None = None  # when, by the clock of the other poses
 
     @property
     def up(self) -> Vector3:
@@ -61,7 +63,7 @@ def pose_of(
         raise CompensationError("a pose without gravity says nothing about a payload")
     return Pose(
         means.wrench, gravity, means.force_spread, means.torque_spread, means.samples,
-        acceleration, means.acceleration_spread,
+        acceleration, means.acceleration_spread, means.time_s,
     )  # fmt: skip
 
 
@@ -73,6 +75,7 @@ class Coverage(NamedTuple):
     spread: Vector3
     missing: str | None  # why the poses do not suffice, a sentence; None if they do
     next_pose: str  # what to do next, a sentence
+    unchecked: str = ""  # the direction along which nothing contradicts an error, if there is one
 
     @property
     def advice(self) -> str:
@@ -82,8 +85,8 @@ class Coverage(NamedTuple):
         return f"not enough yet: {self.missing}; {self.next_pose}"
 
 
-def coverage(poses: Sequence[Pose], *, one_axis: bool = False) -> Coverage:
-    """What `poses` have seen. With `one_axis`, poses about one axis may suffice (see `payload.identify`)."""
+def coverage(poses: Sequence[Pose]) -> Coverage:
+    """What `poses` have seen."""
     if not poses:
         return Coverage(0, ZERO, "there is no pose yet", _sentence(np.array((0.0, 0.0, 1.0))))
     down = -np.array([pose.up for pose in poses])  # where gravity points in the sensor's frame
@@ -91,8 +94,9 @@ def coverage(poses: Sequence[Pose], *, one_axis: bool = False) -> Coverage:
     return Coverage(
         len(poses),
         triple(spread),
-        _missing(len(poses), spread, axes, one_axis),
+        _missing(len(poses), spread, axes),
         _sentence(_next_up(down)),
+        _name_direction(axes[2]) if spread[2] < _UNCHECKED_SPREAD else "",
     )
 
 
@@ -114,7 +118,7 @@ def _spread(down: Array) -> tuple[Array, Array]:
     return np.sqrt(np.maximum(values[::-1], 0.0)), vectors.T[::-1]
 
 
-def _missing(count: int, spread: Array, axes: Array, one_axis: bool) -> str | None:
+def _missing(count: int, spread: Array, axes: Array) -> str | None:
     if spread[0] < _LEAST_SPREAD:
         same = "the only pose had" if count == 1 else f"all {count} poses had"
         return (
@@ -126,15 +130,8 @@ def _missing(count: int, spread: Array, axes: Array, one_axis: bool) -> str | No
             f"gravity moved only along {_name_direction(axes[0])}, so the center of gravity along it is "
             "unseen: tilt the sensor about another axis too"
         )
-    if spread[2] < _LEAST_SPREAD and not one_axis:
-        return (
-            "the sensor was turned about one axis only: gravity never changed along "
-            f"{_name_direction(axes[2])}, so nothing checks the answer in that direction (standard deviation "
-            f"{spread[2]:.2f} g, at least {_LEAST_SPREAD:g} g is needed)"
-        )
-    least = _LEAST_POSES - one_axis
-    if count < least:
-        return f"there {'is' if count == 1 else 'are'} {count} of at least {least} poses"
+    if count < _LEAST_POSES:
+        return f"there {'is' if count == 1 else 'are'} {count} of at least {_LEAST_POSES} poses"
     return None
 
 

@@ -5,7 +5,7 @@
 //   moved                     the same client, moved to another place and back
 //   connect MS | reconnect | close | latest [POSITION] | peek [POSITION] | next MS
 //   server [HOST:PORT]        which one a program uses that is given this, or nothing
-//   info [POSITION] | ask REQUEST | describe | status | tare SAMPLES FX FY FZ MX MY MZ
+//   info [POSITION] | ask REQUEST | describe | tare SAMPLES FX FY FZ MX MY MZ
 //
 // Built with ASan, whose hook counts what `latest` and `next` allocate.
 #include <bota_ethercat.hpp>
@@ -247,15 +247,6 @@ int main(int argc, char** argv) {
                             quoted(s.hardware.view()).c_str(), quoted(s.firmware.view()).c_str(), quoted(s.state.view()).c_str());
             }
             std::printf("],\"version\":%s,", quoted(d.version.view()).c_str());
-            print(control, ok);
-        } else if (command == "status") {
-            Status s;
-            const bool ok = control.status(s);
-            std::printf("{\"cycles\":%" PRIu64 ",\"uptime_s\":%g,\"sensors\":[", s.cycles, s.uptime_s);
-            for (std::size_t i = 0; i < s.sensor_count; ++i)
-                std::printf("%s{\"fresh\":%" PRIu64 ",\"locked\":%s,\"period_us\":%g}", i ? "," : "", s.sensors[i].fresh,
-                            yes(s.sensors[i].locked), s.sensors[i].period_us);
-            std::printf("],");
             print(control, ok);
         } else if (command == "tare") {
             std::array<double, 6> target{};

@@ -37,9 +37,9 @@ int main(int, char** argv) {
         std::thread([moved = std::move(sensor), &stream, &samples]() mutable { stream(moved, samples[2], true); }).join();
     });
     Control control("127.0.0.1", port);
-    Status status;
+    Description described;
     bool ok = true;
-    for (int i = 0; i < 5; ++i) ok = control.status(status) && ok;
+    for (int i = 0; i < 5; ++i) ok = control.describe(described) && ok;
     for (std::thread& thread : threads) thread.join();
     std::printf("%d %d %d %d\n", ok, samples[0], samples[1], samples[2]);
     return ok && samples[0] == kSamples && samples[1] == kSamples && samples[2] == kSamples ? 0 : 1;

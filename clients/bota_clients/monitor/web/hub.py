@@ -244,11 +244,8 @@ class Hub:
         if position is not None and 0 <= position < MOST_PLACES and position != page.sensor:
             page.sensor = position
             self._send_kept(page)
-        if "token" in message:
-            given = message["token"] if isinstance(message["token"], str) else ""
-            page.control = hmac.compare_digest(given.encode(errors="replace"), self.token.encode())
-            if not page.control:
-                return "The token in this link is not that of this run: open the link that it printed"
+        if "token" in message and not self._check_token(page, message["token"]):
+            return "The token in this link is not that of this run: open the link that it printed"
         if action is None:
             return None
         if action not in ("reset", *WAYS):
@@ -264,6 +261,12 @@ class Hub:
         else:
             self._taring = self._tare(page.sensor, self._model.say, action)
         return None
+
+    def _check_token(self, page: Page, given: object) -> bool:
+        """Whether the page may control from now on."""
+        text = given if isinstance(given, str) else ""
+        page.control = hmac.compare_digest(text.encode(errors="replace"), self.token.encode())
+        return page.control
 
     def _send_kept(self, page: Page) -> None:
         for _, text in self._kept.get(page.sensor, ()):

@@ -13,22 +13,6 @@
 
 namespace bota_ethercat {
 
-/// Counters of one sensor, from `status`.
-struct SensorStatus {
-    std::uint8_t sensor = 0;
-    std::uint64_t fresh = 0, repeated = 0, invalid = 0, lost_samples = 0, recoveries = 0;
-    bool locked = false;     ///< the server follows the sensor's clock
-    double period_us = 0.0;  ///< of the sensor's samples
-};
-
-/// Counters of the server, from `status`.
-struct Status {
-    std::uint64_t cycles = 0, missed_deadlines = 0, lost_frames = 0;
-    double uptime_s = 0.0;
-    std::size_t sensor_count = 0;
-    std::array<SensorStatus, kMaxSensors> sensors;
-};
-
 /// What `tare` did: force in N, then torque in Nm.
 struct TareResult {
     std::array<double, 6> old_offset{}, new_offset{};
@@ -83,30 +67,6 @@ public:
     bool describe(Description& into) {
         if (!ask("{\"action\":\"describe\"}")) return false;
         return detail::read_description(reply(), into) || fail("the server speaks another version of the protocol");
-    }
-
-    bool status(Status& into) {
-        if (!ask("{\"action\":\"status\"}")) return false;
-        const json::Value answer = reply();
-        if (!answer["sensors"].is_array()) return fail("the reply to status has no sensors");
-        into = Status();
-        answer["cycles"].get(into.cycles);
-        answer["missed_deadlines"].get(into.missed_deadlines);
-        answer["lost_frames"].get(into.lost_frames);
-        answer["uptime_s"].get(into.uptime_s);
-        answer["sensors"].for_each([&into](json::Value, json::Value each) {
-            if (into.sensor_count == kMaxSensors) return;
-            SensorStatus& status = into.sensors[into.sensor_count++];
-            each["sensor"].get(status.sensor);
-            each["fresh"].get(status.fresh);
-            each["repeated"].get(status.repeated);
-            each["invalid"].get(status.invalid);
-            each["lost_samples"].get(status.lost_samples);
-            each["recoveries"].get(status.recoveries);
-            status.locked = each["clock"]["mode"].is("locked");
-            each["clock"]["period_us"].get(status.period_us);
-        });
-        return true;
     }
 
     /// Set the sensor's own offset so that the mean of `samples` samples becomes `target` (N, Nm). The sensor must be

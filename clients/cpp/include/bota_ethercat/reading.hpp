@@ -71,7 +71,7 @@ public:
     bool fresh_only = true;
 
     /// A new subscription begins: nothing before its first frame counts as missing, unless it has GAP.
-    void begin() noexcept { begun_ = has_new_ = false; }
+    void begin() noexcept { begun_ = has_new_ = false, missed_ = 0; }
     /// Whether a frame has come since.
     bool begun() const noexcept { return begun_; }
 
@@ -91,6 +91,7 @@ public:
         if ((flags & kRepeated) != 0) return ++counts.repeated, FrameKind::repeated;
         new_ns_ = monotonic_ns;
         has_new_ = true;
+        missed_ = 0;
         return ++counts.samples, FrameKind::sample;
     }
 
@@ -103,15 +104,18 @@ private:
         if (!gap) return;
         ++counts.gaps;
         std::uint64_t lost = jump > skipped ? 0 : 1;
+        const std::uint64_t missed = jump + missed_;
         if (has_new_ && rate_hz > 0.0 && monotonic_ns > new_ns_) {
             const double periods = std::nearbyint(static_cast<double>(monotonic_ns - new_ns_) * rate_hz / 1e9);
             const std::uint64_t room = periods < 1.0 ? 0 : static_cast<std::uint64_t>(periods) - 1;
-            if (room > jump && room - jump > lost) lost = room - jump;
+            if (room > missed && room - missed > lost) lost = room - missed;
         }
         counts.lost += lost;
+        missed_ = missed + lost;
     }
 
     std::uint64_t sequence_ = 0, monotonic_ns_ = 0, new_ns_ = 0;
+    std::uint64_t missed_ = 0;  // what is missing already since the newest new frame
     bool begun_ = false, has_new_ = false;
 };
 
