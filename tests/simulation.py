@@ -414,9 +414,14 @@ class MemoryChannel:
 
 
 def more_if_long(usual: Collection[Any], every: Iterable[Any]) -> list[Any]:
-    """Values of a parameter: all of `every`, those that are not in `usual` in long runs only."""
-    marks = ((value, [] if value in usual else [pytest.mark.long]) for value in every)
-    return [pytest.param(value, marks=mark) for value, mark in marks]
+    """Values of parameters: all of `every`, those that are not in `usual` in long runs only."""
+    return [
+        pytest.param(
+            *(value if isinstance(value, tuple) else (value,)),
+            marks=[] if value in usual else [pytest.mark.long],
+        )
+        for value in every
+    ]
 
 
 def fresh(frames: Iterable[DataMessage]) -> list[DataMessage]:

@@ -293,7 +293,7 @@ def test_a_working_counter_that_cannot_be_is_no_complete_exchange(lrw: bool) -> 
 
 
 @LRW_OR_NOT
-@pytest.mark.parametrize("seed", more_if_long([1, 2], range(50)))
+@pytest.mark.parametrize("seed", more_if_long([1], range(50)))
 def test_no_bytes_from_the_wire_end_the_loop(seed: int, lrw: bool, caplog: pytest.LogCaptureFixture) -> None:
     chance = random.Random(seed)
     wire = HostileWire(SensorOptions(), SensorOptions(serial=2))
@@ -324,7 +324,7 @@ def test_no_bytes_from_the_wire_end_the_loop(seed: int, lrw: bool, caplog: pytes
 
     wire.change = change
     client = running.subscribe()
-    for second in range(6):
+    for second in range(2):
         for action in ("sdo_read", "status", "describe"):
             client.send(action, **({"name": "Sampling rate"} if action == "sdo_read" else {}))
         running.command(("power cycle 0.05", "safeop 0x1B")[second % 2])

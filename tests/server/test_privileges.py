@@ -193,7 +193,7 @@ def running(
 ) -> Iterator[tuple[Server, Path]]:
     """It finds its Python unreadable where that is root's: it must need nothing of it any more."""
     config = tmp_path_factory.mktemp("privileges") / "c.toml"
-    config.write_text("[server]\nidle_timeout_s = 50\n")
+    config.write_text("[server]\nidle_timeout_s = 50\n[sensor]\nsinc_length = 512\n")
     config.chmod(0o600)
     with server(bench[0].near, "--config", str(config), under=BY_SUDO) as found:
         yield found, config

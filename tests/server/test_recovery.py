@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from bota_ethercat.framing import DataFlag
-from bota_ethercat.settings import sampling_rate_hz
+from bota_ethercat.settings import SettingValue, sampling_rate_hz
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import PROCESSED_BIT, SHORTEST_FRAME, SOURCE_ADDRESS, Command, build
 from ethercat_server.simulation.machine import Machine
@@ -25,9 +25,11 @@ WANTED = {"acceleration_range_g": 8}
 OFFSET = 0x8000
 
 
-def streaming(*sensors: SensorOptions, machine: Machine | None = None) -> tuple[Simulation, Client]:
+def streaming(
+    *sensors: SensorOptions, machine: Machine | None = None, **settings: SettingValue
+) -> tuple[Simulation, Client]:
     """A server on a sensor, and a client that has subscribed."""
-    simulation = Simulation(*(sensors or (CLOCK,)), machine=machine, settings=WANTED)
+    simulation = Simulation(*(sensors or (CLOCK,)), machine=machine, settings={**WANTED, **settings})
     client = simulation.subscribe()
     client.fresh(50)
     return simulation, client
@@ -45,7 +47,7 @@ def state(client: Client, sensor: int = 0) -> str:
     return found
 
 
-@pytest.mark.parametrize("times", more_if_long([5], [5, 20]))
+@pytest.mark.parametrize("times", more_if_long([2], [2, 20]))
 @pytest.mark.parametrize(
     ("fault", "seconds", "loses_settings"),
     [
@@ -149,7 +151,7 @@ def test_another_sensor_is_refused_and_the_right_one_taken_back(model: str) -> N
     check_frames(simulation.frames)
 
 
-@pytest.mark.parametrize("milliseconds", more_if_long(range(1, 60, 12), range(60)))
+@pytest.mark.parametrize("milliseconds", more_if_long(range(1, 60, 20), range(60)))
 def test_power_cut_again_while_being_set_up(milliseconds: int) -> None:
     simulation, client = streaming()
     for n in range(4):
@@ -272,7 +274,7 @@ def test_a_lost_datagram_is_no_lost_sensor(monkeypatch: pytest.MonkeyPatch, anot
         return None if lose else read(number, address, size)
 
     monkeypatch.setattr(simulation.bus, "read_register", lose_every_other)
-    simulation.run(2.0)
+    simulation.run(1.2)
     assert next(count) > 10
     assert lost(client) == []
 
@@ -359,7 +361,7 @@ def any_machine(chance: random.Random, seed: int) -> Machine:
     )
 
 
-@pytest.mark.parametrize("seed", more_if_long(range(3), range(20)))
+@pytest.mark.parametrize("seed", more_if_long(range(2), range(20)))
 def test_whatever_happens_the_stream_is_true_and_comes_back(seed: int) -> None:
     """Twenty faults in some ten seconds, on a bad machine, while clients configure, tare and save."""
     chance = random.Random(seed)
@@ -428,15 +430,15 @@ def setting_value(name: str, raw: str) -> int | bool:
 
 
 @pytest.mark.parametrize("dc", ["", "none"])
-@pytest.mark.parametrize("wire", [Machine(), Machine(lost=0.1)])
-def test_time_out_of_op_is_no_lost_samples(dc: str, wire: Machine) -> None:
+@pytest.mark.parametrize("lost", more_if_long([0.1], [0.0, 0.1]))
+def test_time_out_of_op_is_no_lost_samples(dc: str, lost: float) -> None:
     """Exchanges go on while it comes back, and bring samples as soon as it is in OP; steps are repeated."""
     simulation, client = streaming(SensorOptions(signal="clock", ppm=150.0, dc=dc))
     stream = simulation.streams[0]
-    for recovery in range(20):
-        simulation.backend.become(wire)
+    for recovery in range(10):
+        simulation.backend.become(Machine(lost=lost))
         simulation.run(0.2)
-        simulation.command("safeop 0x1B" if recovery % 3 else f"power cycle {0.03 * recovery}")
+        simulation.command("safeop 0x1B" if recovery % 3 else f"power cycle {0.06 * recovery}")
         client.wait_event("sensor_lost")
         missed, before = stream.lost_samples, len(simulation.frames)
         client.wait_event("sensor_back")
@@ -475,10 +477,10 @@ def test_three_samples_are_discarded_after_a_return_and_not_shown_as_the_last_go
     assert stream.idle_at_ns > simulation.clock.now_ns + period_ns, "its first samples may still come"
 
 
-@pytest.mark.parametrize("most", more_if_long([5], [5, 20]))
+@pytest.mark.parametrize("most", more_if_long([3], [3, 20]))
 @pytest.mark.parametrize("seed", more_if_long([0], range(5)))
 def test_one_that_returns_with_a_slow_eeprom_costs_the_other_nothing(seed: int, most: int) -> None:
-    """Two sensors, 5 or 20 power cuts of the second; its EEPROM takes 30 ms a read."""
+    """Two sensors, 3 or 20 power cuts of the second; its EEPROM takes 30 ms a read."""
 
     def lost(cuts: int) -> int:
         simulation = Simulation(
@@ -539,7 +541,7 @@ def test_a_busy_computer_is_named_in_place_of_the_cable_only(monkeypatch: pytest
 def test_another_master_on_the_wire_is_named_and_so_is_its_end(
     source: str, index: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    simulation, client = streaming()
+    simulation, client = streaming(sinc_length=512)  # the fewer samples, the faster it is simulated
     caplog.set_level(logging.INFO)
     on = True
     simulation.backend.become(Machine(late=0.1, late_ns=150e6))
@@ -589,10 +591,7 @@ MACHINES = {
 }
 
 
-USUAL = (
-    "frames take 1 ms", "frames take 10 ms", "frames take 30 ms", "3 ms, often more", "5 ms, with stalls",
-    "30 ms, with stalls", "frames get lost too",
-)  # fmt: skip
+USUAL = ("frames take 10 ms", "3 ms, often more", "30 ms, with stalls", "frames get lost too")
 
 
 @pytest.mark.parametrize("machine", more_if_long(USUAL, MACHINES))
@@ -618,7 +617,7 @@ def test_samples_come_and_come_back_after_a_power_cut(machine: str) -> None:
     assert len(fresh(simulation.frames)) > 390, "as fast as the machine again"
 
 
-@pytest.mark.parametrize("milliseconds", more_if_long([1, 5, 30], FRAME_MS))
+@pytest.mark.parametrize("milliseconds", more_if_long([5, 30], FRAME_MS))
 def test_a_sensor_is_not_lost_because_its_frames_take_long(milliseconds: int) -> None:
     simulation, client = streaming()
     simulation.run(0.5)
@@ -626,9 +625,9 @@ def test_a_sensor_is_not_lost_because_its_frames_take_long(milliseconds: int) ->
     simulation.run(2.0)
     client.events.clear()
     before = simulation.status()["lost_frames"]
-    simulation.run(4.0)
+    simulation.run(2.0)
     assert client.events == []
-    assert simulation.status()["lost_frames"] - before <= 8
+    assert simulation.status()["lost_frames"] - before <= 4
     assert len(client.fresh(50)) == 50
 
 

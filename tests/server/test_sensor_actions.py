@@ -651,9 +651,9 @@ def test_a_sensor_that_is_lost_while_a_tare_waits_for_it_is_not_tared(bench: Ben
 
 
 def moments(step_ms: int, count: int) -> list[Any]:
-    """In ms; every third one, and all of them with --long."""
+    """In ms; every sixth one, and all of them with --long."""
     every = range(0, count * step_ms, step_ms)
-    return more_if_long(every[::3], every)
+    return more_if_long(every[::6], every)
 
 
 def check_former(bench: Bench, before: dict[str, Any]) -> None:

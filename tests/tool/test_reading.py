@@ -24,7 +24,7 @@ from tests.tool.running import complaints, one_sentence, refused, told, tool_her
 @pytest.fixture
 def bench() -> Iterator[SimulatedBus]:
     """One sensor with 61 bytes of process data that gives the same numbers for ever."""
-    with simulated_bus("--signal", "constant", "--serial", "4711") as bus:
+    with simulated_bus("--signal", "constant", "--serial", "4711", "--sinc", "512") as bus:
         yield bus
 
 
@@ -66,7 +66,7 @@ def test_every_object_is_read_and_decoded(bench: SimulatedBus) -> None:
     rows = {(int(row["index"], 16), row["subindex"]): row for row in found["objects"]}
     assert set(rows) == {row.address for row in KNOWN_OBJECTS}
     decoded: dict[tuple[int, int], dict[str, object]] = {
-        (0x8011, 0): {"value": 800, "unit": "Hz"},
+        (0x8011, 0): {"value": 100, "unit": "Hz"},
         (0x8004, 0): {"meaning": "±2 g"},
         (0x8006, 2): {"meaning": "FIR off"},
         (0x8006, 1): {"write_states": ["PREOP"], "allowed": {"from": 32, "to": 2048}},
@@ -90,7 +90,7 @@ def test_objects_that_cannot_be_read_have_a_line_with_the_reason(
     missing = next(line for line in lines if "0x8010:4" in line)
     assert "this firmware does not have it (abort 0x06090011)" in missing
     assert "refused" in next(line for line in lines if "0x8002:1" in line)
-    assert any("Sampling rate" in line and "800" in line for line in lines)
+    assert any("Sampling rate" in line and "100" in line for line in lines)
     alone = tool_here("read", near, "0x8010:4", code=1)
     assert "this firmware does not have it" in alone.out + alone.err
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.simulation import SimulatedBus, simulated_bus
+from tests.simulation import SimulatedBus, more_if_long, simulated_bus
 from tests.tool.odd_firmware import fewer_objects, other_sinc_length, refusing
 from tests.tool.running import offset, one_sentence, refused, told, tool_here
 
@@ -26,7 +26,7 @@ def bench() -> Iterator[SimulatedBus]:
 
 @pytest.fixture
 def chain() -> Iterator[SimulatedBus]:
-    with simulated_bus("--sensors", "2", "--serial", "10,20") as bus:
+    with simulated_bus("--sensors", "2", "--serial", "10,20", "--sinc", "512") as bus:
         yield bus
 
 
@@ -291,7 +291,7 @@ def test_another_sensors_snapshot_is_refused(chain: SimulatedBus, tmp_path: Path
     said = refused("restore", near, path, "--sensor", 1)
     assert "serial 10, but this is the BFT-SENS-ECAT-M8 with serial 20" in said
     assert chain.written(1) == []
-    assert "sinc_length  64   128" in tool_here("restore", near, path, "--sensor", 1, "--force").out
+    assert "sinc_length  512  128" in tool_here("restore", near, path, "--sensor", 1, "--force").out
 
 
 @pytest.mark.parametrize("how", ["--undo", "--clear"])
@@ -349,7 +349,7 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
         yield found
 
 
-@pytest.mark.parametrize("length", MEANINGS)
+@pytest.mark.parametrize("length", more_if_long([128, 1000], MEANINGS))
 def test_what_is_said_of_it_follows_the_rate(bus: SimulatedBus, length: int) -> None:
     applied = told("apply", bus.near, "--set", f"sinc_length={length}")
     assert applied["settings"]["sinc_length"] == length
@@ -370,7 +370,7 @@ def test_a_length_that_chop_hides_is_not_overwritten(bus: SimulatedBus) -> None:
     assert (read["value"], read["meaning"]) == (768, "400 Hz; cut-off not in the table" + UNMATCHED)
 
 
-@pytest.mark.parametrize("length", [32, 128, 341, 342, 1000])
+@pytest.mark.parametrize("length", more_if_long([32, 342], [32, 128, 341, 342, 1000]))
 def test_plan_and_restore_end(bus: SimulatedBus, length: int, tmp_path: Path) -> None:
     asked = ("--set", f"sinc_length={length}")
     tool_here("plan", bus.near, *asked, code=3)
