@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from bota_clients.recording.file_format import FORMAT_VERSION
 from bota_clients.recording.writer import DiskFile, RecordingWriter
 from bota_ethercat import pdo
 from bota_ethercat.framing import DataMessage
@@ -38,7 +37,7 @@ def frame(number: int, sensor: int = 0, flags: int = 0, size: int = 61, **values
 def writer(path: Path, **notes: str) -> RecordingWriter:
     """A new recording at `path`."""
     disk = DiskFile(path, overwrite=True)
-    return RecordingWriter(disk, "test", {"format": FORMAT_VERSION, **notes})
+    return RecordingWriter(disk, "test", notes)
 
 
 def record(

@@ -17,9 +17,10 @@ from typing import Any, Self
 from unittest import mock
 
 from bota_clients import program as programs
+from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, start
 from bota_clients.record.cli import parse_options as record_options
-from bota_clients.recording.reader import RecordingError, open_recording
+from bota_clients.recording.reader import open_recording
 from bota_clients.replay import program as replay
 from bota_clients.replay.cli import parse_options as replay_options
 from bota_ethercat.client import Client as StreamClient

@@ -20,12 +20,13 @@ from typing import Any
 
 import pytest
 
+from bota_clients.errors import RecordingError
 from bota_clients.monitor import cli
 from bota_clients.monitor.cli import parse
 from bota_clients.monitor.model import Model, State
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.tare import tare
-from bota_clients.recording.reader import RecordingError, open_recording
+from bota_clients.recording.reader import open_recording
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from ethercat_server.virtual_sensor.options import SensorOptions

@@ -12,17 +12,11 @@ from typing import Any
 import pytest
 import zstandard
 
+from bota_clients.errors import DamagedError, NotARecordingError, RecordingError
 from bota_clients.recording import file_format
 from bota_clients.recording.columns import columns
 from bota_clients.recording.container import MAX_CHUNK, McapFile
-from bota_clients.recording.reader import (
-    DamagedError,
-    Description,
-    Event,
-    NotARecordingError,
-    RecordingError,
-    open_recording,
-)
+from bota_clients.recording.reader import Description, Event, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import SampleDecoder
 from tests.clients.recordings import START_NS, describe, frame, record, writer

@@ -22,7 +22,7 @@ from rosbags.rosbag2 import Reader
 
 from bota_clients.record import cli, recorder
 from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch, Source, Tally
-from bota_clients.recording.file_format import FORMAT_VERSION, frame_topic
+from bota_clients.recording.file_format import frame_topic
 from bota_clients.recording.reader import Description, open_recording
 from bota_ethercat.address import Address
 from bota_ethercat.framing import DataFlag, DataMessage
@@ -223,7 +223,7 @@ def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
 
 
 def new_recorder(out: Path) -> recorder.Recorder:
-    return recorder.Recorder(out, "test", {"format": FORMAT_VERSION}, overwrite=False)
+    return recorder.Recorder(out, "test", {}, overwrite=False)
 
 
 def test_frames_get_into_the_file_before_it_ends(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -412,7 +412,7 @@ def test_a_page_says_what_the_monitor_says() -> None:
 @pytest.mark.parametrize(
     ("argv", "found"),
     [([], "None"), (["--web"], "localhost:12080"), (["--web", "8000"], "localhost:8000"),
-     (["--web", "[::1]:8000"], "[::1]:8000"), (["host:5", "--web"], "localhost:12080"),
+     (["--web", "[::1]:8000"], "[::1]:8000"), (["--server", "host:5", "--web"], "localhost:12080"),
      (["--web", "0.0.0.0:8000"], "'0.0.0.0:8000': the page is for this machine only: give a port, and "
       "reach it from elsewhere over ssh -L"),
      (["--web", "70000"], "'70000': 70000 is no port"), (["--web", "--once"], "cannot be combined"),

@@ -116,7 +116,7 @@ def test_a_port_in_use_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> No
     handler = signal.getsignal(signal.SIGTERM)
     with socket.create_server(("127.0.0.1", free_port())) as other:
         port = other.getsockname()[1]
-        assert cli.main(["--web", str(port), "localhost:1"]) == 1
+        assert cli.main(["--web", str(port), "--server", "localhost:1"]) == 1
     signal.signal(signal.SIGTERM, handler)
     sentence = f"ethercat-monitor: localhost:{port} is in use: choose another port with --web PORT\n"
     assert capsys.readouterr() == ("", sentence)
@@ -126,7 +126,9 @@ def test_the_program_shows_tares_and_ends_with_ctrl_c() -> None:
     """With a real server: the link that it prints is enough to tare."""
     port = free_port()
     with served(SensorOptions(signal="rest")) as server:
-        program = Program("bota_clients.monitor.cli", [f"localhost:{server.port}", "--web", str(port)])
+        program = Program(
+            "bota_clients.monitor.cli", ["--server", f"localhost:{server.port}", "--web", str(port)]
+        )
         try:
             program.wait_for("Ctrl-C ends it")
             link = re.search(rf"http://localhost:{port}/#token=(\S+)", program.said())

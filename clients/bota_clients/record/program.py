@@ -24,7 +24,6 @@ from bota_clients.numbers import count, duration
 from bota_clients.program import Signals, say
 from bota_clients.record.cli import RecordOptions
 from bota_clients.record.recorder import BATCH_S, Batch, Recorder, Source, check_path
-from bota_clients.recording.file_format import FORMAT_VERSION
 from bota_clients.recording.reader import Event
 from bota_ethercat.errors import RefusedError, UnreachableError
 from bota_ethercat.program.version import VERSION
@@ -113,7 +112,6 @@ def _report(batch: Batch, show: Callable[[str], None]) -> None:
 
 def _notes(options: RecordOptions, source: Source) -> dict[str, str]:
     return {
-        "format": FORMAT_VERSION,
         "recorder": _NAME,
         "server": str(options.address),
         "server_version": printable(source.description.get("version"), 40),

@@ -167,8 +167,7 @@ class Recorder:
         self.error: DiskError | None = None
         self.saved = 0
         self._queue: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
-        self._backlog = self._overflow = 0
-        self._unflushed = 0
+        self._backlog = self._overflow = self._unflushed = 0
         self._disk = DiskFile(path, overwrite=overwrite)
         self._writer = RecordingWriter(self._disk, library, notes)
         self._reason = ""
@@ -183,8 +182,8 @@ class Recorder:
 
     @property
     def bytes_written(self) -> int:
-        """Size of the file."""
-        return self._writer.size
+        """Size of the file, without the current chunk."""
+        return self._disk.tell()
 
     def put(self, batch: Batch) -> None:
         """Queue a batch; never blocks."""

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
-from bota_clients.errors import DamagedError, NotARecordingError, RecordingError
+from bota_clients.errors import DamagedError, NotARecordingError
 from bota_clients.recording import file_format
 from bota_clients.recording.container import McapFile
 from bota_ethercat.errors import SettingError
@@ -23,9 +23,6 @@ from bota_ethercat.framing import DataMessage
 from bota_ethercat.settings import SETTINGS, sampling_rate_hz
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import rows, visible
-
-__all__ = ["DamagedError", "Description", "Event", "Histories", "Identity", "NotARecordingError",
-           "RecordedSensor", "Recording", "RecordingError", "Settings", "open_recording"]  # fmt: skip
 
 _MAX_NOTES: Final = 1_000_000  # descriptions and events
 _LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions

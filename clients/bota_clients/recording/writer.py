@@ -130,17 +130,12 @@ class RecordingWriter:
         stream = cast("IO[Any]", disk)
         self._mcap = Writer(stream, _CHUNK_SIZE, CompressionType.ZSTD, enable_data_crcs=True)
         self._mcap.start(file_format.PROFILE, library)
-        self._mcap.add_metadata(file_format.METADATA, dict(notes))
+        self._mcap.add_metadata(file_format.METADATA, {"format": file_format.FORMAT_VERSION, **notes})
         self._schemas: dict[str, int] = {}
         self._descriptions = self._channel(file_format.DESCRIPTION_TOPIC, file_format.TEXT_SCHEMA)
         self._events = self._channel(file_format.EVENTS_TOPIC, file_format.TEXT_SCHEMA)
         self._notes = 0
         self._frame_channels: dict[int, int] = {}
-
-    @property
-    def size(self) -> int:
-        """Size of the file in bytes, without the current chunk."""
-        return self._disk.tell()
 
     def describe(self, stamp_ns: int, description: JsonObject) -> None:
         """Write a reply to `describe`."""

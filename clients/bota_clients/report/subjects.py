@@ -18,7 +18,6 @@ from bota_clients.errors import ReportError
 from bota_clients.numbers import count, listing, moment
 from bota_clients.record.recorder import Recorder, Source
 from bota_clients.recording.columns import Columns, columns
-from bota_clients.recording.file_format import FORMAT_VERSION
 from bota_clients.recording.reader import (
     Histories,
     Identity,
@@ -176,7 +175,7 @@ def of_server(
     with TemporaryDirectory() as folder, contextlib.closing(Source(address, None)) as source:
         source.connect()
         path = Path(folder, "live.mcap")
-        recorder = Recorder(path, "", {"format": FORMAT_VERSION}, overwrite=False)
+        recorder = Recorder(path, "", {}, overwrite=False)
         begin = time.monotonic()
         while (passed := time.monotonic() - begin) < seconds:
             show(completed=passed)
