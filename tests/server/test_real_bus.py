@@ -156,17 +156,6 @@ def test_sensors_among_other_devices(text: str) -> None:
         assert {row["al_state"] for row in before} <= {"INIT", "PREOP"}
 
 
-def test_a_drive_at_work_is_not_touched() -> None:
-    """pysoem opens the interface; nothing is written."""
-    with (
-        virtual_sensor("--chain", "BOTA:OP,DRIVE:OP") as (veth, sensor),
-        contextlib.closing(Server(veth.near)) as refused,
-    ):
-        assert refused.wait() == 1
-        assert "not Bota sensors (position 1 in OP)" in refused.said()
-        assert sensor.stats_of_foreign(1)["write_count"] == 0
-
-
 # -- a service on a chain of two sensors, with a configuration file; the last of these ends it
 
 CONFIG = "[sensor]\nfir = true\nsinc_length = 512\n[sensor.1]\nsinc_length = 1024\n"
