@@ -29,15 +29,10 @@ def add_server(parser: argparse.ArgumentParser, what: str = "the server") -> Non
     parser.add_argument("--server", type=address, metavar="HOST:PORT", help=f"{what} {server_choice.HELP}")
 
 
-def server_of(parser: argparse.ArgumentParser, given: Address | None, argument: str | None = None) -> Address:
-    """The server `given` with --server or by the old form, an `argument` without --server, or the default.
-
-    The parser ends the program if it is wrong, or given twice.
-    """
-    if given is not None and argument is not None:
-        parser.error(f"the server is given twice: leave out {argument}, or --server")
+def server_of(parser: argparse.ArgumentParser, given: Address | None) -> Address:
+    """The server `given` with --server, or the default; the parser ends the program if that is wrong."""
     try:
-        return given or (server_choice.default_server() if argument is None else Address.parse(argument))
+        return given or server_choice.default_server()
     except ValueError as error:
         parser.error(str(error))
 

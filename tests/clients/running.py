@@ -92,7 +92,7 @@ class Replay(Running):
     def __init__(self, *arguments: str | Path, port: int = 0) -> None:
         self.port = port or free_port()
         self._sentences: list[str] = []
-        super().__init__("replay", replay_options([*map(str, arguments), str(self.port)]))
+        super().__init__("replay", replay_options([*map(str, arguments), "--server", str(self.port)]))
         wait_until(self._is_listening, "a replay that listens")
 
     def said(self) -> str:
@@ -127,7 +127,7 @@ class Recorder(Running):
 
     def __init__(self, path: Path, port: int, *arguments: str) -> None:
         self.path = path
-        super().__init__("record", record_options([*arguments, str(path), str(port)]))
+        super().__init__("record", record_options([*arguments, str(path), "--server", str(port)]))
 
     def wait_for_frames(self, count: int) -> None:
         """Until so many more are in the file."""
@@ -148,4 +148,4 @@ class RecorderProcess(Program):
     """`ethercat-record` of what is on `port`, as a process."""
 
     def __init__(self, path: Path, port: int, *arguments: str) -> None:
-        super().__init__("bota_clients.record.cli", [*arguments, str(path), str(port)])
+        super().__init__("bota_clients.record.cli", [*arguments, str(path), "--server", str(port)])

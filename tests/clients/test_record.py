@@ -91,7 +91,7 @@ def is_whole(frames: list[DataMessage]) -> bool:
 
 def test_record_replay_record_gives_the_same_frames(source: Path, out: Path) -> None:
     with Replay("--speed", "max", source) as served:
-        code, said = run(out, served.port, "--no-reconnect")
+        code, said = run(out, "--server", served.port, "--no-reconnect")
         assert served.wait() == 0
     assert code == 0, said
     assert "nothing was lost" in said
@@ -100,7 +100,7 @@ def test_record_replay_record_gives_the_same_frames(source: Path, out: Path) -> 
 
 
 def test_it_ends_by_itself_and_says_what_it_has(endless: Replay, out: Path) -> None:
-    code, said = run(out, endless.port, "--seconds", "0.5")
+    code, said = run(out, "--server", endless.port, "--seconds", "0.5")
     assert code == 0
     assert end(out)["reason"] == "time is up"
     with open_recording(out) as opened:
@@ -115,7 +115,7 @@ def test_a_signal_ends_it_cleanly(
     endless: Replay, out: Path, number: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ready = lambda: frames_in(out) > 50  # noqa: E731
-    assert signalled(cli.main, number, ready, out, endless.port, "--sensor", 1) == 0
+    assert signalled(cli.main, number, ready, out, "--server", endless.port, "--sensor", 1) == 0
     assert "nothing was lost" in capsys.readouterr().err
     assert end(out)["reason"] == "asked to stop"
     with open_recording(out) as opened:
@@ -308,7 +308,7 @@ def test_a_full_disk_ends_it_with_what_was_written_whole(
         return int(real(fd, data[:count]))
 
     monkeypatch.setattr(os, "write", full)
-    code, said = run(out, endless.port, "--seconds", "30")
+    code, said = run(out, "--server", endless.port, "--seconds", "30")
     assert code == 1
     assert "No space left on device; what was written before is intact" in said
     assert "came but could not be written" in said
@@ -323,13 +323,13 @@ def test_a_full_disk_ends_it_with_what_was_written_whole(
 
 def test_nothing_is_overwritten_unasked_or_by_two(endless: Replay, out: Path) -> None:
     out.write_text("precious")
-    code, said = run(out, endless.port, "--seconds", "0.3")
+    code, said = run(out, "--server", endless.port, "--seconds", "0.3")
     assert code == 1
     assert "exists: choose another name, or use --force to replace it" in said
     assert out.read_text() == "precious"
     with Recorder(out, endless.port, "--force") as recorder:
         recorder.wait_for_frames(1)
-        code, said = run(out, endless.port, "--force", "--seconds", "0.3")
+        code, said = run(out, "--server", endless.port, "--force", "--seconds", "0.3")
         assert code == 1
         assert "another ethercat-record is writing to it" in said
     assert is_whole(read(out))
@@ -339,19 +339,19 @@ def test_nothing_is_overwritten_unasked_or_by_two(endless: Replay, out: Path) ->
 
 
 def test_a_refusal_is_one_sentence_and_leaves_no_file(endless: Replay, out: Path) -> None:
-    code, said = run(out, endless.port, "--sensor", "3", "--seconds", "30")
+    code, said = run(out, "--server", endless.port, "--sensor", "3", "--seconds", "30")
     assert code == 1
     assert said.splitlines()[-1] == "ethercat-record: the server has no sensor 3 (it has: 0, 1)"
     assert "nothing was lost" not in said
     assert not list(out.parent.glob("out*.mcap"))
-    assert run(out, endless.port, "--sensor", "1", "--seconds", "0.3")[0] == 0
+    assert run(out, "--server", endless.port, "--sensor", "1", "--seconds", "0.3")[0] == 0
 
 
 @pytest.mark.parametrize(
     ("code", "arguments", "sentence"),
     [
         (2, (), "required"),
-        (2, ("x.mcap", "localhost:99999"), "99999 is no port: it must be from 1 to 65535"),
+        (2, ("x.mcap", "--server", "localhost:99999"), "99999 is no port: it must be from 1 to 65535"),
         (2, ("x.mcap", "--seconds", "-1"), "it must be a time such as"),
         (2, ("x.mcap", "--sensor", "300"), "a position on the bus"),
         *((2, ("x.mcap", f"--for={text}"), "it must be a time such as 30s, 5min or 2h")

@@ -316,7 +316,7 @@ def test_numbers_and_times_stay_in_their_fields() -> None:
     ("code", "arguments", "sentence"),
     [
         (2, (), "required"),
-        (2, ("x.mcap", "99999"), "99999 is no port: it must be from 1 to 65535"),
+        (2, ("x.mcap", "--server", "99999"), "99999 is no port: it must be from 1 to 65535"),
         (2, ("x.mcap", "--speed", "0"), "it must be a number"),
         (2, ("x.mcap", "--speed", "nan"), "it must be a number"),
         (2, ("x.mcap", "--server", "nowhere:1"), "an IP address of this machine"),
@@ -332,7 +332,7 @@ def test_what_cannot_be_played_is_said(code: int, arguments: tuple[str, ...], se
 
 def test_a_port_that_is_taken_is_said(path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        ended = run_here(cli.main, path, taken.getsockname()[1])
+        ended = run_here(cli.main, path, "--server", taken.getsockname()[1])
     assert ended.code == 1
     assert "is in use by another program" in ended.err
 
@@ -341,7 +341,12 @@ def test_a_port_that_is_taken_is_said(path: Path) -> None:
 def test_a_signal_ends_it_before_anybody_came(
     path: Path, number: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert signalled(cli.main, number, lambda: "replaying" in capsys.readouterr().err, path, free_port()) == 0
+    assert (
+        signalled(
+            cli.main, number, lambda: "replaying" in capsys.readouterr().err, path, "--server", free_port()
+        )
+        == 0
+    )
 
 
 def test_a_damaged_recording_ends_it_with_a_sentence(path: Path) -> None:

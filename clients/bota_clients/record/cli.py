@@ -45,7 +45,7 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
         usage="%(prog)s [options] OUT.mcap",
     )
     add = made.add_argument
-    add("names", nargs="+", metavar="OUT.mcap", help="file to write")
+    add("name", metavar="OUT.mcap", help="file to write")
     add_server(made)
     add("--sensor", type=position, action="append", dest="sensors", metavar="N",
         help="record only the sensor at this position on the bus; repeatable")  # fmt: skip
@@ -56,18 +56,14 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
         help="stop when the connection ends, instead of reconnecting")  # fmt: skip
     add("--until-eof", action="store_true",
         help="stop at the end of standard input, when the program at its other end exits")  # fmt: skip
-    options = made.parse_intermixed_args(argv, RecordOptions())
-    # The file, and the address in its old form, in either order.
-    names: list[str] = options.names
-    name, *others = [*sorted(names[:2], key=is_address), *names[2:]]
+    options = made.parse_args(argv, RecordOptions())
+    name: str = options.name
     if is_address(name):
         made.error(
             f"{name} is a server's address, no file: write FILE.mcap --server {name}, "
             f"or ./{name} if a file is called so"
         )
-    if len(others) > 1:
-        made.error(f"unexpected argument {others[1]!r}")
-    options.path, options.address = Path(name), server_of(made, options.server, *others)
+    options.path, options.address = Path(name), server_of(made, options.server)
     if options.sensors is not None:
         options.sensors = sorted(set(options.sensors))
     return options

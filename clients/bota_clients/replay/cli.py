@@ -13,7 +13,7 @@ from typing import Final
 from bota_clients.arguments import address, number, parser, typed
 from bota_clients.program import Signals, start
 from bota_ethercat.address import DEFAULT_HOST, Address
-from bota_ethercat.program.server_choice import is_address, own_server
+from bota_ethercat.program.server_choice import own_server
 
 _HOSTS: Final = ["127.0.0.1", "::1"]
 
@@ -38,7 +38,7 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
         usage="%(prog)s [options] FILE [FILE ...]",
     )
     add = made.add_argument
-    add("names", nargs="+", metavar="FILE", help="recordings")
+    add("paths", nargs="+", type=Path, metavar="FILE", help="recordings")
     add("--server", type=address, metavar="HOST:PORT",
         help="serve at this address of this machine (default: as the clients' --server)")  # fmt: skip
     add("--speed", type=_speed, default=1.0, metavar="X",
@@ -46,16 +46,12 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
     add("--loop", action="store_true", help="start again at the end, until Ctrl-C")
     add("--at-once", action="store_true", help="start without waiting for a subscriber")
     options = made.parse_intermixed_args(argv, ReplayOptions())
-    names: list[str] = options.names
-    old = names.pop() if len(names) > 1 and is_address(names[-1]) else None
-    if options.server is not None and old is not None:
-        made.error(f"the address is given twice: leave out {old}, or --server")
     try:
-        server: Address = options.server or (own_server() if old is None else Address.parse(old))
+        server: Address = options.server or own_server()
         own = _HOSTS if server.host == DEFAULT_HOST else [_host(server.host)]
     except (ValueError, argparse.ArgumentTypeError) as error:
         made.error(str(error))
-    options.paths, options.port, options.hosts = [*map(Path, names)], server.port, own
+    options.port, options.hosts = server.port, own
     return options
 
 
