@@ -279,7 +279,7 @@ CARDS = [
 
 
 @pytest.mark.parametrize(
-    ("sinc_length", "milliseconds", "jitter_us"), more_if_long([CARDS[2], CARDS[4], CARDS[7]], CARDS)
+    ("sinc_length", "milliseconds", "jitter_us"), more_if_long([CARDS[2], CARDS[7]], CARDS)
 )
 def test_a_slow_card_costs_age_and_no_sample(
     sinc_length: int, milliseconds: float, jitter_us: float, caplog: pytest.LogCaptureFixture
@@ -320,7 +320,7 @@ def test_an_answer_that_was_overtaken_is_no_news() -> None:
 
 
 @pytest.mark.parametrize("seed", more_if_long([1], range(20)))
-@pytest.mark.parametrize("disturbance_ms", more_if_long([20, 700], [20, 300, 700]))
+@pytest.mark.parametrize("disturbance_ms", more_if_long([700], [20, 300, 700]))
 def test_the_clock_holds_over_a_stop_of_the_machine(disturbance_ms: float, seed: int) -> None:
     machine = Machine(seed=seed, wake_ns=30_000, frame_jitter_ns=40_000)
     running = run(machine, 32, seconds=0.5)

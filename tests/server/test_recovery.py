@@ -591,7 +591,7 @@ MACHINES = {
 }
 
 
-USUAL = ("frames take 10 ms", "3 ms, often more", "30 ms, with stalls", "frames get lost too")
+USUAL = ("3 ms, often more", "30 ms, with stalls", "frames get lost too")
 
 
 @pytest.mark.parametrize("machine", more_if_long(USUAL, MACHINES))
@@ -617,7 +617,7 @@ def test_samples_come_and_come_back_after_a_power_cut(machine: str) -> None:
     assert len(fresh(simulation.frames)) > 390, "as fast as the machine again"
 
 
-@pytest.mark.parametrize("milliseconds", more_if_long([5, 30], FRAME_MS))
+@pytest.mark.parametrize("milliseconds", more_if_long([30], FRAME_MS))
 def test_a_sensor_is_not_lost_because_its_frames_take_long(milliseconds: int) -> None:
     simulation, client = streaming()
     simulation.run(0.5)

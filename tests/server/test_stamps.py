@@ -242,13 +242,13 @@ def test_stamps_do_not_depend_on_how_late_the_machine_wakes(monkeypatch: pytest.
     assert abs(error_ns(monkeypatch, dc, None)) < WAKES_NS / 8
 
 
-@pytest.mark.parametrize("wrong", [0, -5, 1 << 80])
+@pytest.mark.parametrize("wrong", more_if_long([0, 1 << 80], [0, -5, 1 << 80]))
 def test_an_arrival_that_cannot_be_is_not_used(monkeypatch: pytest.MonkeyPatch, wrong: int) -> None:
     half = error_ns(monkeypatch, "", lambda: wrong)
     assert WAKES_NS / 3 < half < WAKES_NS * 2 / 3, "half of the wake-up counts as the way out"
 
 
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", more_if_long([3], [1, 3]))
 def test_neither_the_length_of_a_frame_nor_the_slaves_behind_are_in_a_stamp(count: int) -> None:
     running = settled(*[""] * count)
     running.frames.clear()
