@@ -6,18 +6,13 @@ import itertools
 import math
 import os
 import random
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from ethercat_server.acquisition.slave_clock import Trust, Verdict
 from tests.clock_simulation import SECOND, Card, ClockSimulation, Controller, Machine, Outcome, Sensor
-from tests.server import sample_clock_figure as figure
 from tests.simulation import more_if_long
-
-ROOT = Path(__file__).parents[2]
 
 QUIET = Machine()
 SETTLED_S = 2.0
@@ -181,21 +176,6 @@ def test_thousands_of_machines_cards_and_sensors(first: int, stolen: float) -> N
     if len(found) > MOST_FAULTS:
         lines = [f"{seed}: {', '.join(what)}: {draw(seed, stolen)}" for seed, what in found.items()]
         pytest.fail("\n".join(lines))
-
-
-def test_the_figure_can_be_drawn_and_shows_what_the_page_says(tmp_path: Path) -> None:
-    held, cost = figure.phases(), figure.costs([100e3, 2e6])
-    at_the_end = [
-        each for each in held if figure.STOP_S <= each.time_s <= figure.STOP_S + figure.STOP_LENGTH_S
-    ]
-    assert all(abs(each.error_us) < 2 * each.deviation_us < 30 for each in at_the_end)
-    assert all(each.lost == 0 for each in cost)
-    out = tmp_path / "figure.svg"
-    figure.draw(out, held, cost)
-    drawn, kept = out.read_text(), (ROOT / "docs" / "sample-clock.svg").read_text()
-    texts = re.findall(r">([^<>]*[a-z]{4}[^<>]*)</text>", kept)
-    assert len(texts) > 8
-    assert all(text in drawn for text in texts)
 
 
 # -- samples dated by a slave controller's event times, and every way in which these can be wrong
