@@ -80,11 +80,6 @@ def test_only_a_stop_at_that_time_explains_a_loss(first: float, last: float, exp
     assert (counts["lost"], counts["lost_in_stops"]) == (3, explained)
 
 
-def test_pauses_become_stops_only_if_longer_than_a_period() -> None:
-    one = np.array([[0, PERIOD], [5 * PERIOD, 7 * PERIOD]])
-    other = np.array([[6 * PERIOD, 8 * PERIOD], [20 * PERIOD, 20 * PERIOD + 900_000]])
-    assert statistics.stops([one, other], PERIOD).tolist() == [[5 * PERIOD, 8 * PERIOD]]
-    assert statistics.stops([], PERIOD).shape == (0, 2)
 
 
 def test_what_wraps_in_the_signal_is_made_continuous() -> None:
@@ -144,15 +139,6 @@ ROWS: list[dict[str, Any]] = [
 ]
 
 
-def test_the_table_has_what_there_is() -> None:
-    this, bare_c, ratio, driver = benchmark.cells("comparison", ROWS)
-    assert this == ["800 Hz, 1", "this", "1 (1) of 200", "80.0", "120", "150", "-", "9.0", "-"]
-    assert bare_c[3:6] == ["40.0", "60.0", "-"]
-    assert ratio[2:] == ["", "2.00", "3.00", "4.00", "", "5.00", ""]
-    assert driver[2] == "it cannot be had"
-    shown = io.StringIO()
-    Console(file=shown, width=108).print(benchmark.table("comparison", ROWS))
-    assert "…" not in shown.getvalue(), "it fits the narrowest table"
 
 
 def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
@@ -183,15 +169,6 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     benchmark.check(ROOT / "docs" / "benchmark.md")
 
 
-def test_an_option_measures_only_what_it_names() -> None:
-    for given, expected in {
-        "": ("comparison", False, None),
-        "--vendor": ("comparison", True, None),
-        "--load 4": ("load", False, 4),
-        "--path": ("path", False, None),
-    }.items():
-        options = benchmark.parse(given.split())
-        assert (options.mode, options.vendor, options.load) == expected
 
 
 # -- its programs

@@ -26,8 +26,11 @@ REAL_TIME: Final = 40  # of the client, or of node and subscriber: the default o
 _MOST_TURNS: Final = 3
 _NONE: Final = "-"
 VENDOR: Final = Path(__file__).parents[2] / ".venv-vendor"
-# What the ROS packages in .venv set is not for another environment's Python.
-_WITHOUT_ROS: Final = ("env", "-u", "LD_LIBRARY_PATH", "-u", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
+# What the ROS packages set is not for another environment's Python, which has no package of this project.
+_OTHER: Final = (
+    "env", "-u", "LD_LIBRARY_PATH", "-u", "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+    f"PYTHONPATH={VENDOR.with_name('protocol')}",
+)  # fmt: skip
 THIS, C_CLIENT, BARE_C, BY_C = "this", "this, C client", "bare C", "this / C"
 DRIVER, ROS = "Bota's driver", "this, ROS"
 RATIOS: Final = {
@@ -44,7 +47,7 @@ def _start(name: str, chain: Chain) -> Child:
     if name == DRIVER:  # with the server's priority, for which it does not ask
         file = chain.directory / "driver"
         return chain.start(
-            "server", *_WITHOUT_ROS, VENDOR / "bin" / "python", "-m", f"{PROCESSES}.vendor_driver", file,
+            "server", *_OTHER, VENDOR / "bin" / "python", "-m", f"{PROCESSES}.vendor_driver", file,
             WARM_UP_S, setup.seconds, chain.bus(), setup.sinc, setup.rate_hz, setup.priority, result=file,
         )  # fmt: skip
     if name == BARE_C:

@@ -365,13 +365,6 @@ def test_every_answer_has_the_headers_and_nothing_else_is_served() -> None:
         assert found.status_code == (200 if path in known else 404), path
 
 
-def test_every_file_is_in_the_package_and_the_library_with_its_license() -> None:
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    patterns = settings["package-data"]["bota_clients.monitor.web"]
-    base = PAGE.parent
-    packed = {path for pattern in patterns for path in base.glob(pattern) if path.is_file()}
-    assert packed == {path for path in PAGE.rglob("*") if path.is_file()}
-    assert "Leon Sorokin" in (PAGE / "uplot/LICENSE").read_text()
 
 
 def test_the_picture_in_the_docs_is_of_this_page() -> None:

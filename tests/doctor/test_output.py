@@ -123,19 +123,6 @@ def written(*findings: Finding, stream: io.StringIO | None = None) -> str:
     return stream.getvalue()
 
 
-def test_everything_is_aligned_below_its_subject() -> None:
-    long = "word " * 60
-    shown = written(
-        named(ok("250 Hz")), named(warning(long, "because", "echo 1 | sudo tee /x"), "processors", "governor")
-    ).splitlines()
-    assert shown[0] == "kernel"
-    assert shown[2:4] == ["", "processors"]
-    at = shown[1].index("250 Hz")
-    assert all(line[at - 1] == " " and line[at] != " " for line in shown[4:-4])
-    assert shown[-5] == " " * at + "$ echo 1 | sudo tee /x"
-    assert shown[-6].strip() == "because"
-    assert max(map(len, shown)) <= 120
-    assert shown[-3] == "Worth a look: 1 warning, 1 ok"
 
 
 def test_the_end_repeats_what_matters_for_the_rest_scrolls_away(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,10 +136,6 @@ def test_the_end_repeats_what_matters_for_the_rest_scrolls_away(monkeypatch: pyt
     assert end[-1] == "  and 2 more above"
 
 
-def test_commands_are_never_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "60")
-    command = "sudo ethtool -C ens5 adaptive-rx off adaptive-tx off rx-usecs 0 tx-usecs 0 and more of it"
-    assert f"$ {command}\n" in written(named(note("x", "y", command)), stream=Terminal())
 
 
 def test_colour_only_on_a_terminal_and_not_against_the_users_will(monkeypatch: pytest.MonkeyPatch) -> None:

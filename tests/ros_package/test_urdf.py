@@ -62,20 +62,6 @@ def numbers(element: ElementTree.Element | None, *names: str) -> list[float]:
     return [float(number) for name in names for number in str(element.get(name)).split()]
 
 
-@pytest.mark.parametrize("model", BODIES)
-def test_the_body_is_a_solid_cylinder_between_mounting_face_and_wrench_origin(model: str) -> None:
-    mass, diameter = BODIES[model]
-    r, h = diameter / 2000, FIGURES[model][0] / 1000
-    (link,) = example(model=model).findall("link[inertial]")
-    assert link.get("name") == "ft_sensor_mounting"
-    assert numbers(link.find("inertial/mass"), "value") == [mass]
-    across, along = mass * (3 * r * r + h * h) / 12, mass * r * r / 2
-    inertia = numbers(link.find("inertial/inertia"), "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    assert inertia == pytest.approx([across, across, along, 0, 0, 0])
-    for shape in ("visual", "collision"):
-        assert numbers(link.find(f"{shape}/geometry/cylinder"), "radius", "length") == [r, h]
-    for part in ("inertial", "visual", "collision"):
-        assert numbers(link.find(f"{part}/origin"), "xyz", "rpy") == [0, 0, h / 2, 0, 0, 0]
 
 
 def test_unknown_models_and_bodies(capsys: pytest.CaptureFixture[str]) -> None:

@@ -331,10 +331,6 @@ def test_the_kernel_says_when_a_frame_had_arrived(ends: Ends) -> None:
     assert right
 
 
-def test_waiting_leaves_the_processor_to_others(ends: Ends) -> None:
-    before = time.thread_time()
-    assert ends[0].receive(0.3) is None
-    assert time.thread_time() - before < 0.15
 
 
 def test_a_link_that_is_down_loses_frames(veth: Veth, ends: Ends) -> None:

@@ -393,7 +393,3 @@ def test_not_granted_is_one_line_and_it_runs_on() -> None:
     assert found["slack"] == "1000", "then at least the timer is made finer"
 
 
-def test_ordinary_scheduling_is_a_choice() -> None:
-    found, said = probe(0, None)
-    assert found["own"][0] == os.SCHED_OTHER
-    assert not said
