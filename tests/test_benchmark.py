@@ -80,8 +80,6 @@ def test_only_a_stop_at_that_time_explains_a_loss(first: float, last: float, exp
     assert (counts["lost"], counts["lost_in_stops"]) == (3, explained)
 
 
-
-
 def test_what_wraps_in_the_signal_is_made_continuous() -> None:
     top = 2**24
     uptime = 2**20 * 10**9 + 5_000_000_000  # the machine has been up for longer than the signal can say
@@ -139,8 +137,6 @@ ROWS: list[dict[str, Any]] = [
 ]
 
 
-
-
 def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     load = {"loops": 4, "chain": "TCP, ordinary", "hand_out_us": AGES, "age_us": AGES}
     content = {
@@ -167,8 +163,6 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
             benchmark.renew(page, content)
         assert page.read_text() == wrong
     benchmark.check(ROOT / "docs" / "benchmark.md")
-
-
 
 
 # -- its programs

@@ -6,7 +6,6 @@ import json
 import math
 import re
 import threading
-import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -363,8 +362,6 @@ def test_every_answer_has_the_headers_and_nothing_else_is_served() -> None:
         assert {name: found.headers[name] for name in HEADERS} == HEADERS
         assert found.headers["Content-Length"] == str(len(found.body))
         assert found.status_code == (200 if path in known else 404), path
-
-
 
 
 def test_the_picture_in_the_docs_is_of_this_page() -> None:

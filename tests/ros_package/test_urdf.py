@@ -62,8 +62,6 @@ def numbers(element: ElementTree.Element | None, *names: str) -> list[float]:
     return [float(number) for name in names for number in str(element.get(name)).split()]
 
 
-
-
 def test_unknown_models_and_bodies(capsys: pytest.CaptureFixture[str]) -> None:
     assert not example(model="MEGS").findall("link/*")
     with pytest.raises(xacro.XacroException, match="no model FOO: it must be one of SENS, ROKS"):

@@ -331,8 +331,6 @@ def test_the_kernel_says_when_a_frame_had_arrived(ends: Ends) -> None:
     assert right
 
 
-
-
 def test_a_link_that_is_down_loses_frames(veth: Veth, ends: Ends) -> None:
     """The last one: it stays down."""
     veth.ip("link", "set", veth.near, "down")

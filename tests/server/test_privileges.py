@@ -391,5 +391,3 @@ def test_not_granted_is_one_line_and_it_runs_on() -> None:
     assert "real-time priority 40 (CAP_SYS_NICE)" in said
     assert found["gc"] is False
     assert found["slack"] == "1000", "then at least the timer is made finer"
-
-

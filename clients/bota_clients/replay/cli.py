@@ -26,7 +26,6 @@ class ReplayOptions(argparse.Namespace):
     hosts: list[str]
     speed: float  # 1 = as recorded; infinite = as fast as the clients read
     loop: bool
-    at_once: bool
 
 
 def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
@@ -44,7 +43,6 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
     add("--speed", type=_speed, default=1.0, metavar="X",
         help="times the recorded speed; 'max': as fast as clients read, without loss")  # fmt: skip
     add("--loop", action="store_true", help="start again at the end, until Ctrl-C")
-    add("--at-once", action="store_true", help="start without waiting for a subscriber")
     options = made.parse_intermixed_args(argv, ReplayOptions())
     try:
         server: Address = options.server or own_server()

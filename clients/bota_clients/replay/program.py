@@ -81,18 +81,17 @@ class Player:
         return self.sensors.status()
 
     def run(self) -> None:
-        """Play, from the first subscriber on unless it is to start at once."""
+        """Play from the first subscriber on."""
         hub, options, recordings = self.hub, self._options, self._recordings
         hub.permissions.control_uids = controlling_uids((), ())
         hub.permissions.names = local_names()
         hub.start(Actions(hub, self, self.sensors, {"replay": self._about()}).handle)
         more = f" and {len(recordings) - 1} more" if len(recordings) > 1 else ""
         frames = sum(recording.frame_count for recording in recordings)
-        waiting = "" if options.at_once else ", waiting for a subscriber"
         name = f"{recordings[0].path.name}{more}, {frames} frames,"
-        _say(f"replaying {name} on port {options.port}{waiting}; Ctrl-C ends it")
+        _say(f"replaying {name} on port {options.port}, waiting for a subscriber; Ctrl-C ends it")
         try:
-            while not (options.at_once or self._signals.asked or self._has_subscriber()):
+            while not (self._signals.asked or self._has_subscriber()):
                 hub.serve(time.monotonic_ns() + _SLICE_NS)
             while self._play_once() and options.loop:
                 self._timeline.begin_again()
