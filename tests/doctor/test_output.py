@@ -123,17 +123,6 @@ def written(*findings: Finding, stream: io.StringIO | None = None) -> str:
     return stream.getvalue()
 
 
-def test_the_end_repeats_what_matters_for_the_rest_scrolls_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    found = [named(ok("x"))] * 30 + [named(warning("slow " * 40, "y"))] * 9 + [named(bad("gone", "y"), "bus")]
-    end = written(*found, stream=Terminal()).rpartition("\n\n")[2].splitlines()
-    assert len(end) < 24
-    assert max(len(line) for line in end[1:]) <= 80
-    assert "Trouble" in end[0]
-    assert end[1] == "  bad      bus, preemption: gone"
-    assert end[-1] == "  and 2 more above"
-
-
 def test_colour_only_on_a_terminal_and_not_against_the_users_will(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
