@@ -19,7 +19,7 @@ from tests.clients.recordings import frame, record
 from tests.clients.test_identify import posed
 from tests.ended import run_here
 from tests.json_schema import SCHEMAS, problems
-from tests.simulation import simulated_bus
+from tests.simulation import more_if_long, simulated_bus
 from tests.tool.running import tool_here
 
 
@@ -54,7 +54,7 @@ def test_the_checks_of_a_report(tmp_path: Path) -> None:
     assert not problems("report", found)
 
 
-@pytest.mark.parametrize("size", [61, 77])
+@pytest.mark.parametrize("size", more_if_long([77], [61, 77]))
 def test_every_command_of_the_tool(size: int, tmp_path: Path) -> None:
     file = tmp_path / "a.json"
     asked = [

@@ -536,7 +536,8 @@ def test_a_busy_computer_is_named_in_place_of_the_cable_only(monkeypatch: pytest
 
 
 @pytest.mark.parametrize(
-    ("source", "index"), [("021011223344", 0x95), ("010101010101", 3)], ids=["IgH", "SOEM"]
+    ("source", "index"),
+    more_if_long([("021011223344", 0x95)], [("021011223344", 0x95), ("010101010101", 3)]),  # IgH's, SOEM's
 )
 def test_another_master_on_the_wire_is_named_and_so_is_its_end(
     source: str, index: int, caplog: pytest.LogCaptureFixture
@@ -591,7 +592,7 @@ MACHINES = {
 }
 
 
-USUAL = ("3 ms, often more", "30 ms, with stalls", "frames get lost too")
+USUAL = ("30 ms, with stalls", "frames get lost too")
 
 
 @pytest.mark.parametrize("machine", more_if_long(USUAL, MACHINES))
