@@ -197,6 +197,7 @@ def run(*command: str | Path, **environment: str) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake here: sudo apt install cmake")
 def test_cmake_installs_the_headers_and_a_program_finds_them(tmp_path: Path) -> None:
     """Installed without a compiler, below a prefix as colcon has it."""

@@ -185,6 +185,7 @@ def test_a_lost_monitor_is_said_and_comes_back(chromium: Page) -> None:
         chromium.wait_for("document.querySelector('#force').plot.data[0].at(-1) > 1001")
 
 
+@pytest.mark.long
 def test_a_page_with_the_token_tares_after_a_question(page: Page, web: Web) -> None:
     feed(web, 80)
     page.wait_for("!document.querySelector('#tare').disabled")
