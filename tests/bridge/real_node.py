@@ -102,23 +102,26 @@ class Listener(Asking):
     ) -> Any:
         """The response of one of the node's services, or None once `until` holds.
 
-        Asked again now and then: a service that is new may be seen before it sees whoever asks.
+        Asked again now and then, each time by a client of its own: one that is new to the service may never
+        get its answers.
         """
-        client = self._node.create_client(service_type, f"/{self.tag}/bridge/{name}")
+        clients: list[Any] = []
         answer: queue.Queue[Any] = queue.Queue()
         deadline, next_ask = time.monotonic() + PATIENCE_S, 0.0
         try:
-            assert client.wait_for_service(PATIENCE_S), f"no service {client.srv_name}"
             while answer.empty() and not until():
-                assert time.monotonic() < deadline, f"no answer of {client.srv_name}"
+                assert time.monotonic() < deadline, f"no answer of {name}"
                 if time.monotonic() > next_ask:
                     next_ask = time.monotonic() + ASK_AGAIN_S
-                    future = client.call_async(request)
+                    clients.append(self._node.create_client(service_type, f"/{self.tag}/bridge/{name}"))
+                    assert clients[-1].wait_for_service(PATIENCE_S), f"no service {name}"
+                    future = clients[-1].call_async(request)
                     future.add_done_callback(lambda future: answer.put(future.result()))
                 time.sleep(0.005)
             return None if answer.empty() else answer.get()
         finally:
-            self._node.destroy_client(client)
+            for client in clients:
+                self._node.destroy_client(client)
 
     def next_number(self) -> float:
         """The first value of the next message: the number that the sample was made from."""
