@@ -349,16 +349,6 @@ def virtual_sensor(
             sensor.close()
 
 
-def check_not_lost(client: Client, events: Sequence[JsonObject], lost_frames: int = 0) -> None:
-    """None of the `events` says that a sensor was lost; for what loses no frame itself.
-
-    Where there are more than `lost_frames` all the same, a busy machine starved the virtual sensor, and
-    nothing can be said.
-    """
-    lost = [event for event in events if event["event"] in ("sensor_lost", "sensor_back")]
-    assert not lost or client.ask("status")["lost_frames"] > lost_frames, lost
-
-
 class FramedClient:
     """A framed connection that keeps everything; `wait` receives until something is so."""
 

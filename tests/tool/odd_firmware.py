@@ -41,16 +41,6 @@ def wrong_rate(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(dictionary, "sampling_rate_hz", lambda _: 500)
 
 
-def subtracting(patch: pytest.MonkeyPatch) -> None:
-    """Subtracts its offsets."""
-    offsets = dictionary.Dictionary.offsets
-
-    def negative(self: dictionary.Dictionary, index: int) -> tuple[float, ...]:
-        return tuple(-value for value in offsets(self, index))
-
-    patch.setattr(dictionary.Dictionary, "offsets", negative)
-
-
 def other_sinc_length(patch: pytest.MonkeyPatch) -> None:
     """Reads back another SINC length than it was given, as real sensors do: 768 at 400 Hz, 2048 at 150 Hz."""
     read = dictionary.Dictionary.read
