@@ -132,7 +132,7 @@ COUNTS = {"made": 200, "lost": 1, "lost_in_stops": 1}
 ROWS: list[dict[str, Any]] = [
     {**ABOUT, "program": "this", **COUNTS, "age_us": AGES, "cpu_percent": {"server": 9.0}},
     {**ABOUT, "program": "bare C", **COUNTS, "age_us": {"p50": 40.0, "p99": 60.0}},
-    {**ABOUT, "program": "this / C", "ratio": dict(zip(modes.RATIOS, (2, 3, 4, 5), strict=True))},
+    {**ABOUT, "program": "this / C, C client", "ratio": dict(zip(modes.RATIOS, (2, 3, 4, 5), strict=True))},
     {**ABOUT, "program": "Bota's driver", "missing": "it cannot be had"},
 ]
 
@@ -294,7 +294,7 @@ def test_what_is_measured_is_shown_and_written(
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))
     assert [row["program"] for row in content["comparison"]] == [
-        "this", "this, C client", "bare C", "this / C", *["Bota's driver"] * installed,
+        "this", "this, C client", "bare C", "this / C, C client", *["Bota's driver"] * installed,
         *["Bota's driver"] * (not installed),
     ]  # fmt: skip
     assert {(row["rate_hz"], row["sensors"]) for row in content["comparison"]} == {(800, 1)}

@@ -44,14 +44,10 @@ _MOST_PULL: Final = 0.03
 _LARGEST_PULL: Final = 0.12
 _STEADY: Final = 2e-6  # relative standard deviation of the period below which it counts as known
 # -- the margin
-# Cost of an exchange, as age.
-_PRICE_NS: Final = 15_000.0
 # Cost of a lost sample, as age in periods, where there is no time for a second poll.
 _LOSS_PERIODS: Final = 10.0
 _NO_TIME: Final = 0.5  # round trip, in periods, beyond which there is no time for one
 _LARGEST_MARGIN: Final = 0.4
-# Factor by which an early look costs more where nothing is learned from it: events date the samples.
-_NOTHING_LEARNED: Final = 1.2
 # -- the clock
 # Standard deviation of the phase, in periods, below which the clock is followed.
 _LOCKED: Final = 0.125
@@ -406,9 +402,7 @@ class SampleClock:
         1 / cost.
         """
         timing, period_ns = self._timing, self.estimate.period_ns
-        cost_ns = _LOSS_PERIODS * period_ns if self._single else timing.usual_ns + _PRICE_NS
-        if self._follows_events:
-            cost_ns *= _NOTHING_LEARNED
+        cost_ns = _LOSS_PERIODS * period_ns if self._single else timing.usual_ns
         deviation_ns = math.sqrt(self.estimate.variance + timing.variance)
         ratio = cost_ns / (deviation_ns * _ROOT_2_PI)
         if ratio <= 1:

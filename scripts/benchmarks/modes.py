@@ -31,7 +31,7 @@ _OTHER: Final = (
     "env", "-u", "LD_LIBRARY_PATH", "-u", "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
     f"PYTHONPATH={VENDOR.with_name('protocol')}",
 )  # fmt: skip
-THIS, C_CLIENT, BARE_C, BY_C = "this", "this, C client", "bare C", "this / C"
+THIS, C_CLIENT, BARE_C, BY_C = "this", "this, C client", "bare C", "this / C, C client"
 DRIVER, ROS = "Bota's driver", "this, ROS"
 RATIOS: Final = {
     "age_p50": ("age_us", "p50"),
@@ -101,7 +101,7 @@ def compare(setup: Setup, with_driver: bool) -> list[Figures]:
     for name, (figures, _) in taken.items():
         rows.append({"program": name, **figures})
         if name == BARE_C:
-            rows.append({"program": BY_C, "ratio": ratios(*([e[n] for e in rounds] for n in (THIS, BARE_C)))})
+            rows.append({"program": BY_C, "ratio": ratios(*([e[n] for e in rounds] for n in (C_CLIENT, BARE_C)))})
     rows += [{"program": name, "missing": why} for name, why in missing.items()]
     return [{"rate_hz": setup.rate_hz, "sensors": setup.sensors, **row} for row in rows]
 

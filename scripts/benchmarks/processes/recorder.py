@@ -31,9 +31,9 @@ def tcp(recording: Recording, port: int = PORT) -> None:
     old = DataFlag.REPEATED | DataFlag.INVALID
     with connect(port) as connection:
         connection.sendall(encode_json(request("subscribe")))
-        while data := connection.recv(65536):
+        while size := connection.recv_into(frames.get_buffer()):
             now = time.monotonic_ns()
-            frames.feed(data)
+            frames.received(size)
             for frame in frames:
                 if not isinstance(frame, DataMessage) or frame.flags & old:
                     continue
