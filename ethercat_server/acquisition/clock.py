@@ -44,10 +44,14 @@ _MOST_PULL: Final = 0.03
 _LARGEST_PULL: Final = 0.12
 _STEADY: Final = 2e-6  # relative standard deviation of the period below which it counts as known
 # -- the margin
+# Cost of an exchange, as age.
+_PRICE_NS: Final = 15_000.0
 # Cost of a lost sample, as age in periods, where there is no time for a second poll.
 _LOSS_PERIODS: Final = 10.0
 _NO_TIME: Final = 0.5  # round trip, in periods, beyond which there is no time for one
 _LARGEST_MARGIN: Final = 0.4
+# Factor by which an early look costs more where nothing is learned from it: events date the samples.
+_NOTHING_LEARNED: Final = 1.2
 # -- the clock
 # Standard deviation of the phase, in periods, below which the clock is followed.
 _LOCKED: Final = 0.125
@@ -402,7 +406,9 @@ class SampleClock:
         1 / cost.
         """
         timing, period_ns = self._timing, self.estimate.period_ns
-        cost_ns = _LOSS_PERIODS * period_ns if self._single else timing.usual_ns
+        cost_ns = _LOSS_PERIODS * period_ns if self._single else timing.usual_ns + _PRICE_NS
+        if self._follows_events:
+            cost_ns *= _NOTHING_LEARNED
         deviation_ns = math.sqrt(self.estimate.variance + timing.variance)
         ratio = cost_ns / (deviation_ns * _ROOT_2_PI)
         if ratio <= 1:
@@ -489,15 +495,16 @@ class SampleClock:
         # never as younger than it may be.
         looked_at_ns = sent_ns + (excess_ns / 2 if excess_ns < _LONGEST_LOOK * period_ns else 0.0)
         late = (looked_at_ns - phase_ns) / period_ns
+        doubt_ns = _CERTAIN * math.sqrt(self.estimate.variance)
+        if not self._single:
+            doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
         if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
-            # It came between two looks: it is the one expected nearest to them.
+            # It came between two looks: it is the one expected nearest to them, but none that is yet to come.
+            latest = math.floor(late + doubt_ns / period_ns)
             late = ((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns
-            newest = 1 + round(late)
+            newest = 1 + min(round(late), latest)
         else:
             newest = 1 + math.floor(late)
-            doubt_ns = _CERTAIN * math.sqrt(self.estimate.variance)
-            if not self._single:
-                doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
             most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
             lost_track = events is not None and events.is_doubtful and unwatched_ns > _MISSABLE * period_ns

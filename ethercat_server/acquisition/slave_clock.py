@@ -318,8 +318,8 @@ class EventTimes:
 
     @property
     def has_none(self) -> bool:
-        """Whether the new sample of the newest exchange has no event although the local clock is known."""
-        return self._answers and self.local_clock.is_known and not self.instant_ns
+        """Whether no event is certainly the new sample's of the newest exchange; the local clock is known."""
+        return self._answers and self.local_clock.is_known and not (self.instant_ns and self._is_certain)
 
     def take(self, latched: Latched, sent_ns: int, back_ns: int, fresh: bool, period_ns: float) -> None:
         """Take what was latched when a frame passed that was sent and back then.
@@ -341,6 +341,7 @@ class EventTimes:
         # Between these the process data passed: in the frame before, and in this one.
         oldest, newest = before + self._passing_ns - _SLACK_NS, local + self._passing_ns
         self._is_next = newest < event < local + self._reading_ns and event - period_ns > oldest
+        self._is_certain = self._is_next or event <= newest
         if clock.is_known and (self._is_next or oldest < event <= newest + _SLACK_NS):
             at_ns = clock.time_at + (local - clock.local_at) * (1 + clock.rate)
             # Else the clock has jumped.

@@ -101,7 +101,8 @@ def compare(setup: Setup, with_driver: bool) -> list[Figures]:
     for name, (figures, _) in taken.items():
         rows.append({"program": name, **figures})
         if name == BARE_C:
-            rows.append({"program": BY_C, "ratio": ratios(*([e[n] for e in rounds] for n in (C_CLIENT, BARE_C)))})
+            turns = ([each[by] for each in rounds] for by in (C_CLIENT, BARE_C))
+            rows.append({"program": BY_C, "ratio": ratios(*turns)})
     rows += [{"program": name, "missing": why} for name, why in missing.items()]
     return [{"rate_hz": setup.rate_hz, "sensors": setup.sensors, **row} for row in rows]
 

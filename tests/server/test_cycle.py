@@ -231,12 +231,13 @@ def test_a_run_is_repeated_by_its_seed() -> None:
     assert run(1) != run(2)
 
 
-def test_what_a_stuck_sensor_leaves_out_is_flagged() -> None:
-    running = simulation()
+@pytest.mark.parametrize("seed", more_if_long([4], range(1, 13)))
+def test_what_a_stuck_sensor_leaves_out_is_flagged(seed: int) -> None:
+    running, draw = simulation(Machine(seed=seed)), random.Random(seed)
     running.run(2.0)
-    for eighth in range(24):  # of a period: it is freed before and after polls
+    for _ in range(24):  # it is freed at any instant of its period, before and after polls
         running.at(0.0, "stick")
-        running.at(0.02 + eighth * PERIOD_NS / 8e9, "unstick")
+        running.at(0.02 + draw.random() * PERIOD_NS / 1e9, "unstick")
         running.run(0.1)
     check_frames(running.frames)
     assert running.status()["sensors"][0]["lost_samples"] == 0, "what was not there cannot be lost"
