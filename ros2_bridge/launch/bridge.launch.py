@@ -25,6 +25,8 @@ PARAMETERS = {
     "array_topic": (TEXT, "Topic of the Float64MultiArray; without a leading slash it is in the namespace"),
 }
 IN_FILE = " (empty: as in params_file)"
+# Of another driver: its node's name and, beside them, parameters in config/compat_NAME.yaml, its names of our topics.
+COMPATIBLE = {"bota": ("bota_ft_sensor", [("wrench_compensated", "~/wrench"), ("imu/data_raw", "~/imu")])}
 
 
 def start_node(context):
@@ -35,6 +37,11 @@ def start_node(context):
     if not file.is_file():
         # launch_ros would warn and start the node with its defaults.
         raise FileNotFoundError(f"params_file: there is no file {file.absolute()}")
+    parameters = [file]
+    node, remappings = "bridge", []
+    if compat := value("compat"):
+        node, remappings = COMPATIBLE[compat]
+        parameters.append(PathJoinSubstitution([FindPackageShare("bridge"), "config", f"compat_{compat}.yaml"]))
     given = {
         name: ParameterValue(LaunchConfiguration(name), value_type=value_type)
         for name, (value_type, _) in PARAMETERS.items()
@@ -44,9 +51,10 @@ def start_node(context):
         Node(
             package="bridge",
             executable="client",
-            name="bridge",
+            name=node,
             namespace=value("namespace"),
-            parameters=[file, *([given] if given else [])],
+            parameters=[*parameters, *([given] if given else [])],
+            remappings=remappings,
             ros_arguments=["--log-level", value("log_level")] if value("log_level") else [],
             respawn=LaunchConfiguration("respawn"),
             respawn_delay=2.0,
@@ -61,6 +69,12 @@ def generate_launch_description():
         [
             DeclareLaunchArgument("params_file", default_value=file, description="The node's parameters"),
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node"),
+            DeclareLaunchArgument(
+                "compat",
+                default_value="",
+                choices=["", *COMPATIBLE],
+                description="bota: names of node, topics, frames and tare as Bota's driver has them",
+            ),
             *(
                 DeclareLaunchArgument(name, default_value="", description=description + IN_FILE)
                 for name, (_, description) in PARAMETERS.items()

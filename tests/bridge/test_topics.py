@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import random
+import re
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,8 +22,9 @@ from bridge.parameters.table import ParameterError, parse_frames
 from ft_compensation.outputs import WrenchFilter
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.scripted_server import process_data
-from tests.bridge.simulated_node import RATE_HZ, STEP_S, Node, Server, six, stamp_ns, values
+from tests.bridge.simulated_node import RATE_HZ, STEP_S, UP, ZERO6, Node, Server, six, stamp_ns, values
 
+PACKAGE = Path(__file__).parents[2] / "ros2_bridge"
 QUATERNION = {"orientation.x": 0.5, "orientation.y": -0.5, "orientation.z": 0.5, "orientation.w": 0.5}
 NAMES = [f"{name}.{axis}" for name in ("force", "torque", "acceleration", "angular_rate") for axis in "xyz"]
 RAW = [2.0 + i / 16 for i in range(12)]
@@ -449,3 +453,22 @@ def test_every_topic_is_reliable_unless_its_qos_is_overridden() -> None:
     assert got.pop("mine") == ("BEST_EFFORT", "VOLATILE", 10)
     assert {"wrench_compensated", "wrench_filtered", "tcp", "data_raw", "diagnostics"} <= got.keys()
     assert got == dict.fromkeys(got, ("RELIABLE", "VOLATILE", 10))
+
+
+def test_with_compat_bota_names_frames_and_tare_are_those_of_botas_driver() -> None:
+    text = (PACKAGE / "launch" / "bridge.launch.py").read_text()
+    (table,) = re.findall(r"^COMPATIBLE = (.+)$", text, re.MULTILINE)
+    name, remappings = ast.literal_eval(table)["bota"]
+    told = [word for pair in (("__node", name), *remappings) for word in ("-r", "{}:={}".format(*pair))]
+    told += ["--params-file", str(PACKAGE / "config" / "compat_bota.yaml")]
+    server = Server()
+    with Node(server, *told, **{"rest.duration": 0.3}) as node:
+        node.name = node.name.replace("bridge", "bota_ft_sensor")
+        wrenches, motions = node.hear(f"{node.name}/wrench"), node.hear(f"{node.name}/imu")
+        server.hold(UP)
+        node.run(0.2)
+        assert six(wrenches[-1])[2] < -5.0, "as measured, with the weight of the tool"
+        node.do("tare")
+        assert six(node.fresh(wrenches, 0.1)[0]) == pytest.approx(ZERO6, abs=1e-6)
+        frames = wrenches[-1].header.frame_id, motions[-1].header.frame_id
+        assert frames == ("bota_ft_sensor_wrench", "bota_ft_sensor_imu")

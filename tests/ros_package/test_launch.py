@@ -33,7 +33,7 @@ sys.exit(main())
 LAUNCH = PACKAGE / "launch"
 NODE = {
     "params_file", "namespace", "server_host", "server_port", "sensor", "frame_id", "imu_frame_id",
-    "array_topic", "respawn", "log_level",
+    "array_topic", "respawn", "log_level", "compat",
 }  # fmt: skip
 SERVER = {"server_port", "server_command", "sensor_options"}
 # Of each file, the arguments that have an effect: what a file sets itself is none.
@@ -50,7 +50,7 @@ class StandIn:
     """Any action or substitution: it keeps what it is given. PyPI has neither `launch` nor `launch_ros`."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
-        self.given_to_it = given
+        self.given_to_it, self.named = given, named
 
     def get_sub_entities(self) -> list[Any]:
         return []
@@ -135,7 +135,10 @@ def test_a_parameter_file_is_found_or_refused(tmp_path: Path, monkeypatch: pytes
     # The shell leaves the ~ of `params_file:=~/robot.yaml` as it is.
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "robot.yaml").touch()
-    assert len(start_node({"params_file": "~/robot.yaml"})) == 1
+    (node,) = start_node({"params_file": "~/robot.yaml"})
+    (other,) = start_node({"params_file": "~/robot.yaml", "compat": "bota"})  # what that is: tests/bridge
+    assert (node.named["name"], len(node.named["parameters"])) == ("bridge", 1)
+    assert (other.named["name"], len(other.named["parameters"])) == ("bota_ft_sensor", 2)
 
 
 def test_the_page_names_every_file_and_argument() -> None:

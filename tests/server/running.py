@@ -27,6 +27,7 @@ from tests.rights import socket_of
 Test = TypeVar("Test", bound=Callable[..., None])
 OLD = int(DataFlag.REPEATED | DataFlag.INVALID)  # flags of frames that carry no new sample
 START_TIMEOUT_S = 40.0
+HERE, THERE = "10.77.12.1", "10.77.12.2"  # the ends of a Veth between two machines
 PATIENCE_S = 30.0
 
 
@@ -333,6 +334,27 @@ class Veth:
     @staticmethod
     def ip(*arguments: str) -> str:
         return subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True).stdout
+
+
+@contextlib.contextmanager
+def another_machine(veth: Veth) -> Iterator[list[str]]:
+    """A network namespace with the far end of `veth` in it, and what runs a command there."""
+    keeper = subprocess.Popen(["unshare", "--net", "sleep", "1000"])
+    there = ["nsenter", f"--net=/proc/{keeper.pid}/ns/net"]
+    try:
+        own = Path("/proc/self/ns/net").readlink()
+        wait_until(lambda: Path(f"/proc/{keeper.pid}/ns/net").readlink() != own, "the namespace")
+        veth.ip("link", "set", veth.far, "netns", str(keeper.pid))
+        for command in (
+            f"address add {THERE}/30 dev {veth.far}",
+            "link set lo up",
+            f"link set {veth.far} up",
+        ):
+            subprocess.run([*there, "ip", *command.split()], check=True)
+        yield there
+    finally:
+        keeper.kill()
+        keeper.wait()
 
 
 @contextlib.contextmanager

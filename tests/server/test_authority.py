@@ -28,7 +28,17 @@ from ethercat_server.serving.bare_json import encode_bare_json
 from ethercat_server.serving.permissions import controlling_uids
 from ethercat_server.serving.transport import open_diagnostics, peer_uid
 from tests.rights import NOBODY, needs_another_user, socket_of
-from tests.server.running import Server, Veth, free_port, on_a_bus, server, wait_until
+from tests.server.running import (
+    HERE,
+    THERE,
+    Server,
+    Veth,
+    another_machine,
+    free_port,
+    on_a_bus,
+    server,
+    wait_until,
+)
 
 RESET = struct.pack("ii", 1, 0)  # SO_LINGER with which a close resets the connection
 
@@ -140,7 +150,6 @@ CONTROL: dict[str, dict[str, Any]] = {
     "tare": {"sensor": 0, "samples": 10},
     "sdo_write": {"sensor": 0, "index": 0x8010, "subindex": 1, "hex": "00"},
 }
-HERE, THERE = "10.77.12.1", "10.77.12.2"
 
 
 def with_server(test: Callable[..., None]) -> Callable[..., None]:
@@ -232,23 +241,6 @@ def test_asking_and_being_gone_at_once_changes_nothing(shared: Server) -> None:
         told = {event["event"] for event in watcher.events}
         assert told <= {"sensor_lost", "sensor_back"}, "a busy machine starves the sensor, nothing else"
         watcher.fresh(10)
-
-
-@contextlib.contextmanager
-def another_machine(veth: Veth) -> Iterator[list[str]]:
-    """A network namespace with the far end of `veth` in it, and what runs a command there."""
-    keeper = subprocess.Popen(["unshare", "--net", "sleep", "1000"])
-    there = ["nsenter", f"--net=/proc/{keeper.pid}/ns/net"]
-    try:
-        own = Path("/proc/self/ns/net").readlink()
-        wait_until(lambda: Path(f"/proc/{keeper.pid}/ns/net").readlink() != own, "the namespace")
-        veth.ip("link", "set", veth.far, "netns", str(keeper.pid))
-        for command in (["address", "add", f"{THERE}/30", "dev", veth.far], ["link", "set", veth.far, "up"]):
-            subprocess.run([*there, "ip", *command], check=True)
-        yield there
-    finally:
-        keeper.kill()
-        keeper.wait()
 
 
 FROM_PORT = f"""
