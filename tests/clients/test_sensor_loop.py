@@ -314,12 +314,10 @@ def test_the_payload_from_the_file_of_an_identification(running: Loop, tmp_path:
             "has a sample every 0.006667 s: raise max_age (0.01 s) to at least 0.01333",
         ),
         ("imu", {}, {"imu_active": 0}, "has its IMU switched off"),
-        ("orientation", {}, {"orientation_estimation": True}, "does not send its orientation (77 bytes"),
-        ("orientation", {}, {"pdo_size": 77}, "does not send its orientation"),
         ("", {"tool_mass": 1}, {"imu_active": 0}, "has its IMU switched off"),
         ("", {"tool_mass": 1}, {"inertia_compensation": True}, "subtracts gravity and inertia itself"),
         ("", {}, {"imu_active": 0, "rate_hz": None, "inertia_compensation": True}, ""),
-        ("orientation", {}, {"pdo_size": 77, "orientation_estimation": True}, ""),
+        ("imu orientation", {}, {"orientation_estimation": False}, ""),  # NaN, as imu_sensor_broadcaster can take it
     ],
 )
 def test_sensors_that_cannot_give_what_the_urdf_asks_for(

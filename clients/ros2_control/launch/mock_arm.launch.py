@@ -13,7 +13,7 @@ from launch import LaunchDescription
 
 PACKAGE = FindPackageShare("bota_ethercat_hardware")
 CONTROLLERS = PathJoinSubstitution([PACKAGE, "config", "mock_arm_controllers.yaml"])
-BROADCASTERS = "joint_state_broadcaster force_torque_sensor_broadcaster"
+BROADCASTERS = "joint_state_broadcaster force_torque_sensor_broadcaster imu_sensor_broadcaster"
 ARGUMENTS = (
     ("host", "localhost", "Of ethercat-server"),
     ("port", "12001", "Of ethercat-server"),

@@ -114,6 +114,9 @@ private:
         if (sensor.rate_hz > 0.0 && sensor.rate_hz < 0.99 * info_.rw_rate)
             log(Level::warning, "the sensor gives " + rate + " samples a second and is read " + std::to_string(info_.rw_rate) +
                                     " times: some cycles see the sample of the cycle before");
+        if (parameters_.wants_orientation && (sensor.pdo_size == bota_ethercat::kPdoSize || sensor.orientation_estimation == false))
+            log(Level::warning, "the sensor does not estimate its orientation, so that is NaN: switch its setting orientation_estimation "
+                                "on (77 bytes of process data), or let imu_sensor_broadcaster say so (static_covariance_orientation)");
         if (sensor.coordinate_system == true)
             log(Level::warning, "the sensor's setting coordinate_system is on: forces are in the frame stored in the sensor");
         if (sensor.inertia_compensation == true)

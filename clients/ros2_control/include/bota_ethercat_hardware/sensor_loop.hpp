@@ -217,8 +217,6 @@ inline std::string objection(const Parameters& parameters, const SensorInfo& sen
         return "has its IMU switched off: set imu_active to 1, or leave linear_acceleration, angular_velocity and payload out of the URDF";
     if (parameters.has_payload && sensor.inertia_compensation == true)
         return "subtracts gravity and inertia itself: switch its setting inertia_compensation off, or leave the payload out";
-    if (parameters.wants_orientation && (sensor.pdo_size == bota_ethercat::kPdoSize || sensor.orientation_estimation == false))
-        return "does not send its orientation (77 bytes of process data, setting orientation_estimation): leave it out of the URDF";
     for (const auto& [name, setting] : {std::pair("coordinate_system", &SensorInfo::coordinate_system),
                                         std::pair("inertia_compensation", &SensorInfo::inertia_compensation)})
         if (before.*setting && sensor.*setting && before.*setting != sensor.*setting)
