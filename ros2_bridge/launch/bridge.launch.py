@@ -25,7 +25,7 @@ PARAMETERS = {
     "array_topic": (TEXT, "Topic of the Float64MultiArray; without a leading slash it is in the namespace"),
 }
 IN_FILE = " (empty: as in params_file)"
-# Of another driver: its node's name and, beside them, parameters in config/compat_NAME.yaml, its names of our topics.
+# Other drivers: the node's name and its names of our topics; config/compat_NAME.yaml has the parameters.
 COMPATIBLE = {"bota": ("bota_ft_sensor", [("wrench_compensated", "~/wrench"), ("imu/data_raw", "~/imu")])}
 
 
@@ -37,11 +37,11 @@ def start_node(context):
     if not file.is_file():
         # launch_ros would warn and start the node with its defaults.
         raise FileNotFoundError(f"params_file: there is no file {file.absolute()}")
-    parameters = [file]
-    node, remappings = "bridge", []
+    node, remappings, compatible = "bridge", [], []
     if compat := value("compat"):
         node, remappings = COMPATIBLE[compat]
-        parameters.append(PathJoinSubstitution([FindPackageShare("bridge"), "config", f"compat_{compat}.yaml"]))
+        name = f"compat_{compat}.yaml"
+        compatible = [PathJoinSubstitution([FindPackageShare("bridge"), "config", name])]
     given = {
         name: ParameterValue(LaunchConfiguration(name), value_type=value_type)
         for name, (value_type, _) in PARAMETERS.items()
@@ -53,7 +53,7 @@ def start_node(context):
             executable="client",
             name=node,
             namespace=value("namespace"),
-            parameters=[*parameters, *([given] if given else [])],
+            parameters=[file, *compatible, *([given] if given else [])],
             remappings=remappings,
             ros_arguments=["--log-level", value("log_level")] if value("log_level") else [],
             respawn=LaunchConfiguration("respawn"),

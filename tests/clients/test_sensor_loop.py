@@ -317,7 +317,7 @@ def test_the_payload_from_the_file_of_an_identification(running: Loop, tmp_path:
         ("", {"tool_mass": 1}, {"imu_active": 0}, "has its IMU switched off"),
         ("", {"tool_mass": 1}, {"inertia_compensation": True}, "subtracts gravity and inertia itself"),
         ("", {}, {"imu_active": 0, "rate_hz": None, "inertia_compensation": True}, ""),
-        ("imu orientation", {}, {"orientation_estimation": False}, ""),  # NaN, as imu_sensor_broadcaster can take it
+        ("imu orientation", {}, {"orientation_estimation": False}, ""),  # NaN
     ],
 )
 def test_sensors_that_cannot_give_what_the_urdf_asks_for(
