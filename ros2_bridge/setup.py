@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ROS 2 package `bridge` for colcon; for pip, use the pyproject.toml above.
 
 What goes to share/bridge is what lies in these folders; the pyproject.toml names the same ones.
@@ -29,7 +30,7 @@ setup(
     zip_safe=False,
     python_requires=">=3.11",
     maintainer="The ethercat-server authors",
-    maintainer_email="maintainers@example.org",
+    maintainer_email="bota-ethercat-bridge@users.noreply.github.com",
     description="Publishes the force/torque sensor that ethercat-server serves: every sample, fresh, once.",
     license="Apache-2.0",
     entry_points={"console_scripts": ["client = bridge.client:main"]},

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The program `ros2 run bridge client`, on PATH as `bridge-client`: arguments, signals, exit codes.
 
 Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong arguments or

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node's own process: stop signals, the scheduling of its threads, and threads that do not die silently.
 
 SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in every thread and one

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts the node with its parameter file; what is given as an argument wins over the file.
 
 `ros2 launch bridge bridge.launch.py --show-args` lists the arguments.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole chain without hardware: `ethercat-server` with a virtual sensor, and the node.
 
 Whichever of the two ends first, and Ctrl-C, ends both.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Includes another launch file of this folder, for the launch files beside it, which load it by its path."""
 
 from pathlib import Path

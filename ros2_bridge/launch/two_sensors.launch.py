@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A SensONE and a Rokubi on one bus and one server: a node and a namespace for each.
 
 `virtual:=true` starts the server too, with a virtual bus that has both.
