@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the compensation of a moving tool cannot know, in N: from the IMU's samples of about a second.
 
 - Filters: by the spectrum of acceleration and angular rate, what force and torque have of them (magnitude and
