@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The services, all `std_srvs/Trigger`; the message is the result.
 
 Each blocks the executor, and never the stream: until the server has answered or a time-out, or for the

@@ -1,6 +1,7 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts the node with its parameter file; what is given as an argument wins over the file.
 
-`ros2 launch bridge bridge.launch.py --show-args` lists the arguments.
+`ros2 launch bota_ethercat_bridge bridge.launch.py --show-args` lists the arguments.
 """
 
 from pathlib import Path
@@ -41,7 +42,7 @@ def start_node(context):
     if compat := value("compat"):
         node, remappings = COMPATIBLE[compat]
         name = f"compat_{compat}.yaml"
-        compatible = [PathJoinSubstitution([FindPackageShare("bridge"), "config", name])]
+        compatible = [PathJoinSubstitution([FindPackageShare("bota_ethercat_bridge"), "config", name])]
     given = {
         name: ParameterValue(LaunchConfiguration(name), value_type=value_type)
         for name, (value_type, _) in PARAMETERS.items()
@@ -49,7 +50,7 @@ def start_node(context):
     }
     return [
         Node(
-            package="bridge",
+            package="bota_ethercat_bridge",
             executable="client",
             name=node,
             namespace=value("namespace"),
@@ -64,7 +65,7 @@ def start_node(context):
 
 
 def generate_launch_description():
-    file = PathJoinSubstitution([FindPackageShare("bridge"), "config", "client.yaml"])
+    file = PathJoinSubstitution([FindPackageShare("bota_ethercat_bridge"), "config", "client.yaml"])
     return LaunchDescription(
         [
             DeclareLaunchArgument("params_file", default_value=file, description="The node's parameters"),
