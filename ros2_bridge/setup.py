@@ -22,7 +22,7 @@ setup(
     name="bridge",
     version="0.1.0",
     packages=find_packages(exclude=["test"]),
-    package_data={"": ["py.typed"], "bridge": ["fastdds.xml"]},
+    package_data={"": ["py.typed"]},
     data_files=list(data_files()),
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},

@@ -3,6 +3,7 @@
 `ros2 launch bridge bridge.launch.py --show-args` lists the arguments.
 """
 
+import os
 from pathlib import Path
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -25,6 +26,8 @@ PARAMETERS = {
     "array_topic": (TEXT, "Topic of the Float64MultiArray; without a leading slash it is in the namespace"),
 }
 IN_FILE = " (empty: as in params_file)"
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+REAL_TIME = 40  # SCHED_FIFO, below the 50 of a controller manager
 
 
 def start_node(context):
@@ -40,6 +43,11 @@ def start_node(context):
         for name, (value_type, _) in PARAMETERS.items()
         if value(name)
     }
+    environment = {}
+    if value("realtime").lower() in {"true", "1"}:
+        given["rt_priority"] = REAL_TIME
+        profiles = Path(__file__).parents[1] / "config" / "fastdds.xml"
+        environment = {PROFILES: os.environ.get(PROFILES) or str(profiles)}
     return [
         Node(
             package="bridge",
@@ -47,6 +55,7 @@ def start_node(context):
             name="bridge",
             namespace=value("namespace"),
             parameters=[file, *([given] if given else [])],
+            additional_env=environment,
             ros_arguments=["--log-level", value("log_level")] if value("log_level") else [],
             respawn=LaunchConfiguration("respawn"),
             respawn_delay=2.0,
@@ -64,6 +73,11 @@ def generate_launch_description():
             *(
                 DeclareLaunchArgument(name, default_value="", description=description + IN_FILE)
                 for name, (_, description) in PARAMETERS.items()
+            ),
+            DeclareLaunchArgument(
+                "realtime",
+                default_value="false",
+                description=f"true asks for SCHED_FIFO {REAL_TIME}, locked memory and our Fast DDS profile",
             ),
             DeclareLaunchArgument(
                 "respawn",

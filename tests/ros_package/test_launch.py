@@ -33,7 +33,7 @@ sys.exit(main())
 LAUNCH = PACKAGE / "launch"
 NODE = {
     "params_file", "namespace", "server_host", "server_port", "sensor", "frame_id", "imu_frame_id",
-    "array_topic", "respawn", "log_level",
+    "array_topic", "realtime", "respawn", "log_level",
 }  # fmt: skip
 SERVER = {"server_port", "server_command", "sensor_options"}
 # Of each file, the arguments that have an effect: what a file sets itself is none.
@@ -50,7 +50,7 @@ class StandIn:
     """Any action or substitution: it keeps what it is given. PyPI has neither `launch` nor `launch_ros`."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
-        self.given_to_it = given
+        self.given_to_it, self.named = given, named
 
     def get_sub_entities(self) -> list[Any]:
         return []
@@ -135,7 +135,13 @@ def test_a_parameter_file_is_found_or_refused(tmp_path: Path, monkeypatch: pytes
     # The shell leaves the ~ of `params_file:=~/robot.yaml` as it is.
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "robot.yaml").touch()
-    assert len(start_node({"params_file": "~/robot.yaml"})) == 1
+    (node,) = start_node({"params_file": "~/robot.yaml"})
+    assert node.named["parameters"] == [tmp_path / "robot.yaml"]
+    assert not node.named["additional_env"]
+    (node,) = start_node({"params_file": "~/robot.yaml", "realtime": "true"})
+    assert node.named["parameters"][1] == {"rt_priority": 40}
+    (profiles,) = node.named["additional_env"].values()
+    assert Path(profiles).samefile(PACKAGE / "config/fastdds.xml")
 
 
 def test_the_page_names_every_file_and_argument() -> None:

@@ -117,7 +117,7 @@ PARAMETERS: Final = (
     Row("server_port", _PORT, "TCP port of ethercat-server", 1, 65535, live=False),
     Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535, live=False),
     Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255, live=False),
-    Row("rt_priority", 40,
+    Row("rt_priority", 0,
         "SCHED_FIFO priority of the stream's thread, if allowed; 0 = as the node was started",
         0, HIGHEST_PRIORITY, live=False),
     Row("cpu", -1, "CPU of the stream's thread; -1 = any", -1, 1023, live=False),
