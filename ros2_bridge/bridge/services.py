@@ -20,7 +20,7 @@ from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import Vector3
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.declare import SettingsParameters
-from bridge.parameters.table import AUTO
+from bridge.parameters.table import AUTO, ParameterError
 from bridge.publishing.compensated_wrench import RestWindow
 from bridge.stream.link import (
     CONFIGURE_TIMEOUT_S,
@@ -54,7 +54,7 @@ def _create_triggers(node: Node, prefix: str, *acts: Callable[[], str]) -> None:
         def answer(_request: Any, response: Any, act: Callable[[], str] = act) -> Any:
             try:
                 response.message, response.success = act(), True
-            except (CompensationError, RequestFailedError) as error:
+            except (CompensationError, ParameterError, RequestFailedError) as error:
                 response.message, response.success = str(error), False
                 log.warning(f"{prefix}{_name(act)} failed: {error}")
             else:

@@ -24,6 +24,7 @@ PARAMETERS = {
     "frame_id": (TEXT, "Frame of the wrench"),
     "imu_frame_id": (TEXT, "Frame of the IMU"),
     "array_topic": (TEXT, "Topic of the Float64MultiArray; without a leading slash it is in the namespace"),
+    "lifecycle": (NUMBER, "true: a managed node, which waits for its transitions"),
 }
 IN_FILE = " (empty: as in params_file)"
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"

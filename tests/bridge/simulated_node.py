@@ -246,6 +246,9 @@ class Node(Asking):
                 topic = Topic(super().create_publisher(*arguments, **options))
                 return bench.topics.setdefault(topic.topic_name, topic)
 
+            def destroy_publisher(self, publisher: Any) -> bool:
+                return bool(super().destroy_publisher(getattr(publisher, "_publisher", publisher)))
+
             def create_guard_condition(self, callback: Callable[[], object], *_: Any) -> Any:
                 return Guard(callback, bench._triggered)
 
@@ -366,6 +369,10 @@ class Node(Asking):
         heard = self.topics[topic if topic.startswith("/") else f"{self.name.removesuffix('bridge')}{topic}"]
         heard.is_heard = True
         return heard.messages
+
+    def unhear(self, topic: str) -> None:
+        """Subscribe no more."""
+        self.topics[f"{self.name.removesuffix('bridge')}{topic}"].is_heard = False
 
     def statuses(self) -> dict[str, Any]:
         """The next array of /diagnostics: {short name: status}."""

@@ -33,7 +33,7 @@ sys.exit(main())
 LAUNCH = PACKAGE / "launch"
 NODE = {
     "params_file", "namespace", "server_host", "server_port", "sensor", "frame_id", "imu_frame_id",
-    "array_topic", "realtime", "respawn", "log_level",
+    "array_topic", "lifecycle", "realtime", "respawn", "log_level",
 }  # fmt: skip
 SERVER = {"server_port", "server_command", "sensor_options"}
 # Of each file, the arguments that have an effect: what a file sets itself is none.

@@ -123,6 +123,8 @@ PARAMETERS: Final = (
     Row("cpu", -1, "CPU of the stream's thread; -1 = any", -1, 1023, live=False),
     Row("publishing_frequency", 0.0, "Most messages a second, no low-pass; 0 = every sample", 0, 1e6),
     Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray", live=False),
+    Row("lifecycle", False, "Managed by transitions (configure, activate); false = active at once",
+        live=False),
     Row("supervisor_topic", "/supervisor_status_data", "Topic that stops server and node; empty = none",
         live=False, optional=True),
     Row("stamp", "sample",
@@ -218,6 +220,7 @@ class Parameters(NamedTuple):
     cpu: int
     publishing_frequency: float
     array_topic: str
+    lifecycle: bool
     supervisor_topic: str
     stamp: str
     imu_units: ImuUnits

@@ -63,10 +63,12 @@ class FrameTopic(WrenchTopic):
     def __init__(self, node: Node, frame: WrenchFrame, stamps: Stamps, parameters: Parameters) -> None:
         super().__init__(node, f"wrench_compensated/{frame.name}", frame.name, stamps)
         self._name, self._source = frame.name, parameters.frame_id
-        self.wanted = False  # whether anybody had subscribed at the last look
+        # Whether anybody had subscribed at the last look, or it is not known yet that TF has its pose.
+        self.wanted = False
         self.on_change: Callable[[], object] = lambda: None  # called when that changes
         # The transform, and of which time it is, ns; 0: it holds at any time.
         self._found: tuple[WrenchTransform, int] | None = frame.fixed and (frame.fixed, 0)
+        self._is_known = self._found is not None  # whether there has been a pose
         self._error, self._misses, self._asked_ns = "", 0, 0
         self.configure(parameters)
 
@@ -76,10 +78,11 @@ class FrameTopic(WrenchTopic):
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed."""
-        was, self.wanted = self.wanted, super().is_wanted()
+        is_wanted = super().is_wanted()
+        was, self.wanted = self.wanted, is_wanted or not self._is_known
         if self.wanted is not was:
             self.on_change()
-        return self.wanted
+        return is_wanted
 
     def look(self, look_up: LookUp) -> None:
         """Ask TF for the latest it has."""
@@ -90,6 +93,7 @@ class FrameTopic(WrenchTopic):
             self._misses += 1
         else:
             self._found = WrenchTransform.of(translation, rotation), stamp_ns
+            self._is_known = True
 
     def forget(self) -> None:
         """Forget the pose."""
@@ -169,19 +173,24 @@ class FilteredTopic:
         self._cutoff_hz = parameters.filter_cutoff
         if self._cutoff_hz and self._topic is None:
             self._topic = WrenchTopic(self._node, "wrench_filtered", self._frame_id, self._stamps)
+        elif not self._cutoff_hz and self._topic is not None:
+            topic, self._topic, self.problem, self._designed = self._topic, None, "", None
+            topic.close()
 
     def is_wanted(self) -> bool:
         """Whether it is configured and anybody has subscribed."""
-        if self._topic is None or not self._cutoff_hz:
+        if self._topic is None:
             return False
         wanted = self._topic.is_wanted()
         if not wanted and self._rate_hz():
-            self._is_ready()  # so that the delay is logged before there is a subscriber
+            self._is_ready()  # so that delay or problem are told before there is a subscriber
         return wanted
 
     def _is_ready(self) -> bool:
         """Whether there is a filter for the current settings and sampling rate."""
         cutoff_hz, rate_hz = wanted = self._cutoff_hz, self._rate_hz()
+        if not cutoff_hz:  # it has just been switched off
+            return False
         if wanted != self._designed:
             self._designed = wanted
             try:
@@ -193,9 +202,8 @@ class FilteredTopic:
         return not self.problem
 
     def _design(self, cutoff_hz: float, rate_hz: float) -> None:
-        if not cutoff_hz or not rate_hz:
-            why = "the server does not report the sampling rate" if cutoff_hz else "filter.cutoff is 0"
-            raise CompensationError(why)
+        if not rate_hz:
+            raise CompensationError("the server does not report the sampling rate")
         self._filter.design(cutoff_hz, rate_hz)
         self._node.get_logger().info(
             f"wrench_filtered is delayed by {self._filter.delay_s * 1e3:.1f} ms: cut-off "
@@ -209,8 +217,8 @@ class FilteredTopic:
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Filter a sample and publish it."""
-        if self._is_ready() and self._topic is not None:
-            self._topic.send(*self._filter.step(force, torque, frame.monotonic_ns), frame)
+        if (topic := self._topic) is not None and self._is_ready():
+            topic.send(*self._filter.step(force, torque, frame.monotonic_ns), frame)
 
 
 class Plan(NamedTuple):
@@ -294,8 +302,8 @@ class CompensatedOutput:
 
     @property
     def problem(self) -> str:
-        """Why single subscribed topics are silent; "" if none is."""
-        return "; ".join(topic.problem for topic in self._wanted if topic.problem)
+        """Why single topics are silent, or would be with a subscriber; "" if none is."""
+        return "; ".join(topic.problem for topic in self._all if topic.problem)
 
     def configure(self, parameters: Parameters) -> None:
         """Take what parameters say of the topics; for the executor's thread."""

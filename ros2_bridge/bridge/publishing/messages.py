@@ -50,12 +50,16 @@ class Topic:
     """A publisher, and whether anybody has subscribed."""
 
     def __init__(self, node: Node, message_type: Any, topic: str) -> None:
-        self._publisher = create_publisher(node, message_type, topic)
+        self._node, self._publisher = node, create_publisher(node, message_type, topic)
         self._send: Send = self._publisher.publish
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed."""
         return bool(self._publisher.get_subscription_count())
+
+    def close(self) -> None:
+        """Advertise it no more; a message that is being published raises InvalidHandle."""
+        self._node.destroy_publisher(self._publisher)
 
 
 class Stamps:
