@@ -27,8 +27,9 @@ from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import Worker, call_on_stop_signal, prepare
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.publishing.messages import Stamps, make_measured
+from bridge.rclpy_internals import is_about_arguments, make_executors
 from bridge.services import BiasServices, IdentifyServices, SensorServices
-from bridge.spinning import PartExecutor, Spinner
+from bridge.spinning import Spinner
 from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
 
@@ -56,7 +57,9 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.on_finish: Callable[[], None] = lambda: None
         self.parameters = parameters = declare(self)
         self.stamps = stamps = Stamps(self.get_logger())
-        compensated = CompensatedOutput(self, parameters, stamps, lambda: self.reader.link.info.rate_hz)
+        compensated = CompensatedOutput(
+            self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock, self.fail
+        )
         self.outputs = Outputs([*make_measured(self, parameters, stamps), compensated])
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
@@ -147,12 +150,10 @@ def run(arguments: Sequence[str]) -> int:
             return _refuse(f"unknown argument {unknown[0]!r}: see --help", 2)
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
-        # rclpy has no public names for these.
-        wrong_arguments = type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
         text = " ".join(str(error).split())
         if "logging directory" in text:
             text += "; set HOME, or ROS_LOG_DIR to a directory for its log"
-        return _refuse(f"ROS cannot start: {text}", 2 if wrong_arguments else 1)
+        return _refuse(f"ROS cannot start: {text}", 2 if is_about_arguments(error) else 1)
     try:
         node = BridgeNode.create()
         call_on_stop_signal(lambda _signal: node.finish(0))
@@ -169,14 +170,15 @@ def spin(node: BridgeNode, on_started: Callable[[], object] = lambda: None) -> i
 
     `on_started` is called once its threads run.
     """
-    prompt = PartExecutor(node)
-    executor = PartExecutor(node, prompt)
+    executor, prompt = make_executors(node)
     spinner, prompt_spinner = Spinner(executor), Spinner(prompt)
     node.on_finish = spinner.stop
     listener = Worker("listener", prompt_spinner.run, node.fail)
     listener.start()
     node.reader.thread.start()
     node.monitor.thread.start()
+    frames = node.compensation.output.frames
+    frames.thread.start()
     try:
         on_started()
         if node.exit_code is not None:  # a signal came before there was a spinner
@@ -185,7 +187,7 @@ def spin(node: BridgeNode, on_started: Callable[[], object] = lambda: None) -> i
         return node.exit_code or 0
     finally:
         prompt_spinner.stop()
-        if not (listener.has_ended() & node.monitor.stop() & node.reader.stop()):
+        if not (listener.has_ended() & node.monitor.stop() & node.reader.stop() & frames.stop()):
             node.get_logger().error("a thread did not end in time")
         else:
             prompt.shutdown()

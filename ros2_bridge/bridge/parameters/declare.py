@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -18,13 +17,13 @@ from bota_ethercat.errors import SettingError
 from bota_ethercat.settings import SETTINGS, Setting, SettingValue, check_settings, known_settings
 from bota_ethercat.text.did_you_mean import did_you_mean
 from bridge.parameters.table import PARAMETERS, ParameterError, Parameters, Row, gather
+from bridge.rclpy_internals import given_parameters, refuse_unknown_types
 from bridge.stream.link import CONFIGURE_TIMEOUT_S, Link, RequestFailedError
 
 _PREFIX: Final = "settings."
 # Prefixes of parameters that rclpy itself may declare.
 _OF_OTHERS: Final = ("qos_overrides.", "use_sim_time", "start_type_description_service")
 _LIVE: Final = {row.name: row for row in PARAMETERS if row.live}
-_TYPES: Final = {type_.value for type_ in Parameter.Type}
 
 
 def declare(node: Node) -> Parameters:
@@ -46,7 +45,7 @@ def warn_of_others(node: Node) -> None:
     """Warn of given parameters that the node does not have; call it once all are declared."""
     # Not the node's own list, which leaves out settings without a value.
     names = [row.name for row in PARAMETERS] + [_PREFIX + name for name in SETTINGS]
-    for given in node._parameter_overrides:  # rclpy has no public name
+    for given in given_parameters(node):
         if node.has_parameter(given) or given.startswith(_OF_OTHERS):
             continue
         guess = did_you_mean(given, names) or "; ros2 param list shows the valid names"
@@ -83,9 +82,7 @@ class LiveParameters:
         node.add_pre_set_parameters_callback(_convert)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._after_set)
-        for service in node.services:
-            if service.srv_type in (SetParameters, SetParametersAtomically):
-                service.callback = _refuse_unknown_types(service.callback)
+        refuse_unknown_types(node)
 
     def put(self, **values: Any) -> None:
         """Set parameters from within; ParameterError if that is refused."""
@@ -110,17 +107,6 @@ class LiveParameters:
     def _gather(self, changed: dict[str, Any]) -> Parameters:
         values = {row.name: self._node.get_parameter(row.name).value for row in PARAMETERS} | changed
         return gather({row.name: row.check(values[row.name]) for row in PARAMETERS})
-
-
-def _refuse_unknown_types(set_parameters: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """rclpy's callback of a service, which raises where anybody sends a type that there is not."""
-
-    def callback(request: Any, response: Any) -> Any:
-        if {parameter.value.type for parameter in request.parameters} <= _TYPES:
-            return set_parameters(request, response)
-        return response  # nothing was set
-
-    return callback
 
 
 def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:
