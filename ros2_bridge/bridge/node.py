@@ -25,19 +25,14 @@ from rclpy.utilities import remove_ros_args
 from bota_ethercat.client.channel import Channel
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
-from bridge.parameters.declare import (
-    LiveParameters,
-    SettingsParameters,
-    declare,
-    refuse_what_raises,
-    warn_of_others,
-)
+from bridge.parameters.declare import LiveParameters, SettingsParameters, declare, warn_of_others
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import Worker, call_on_stop_signal, prepare
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.publishing.messages import Stamps, make_measured
+from bridge.rclpy_internals import is_about_arguments, make_executors, refuse_what_raises
 from bridge.services import BiasServices, IdentifyServices, SensorServices
-from bridge.spinning import PartExecutor, Spinner
+from bridge.spinning import Spinner
 from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
 
@@ -123,7 +118,9 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         """Make everything; nothing runs yet. Errors as at the start."""
         self.parameters = parameters = self.live.gather({})
         self.stamps = stamps = Stamps(self.get_logger())
-        compensated = CompensatedOutput(self, parameters, stamps, lambda: self.reader.link.info.rate_hz)
+        compensated = CompensatedOutput(
+            self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock, self.fail
+        )
         self.outputs = Outputs([*make_measured(self, parameters, stamps), compensated], InvalidHandle)
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
@@ -154,13 +151,14 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         """Start the threads."""
         self.reader.thread.start()
         self.monitor.thread.start()
+        self.compensation.output.frames.thread.start()
         prepare(self.parameters.rt_priority, self.parameters.cpu, self.get_logger())
 
     def stop(self) -> bool:
         """Stop the threads and all that listens; False if a thread does not end in time."""
         if not self.is_open:
             return True
-        ended = self.monitor.stop() & self.reader.stop()
+        ended = self.monitor.stop() & self.reader.stop() & self.compensation.output.frames.stop()
         self.compensation.choice.close()
         return ended
 
@@ -250,12 +248,10 @@ def run(arguments: Sequence[str]) -> int:
             return _refuse(f"unknown argument {unknown[0]!r}: see --help", 2)
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
-        # rclpy has no public names for these.
-        wrong_arguments = type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
         text = " ".join(str(error).split())
         if "logging directory" in text:
             text += "; set HOME, or ROS_LOG_DIR to a directory for its log"
-        return _refuse(f"ROS cannot start: {text}", 2 if wrong_arguments else 1)
+        return _refuse(f"ROS cannot start: {text}", 2 if is_about_arguments(error) else 1)
     try:
         node = BridgeNode.create()
         call_on_stop_signal(lambda _signal: node.finish(0))
@@ -271,12 +267,7 @@ def spin(node: BridgeNode) -> int:
 
     Services may block: parameters do not wait for them, nor do supervisor and orientation.
     """
-    ordinary, parameters = node.default_callback_group, node.live.group
-    beside = {
-        "listener": PartExecutor(node, lambda group: group not in (ordinary, parameters)),
-        "parameters": PartExecutor(node, lambda group: group is parameters),
-    }
-    executor = PartExecutor(node, lambda group: group is ordinary, *beside.values())
+    executor, beside = make_executors(node, node.live.group)
     spinner, spinners = Spinner(executor), {name: Spinner(each) for name, each in beside.items()}
     node.on_finish = spinner.stop
     workers = [Worker(name, each.run, node.fail) for name, each in spinners.items()]

@@ -18,7 +18,9 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from bota_ethercat.text.json_text import JsonObject
+from bridge import rclpy_internals
 from bridge.node import SERVER_GOES_ON, StartError, run
+from bridge.rclpy_internals import RIGHT_FOR
 from ft_compensation.quantities import Wrench
 from tests.bridge.real_node import PATIENCE_S, Listener, Start, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
@@ -49,11 +51,16 @@ def test_every_new_sample_once_and_in_order(server: ScriptedServer, listener: Li
     assert "Traceback" not in node.log
 
 
-@pytest.mark.parametrize("service", ["sensor_tare", "tare", "settings.fir"])
+@pytest.mark.parametrize(
+    ("service", "versions"),
+    [*((name, RIGHT_FOR) for name in ("sensor_tare", "tare", "settings.fir")), ("tare", ())],
+)
 def test_the_supervisor_is_heard_during_each_service(
-    server: ScriptedServer, listener: Listener, start: Start, service: str
-) -> None:
+    server: ScriptedServer, listener: Listener, start: Start, monkeypatch: pytest.MonkeyPatch,
+    service: str, versions: tuple[str, ...],
+) -> None:  # fmt: skip
     """In real time, with rclpy's own executors: which callback waits for which is what is tested."""
+    monkeypatch.setattr(rclpy_internals, "RIGHT_FOR", versions)
     node = start(server.port, **{"rest.duration": 60.0})
     node.says("connected to")
     server.answers |= {"tare": lambda _: None, "configure": lambda _: None}
@@ -83,6 +90,15 @@ def test_the_supervisor_is_heard_during_each_service(
     assert "shutdown" in actions()
     assert "no reply within" not in node.log
     assert "Traceback" not in node.log
+
+
+def test_the_versions_that_the_internals_are_right_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of Jazzy and Kilted. Before another one is added, tests/bridge have to pass with it."""
+    assert RIGHT_FOR == ("7.1.", "9.1.")
+    assert rclpy_internals.is_known()
+    monkeypatch.setattr(rclpy_internals, "RIGHT_FOR", ("7.0.",))
+    with Node(Server(), zzz=1) as node:
+        assert "unknown parameter" not in node.log
 
 
 def supervised(server: Server, exit_code: int = 0) -> Node:

@@ -113,6 +113,7 @@ class CompensationControl:
             {
                 "gravity_source": source.describe,
                 "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
+                "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
                 "accelerometer_force": "" if bound is None else round(bound, 3),
                 "motion_force": "" if motion is None else round(motion.filters, 3),
                 "tool_mass": round(payload.mass, 4),

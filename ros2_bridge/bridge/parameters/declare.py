@@ -6,7 +6,6 @@ The table's that are set are checked one by one and together, then applied.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -19,6 +18,7 @@ from bota_ethercat.errors import SettingError
 from bota_ethercat.settings import SETTINGS, Setting, SettingValue, check_settings, known_settings
 from bota_ethercat.text.did_you_mean import did_you_mean
 from bridge.parameters.table import PARAMETERS, ParameterError, Parameters, Row, gather
+from bridge.rclpy_internals import given_parameters
 from bridge.stream.link import CONFIGURE_TIMEOUT_S, Link, RequestFailedError
 
 _PREFIX: Final = "settings."
@@ -50,7 +50,7 @@ def warn_of_others(node: Node) -> None:
     """Warn of given parameters that the node does not have; call it once all are declared."""
     # Not the node's own list, which leaves out settings without a value.
     names = [row.name for row in PARAMETERS] + [_PREFIX + name for name in SETTINGS]
-    for given in node._parameter_overrides:  # rclpy has no public name
+    for given in given_parameters(node):
         if node.has_parameter(given) or given.startswith(_OF_OTHERS):
             continue
         guess = did_you_mean(given, names) or "; ros2 param list shows the valid names"
@@ -122,22 +122,6 @@ class LiveParameters:
         """The values, with these changed; ParameterError if they cannot be."""
         values = {row.name: self._node.get_parameter(row.name).value for row in PARAMETERS} | changed
         return gather({row.name: row.check(values[row.name]) for row in PARAMETERS})
-
-
-def refuse_what_raises(node: Node) -> None:
-    """A type of parameter that there is not, a transition that a state does not have: at that rclpy raises,
-    which would end the node. Here they grant nothing."""
-    for service in node.services:
-        service.callback = _refusing(service.callback)
-
-
-def _refusing(act: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    def callback(request: Any, response: Any) -> Any:
-        with contextlib.suppress(ValueError, RuntimeError):
-            return act(request, response)
-        return response
-
-    return callback
 
 
 def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:

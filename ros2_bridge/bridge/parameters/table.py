@@ -135,6 +135,8 @@ PARAMETERS: Final = (
     Row("wrench_frames", NO_TEXTS,
         "Frames of wrench_compensated/NAME: NAME (by TF), or 'NAME x y z [qx qy qz qw]' in frame_id, m",
         live=False),
+    Row("tf_wait", 0.02,
+        "Longest wait for TF's pose at the sample's stamp, s; then, and with 0, the latest is used", 0, 0.5),
     Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages", live=False),
     Row("imu_raw_units", ImuUnits.G_DPS.value, "What the sensor sends acceleration and angular rate in",
         choices=tuple(units.value for units in ImuUnits), live=False),
@@ -232,6 +234,7 @@ class Parameters(NamedTuple):
     temperature_variance: float
     limits: Limits
     wrench_frames: tuple[WrenchFrame, ...]
+    tf_wait: float
     payload: Payload
     gravity: Vector3
     bias: Wrench
