@@ -500,8 +500,8 @@ class SampleClock:
             doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
         most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
         if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
-            # It came between two looks: it is the one expected nearest to them. By events the phase is so exact
-            # that no sample can have come before it: it was held back.
+            # It came between two looks: it is the one expected nearest to them. By events the phase is so
+            # exact that no sample can have come before it: it was held back.
             late = ((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns
             newest = 1 + (min(round(late), most) if events is not None else round(late))
         else:

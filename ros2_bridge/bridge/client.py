@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The program `ros2 run bridge client`, on PATH as `bridge-client`: arguments, signals, exit codes.
 
 Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong arguments or
@@ -17,7 +18,7 @@ usage: ros2 run bridge client [--ros-args -p NAME:=VALUE ... --params-file FILE 
        bridge-client          [--ros-args ...]
 
 Publishes the force/torque sensor that ethercat-server serves. Parameters, topics and their
-defaults: share/bridge/config/client.yaml.
+defaults: share/bota_ethercat_bridge/config/client.yaml.
 """
 
 
@@ -31,9 +32,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         from bridge.node import run  # noqa: PLC0415 - rclpy takes a while to load, see above
     except ImportError as error:
-        sys.stderr.write(
-            f"bridge-client: rclpy cannot be loaded ({error}): source ROS 2, or pip install the extra 'ros'\n"
-        )
+        missing = (error.name or "").partition(".")[0]
+        remedy = "source ROS 2, or pip install the extra 'ros'"
+        if missing == "bota_ethercat":
+            remedy = "build the package bota_ethercat_protocol too"
+        sys.stderr.write(f"bridge-client: {missing} cannot be loaded ({error}): {remedy}\n")
         return 1
     return run(own)
 

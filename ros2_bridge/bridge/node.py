@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node: what is wired to what, and in which order it is taken apart.
 
 `run` is the program. `BridgeNode.create` and `spin` are what it does once ROS is up: with them the tests run

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node's own process: stop signals, the scheduling of its threads, and threads that do not die silently.
 
 SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in every thread and one
@@ -23,8 +24,6 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
-
-from bota_ethercat.client.real_time import make_real_time
 
 STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
 _SAME_S: Final = 1.0
@@ -80,6 +79,8 @@ def call_on_stop_signal(callback: Callable[[signal.Signals], None]) -> None:
 
 def prepare(rt_priority: int, cpu: int, log: Any) -> None:
     """Give the node's threads, which run, their scheduling as far as allowed, and log one line of it."""
+    from bota_ethercat.client.real_time import make_real_time  # noqa: PLC0415 - `client` says where it is missing
+
     if not rt_priority and cpu < 0:
         return
     stream = next((each.native_id for each in threading.enumerate() if each.name == STREAM), None)

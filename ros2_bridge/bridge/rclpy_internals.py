@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the node knows of rclpy beyond its documentation: all of it is here, and each has a fallback.
 
 Executors and parameters are so for the versions of `RIGHT_FOR` only. A message that is serialized here must

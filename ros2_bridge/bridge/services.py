@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The services: `std_srvs/Trigger`, whose message is the result; where the package `bota_ethercat_msgs` is
 built, some with numbers too, as `~/typed/NAME`.
 

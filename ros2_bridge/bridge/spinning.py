@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs an executor until it is told to stop, from any thread.
 
 Not with rclpy's `spin_until_future_complete`: that keeps a callback for every message it has handled. Nor

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bias: estimated while the sensor is stationary, ramped in, and undone.
 
 Pose-aware: with a payload, its weight at the pose of the window is not part of the bias, so it stays with

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Was the sensor stationary for the whole of a window, and what did it read meanwhile?
 
 The one criterion of tare and identification, live and in recordings, with the limits of `StationaryLimits`:

@@ -1,6 +1,7 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts the node with its parameter file; what is given as an argument wins over the file.
 
-`ros2 launch bridge bridge.launch.py --show-args` lists the arguments.
+`ros2 launch bota_ethercat_bridge bridge.launch.py --show-args` lists the arguments.
 """
 
 import os
@@ -51,7 +52,7 @@ def start_node(context):
         environment = {PROFILES: os.environ.get(PROFILES) or str(profiles)}
     return [
         Node(
-            package="bridge",
+            package="bota_ethercat_bridge",
             executable="client",
             name="bridge",
             namespace=value("namespace"),
@@ -66,7 +67,7 @@ def start_node(context):
 
 
 def generate_launch_description():
-    file = PathJoinSubstitution([FindPackageShare("bridge"), "config", "client.yaml"])
+    file = PathJoinSubstitution([FindPackageShare("bota_ethercat_bridge"), "config", "client.yaml"])
     return LaunchDescription(
         [
             DeclareLaunchArgument("params_file", default_value=file, description="The node's parameters"),

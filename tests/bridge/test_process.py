@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import queue
+import re
 import signal
 import sys
 import threading
@@ -19,11 +20,27 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
-from bridge import process
+from bridge import client, process
 from bridge.spinning import Spinner
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.rights import needs_root, skip_if_forbidden
+
+
+@pytest.mark.parametrize(
+    ("missing", "remedy"),
+    [("rclpy", "source ROS 2"), ("std_msgs", "source ROS 2"), ("bota_ethercat", "build the package")],
+)
+def test_a_missing_module_is_named(
+    missing: str, remedy: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(client, "block_stop_signals", lambda: None)
+    for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bridge"}]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)
+    assert client.main([]) == 1
+    said = capsys.readouterr().err
+    assert re.match(rf"bridge-client: {missing} cannot be loaded \(.*\): {remedy}", said)
 
 
 def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,7 +115,7 @@ def test_a_refusal_is_a_warning_and_no_change(
         asked.append((priority, cpu, thread))
         return Scheduling(refused=(f"SCHED_FIFO {priority} (a remedy)",))
 
-    monkeypatch.setattr(process, "make_real_time", refuse)
+    monkeypatch.setattr("bota_ethercat.client.real_time.make_real_time", refuse)
     lines = Log(None)
     process.prepare(0, -1, lines)  # nothing is asked for
     assert not lines.lines

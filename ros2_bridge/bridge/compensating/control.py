@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the compensation is to do: parameters made into a `Plan`, the bias with its history, the source.
 
 Lives in the executor's thread, but for `link_changed`. The parameter `bias` is the bias: every

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The specific force at the tool, sample by sample: from the sensor's IMU, or from the robot (messages, TF).
 
 Messages of the robot have a callback group of their own, which waits for no service: a pose that is not taken

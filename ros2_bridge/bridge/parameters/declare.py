@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The table's parameters and the sensor's settings on the node: declared with what was given, and set while
 it runs.
 

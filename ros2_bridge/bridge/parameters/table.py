@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node's parameters: one table, from which they are declared, checked, described and documented. No ROS.
 
 A wrong value ends the node at start, or is refused while it runs, with one sentence. The sensor's settings

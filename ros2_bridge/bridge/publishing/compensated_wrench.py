@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`wrench_compensated`, what was subtracted, and the same filtered and in other frames: a topic each.
 
 The reader calls `publish` for every selected sample, but only while somebody has subscribed or a window is

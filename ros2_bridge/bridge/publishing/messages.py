@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ROS messages of what the sensor measures, which are published in serialized form.
 
 An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reader: the thread that the node's client receives in, which publishes at once. Nothing else touches
 the stream.
 
