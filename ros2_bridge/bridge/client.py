@@ -8,17 +8,10 @@ Everything of ROS is imported only after the signals are in hand, so that Ctrl-C
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import MutableMapping, Sequence
-from pathlib import Path
-from typing import Final
+from collections.abc import Sequence
 
 from bridge.process import block_stop_signals
-
-# For many small messages. Only Fast DDS 2, the default of ROS 2 Jazzy, reads it; it says why itself.
-PROFILES: Final = Path(__file__).with_name("fastdds.xml")
-_PROFILES_VARIABLE: Final = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 USAGE = """\
 usage: ros2 run bridge client [--ros-args -p NAME:=VALUE ... --params-file FILE ...]
@@ -29,12 +22,6 @@ defaults: share/bota_ethercat_bridge/config/client.yaml.
 """
 
 
-def use_own_profiles(environment: MutableMapping[str, str]) -> None:
-    """Name our file in `environment`, unless the user has named one: who tunes the middleware knows best."""
-    if not environment.get(_PROFILES_VARIABLE):
-        environment[_PROFILES_VARIABLE] = str(PROFILES)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until it is told to stop; returns the exit code."""
     block_stop_signals()
@@ -42,7 +29,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if own and own[0] in {"-h", "--help"}:
         sys.stdout.write(USAGE)
         return 0
-    use_own_profiles(os.environ)
     try:
         from bridge.node import run  # noqa: PLC0415 - rclpy takes a while to load, see above
     except ImportError as error:

@@ -4,6 +4,7 @@
 `ros2 launch bota_ethercat_bridge bridge.launch.py --show-args` lists the arguments.
 """
 
+import os
 from pathlib import Path
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -24,10 +25,13 @@ PARAMETERS = {
     "frame_id": (TEXT, "Frame of the wrench"),
     "imu_frame_id": (TEXT, "Frame of the IMU"),
     "array_topic": (TEXT, "Topic of the Float64MultiArray; without a leading slash it is in the namespace"),
+    "lifecycle": (NUMBER, "true: a managed node, which waits for its transitions"),
 }
 IN_FILE = " (empty: as in params_file)"
 # Other drivers: the node's name and its names of our topics; config/compat_NAME.yaml has the parameters.
 COMPATIBLE = {"bota": ("bota_ft_sensor", [("wrench_compensated", "~/wrench"), ("imu/data_raw", "~/imu")])}
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+REAL_TIME = 40  # SCHED_FIFO, below the 50 of a controller manager
 
 
 def start_node(context):
@@ -48,6 +52,11 @@ def start_node(context):
         for name, (value_type, _) in PARAMETERS.items()
         if value(name)
     }
+    environment = {}
+    if value("realtime").lower() in {"true", "1"}:
+        given["rt_priority"] = REAL_TIME
+        profiles = Path(__file__).parents[1] / "config" / "fastdds.xml"
+        environment = {PROFILES: os.environ.get(PROFILES) or str(profiles)}
     return [
         Node(
             package="bota_ethercat_bridge",
@@ -56,6 +65,7 @@ def start_node(context):
             namespace=value("namespace"),
             parameters=[file, *compatible, *([given] if given else [])],
             remappings=remappings,
+            additional_env=environment,
             ros_arguments=["--log-level", value("log_level")] if value("log_level") else [],
             respawn=LaunchConfiguration("respawn"),
             respawn_delay=2.0,
@@ -79,6 +89,11 @@ def generate_launch_description():
             *(
                 DeclareLaunchArgument(name, default_value="", description=description + IN_FILE)
                 for name, (_, description) in PARAMETERS.items()
+            ),
+            DeclareLaunchArgument(
+                "realtime",
+                default_value="false",
+                description=f"true asks for SCHED_FIFO {REAL_TIME}, locked memory and our Fast DDS profile",
             ),
             DeclareLaunchArgument(
                 "respawn",

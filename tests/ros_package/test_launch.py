@@ -33,7 +33,7 @@ sys.exit(main())
 LAUNCH = PACKAGE / "launch"
 NODE = {
     "params_file", "namespace", "server_host", "server_port", "sensor", "frame_id", "imu_frame_id",
-    "array_topic", "respawn", "log_level", "compat",
+    "array_topic", "lifecycle", "realtime", "respawn", "log_level", "compat",
 }  # fmt: skip
 SERVER = {"server_port", "server_command", "sensor_options"}
 # Of each file, with those of what it includes.
@@ -128,9 +128,14 @@ def test_a_parameter_file_is_found_or_refused(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "robot.yaml").touch()
     (node,) = start_node({"params_file": "~/robot.yaml"})
-    (other,) = start_node({"params_file": "~/robot.yaml", "compat": "bota"})  # what that is: tests/bridge
-    assert (node.named["name"], len(node.named["parameters"])) == ("bridge", 1)
-    assert (other.named["name"], len(other.named["parameters"])) == ("bota_ft_sensor", 2)
+    assert node.named["parameters"] == [tmp_path / "robot.yaml"]
+    assert not node.named["additional_env"]
+    (node,) = start_node({"params_file": "~/robot.yaml", "realtime": "true"})
+    assert node.named["parameters"][1] == {"rt_priority": 40}
+    (profiles,) = node.named["additional_env"].values()
+    assert Path(profiles).samefile(PACKAGE / "config/fastdds.xml")
+    (node,) = start_node({"params_file": "~/robot.yaml", "compat": "bota"})  # what that is: tests/bridge
+    assert (node.named["name"], len(node.named["parameters"])) == ("bota_ft_sensor", 2)
 
 
 def test_the_page_names_every_file_and_argument() -> None:

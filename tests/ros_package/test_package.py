@@ -30,6 +30,7 @@ def test_the_manifests_and_one_version() -> None:
     found = find_packages(str(ROOT), warnings=warnings)
     assert not warnings
     folders = {"clients/cpp": "bota_ethercat", "clients/ros2_control": "bota_ethercat_hardware"}
+    folders["clients/bota_ethercat_msgs"] = "bota_ethercat_msgs"
     folders |= {str(folder.relative_to(ROOT)): name for name, folder in PACKAGES.items()}
     assert {path: package.name for path, package in found.items()} == folders
     version = PROJECT["project"]["version"]
@@ -45,6 +46,7 @@ def test_the_manifests_and_one_version() -> None:
 
 def test_everything_that_is_imported_is_a_dependency_once() -> None:
     ours = {"bridge", "ft_compensation", "bota_ethercat", "__future__", *sys.stdlib_module_names}
+    ours.add("bota_ethercat_msgs")  # used where it is there
     # Packages that are not named as their modules; the package tf2_ros is C++.
     packages = {"tf2_ros": "tf2_ros_py", "numpy": "python3-numpy"}
     needed = {
