@@ -86,7 +86,6 @@ PACKAGES: Final[dict[str, set[str]]] = {
     "rich": {"bota_clients"},
     "textual": {"bota_clients.monitor.app"},
     "websockets": {"bota_clients.monitor.web.server"},
-    "shtab": {"bota_ethercat.program.completion"},
 } | {
     ros: {"bridge"}
     for ros in (

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
-from bota_ethercat.program.completion import add_completion
 from bota_ethercat.settings import SETTINGS
 from ethercat_server import __version__
 from ethercat_server.errors import InterfaceError
@@ -93,7 +92,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    add_completion(parser)
     return parser
 
 
