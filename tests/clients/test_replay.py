@@ -94,16 +94,6 @@ def test_it_loops_with_numbers_that_go_on(path: Path) -> None:
     assert all(b.stamp_ns > a.stamp_ns for a, b in pairwise(played))
 
 
-def test_several_recordings_are_played_one_after_the_other(tmp_path: Path) -> None:
-    first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
-    record(first, (frame(n) for n in range(10)))
-    record(second, (frame(n, **{"force.z": 1}) for n in range(10)))
-    with Replay("--speed", "max", first, second) as served, listen(served.port) as client:
-        played = list(client.frames())
-        assert client.description["replay"]["files"] == ["a.mcap", "b.mcap"]
-    assert [item.sequence for item in played] == list(range(20))
-
-
 def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])

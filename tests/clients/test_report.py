@@ -115,7 +115,6 @@ def test_the_noise_is_that_of_the_sensor_whatever_it_does(healthy: Subject) -> N
         ("noise torque.z 0.02", FORCE_TORQUE, TROUBLE, "^Torque z has a noise of 0.0193"),
         ("noise acceleration.x 0.02", IMU, TROUBLE, "^Acceleration x has a noise of 0.19"),
         ("noise angular_rate.z 10", IMU, TROUBLE, "^Angular rate z has a noise of 0.17"),
-        ("noise angular_rate.x 1", IMU, LOOK, "^Angular rate x has 2"),  # louder than the others
         ("limit force.z 9", "Saturation", TROUBLE, "Force z was saturated in"),
         ("limit torque.y 0.3", "Saturation", TROUBLE, "Torque y was saturated in"),
         ("limit angular_rate.x 5", "Saturation", TROUBLE, "Angular rate x was saturated in"),
@@ -128,7 +127,7 @@ def test_an_injected_fault_is_found_and_nothing_else(
     command: str, check: str, level: Level, words: str
 ) -> None:
     examination = expect(sensor(6.5, command, seed=5, sinc_length=SLOW), {check: (level, words)})
-    assert examination.headline == {LOOK: "Worth a look", TROUBLE: "Trouble"}[level]
+    assert examination.headline == "Trouble"
     assert check.lower().replace("imu", "IMU") in examination.sentence
 
 
