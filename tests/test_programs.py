@@ -137,10 +137,8 @@ for name, entry in {[(name, PROGRAMS[name]) for name in CLIENTS]!r}:
     ("option", "value"),
     [
         ("--sensors", "99"),
-        ("--seed", "x"),
         ("--sinc", "1"),
         ("--serial", "x"),
-        ("--eeprom-ms", "x"),
         ("--ppm", "x"),
     ],
 )

@@ -21,8 +21,6 @@ from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_
 from ethercat_server.virtual_sensor.faults import COMMANDS, PPM_LIMIT
 from ethercat_server.virtual_sensor.foreign import KINDS, MOST_SLAVES, SENSOR, parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import (
-    EEPROM_MS,
-    WRITE_US,
     ForeignOptions,
     SensorOptions,
     SlaveOptions,
@@ -63,10 +61,6 @@ _OPTIONS: Final[tuple[tuple[str, str, str | None, Callable[[str], Any], str], ..
     ("sinc", "N", None, _sinc_length, "SINC length after power-on (default 64)"),
     ("ppm", "X", None, real(-PPM_LIMIT, PPM_LIMIT), f"clock error{_SEVERAL}"),
     ("dc", "WORD[=VALUE][+...]", None, _clock, f"distributed clock, see below{_SEVERAL}"),
-    ("write-us", "X", str(WRITE_US), real(0, 1000),
-     f"time of the firmware's write of a sample to the controller (default {WRITE_US:g})"),
-    ("seed", "N", "0", whole(0, 2**63), "seed of the noise"),
-    ("eeprom-ms", "X", str(EEPROM_MS), real(0, 1000), f"time of an EEPROM read (default {EEPROM_MS:g})"),
 )  # fmt: skip
 
 
@@ -139,15 +133,13 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
             sinc_length=given["sinc"],
             ppm=of("ppm", position, 0.0),
             dc=of("dc", position, ""),
-            write_us=given["write-us"],
             signal=args.signal,
             noise=args.noise == "on",
-            seed=given["seed"] + position,
-            eeprom_ms=given["eeprom-ms"],
+            seed=position,
         )
         for position in range(count)
     ]
-    return tuple(sensors) if chain is None else slaves_in(chain, sensors, given["eeprom-ms"])
+    return tuple(sensors) if chain is None else slaves_in(chain, sensors)
 
 
 def main(

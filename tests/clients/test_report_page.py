@@ -90,12 +90,12 @@ def test_it_can_be_read_without_seeing_it(page: str) -> None:
     reader = Reader(page)
     assert "`" not in "".join(reader.words), "commands are set as code"
     plots = reader.of("svg")
-    assert len(plots) == 7
+    assert len(plots) == 6
     for plot in plots:
         assert plot["role"] == "img"
         assert set(str(plot["aria-labelledby"]).split()) <= set(reader.identifiers)
     descriptions = re.findall(r"<desc [^>]*>([^<]+)</desc>", page)
-    assert len(descriptions) == 7
+    assert len(descriptions) == 6
     assert all(re.search(r"\d", words) for words in descriptions), "they say what is in the plot"
     assert len(reader.of("th")) == len([tag for tag in reader.of("th") if tag.get("scope")])
     assert reader.of("html") == [{"lang": "en"}]
