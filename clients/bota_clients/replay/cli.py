@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import ipaddress
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -64,7 +63,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Replay; returns the exit code."""
     signals = Signals()
     return start("ethercat-replay", "replay.program", parse_options(argv), signals)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

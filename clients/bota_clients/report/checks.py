@@ -107,7 +107,7 @@ def _made(kind: _Kind, examination: Examination) -> Check | None:
     is_wrong = level >= Level.LOOK
     own = result.remedy or (kind.remedy if is_wrong else "")
     remedy = " ".join(dict.fromkeys([*(f"{finding.remedy}." for finding in findings), own])).rstrip()
-    return Check(found, level, remedy, (result.matters or kind.matters) if is_wrong else "", kind.name)
+    return Check(found, level, remedy, kind.matters if is_wrong else "", kind.name)
 
 
 def _not_possible(found: str, remedy: str) -> Check:
