@@ -164,18 +164,14 @@ HOSTILE: list[Callable[[Columns], dict[str, Any]]] = [
         "force_torque_saturated": c.warnings + 0xFFFF,
         "flags": np.random.default_rng(1).integers(0, 256, len(c)),
     },
-    lambda c: {"torque": -c.torque * 1e38, "acceleration": c.force * np.inf},
     lambda c: {"monotonic_ns": c.monotonic_ns[::-1].copy()},
     lambda c: {"monotonic_ns": c.monotonic_ns * 0, "stamp_ns": c.stamp_ns * 0 + LAST},
-    lambda c: {"monotonic_ns": np.where(np.arange(len(c)) == 7, LAST, c.monotonic_ns)},
     lambda c: {"sequence": c.sequence[::-1].copy(), "flags": c.flags + DataFlag.GAP},
-    lambda c: {"flags": np.random.default_rng(1).integers(0, 256, len(c))},
-    lambda c: {"warnings": c.warnings + 0xFFFFFFFF, "force_torque_saturated": c.warnings + 0xFFFF},
     lambda c: {"temperature": c.temperature * 1e30, "angular_rate": c.force * 0},
 ]
 
 
-@pytest.mark.parametrize("spoil", more_if_long((*HOSTILE[:2], HOSTILE[3]), HOSTILE))
+@pytest.mark.parametrize("spoil", more_if_long(HOSTILE[:3], HOSTILE))
 def test_nonsense_is_examined_and_drawn_without_an_error(
     spoil: Callable[[Columns], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
