@@ -153,8 +153,6 @@ def main(
     args = build_parser().parse_args(argv)
     try:
         slaves = options_from(args, _SERIAL_NUMBERS * (number or _number_of(args.iface)) or 1)
-        if len(args.iface.encode()) > link.LONGEST_NAME:
-            raise UsageError(f"interface name {args.iface!r} is longer than {link.LONGEST_NAME} characters")
     except UsageError as error:
         print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
         return 2
