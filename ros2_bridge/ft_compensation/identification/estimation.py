@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The equations of the poses and their answer, with intervals.
 
 In every pose: force = m g + bias force, torque = c x g + bias torque, with c = m times the center of gravity.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Payload and bias as a YAML file in the form of ROS 2 parameters, to start the node with."""
 
 from __future__ import annotations

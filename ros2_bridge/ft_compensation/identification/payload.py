@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Payload identification: mass, center of gravity, bias and the accelerometer's offset from static poses.
 
 Checks what is given, has `estimation` solve it, and judges how well the poses fit one payload. Two things are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Static poses for payload identification: what they have seen so far, and which one to take next.
 
 What counts is where gravity points in the sensor's frame. A turn about the vertical changes nothing.
