@@ -1,6 +1,7 @@
 """Entry points of the programs here, which need Linux and what `pip install .` installs there."""
 
 import sys
+from collections.abc import Callable
 from pathlib import PurePath
 
 from bota_ethercat.program import start
@@ -21,21 +22,11 @@ def run(module: str) -> int:
         return 1
 
 
-def server() -> int:
-    """`ethercat-server`."""
-    return run("ethercat_server.daemon.cli")
+def _program(module: str) -> Callable[[], int]:
+    return lambda: run(f"ethercat_server.{module}.cli")
 
 
-def sensor() -> int:
-    """`ethercat-sensor`."""
-    return run("ethercat_server.tool.cli")
-
-
-def doctor() -> int:
-    """`ethercat-doctor`."""
-    return run("ethercat_server.doctor.cli")
-
-
-def virtual_sensor() -> int:
-    """`ethercat-virtual-sensor`."""
-    return run("ethercat_server.virtual_sensor.cli")
+server = _program("daemon")
+sensor = _program("tool")
+doctor = _program("doctor")
+virtual_sensor = _program("virtual_sensor")

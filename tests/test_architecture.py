@@ -69,7 +69,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     "bota_clients.export": CLIENTS | {"bota_clients.export"},
     "bota_clients.record": CLIENTS | {"bota_clients.record"},
     "bota_clients.report": CLIENTS | {"bota_clients.report", "bota_clients.record"},
-    "bota_clients.monitor": CLIENTS | {"bota_clients.monitor"},
+    "bota_clients.monitor": CLIENTS | {"bota_clients.monitor", "bota_clients.record"},
     "bota_clients.replay": CLIENTS | {"bota_clients.replay", f"{S}.serving", S},
     "bota_clients.identify": CLIENTS | {"bota_clients.identify", "ft_compensation"},
 }
@@ -86,7 +86,6 @@ PACKAGES: Final[dict[str, set[str]]] = {
     "rich": {"bota_clients"},
     "textual": {"bota_clients.monitor.app"},
     "websockets": {"bota_clients.monitor.web.server"},
-    "shtab": {"bota_ethercat.program.completion"},
 } | {
     ros: {"bridge"}
     for ros in (

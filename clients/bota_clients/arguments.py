@@ -9,7 +9,6 @@ from typing import TypeVar
 from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program import server_choice
-from bota_ethercat.program.completion import add_completion
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor_choice import MOST_PLACES
 
@@ -20,7 +19,6 @@ def parser(prog: str, description: str, epilog: str, usage: str | None = None) -
     """The parser of a program, with --version."""
     made = argparse.ArgumentParser(prog=prog, usage=usage, description=description, epilog=epilog)
     made.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
-    add_completion(made)
     return made
 
 

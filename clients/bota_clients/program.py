@@ -25,12 +25,6 @@ def say(program: str, sentence: str) -> None:
     sys.stderr.flush()
 
 
-def missing(name: str) -> str:
-    """That a package or program is not installed, and how to install it."""
-    command = shlex.join([sys.executable, "-m", "pip", "install", ".[client]"])
-    return f"{name.partition('.')[0]} is not installed: in this project's folder run {command}"
-
-
 def start(program: str, module: str, *arguments: object) -> int:
     """The exit code of `run` in a module that is imported only now: `--help` needs nothing of the extra.
 
@@ -47,8 +41,10 @@ def start(program: str, module: str, *arguments: object) -> int:
 
 
 def not_installed(program: str, error: ImportError) -> int:
-    """Say which package is not installed; returns the exit code."""
-    say(program, missing(error.name or str(error)))
+    """Say which package is not installed, and how to install it; returns the exit code."""
+    package = (error.name or str(error)).partition(".")[0]
+    command = shlex.join([sys.executable, "-m", "pip", "install", ".[client]"])
+    say(program, f"{package} is not installed: in this project's folder run {command}")
     return 1
 
 

@@ -55,7 +55,6 @@ class Adapter(NamedTuple):
     ethernet: bool = True  # wired Ethernet, or a virtual interface like it
     master: str = ""  # bridge or bond that it is a part of
     upper: tuple[str, ...] = ()  # interfaces that stand on it, such as VLANs
-    parent: str = ""  # device behind it, by the kernel's name, such as 0000:00:1f.6 or virtio2
     counters: Mapping[str, int] = {}
     routes: Routes = Routes()
     holder: Holder | None = None  # the EtherCAT master that uses it
@@ -114,7 +113,6 @@ def _link(row: Any, rows: Sequence[Any]) -> Adapter:
         ethernet=row["ifi_type"] == _ETHERNET and not wireless,
         master=next((_name(each) for each in rows if each["index"] == row.get_attr("IFLA_MASTER")), ""),
         upper=tuple(_name(each) for each in rows if _stands_on(each, row["index"])),
-        parent=row.get_attr("IFLA_PARENT_DEV_NAME") or "",
         counters={key: int(stats[key]) for key in stats.keys() if isinstance(stats[key], int)},  # noqa: SIM118
     )
 

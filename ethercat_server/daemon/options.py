@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.errors import SettingError
-from bota_ethercat.program.completion import add_completion
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import (
     SETTINGS,
@@ -309,7 +308,6 @@ def build_parser() -> argparse.ArgumentParser:
             type=setting.parse_argument, action="append" if setting.many else "store",
         )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    add_completion(parser)
     return parser
 
 

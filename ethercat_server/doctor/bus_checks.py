@@ -263,9 +263,9 @@ def exchange_finding(when: str, summary: Mapping[str, Any], lost: int, count: in
         f"{text}; {lost} frames lost of {count}" if lost else text,
         (lost, warning, "each may cost a sample: check the cable; a busy virtual machine loses frames, too"),
         (summary["p50"] > SLOW_US, warning,
-         f"slow network card or driver: {cost(summary['p50'])}; see coalescing, interrupts"),
+         f"slow network card or driver: {cost(summary['p50'])}; see coalescing"),
         (summary["p99"] > _EXCHANGE_NOTE_US, note,
-         "network card, driver or load: see coalescing, interrupts"),
+         "network card, driver or load: see coalescing"),
         **{**summary, "exchanges": count, "lost": lost},
     )  # fmt: skip
 

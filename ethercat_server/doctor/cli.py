@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from bota_ethercat.health.verdict import Level
-from bota_ethercat.program.completion import add_completion
 from bota_ethercat.text.untrusted import visible
 from ethercat_server import __version__
 from ethercat_server.daemon.options import SERVER_SETTINGS, VIRTUAL_INTERFACE
@@ -55,7 +54,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    add_completion(parser)
     return parser
 
 

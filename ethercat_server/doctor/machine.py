@@ -15,10 +15,9 @@ import re
 import shlex
 import socket
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -69,7 +68,6 @@ FACTS: Final[Mapping[str, Callable[[str], Any]]] = {
     "settings": _settings,  # speed in Mbit/s and duplex
     "driver": _driver,  # its name, and the bus the card is on
     "coalescing": lambda ifname: dict(_ethtool(ifname, lambda asked: asked.get_coalesce())),
-    "offloads": lambda ifname: _ethtool(ifname, lambda asked: asked.get_offload_flags()),
     "EEE": lambda ifname: tuple(map(bool, _request(ifname, *_GET_EEE)))[::-1],  # switched on, in use
 }
 
@@ -161,11 +159,6 @@ class Machine:
         """The online processors."""
         return processor_list(self.text("/sys/devices/system/cpu/online"))
 
-    @cached_property
-    def isolated(self) -> list[int]:
-        """The isolated processors."""
-        return processor_list(self.text("/sys/devices/system/cpu/isolated", ""))
-
     def has_capability(self, bit: int) -> bool:
         """Whether this process has a capability."""
         found = re.search(r"^CapEff:\s*([0-9a-fA-F]+)$", self.text("/proc/self/status"), re.MULTILINE)
@@ -188,10 +181,3 @@ def processor_list(text: str) -> list[int]:
             raise CannotLookError(f"{text[:40]!r} is not a list of processors")
         found.extend(range(int(match[1]), int(match[2] or match[1]) + 1))
     return found
-
-
-def as_list(numbers: Iterable[int]) -> str:
-    """Such a list, the other way round."""
-    runs = groupby(enumerate(sorted(set(numbers))), lambda each: each[1] - each[0])
-    ends = [[number for _, number in run] for _, run in runs]
-    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in ends)

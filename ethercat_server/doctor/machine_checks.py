@@ -5,7 +5,6 @@ A check that fails does not stop the others.
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import struct
@@ -16,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 from ethercat_server.access.adapters import Adapter
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE
-from ethercat_server.doctor.machine import Machine, as_list, processor_list
+from ethercat_server.doctor.machine import Machine
 from ethercat_server.doctor.report import (
     CannotLookError,
     Finding,
@@ -177,12 +176,6 @@ def _latency_limit_us(machine: Machine) -> int | None:
 
 _ETHERCAT_SPEED: Final = 100
 _GUEST_DRIVERS: Final = frozenset({"virtio_net", "vmxnet3", "hv_netvsc", "xen-netfront", "vif", "ena", "gve"})
-_UNWANTED: Final = {
-    "generic-receive-offload": "gro",
-    "large-receive-offload": "lro",
-    "tcp-segmentation-offload": "tso",
-    "generic-segmentation-offload": "gso",
-}
 _DELAYS: Final = ("rx_coalesce_usecs", "tx_coalesce_usecs")
 _ADAPTIVE: Final = ("use_adaptive_rx_coalesce", "use_adaptive_tx_coalesce")
 _ERRORS: Final = (
@@ -264,15 +257,6 @@ def _coalescing(machine: Machine) -> Finding:
     )
 
 
-def _offloads(machine: Machine) -> Finding:
-    virtual, found = machine.link.kind, machine.fact("offloads")
-    on = [short for name, short in _UNWANTED.items() if found.get(name)]
-    text = f"{', '.join(on)} on{', without effect on a virtual interface' if virtual else ''}"
-    command = f"sudo ethtool -K {machine.shown} {' '.join(f'{short} off' for short in on)}"
-    why = "meant for TCP; some drivers delay other frames because of them"
-    return graded(text if on else "off", (on and not virtual, note, why, command), on=on)
-
-
 def _energy_efficient_ethernet(machine: Machine) -> Finding:
     enabled, active = machine.fact("EEE")
     mend = f"sudo ethtool --set-eee {machine.shown} eee off"
@@ -300,47 +284,6 @@ def rising(before: Mapping[str, int], after: Mapping[str, int]) -> Finding:
 
 def _counted(found: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in found.items())
-
-
-def _affinity(machine: Machine) -> Finding:
-    numbers, apart = _interrupts(machine), machine.isolated
-    if not numbers and machine.link.kind:
-        return ok("none: a virtual interface", irqs=[])
-    if not numbers:
-        raise CannotLookError(f"/proc/interrupts lists none for {machine.ifname}")
-    everywhere: set[int] = set()
-    for number in numbers:
-        folder = f"/proc/irq/{number}"
-        text = machine.text(f"{folder}/effective_affinity_list", "")
-        everywhere.update(processor_list(text or machine.text(f"{folder}/smp_affinity_list", "")))
-    text = f"IRQ{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))} on processor "
-    files = (f"/proc/irq/{number}/smp_affinity_list" for number in numbers)
-    return graded(
-        text + (as_list(everywhere) or "unknown"),
-        (apart and everywhere.isdisjoint(apart), note,
-         f"frames are received on another processor than the server's: {as_list(apart)} is isolated",
-         *(f"echo {max(apart, default=0)} | sudo tee {file}" for file in files)),
-        (apart and "irqbalance" in machine.commands_running().values(), note,
-         "irqbalance runs and may move interrupts: exclude the isolated processors with "
-         "IRQBALANCE_BANNED_CPULIST in /etc/default/irqbalance", "sudo systemctl restart irqbalance"),
-        irqs=numbers, processors=sorted(everywhere),
-    )  # fmt: skip
-
-
-def _interrupts(machine: Machine) -> list[int]:
-    """The numbers of the interface's interrupts, which have its name, or that of a device of its own."""
-    names = {machine.ifname, machine.link.parent} - {""}
-    folder = machine.path(f"/sys/class/net/{machine.ifname}/device")
-    if folder.exists():
-        names.add(os.path.basename(os.path.realpath(folder)))  # noqa: PTH119 - a link's target's name
-    any_name = "|".join(map(re.escape, names))
-    # A queue's interrupt has more behind the name, such as ens5-rx-0.
-    about = re.compile(rf"(?:{any_name})(?![^\W_])|.*@pci:(?:{any_name})$")
-    rows = (line.partition(":") for line in machine.text("/proc/interrupts").splitlines())
-    return sorted(
-        int(head) for head, _, rest in rows
-        if head.strip().isdecimal() and any(map(about.match, rest.replace(",", " ").split()))
-    )  # fmt: skip
 
 
 _DHCP_CLIENTS: Final = frozenset({"dhclient", "dhcpcd", "udhcpc", "connmand", "wicked"})
@@ -419,7 +362,7 @@ _BY_SUBJECT: Final[Mapping[str, Mapping[str, Look]]] = {
     "rights": {"capabilities": _capabilities},
     "processors": {"governor": _governor, "idle states": _idle_states},
     "interface": {"link": _link_state, "speed": _speed, "driver": _driver, "coalescing": _coalescing,
-                  "offloads": _offloads, "EEE": _energy_efficient_ethernet, "interrupts": _affinity},
+                  "EEE": _energy_efficient_ethernet},
     "other software": {"managers": _managers, "addresses": _addresses, "membership": _membership},
 }  # fmt: skip
 CHECKS: Final = tuple(

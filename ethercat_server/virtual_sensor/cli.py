@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
-from bota_ethercat.program.completion import add_completion
 from bota_ethercat.settings import SETTINGS
 from ethercat_server import __version__
 from ethercat_server.errors import InterfaceError
@@ -22,8 +21,6 @@ from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_
 from ethercat_server.virtual_sensor.faults import COMMANDS, PPM_LIMIT
 from ethercat_server.virtual_sensor.foreign import KINDS, MOST_SLAVES, SENSOR, parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import (
-    EEPROM_MS,
-    WRITE_US,
     ForeignOptions,
     SensorOptions,
     SlaveOptions,
@@ -64,10 +61,6 @@ _OPTIONS: Final[tuple[tuple[str, str, str | None, Callable[[str], Any], str], ..
     ("sinc", "N", None, _sinc_length, "SINC length after power-on (default 64)"),
     ("ppm", "X", None, real(-PPM_LIMIT, PPM_LIMIT), f"clock error{_SEVERAL}"),
     ("dc", "WORD[=VALUE][+...]", None, _clock, f"distributed clock, see below{_SEVERAL}"),
-    ("write-us", "X", str(WRITE_US), real(0, 1000),
-     f"time of the firmware's write of a sample to the controller (default {WRITE_US:g})"),
-    ("seed", "N", "0", whole(0, 2**63), "seed of the noise"),
-    ("eeprom-ms", "X", str(EEPROM_MS), real(0, 1000), f"time of an EEPROM read (default {EEPROM_MS:g})"),
 )  # fmt: skip
 
 
@@ -93,7 +86,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    add_completion(parser)
     return parser
 
 
@@ -141,15 +133,13 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
             sinc_length=given["sinc"],
             ppm=of("ppm", position, 0.0),
             dc=of("dc", position, ""),
-            write_us=given["write-us"],
             signal=args.signal,
             noise=args.noise == "on",
-            seed=given["seed"] + position,
-            eeprom_ms=given["eeprom-ms"],
+            seed=position,
         )
         for position in range(count)
     ]
-    return tuple(sensors) if chain is None else slaves_in(chain, sensors, given["eeprom-ms"])
+    return tuple(sensors) if chain is None else slaves_in(chain, sensors)
 
 
 def main(
@@ -163,8 +153,6 @@ def main(
     args = build_parser().parse_args(argv)
     try:
         slaves = options_from(args, _SERIAL_NUMBERS * (number or _number_of(args.iface)) or 1)
-        if len(args.iface.encode()) > link.LONGEST_NAME:
-            raise UsageError(f"interface name {args.iface!r} is longer than {link.LONGEST_NAME} characters")
     except UsageError as error:
         print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
         return 2

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final, Protocol
 
 from ethercat_server.ethercat.slave.al import AlState
@@ -74,11 +73,9 @@ class ObjectTable:
 _COE_HEADER: Final = struct.Struct("<H")
 _SDO_HEADER_SIZE: Final = 8
 _REQUEST, _RESPONSE, _INFORMATION = 2, 3, 8  # services in the CoE header
-_SEGMENT_MINIMUM = 7
 # Command specifiers, in the top three bits of the command.
-_DOWNLOAD_SEGMENT, _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0, 1, 2, 3, 4
-_DOWNLOADED = 3
-_SIZE_INDICATED, _EXPEDITED, _COMPLETE, _TOGGLE = 0x01, 0x02, 0x10, 0x10
+_DOWNLOAD, _UPLOAD, _DOWNLOADED, _ABORT = 1, 2, 3, 4
+_SIZE_INDICATED, _EXPEDITED, _COMPLETE = 0x01, 0x02, 0x10
 
 
 class _Objects(Protocol):
@@ -90,28 +87,16 @@ class _Objects(Protocol):
     def write(self, index: int, subindex: int, data: bytes) -> None: ...
 
 
-@dataclass
-class _Transfer:
-    """A segmented transfer under way."""
-
-    index: int
-    subindex: int
-    upload: bool
-    data: bytearray
-    size: int
-    toggle: int = 0
-
-
 class CoeServer:
-    """Answers CoE requests one at a time: SDO upload and download, expedited, normal and segmented.
+    """Answers CoE requests one at a time: SDO upload and download, expedited and normal.
 
-    `information` answers requests to the SDO Information service.
+    No object is too long for the mailbox, so there are no segments. `information` answers requests to the SDO
+    Information service.
     """
 
     def __init__(self, objects: _Objects, information: Callable[[bytes, int], list[bytes]]) -> None:
         self._objects = objects
         self._information = information
-        self._transfer: _Transfer | None = None
 
     def answer(self, message: bytes, room: int) -> list[bytes]:
         """The replies to `message`, each at most `room` bytes.
@@ -125,59 +110,34 @@ class CoeServer:
             return [_COE_HEADER.pack(service << 12) + reply for reply in self._information(request, room)]
         if service != _REQUEST:
             raise MailboxError(INVALID_HEADER)
-        # A segment may be shorter than the full SDO header; nothing else may.
-        if not request or (request[0] >> 5 in (_DOWNLOAD, _UPLOAD) and len(request) < _SDO_HEADER_SIZE):
+        if len(request) < _SDO_HEADER_SIZE:
             raise MailboxError(TOO_SHORT)
-        index, subindex = struct.unpack_from("<HB", request.ljust(_SDO_HEADER_SIZE, b"\0"), 1)
-        if self._transfer is not None and request[0] >> 5 in (_DOWNLOAD_SEGMENT, _UPLOAD_SEGMENT):
-            index, subindex = self._transfer.index, self._transfer.subindex
+        index, subindex = struct.unpack_from("<HB", request, 1)
         try:
-            reply = self._sdo(request, index, subindex, room)
+            reply = self._sdo(request, index, subindex)
         except SdoAbortError as abort:
-            self._transfer = None
             # An abort is coded as a request.
             return [struct.pack("<HBHBI", _REQUEST << 12, _ABORT << 5, index, subindex, abort.code)]
         return [_COE_HEADER.pack(_RESPONSE << 12) + reply] if reply else []
 
-    def _sdo(self, request: bytes, index: int, subindex: int, room: int) -> bytes:
-        command, transfer = request[0], self._transfer
-        specifier = command >> 5
-        if specifier in (_UPLOAD, _DOWNLOAD, _ABORT):
-            self._transfer = None
-            if specifier == _ABORT:
-                return b""
-            if command & _COMPLETE:
-                raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS)
-            if specifier == _UPLOAD:
-                return self._upload(index, subindex, room)
-            return self._download(request, index, subindex)
-        if transfer is None or specifier != (_UPLOAD_SEGMENT if transfer.upload else _DOWNLOAD_SEGMENT):
+    def _sdo(self, request: bytes, index: int, subindex: int) -> bytes:
+        command, specifier = request[0], request[0] >> 5
+        if specifier == _ABORT:
+            return b""
+        if specifier not in (_UPLOAD, _DOWNLOAD):
             raise SdoAbortError(AbortCode.UNKNOWN_COMMAND)
-        if command & _TOGGLE != transfer.toggle:
-            raise SdoAbortError(AbortCode.TOGGLE_NOT_CHANGED)
-        if transfer.upload:
-            return self._upload_segment(transfer, room)
-        return self._download_segment(transfer, request)
+        if command & _COMPLETE:
+            raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS)
+        if specifier == _UPLOAD:
+            return self._upload(index, subindex)
+        return self._download(request, index, subindex)
 
-    def _upload(self, index: int, subindex: int, room: int) -> bytes:
+    def _upload(self, index: int, subindex: int) -> bytes:
         data = self._objects.read(index, subindex)
         if 0 < len(data) <= 4:
             command = _UPLOAD << 5 | (4 - len(data)) << 2 | _EXPEDITED | _SIZE_INDICATED
             return struct.pack("<BHB", command, index, subindex) + data.ljust(4, b"\0")
-        first = data[: room - _SDO_HEADER_SIZE]
-        if len(first) < len(data):
-            rest = bytearray(data[len(first) :])
-            self._transfer = _Transfer(index, subindex, True, rest, len(data))
-        return struct.pack("<BHBI", _UPLOAD << 5 | _SIZE_INDICATED, index, subindex, len(data)) + first
-
-    def _upload_segment(self, transfer: _Transfer, room: int) -> bytes:
-        part = bytes(transfer.data[: room - 1])
-        del transfer.data[: len(part)]
-        command = transfer.toggle | max(_SEGMENT_MINIMUM - len(part), 0) << 1 | (not transfer.data)
-        transfer.toggle ^= _TOGGLE
-        if not transfer.data:
-            self._transfer = None
-        return bytes([command]) + part.ljust(_SEGMENT_MINIMUM, b"\0")
+        return struct.pack("<BHBI", _UPLOAD << 5 | _SIZE_INDICATED, index, subindex, len(data)) + data
 
     def _download(self, request: bytes, index: int, subindex: int) -> bytes:
         command = request[0]
@@ -186,32 +146,13 @@ class CoeServer:
                 size = 4 - (command >> 2 & 3)
             else:  # the client leaves it to the server
                 size = min(self._objects.length(index, subindex), 4)
-            self._objects.write(index, subindex, request[4 : 4 + size])
+            data = request[4 : 4 + size]
         else:
             (size,) = struct.unpack_from("<I", request, 4)
             data = request[_SDO_HEADER_SIZE : _SDO_HEADER_SIZE + size]
             self._objects.check_download(index, subindex, size)
-            if len(data) < size:
-                self._transfer = _Transfer(index, subindex, False, bytearray(data), size)
-            else:
-                self._objects.write(index, subindex, data)
+        self._objects.write(index, subindex, data)
         return struct.pack("<BHBI", _DOWNLOADED << 5, index, subindex, 0)
-
-    def _download_segment(self, transfer: _Transfer, request: bytes) -> bytes:
-        command, data = request[0], request[1:]
-        if len(data) <= _SEGMENT_MINIMUM:
-            data = data[: _SEGMENT_MINIMUM - (command >> 1 & 7)]
-        transfer.data += data
-        if len(transfer.data) > transfer.size:
-            raise SdoAbortError(AbortCode.TOO_LONG)
-        if command & 1:
-            self._transfer = None
-            if len(transfer.data) != transfer.size:
-                raise SdoAbortError(AbortCode.LENGTH_MISMATCH)
-            self._objects.write(transfer.index, transfer.subindex, bytes(transfer.data))
-        reply = bytes([_DOWNLOAD << 5 | transfer.toggle]) + bytes(_SEGMENT_MINIMUM)
-        transfer.toggle ^= _TOGGLE
-        return reply
 
 
 _INFO_HEADER: Final = struct.Struct("<BBH")

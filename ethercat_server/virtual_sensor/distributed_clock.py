@@ -16,6 +16,7 @@ from ethercat_server.virtual_sensor.options import Command, UsageError, real
 
 RATE_SCALE: Final = 10**12  # rates are in parts of this
 HOP_NS: Final = 700  # from slave to slave, cable included
+WRITE_NS: Final = 12_000  # of a sample by the firmware: about what 61 bytes take over SPI at 40 MHz
 _U64 = 2**64 - 1
 _MASK: Final = 2**32 - 1
 _U16, _I16, _U32, _TIME = (struct.Struct(f"<{code}") for code in "HhIQ")
@@ -110,12 +111,12 @@ class EventTimes:
         self.none = True
         self._memory[reg.DC_ECAT_EVENT : reg.DC_END] = bytes(reg.DC_END - reg.DC_ECAT_EVENT)
 
-    def follow(self, newest_at: Callable[[int], int], end_of: Callable[[int], int], write_ns: int) -> None:
-        """Show the firmware's writes of inputs, of which each takes so long.
+    def follow(self, newest_at: Callable[[int], int], end_of: Callable[[int], int]) -> None:
+        """Show the firmware's writes of inputs.
 
         They are numbered: the newest that is complete at an instant, and when one is complete.
         """
-        self._newest_at, self._end_of, self._write_ns = newest_at, end_of, write_ns
+        self._newest_at, self._end_of = newest_at, end_of
 
     def latch(self, wanted: bool, now: int) -> None:
         """Latch the writes from now on, or no longer."""
@@ -135,9 +136,9 @@ class EventTimes:
             if end >= since:
                 self._any_shown = True
                 self._show(reg.DC_PDI_CHANGE_EVENT, end)
-        if starts and (begun := newest_at(now + self._write_ns)) != self._begun:
+        if starts and (begun := newest_at(now + WRITE_NS)) != self._begun:
             self._begun = begun
-            start = self._end_of(begun) - self._write_ns
+            start = self._end_of(begun) - WRITE_NS
             if start >= since:
                 self._show(reg.DC_PDI_START_EVENT, start)
 

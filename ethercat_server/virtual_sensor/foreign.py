@@ -83,8 +83,8 @@ _DISABLED, _ENABLED = 0x0240, 0x0237
 class Drive(Application):
     """A servo drive, which the controlword enables in one step, and the end of process data disables."""
 
-    def __init__(self, clock: Callable[[], int], eeprom_ms: float) -> None:
-        super().__init__(_DRIVE, clock, _objects_of(_DRIVE), eeprom_ms)
+    def __init__(self, clock: Callable[[], int]) -> None:
+        super().__init__(_DRIVE, clock, _objects_of(_DRIVE), EEPROM_MS)
 
     @property
     def enabled(self) -> bool:
@@ -133,11 +133,11 @@ class ForeignSlave:
         if not on:
             self.life = None
         elif self.life is None:
-            device, eeprom_ms = KINDS[self.options.kind], self.options.eeprom_ms
+            device = KINDS[self.options.kind]
             self.life = (
-                Drive(self._clock, eeprom_ms)
+                Drive(self._clock)
                 if device is _DRIVE
-                else Application(device, self._clock, _objects_of(device), eeprom_ms)
+                else Application(device, self._clock, _objects_of(device), EEPROM_MS)
             )
             self.life.esc.record = self._remember
 
@@ -214,9 +214,7 @@ def parse_chain(text: str) -> list[tuple[str, AlState]]:
 
 
 def slaves_in(
-    chain: Iterable[tuple[str, AlState]],
-    sensors: Sequence[SensorOptions] = (),
-    eeprom_ms: float = EEPROM_MS,
+    chain: Iterable[tuple[str, AlState]], sensors: Sequence[SensorOptions] = ()
 ) -> tuple[SlaveOptions, ...]:
     """The options of the slaves in a parsed chain; `sensors` are its sensors, the default ones if too few."""
     slaves: list[SlaveOptions] = []
@@ -224,8 +222,8 @@ def slaves_in(
     for kind, state in chain:
         if kind == SENSOR:
             number += 1
-            sensor = next(given, SensorOptions(serial=number, eeprom_ms=eeprom_ms))
+            sensor = next(given, SensorOptions(serial=number))
             slaves.append(replace(sensor, state=state))
         else:
-            slaves.append(ForeignOptions(kind, state, eeprom_ms))
+            slaves.append(ForeignOptions(kind, state))
     return tuple(slaves)

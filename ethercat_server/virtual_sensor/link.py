@@ -25,7 +25,6 @@ from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, QuitCommand, obey
 from ethercat_server.virtual_sensor.options import SlaveOptions
 
-LONGEST_NAME: Final = 15  # characters in the name of a network interface
 _BUFFER = 2048
 _SOL_PACKET, _PACKET_AUXDATA, _ETH_P_ALL = 263, 8, 3
 _AUXDATA: Final = struct.Struct("=I12xHH")  # status, VLAN tag: control information and type
@@ -53,9 +52,7 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
 
     The kernel removes VLAN tags; what they were it says only to sockets for all protocols.
     """
-    if not ifname or len(ifname.encode()) > LONGEST_NAME:
-        raise LinkError(f"interface name {ifname!r}: it must have 1 to {LONGEST_NAME} characters")
-    if not _index(ifname):
+    if ifname not in dict(socket.if_nameindex()).values():
         raise LinkError(f"no network interface {ifname!r}: see `ip link`")
     if not look_up(ifname).is_up:
         raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
@@ -74,14 +71,6 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
         raw.close()
         raise LinkError(f"interface {ifname} cannot be used: {error.strerror}") from None
     return raw
-
-
-def _index(ifname: str) -> int:
-    """Of the interface; 0 if there is none."""
-    try:
-        return socket.if_nametoindex(ifname)
-    except OSError:
-        return 0
 
 
 def run(
@@ -115,14 +104,14 @@ def run(
         gc.collect()
         gc.freeze()
         on_ready()
-        answers, index, up = _Answers(raw, bus, ifname), _index(ifname), True
+        answers, index, up = _Answers(raw, bus, ifname), socket.if_nametoindex(ifname), True
         stack.enter_context(contextlib.suppress(QuitCommand))
         while not stop.is_set() and not (exit_on_eof and channel.ended):
             ready = [descriptor for descriptor, _ in poller.poll(_IDLE_MS)]
             if not ready:
                 bus.idle(time.monotonic_ns())
                 # Down is like an unplugged cable: it may come back, unless the interface was deleted.
-                if not up and _index(ifname) != index:
+                if not up and index not in dict(socket.if_nameindex()):
                     raise LinkError(f"interface {ifname} has disappeared: create it again, and restart")
             for descriptor in ready:
                 if descriptor != raw.fileno():

@@ -11,7 +11,6 @@ from typing import Any, Final
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import MODELS
 
-WRITE_US: Final = 12.0  # about what 61 bytes take over SPI at 40 MHz
 EEPROM_MS: Final = 2.0  # about what a real EEPROM needs for the eight bytes of a read command
 
 
@@ -30,7 +29,6 @@ class SensorOptions:
     chop_divides: int = 1  # by what CHOP divides its sampling rate
     ppm: float = 0.0  # error of its clock: positive is fast
     dc: str = ""  # its distributed clock, in `distributed_clock.CLOCK_WORDS`: `32-bit+ppm=20+late=50`
-    write_us: float = WRITE_US  # in which its firmware writes a sample to the controller, before its instant
     signal: str = "scene"
     noise: bool = True
     seed: int = 0
@@ -44,7 +42,6 @@ class ForeignOptions:
 
     kind: str  # one of `foreign.KINDS`
     state: AlState = AlState.INIT  # in which another master has left it; a drive in OP turns
-    eeprom_ms: float = EEPROM_MS
 
 
 SlaveOptions = SensorOptions | ForeignOptions

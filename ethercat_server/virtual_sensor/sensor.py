@@ -44,9 +44,7 @@ class Firmware(Application):
         ] = {}  # code and until when, by write
         device = sensor_device(options.model, options.serial, options.pdo_size)
         super().__init__(device, clock, self.dictionary, options.eeprom_ms)
-        self.esc.clock.events.follow(
-            self.sampler.number_at, self.sampler.clock.instant, round(options.write_us * 1000)
-        )
+        self.esc.clock.events.follow(self.sampler.number_at, self.sampler.clock.instant)
         for apply in parse_clock(options.dc):
             apply(self.esc.clock)
 

@@ -20,7 +20,6 @@ from typing import Any
 
 import pytest
 
-from bota_clients.errors import RecordingError
 from bota_clients.monitor import cli
 from bota_clients.monitor.cli import parse
 from bota_clients.monitor.model import Model, State
@@ -32,6 +31,7 @@ from bota_ethercat.client import Client
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.pictures import DOCS
+from tests.clients.running import frames_in
 from tests.rights import NO_OTHER_USER
 from tests.served_simulation import ServedSimulation, served
 from tests.server.running import PATIENCE_S, free_port, wait_until
@@ -222,29 +222,25 @@ def test_the_terminal_is_as_it_was_and_had_no_color(shared: ServedSimulation) ->
     assert not codes & colors, "NO_COLOR"
 
 
-@pytest.mark.parametrize("way", ["the terminal closes", "SIGHUP and the terminal closes", "SIGKILL"])
+@pytest.mark.parametrize("way", ["r again", "the terminal closes", "SIGHUP and the terminal closes"])
 def test_a_recording_ends_with_the_monitor(shared: ServedSimulation, way: str, tmp_path: Path) -> None:
     with Terminal("--server", str(shared.port), cwd=tmp_path) as terminal:
         terminal.wait_for("BFT-SENS-ECAT-M8")
         terminal.type("r")
-        wait_until(lambda: bool(list(tmp_path.glob("*.mcap"))), "the recording's file")
-        if way == "SIGKILL":
-            terminal.process.kill()
+        terminal.wait_for("REC ")
+        wait_until(lambda: any(map(frames_in, tmp_path.glob("*.mcap"))), "frames in the recording")
+        if way == "r again":
+            terminal.type("r")
+            terminal.wait_for("Recorded recording-")
         else:
             terminal.hang_up()
             if "SIGHUP" in way:  # which nohup ignores
                 terminal.process.send_signal(signal.SIGHUP)
-        terminal.process.wait(PATIENCE_S)
-        (made,) = tmp_path.glob("*.mcap")
-
-        def ended() -> bool:
-            try:
-                with open_recording(made) as recording:
-                    return recording.end is not None
-            except RecordingError:  # it has only begun to write
-                return False
-
-        wait_until(ended, "the end of the recording")
+            terminal.process.wait(PATIENCE_S)
+    (made,) = tmp_path.glob("*.mcap")
+    with open_recording(made) as recording:
+        assert recording.end is not None
+        assert recording.end["reason"] == "asked to stop"
 
 
 @contextlib.contextmanager

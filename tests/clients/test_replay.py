@@ -94,16 +94,6 @@ def test_it_loops_with_numbers_that_go_on(path: Path) -> None:
     assert all(b.stamp_ns > a.stamp_ns for a, b in pairwise(played))
 
 
-def test_several_recordings_are_played_one_after_the_other(tmp_path: Path) -> None:
-    first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
-    record(first, (frame(n) for n in range(10)))
-    record(second, (frame(n, **{"force.z": 1}) for n in range(10)))
-    with Replay("--speed", "max", first, second) as served, listen(served.port) as client:
-        played = list(client.frames())
-        assert client.description["replay"]["files"] == ["a.mcap", "b.mcap"]
-    assert [item.sequence for item in played] == list(range(20))
-
-
 def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
@@ -164,7 +154,6 @@ def test_status_has_all_that_a_server_s_has(path: Path) -> None:
         ("configure", {"settings": {"sinc_length": 64}}),
         ("tare", {}),
         ("sdo_read", {"index": 0x8010, "subindex": 1}),
-        ("sdo_write", {"index": 0x8010, "subindex": 1, "hex": "00"}),
     ],
 )
 def test_what_needs_a_sensor_is_refused_in_a_sentence(
@@ -317,7 +306,6 @@ def test_numbers_and_times_stay_in_their_fields() -> None:
     [
         (2, (), "required"),
         (2, ("x.mcap", "--server", "99999"), "99999 is no port: it must be from 1 to 65535"),
-        (2, ("x.mcap", "--speed", "0"), "it must be a number"),
         (2, ("x.mcap", "--speed", "nan"), "it must be a number"),
         (2, ("x.mcap", "--server", "nowhere:1"), "an IP address of this machine"),
         (1, ("/no/x.mcap",), "No such file"),

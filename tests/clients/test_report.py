@@ -112,14 +112,10 @@ def test_the_noise_is_that_of_the_sensor_whatever_it_does(healthy: Subject) -> N
     ("command", "check", "level", "words"),
     [
         ("noise force.y 0.6", FORCE_TORQUE, TROUBLE, "^Force y has a noise of 0.58"),
-        ("noise torque.z 0.02", FORCE_TORQUE, TROUBLE, "^Torque z has a noise of 0.0193"),
         ("noise acceleration.x 0.02", IMU, TROUBLE, "^Acceleration x has a noise of 0.19"),
         ("noise angular_rate.z 10", IMU, TROUBLE, "^Angular rate z has a noise of 0.17"),
-        ("noise angular_rate.x 1", IMU, LOOK, "^Angular rate x has 2"),  # louder than the others
         ("limit force.z 9", "Saturation", TROUBLE, "Force z was saturated in"),
-        ("limit torque.y 0.3", "Saturation", TROUBLE, "Torque y was saturated in"),
         ("limit angular_rate.x 5", "Saturation", TROUBLE, "Angular rate x was saturated in"),
-        ("freeze torque.x", "Stuck values", TROUBLE, "^Torque x was constant at"),
         ("freeze angular_rate.y", "Stuck values", TROUBLE, "^Angular rate y was constant at"),
         ("skip 2", "Lost samples", TROUBLE, r"were lost\. In "),
     ],
@@ -128,7 +124,7 @@ def test_an_injected_fault_is_found_and_nothing_else(
     command: str, check: str, level: Level, words: str
 ) -> None:
     examination = expect(sensor(6.5, command, seed=5, sinc_length=SLOW), {check: (level, words)})
-    assert examination.headline == {LOOK: "Worth a look", TROUBLE: "Trouble"}[level]
+    assert examination.headline == "Trouble"
     assert check.lower().replace("imu", "IMU") in examination.sentence
 
 
@@ -148,8 +144,6 @@ SHAKES = {"acceleration.x": 0.05, "acceleration.y": 0.05, "force.x": 1.5, "torqu
         (SLOW, 5, {4.0: "freeze force.x", 4.5: "thaw force.x"},
          {"Stuck values": (TROUBLE, r"^Force x .* for (49|50)\d ms \((49|50|51) samples\) from (3.9|4.0)")}),
         (SLOW, 8, {5.0: "stick"}, {SILENT: (TROUBLE, "the longest 3.00 s")}),
-        (SINC, 5, {2.0: "warn 0x20 80", 4.0: "warn 0x40 8"},
-         {"Warnings": (TROUBLE, r"Wrong supply voltage \(fatal\) in 8 samples")}),
     ],
 )  # fmt: skip
 def test_a_fault_that_comes_and_goes_is_found(
@@ -163,7 +157,8 @@ def test_a_fault_that_comes_and_goes_is_found(
 
 def test_warnings_are_told_with_their_remedy() -> None:
     script = Script(((2.0, "warn 0x20 80"), (4.0, "warn 0x40 8")))
-    check = check_of(Examination(sensor(5, script=script, sinc_length=SINC)), "Warnings")
+    fatal = {"Warnings": (TROUBLE, r"Wrong supply voltage \(fatal\) in 8 samples")}
+    check = check_of(expect(sensor(5, script=script, sinc_length=SINC), fatal), "Warnings")
     words = r"Overtemperature \(warning\) in (79|80|81) samples, first (1.99|2.00) s after the start"
     assert re.search(words, check.found)
     assert "let it cool down" in check.remedy

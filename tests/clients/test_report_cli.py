@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import pytest
 
-from bota_clients.program import missing
 from bota_clients.report import cli, page, plots, subjects
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import writer
@@ -268,17 +267,6 @@ def test_ctrl_c_leaves_nothing(report: Report, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(page, "render", interrupted)
     assert report.run(report.path) == (1, "", "ethercat-report: stopped: no report was written\n")
     assert list(report.folder.iterdir()) == [report.path]
-
-
-def test_what_is_not_installed_is_said() -> None:
-    script = (
-        "import sys; sys.modules['matplotlib'] = None; "
-        "from bota_clients.report.cli import main; sys.exit(main(['a.mcap']))"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert missing("matplotlib") in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 def test_live_sensors_are_reported_on(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from ethercat_server.doctor.report import CannotLookError
 from ethercat_server.ethercat.nic import Routes
 
 CPUS = "/sys/devices/system/cpu"
-CARD = Adapter("ens5", ifindex=7, parent="0000:00:1f.6", counters={"rx_packets": 100})
+CARD = Adapter("ens5", ifindex=7, counters={"rx_packets": 100})
 Facts = Mapping[str, Any]
 FACTS: Facts = {
     "link": CARD,
@@ -21,7 +21,6 @@ FACTS: Facts = {
     "settings": (100, "full"),
     "driver": ("e1000e", "0000:00:1f.6"),
     "coalescing": {"rx_coalesce_usecs": 0, "tx_coalesce_usecs": 0, "use_adaptive_rx_coalesce": 0},
-    "offloads": {"generic-receive-offload": False, "tcp-segmentation-offload": False},
     "EEE": (False, False),
 }
 Files = Mapping[str, str | bytes | None]
@@ -29,12 +28,8 @@ GOOD: Files = {
     "/proc/version": "Linux version 6.12.0-rt-amd64 (x@y) #1 SMP PREEMPT_RT Debian",
     "/proc/cmdline": "quiet isolcpus=3",
     "/proc/self/status": "Name:\tpython\nCapEff:\t000001ffffffffff\n",
-    "/proc/interrupts": " 0: 9 IO-APIC timer\n 130: 1 2 IR-PCI-MSI-0000:00:1f.6 0-edge ens5\n 131: 7 xhci\n",
-    "/proc/irq/130/smp_affinity_list": "0-3\n",
-    "/proc/irq/130/effective_affinity_list": "3\n",
     "/sys/kernel/realtime": "1\n",
     f"{CPUS}/online": "0-3\n",
-    f"{CPUS}/isolated": "3\n",
     **{f"{CPUS}/cpu{n}/cpufreq/scaling_governor": "performance\n" for n in range(4)},
     **{f"{CPUS}/cpu{n}/cpuidle/state0/latency": "0\n" for n in range(4)},
     **{f"{CPUS}/cpu{n}/cpuidle/state1/latency": "2\n" for n in range(4)},

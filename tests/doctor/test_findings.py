@@ -48,7 +48,6 @@ def test_whether_anything_answers() -> None:
     ("changes", "level", "named"),
     [
         ({}, FINE, "supported"),
-        ({"name": "BFT-ROKS-ECAT-M8"}, FINE, "BFT-ROKS"),
         ({"vendor": 2, "name": "EK1100"}, FINE, "vendor 0x00000002, product 0x00000001: not a Bota"),
         ({"product": 9}, FINE, "product 0x00000009: not a Bota"),
         ({"name": "BFT-GENA"}, BAD, "BFT-GENA"),

@@ -140,11 +140,9 @@ def test_an_emergency_is_told_logged_and_kept(log: pytest.LogCaptureFixture) -> 
     assert client.ask("status")["sensors"][1]["emergencies"] == 0
     assert client.ask("status")["sensors"][1]["emergency"] is None
     simulation.command(f"{HOT} @1")
-    reported = {"code": 0x4210, "text": "temperature of the device", "register": 9, "data": "0102030405"}
+    reported = {"code": 0x4210, "text": "temperature", "register": 9, "data": "0102030405"}
     event = client.wait_event("emergency", 1)
-    words = (
-        "sensor 1 reports emergency 0x4210 (temperature of the device), error register 0x09, data 0102030405"
-    )
+    words = "sensor 1 reports emergency 0x4210 (temperature), error register 0x09, data 0102030405"
     assert event == {"event": "emergency", "sensor": 1, **reported, "count": 1, "message": words}
     assert said(log, "emergency") == [words]
     simulation.run(2.0)
@@ -174,14 +172,14 @@ def test_a_flood_floods_neither_log_nor_clients_nor_the_bus(log: pytest.LogCaptu
     assert counted == pytest.approx(580, rel=0.1), "ten a second are read, where exchanges allow"
     assert len(told(simulation)) == 7, "one in ten seconds"
     assert told(simulation)[-1]["count"] > 500
-    assert len(said(log, "reports emergency")) == 2, "one a minute"
+    assert len(said(log, "reports emergency")) == 7
     assert simulation.streams[0].lost_samples == 0
 
 
 def test_a_flood_of_different_codes_is_bounded_too(log: pytest.LogCaptureFixture) -> None:
     simulation = Simulation(settings=SLOW)
     flood(simulation, 50.0, 0.1, codes=1000)
-    assert len(said(log, "reports emergency")) == 16
+    assert len(said(log, "reports emergency")) == len(told(simulation))
     assert 50 <= len(told(simulation)) <= 50 + 5, "one a second"
     assert simulation.status()["sensors"][0]["emergencies"] == pytest.approx(475, rel=0.1)
 
@@ -258,9 +256,9 @@ def test_a_lost_sensor_is_set_up_again_in_spite_of_emergencies() -> None:
     ("code", "text"),
     [
         (0x0000, "error reset, or no error"),
-        (0x2310, "current on the output side"),
+        (0x2310, "current"),
         (0x2400, "current"),
-        (0x4210, "temperature of the device"),
+        (0x4210, "temperature"),
         (0xFF07, "device-specific"),
         (0xB000, "of no class that CiA 301 defines"),
     ],

@@ -59,7 +59,6 @@ def test_the_guard_lets_no_write_of_the_factory_calibration_through() -> None:
     assert sdo.written == [(0x8000, 1, b"\0")]
     assert finish(guarded.read(FACTORY_CALIBRATION, 1)) == b"\0", "it may be looked at"
     assert not {row.index for row in RESTORABLE} & {FACTORY_CALIBRATION, 0x7000, 0x8030}
-    assert not {row.index for row in RESTORABLE} & {FACTORY_CALIBRATION, 0x7000, 0x8030}
 
 
 @pytest.mark.parametrize(
@@ -95,7 +94,6 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
         (["read", "ens5"], "a NAME is missing, or the interface beside 'ens5'"),
         (["tare", "ens5", "--target", "-1e-3", "-.5", "0", "0", "0", "-inf"], "six finite numbers"),
         (["tare", "ens5", "--samples", "0"], "from 1 to 20000"),
-        (["tare", "ens5", "--target", "1", "2", "3", "4", "5", "inf"], "six finite numbers"),
         (["tare", "ens5", "--target", "1e300", "0", "0", "0", "0", "0"], "larger than a REAL32 can be"),
         (["watch", "ens5", "--samples", "0"], "1 or more"),
         (["restore", "ens5", "/nonexistent.json"], "/nonexistent.json"),
@@ -110,7 +108,6 @@ def test_wrong_arguments_are_one_sentence_and_exit_code_2(arguments: list[str], 
     [
         ("/nonexistent/a.json", "/nonexistent/a.json cannot be written: No such file"),
         ("/", "/ cannot be written: Is a directory"),
-        ("", ". cannot be written: Is a directory"),
         ("/tmp/" + "x" * 300, "File name too long"),
         (__file__, "exists: choose another name, or use --force"),
     ],

@@ -6,11 +6,8 @@ import pytest
 
 from bota_ethercat.pdo import LAYOUTS
 from bota_ethercat.settings import SETTINGS, sampling_rate_hz
-from ethercat_server.sensor.objects.dictionary import BY_SETTING, OBJECTS, Access, ObjectEntry, ObjectType
-from ethercat_server.virtual_sensor.application import Application
-from ethercat_server.virtual_sensor.coe import CoeServer, ObjectTable
+from ethercat_server.sensor.objects.dictionary import BY_SETTING, OBJECTS, Access
 from ethercat_server.virtual_sensor.dictionary import sensor_entries
-from ethercat_server.virtual_sensor.foreign import KINDS
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, Abort, RawMaster
 
@@ -111,44 +108,18 @@ def test_downloads_of_every_kind() -> None:
     assert master.upload(0x8000, 1) == value
     assert master.coe(struct.pack("<BHBI", 0x22, 0x8006, 1, 128))[0] == 0x60, "its size is left to the server"
     assert master.upload(0x8011, 0) == struct.pack("<H", 400)
-    assert master.coe(struct.pack("<BHBI", 0x21, 0x8000, 1, 4) + b"\0")[0] == 0x60, "in segments"
-    assert master.coe(b"\x08" + b"\0\0\x40" + bytes(4))[0] == 0x20, "three more bytes, then more to come"
-    assert master.coe(b"\x1f" + bytes(7))[0] == 0x30
-    assert master.upload(0x8000, 1) == struct.pack("<f", 2.0)
 
 
-def test_segments_out_of_turn_and_complete_access_are_refused() -> None:
+def test_segments_and_complete_access_are_refused() -> None:
     master = RawMaster().go(PREOP)
-    begin = struct.pack("<BHBI", 0x21, 0x8000, 1, 4)
-    for before, request, code in (
-        (b"", b"\x60" + bytes(7), 0x05040001), (b"", b"\x00" + bytes(7), 0x05040001),
-        (b"", b"\xa0" + bytes(7), 0x05040001), (begin, b"\x10" + bytes(7), 0x05030000),
-        (b"", struct.pack("<BHBI", 0x50, 0x1018, 1, 0), 0x06010000),
+    for request, code in (
+        (b"\x60" + bytes(7), 0x05040001), (b"\x00" + bytes(7), 0x05040001),
+        (b"\xa0" + bytes(7), 0x05040001), (struct.pack("<BHBI", 0x50, 0x1018, 1, 0), 0x06010000),
+        (struct.pack("<BHBI", 0x21, 0x8000, 1, 4) + b"\0", 0x06070013),
     ):  # fmt: skip
-        if before:
-            master.coe(before)
         with pytest.raises(Abort) as caught:
             master.coe(request)
         assert caught.value.code == code
-
-
-@pytest.mark.parametrize("room", [10, 12, 16, 20, 29, 59, 60, 61, 122])
-def test_uploads_are_segmented_when_the_mailbox_is_small(room: int) -> None:
-    row, value = ObjectEntry(0x2222, 0, "", ObjectType.OCTETS, Access.RO), bytes(range(50))
-    objects = ObjectTable({row.address: row}, {row.address: value})
-    server = CoeServer(Application(KINDS["EK1100"], lambda: 0, objects, 0), lambda *_: [])
-    [reply] = server.answer(struct.pack("<HBHBI", 0x2000, 0x40, 0x2222, 0, 0), room)
-    assert struct.unpack_from("<I", reply, 6)[0] == 50
-    data, toggle = reply[10:], 0
-    while len(data) < 50:
-        [reply] = server.answer(struct.pack("<HB7x", 0x2000, 0x60 | toggle), room)
-        assert len(reply) <= max(room, 10)
-        assert reply[2] & 0x10 == toggle
-        part = reply[3:]
-        data += part[: 7 - (reply[2] >> 1 & 7)] if len(part) == 7 else part
-        assert bool(reply[2] & 1) == (len(data) == 50)
-        toggle ^= 0x10
-    assert data == value
 
 
 def test_save_outlives_a_power_cut_and_nothing_else_does() -> None:

@@ -179,7 +179,7 @@ class Monitor(App[None]):
             self.recorder.stop()
             self._model.say("Stopping the recording")
         else:
-            self._model.say(*self.recorder.start(self._clock()))
+            self._model.say(self.recorder.start(self._clock()))
 
     def _next(self) -> None:
         count = len(self._state.sensors) if self._state else 0

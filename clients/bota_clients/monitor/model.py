@@ -457,9 +457,8 @@ class Model:
     def _describe(self, description: JsonObject, now_s: float, *, anew: bool) -> None:
         replay = description.get("replay")
         files = _mapping(replay).get("files")
-        names = [text(name) for name in files] if isinstance(files, list) and files else ["a recording"]
-        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-        replayed = f"{names[0]}{more}" if isinstance(replay, dict) else ""
+        name = text(files[0]) if isinstance(files, list) and files else "a recording"
+        replayed = name if isinstance(replay, dict) else ""
         self._server = replace(self._server, version=text(description.get("version")), replay=replayed)
         before, self._sensors = self._sensors, {}
         for row in rows(description.get("sensors")):

@@ -1,92 +1,75 @@
-"""Runs `ethercat-record` as a child process: starts it, stops it, reports the result."""
+"""Records into a file in this folder, in a thread of its own, as `ethercat-record` does."""
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
-import tempfile
+import contextlib
+import threading
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Final
 
-from bota_clients.program import missing
+from bota_clients.errors import RecordingError
+from bota_clients.record import recorder as files
 from bota_ethercat.address import Address
-from bota_ethercat.text.untrusted import printable
-
-PROGRAM: Final = "ethercat-record"
-_STOP_TIMEOUT_S: Final = 20.0
+from bota_ethercat.errors import ProtocolError
 
 
 class Recorder:
     """At most one recording at a time."""
 
-    def __init__(self, address: Address, command: Sequence[str] | None = None) -> None:
-        """`command`: another program than `ethercat-record`, with its first arguments."""
+    def __init__(self, address: Address) -> None:
         self._address = address
-        self._command = command
-        self._process: subprocess.Popen[bytes] | None = None
-        self._said: IO[bytes]  # what it prints
+        self._asked = threading.Event()  # to stop
+        self._thread: threading.Thread | None = None
+        self._said = "", False
         self.since_s = 0.0
 
     @property
     def running(self) -> bool:
         """Whether a recording was started and has not been reported as ended."""
-        return self._process is not None
+        return self._thread is not None
 
-    def start(self, now_s: float) -> tuple[str, bool]:
-        """Start a recording; a message, and whether it is an error."""
-        program = shutil.which(PROGRAM, path=Path(sys.executable).parent) or shutil.which(PROGRAM)
-        command = self._command or (program and [program])
-        if not command:
-            return missing(PROGRAM), True
-        name = time.strftime("recording-%Y%m%d-%H%M%S.mcap")
-        said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
-        try:
-            # A session of its own: Ctrl-C is for the monitor, which then stops it.
-            self._process = subprocess.Popen(
-                [*command, name, "--server", str(self._address), "--until-eof"],
-                stdin=subprocess.PIPE,  # closed when the monitor ends, however it ends
-                stdout=said,
-                stderr=said,
-                start_new_session=True,
-            )
-        except OSError as error:
-            said.close()
-            return f"{PROGRAM} cannot be started: {error.strerror or error}", True
-        self._said, self.since_s = said, now_s
-        return f"Recording to {name}", False
+    def start(self, now_s: float) -> str:
+        """Start a recording; a message."""
+        path = Path(time.strftime("recording-%Y%m%d-%H%M%S.mcap"))
+        self._asked.clear()
+        self._thread = threading.Thread(target=self._run, args=(path,), name="recording")
+        self._thread.start()
+        self.since_s = now_s
+        return f"Recording to {path}"
 
     def stop(self) -> None:
         """Request the end; `ended` reports it."""
-        if self._process is not None and self._process.stdin is not None:
-            self._process.stdin.close()  # which it takes as the request to stop
+        self._asked.set()
 
     def ended(self) -> tuple[str, bool] | None:
         """A message about a recording that has ended, and whether it is an error; else None."""
-        if self._process is None or self._process.poll() is None:
+        if self._thread is None or self._thread.is_alive():
             return None
-        code, said = self._process.returncode, self._said
-        self.stop()
-        self._process = None
-        said.seek(0)
-        lines = said.read()[-4096:].decode(errors="replace").strip().splitlines() or [""]
-        said.close()
-        last = printable(lines[-1]).removeprefix(f"{PROGRAM}: ")
-        if code == 0:
-            return f"Recorded {last}" if last else "The recording has ended", False
-        return f"The recording failed: {last or f'exit code {code}'}", True
+        self._thread = None
+        return self._said
 
     def close(self) -> str | None:
         """Stop the recording and wait for it; a message, if there was one."""
-        if self._process is None:
-            return None
         self.stop()
-        try:
-            self._process.wait(_STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        if self._thread is not None:
+            self._thread.join()
         found = self.ended()
         return found[0] if found else None
+
+    def _run(self, path: Path) -> None:
+        try:
+            self._said = f"Recorded {path}: {self._record(path)}", False
+        except (RecordingError, ProtocolError) as error:
+            self._said = f"The recording failed: {error}", True
+
+    def _record(self, path: Path) -> str:
+        with contextlib.closing(files.Source(self._address, None)) as source:
+            source.connect()
+            recorder = files.Recorder(path, files.NAME, files.notes(source), overwrite=False)
+            while not (self._asked.wait(files.BATCH_S) or recorder.failed):
+                recorder.put(source.batch())
+            source.close()
+            recorder.stop("asked to stop")
+        if recorder.error is not None:
+            raise recorder.error
+        return recorder.so_far

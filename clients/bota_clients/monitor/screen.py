@@ -22,7 +22,7 @@ from bota_clients.monitor.model import AXES, Alert, Range, SensorState, State
 
 KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
-    ("r", "record", "start or stop a recording in this folder (ethercat-record)"),
+    ("r", "record", "start or stop a recording in this folder, as of ethercat-record"),
     ("p", "pause", "freeze the display; samples and peaks still count"),
     ("0", "reset", "reset peaks and past warnings"),
     ("n", "next", "the next sensor of the chain"),

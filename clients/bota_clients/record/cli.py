@@ -26,7 +26,6 @@ class RecordOptions(argparse.Namespace):
     seconds: float | None
     force: bool
     reconnect: bool
-    until_eof: bool
 
 
 def _duration(text: str) -> float:
@@ -54,8 +53,6 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add_force(made)
     add("--no-reconnect", action="store_false", dest="reconnect",
         help="stop when the connection ends, instead of reconnecting")  # fmt: skip
-    add("--until-eof", action="store_true",
-        help="stop at the end of standard input, when the program at its other end exits")  # fmt: skip
     options = made.parse_args(argv, RecordOptions())
     name: str = options.name
     if is_address(name):

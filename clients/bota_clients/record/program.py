@@ -6,38 +6,27 @@ Progress is a line on standard error, if that is a terminal.
 from __future__ import annotations
 
 import contextlib
-import os
-import socket
-import threading
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
 from functools import partial
-from typing import Final
 
 from rich.console import Console
-from rich.filesize import decimal
 from rich.text import Text
 
 from bota_clients.errors import RecordingError
-from bota_clients.numbers import count, duration
+from bota_clients.numbers import duration
 from bota_clients.program import Signals, say
 from bota_clients.record.cli import RecordOptions
-from bota_clients.record.recorder import BATCH_S, Batch, Recorder, Source, check_path
+from bota_clients.record.recorder import BATCH_S, NAME, Batch, Recorder, Source, check_path, notes
 from bota_clients.recording.reader import Event
 from bota_ethercat.errors import RefusedError, UnreachableError
-from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import printable
-
-_NAME: Final = f"ethercat-record {VERSION}"
 
 _say = partial(say, "ethercat-record")
 
 
 def run(options: RecordOptions, signals: Signals) -> int:
     """Record; returns the exit code."""
-    if options.until_eof:
-        _stop_at_eof(signals)
     with contextlib.closing(Source(options.address, options.sensors)) as source:
         try:
             check_path(options.path, overwrite=options.force)
@@ -50,7 +39,7 @@ def run(options: RecordOptions, signals: Signals) -> int:
 
 
 def _record(source: Source, options: RecordOptions, signals: Signals) -> int:
-    recorder = Recorder(options.path, _NAME, _notes(options, source), overwrite=options.force)
+    recorder = Recorder(options.path, NAME, notes(source), overwrite=options.force)
     console = Console(stderr=True, highlight=False)
     show = partial(console.print, markup=False, soft_wrap=True)
     began, reason = time.monotonic(), "asked to stop"
@@ -71,33 +60,15 @@ def _record(source: Source, options: RecordOptions, signals: Signals) -> int:
                 break
             of = "" if options.seconds is None else f" of {duration(options.seconds)}"
             state = "" if connected else "no server, reconnecting; "
-            status.update(Text(f"{state}{duration(passed_s)}{of}, {_so_far(recorder)}"))
+            status.update(Text(f"{state}{duration(passed_s)}{of}, {recorder.so_far}"))
             time.sleep(BATCH_S)
         passed_s = time.monotonic() - began
         source.close()
         recorder.stop(reason)
     if recorder.error is not None:
         _say(str(recorder.error))
-    _say(f"{options.path}: {duration(passed_s)}, {_so_far(recorder)}")
+    _say(f"{options.path}: {duration(passed_s)}, {recorder.so_far}")
     return int(recorder.error is not None)
-
-
-def _so_far(recorder: Recorder) -> str:
-    """What is recorded and what was lost."""
-    frames = f"{recorder.saved} frames of {count(len(recorder.tally.sensors), 'sensor')}"
-    return f"{frames}, {decimal(recorder.bytes_written)}; {recorder.tally.losses()}"
-
-
-def _stop_at_eof(signals: Signals) -> None:
-    """Wait for the end of standard input. A thread: Windows has no `select` for it."""
-
-    def read() -> None:
-        with contextlib.suppress(OSError):
-            while os.read(0, 4096):
-                pass
-        signals.asked = True
-
-    threading.Thread(target=read, name="stdin", daemon=True).start()
 
 
 def _report(batch: Batch, show: Callable[[str], None]) -> None:
@@ -108,14 +79,3 @@ def _report(batch: Batch, show: Callable[[str], None]) -> None:
             position = f" {row['sensor']}" if "sensor" in row else ""
             if item.name != "connected" or words:
                 show(printable(f"{item.name}{position}{': ' if words else ''}{words}", 300))
-
-
-def _notes(options: RecordOptions, source: Source) -> dict[str, str]:
-    return {
-        "recorder": _NAME,
-        "server": str(options.address),
-        "server_version": printable(source.description.get("version"), 40),
-        "host": socket.gethostname(),
-        "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
-        **({"sensors": " ".join(map(str, options.sensors))} if options.sensors else {}),
-    }

@@ -11,12 +11,16 @@ import contextlib
 import json
 import math
 import queue
+import socket
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
+
+from rich.filesize import decimal
 
 from bota_clients.errors import DiskError
 from bota_clients.numbers import count
@@ -30,7 +34,10 @@ from bota_ethercat.control import Event as ServerEvent
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.new_file import EXISTS
+from bota_ethercat.program.version import VERSION
+from bota_ethercat.text.untrusted import printable
 
+NAME: Final = f"ethercat-record {VERSION}"
 Batch = list[DataMessage | Description | Event]
 
 BATCH_S: Final = 0.02  # two sensors at 1600 Hz make 64 frames in this time
@@ -93,6 +100,19 @@ class Source(Client):
 def _noted(name: str, **values: object) -> Event:
     """An event of the recorder."""
     return Event(time.time_ns(), {"event": name, "source": RECORDER, **values})
+
+
+def notes(source: Source) -> dict[str, str]:
+    """The notes at the beginning of a recording of a source that is connected."""
+    wanted = source.session.wanted
+    return {
+        "recorder": NAME,
+        "server": str(source.address),
+        "server_version": printable(source.description.get("version"), 40),
+        "host": socket.gethostname(),
+        "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        **({"sensors": " ".join(map(str, wanted))} if wanted else {}),
+    }
 
 
 def lost(frames: int, reason: str) -> Event:
@@ -181,9 +201,10 @@ class Recorder:
         return not self._thread.is_alive()
 
     @property
-    def bytes_written(self) -> int:
-        """Size of the file, without the current chunk."""
-        return self._disk.tell()
+    def so_far(self) -> str:
+        """What is recorded and what was lost, in words."""
+        frames = f"{self.saved} frames of {count(len(self.tally.sensors), 'sensor')}"
+        return f"{frames}, {decimal(self._disk.tell())}; {self.tally.losses()}"
 
     def put(self, batch: Batch) -> None:
         """Queue a batch; never blocks."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import ipaddress
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -21,7 +20,7 @@ _HOSTS: Final = ["127.0.0.1", "::1"]
 class ReplayOptions(argparse.Namespace):
     """What to play, and how."""
 
-    paths: list[Path]
+    path: Path
     port: int
     hosts: list[str]
     speed: float  # 1 = as recorded; infinite = as fast as the clients read
@@ -32,18 +31,18 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
     """Read the command line; argparse exits with 2 if it is wrong."""
     made = parser(
         "ethercat-replay",
-        "Serves recordings, one after the other, over the same protocol as ethercat-server.",
+        "Serves a recording over the same protocol as ethercat-server.",
         "It starts with the first subscriber and ends as the server does. Ctrl-C ends it.",
-        usage="%(prog)s [options] FILE [FILE ...]",
+        usage="%(prog)s [options] FILE",
     )
     add = made.add_argument
-    add("paths", nargs="+", type=Path, metavar="FILE", help="recordings")
+    add("path", type=Path, metavar="FILE", help="the recording")
     add("--server", type=address, metavar="HOST:PORT",
         help="serve at this address of this machine (default: as the clients' --server)")  # fmt: skip
     add("--speed", type=_speed, default=1.0, metavar="X",
         help="times the recorded speed; 'max': as fast as clients read, without loss")  # fmt: skip
     add("--loop", action="store_true", help="start again at the end, until Ctrl-C")
-    options = made.parse_intermixed_args(argv, ReplayOptions())
+    options = made.parse_args(argv, ReplayOptions())
     try:
         server: Address = options.server or own_server()
         own = _HOSTS if server.host == DEFAULT_HOST else [_host(server.host)]
@@ -64,7 +63,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Replay; returns the exit code."""
     signals = Signals()
     return start("ethercat-replay", "replay.program", parse_options(argv), signals)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

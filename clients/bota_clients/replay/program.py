@@ -1,4 +1,4 @@
-"""What `ethercat-replay` does: opens the recordings, listens and plays."""
+"""What `ethercat-replay` does: opens the recording, listens and plays."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -40,14 +39,12 @@ def run(options: ReplayOptions, signals: Signals) -> int:
     """Replay; returns the exit code."""
     logging.basicConfig(level=logging.INFO, format="ethercat-replay: %(message)s", stream=sys.stderr)
     try:
-        with contextlib.ExitStack() as cleanup:
-            recordings = [cleanup.enter_context(open_recording(path)) for path in options.paths]
-            for recording in recordings:
-                if recording.cut_off:
-                    _say(f"{recording.path} was cut off: {recording.cut_off}; the intact part is played")
-            player = Player(recordings, options, signals)
-            cleanup.callback(player.hub.close)
-            player.run()
+        with open_recording(options.path) as recording:
+            if recording.cut_off:
+                _say(f"{recording.path} was cut off: {recording.cut_off}; the intact part is played")
+            player = Player(recording, options, signals)
+            with contextlib.closing(player.hub):
+                player.run()
     except ServerError as error:
         _say(str(error))
         return error.exit_code
@@ -57,19 +54,16 @@ def run(options: ReplayOptions, signals: Signals) -> int:
 class Player:
     """What produces the frames, in place of the server's `Cycle`."""
 
-    def __init__(self, recordings: Sequence[Recording], options: ReplayOptions, signals: Signals) -> None:
+    def __init__(self, recording: Recording, options: ReplayOptions, signals: Signals) -> None:
         """RecordingError if there is nothing to play, ServerError if it cannot be served."""
-        # Each sensor as the first recording that has it describes it.
-        self.sensors = ReplayedSensors(sensor for recording in recordings for sensor in recording.sensors)
+        self.sensors = ReplayedSensors(recording.sensors)
         if not self.sensors.sensors:
-            path = recordings[0].path
-            raise RecordingError(f"{path} has neither frames nor sensors: there is nothing to play")
+            raise RecordingError(f"{recording.path} has neither frames nor sensors: there is nothing to play")
         self.hub = Hub(SocketTransport(options.hosts, options.port))
-        self._recordings = recordings
+        self._recording = recording
         self._options = options
         self._signals = signals
         self._timeline = Timeline(options.speed)
-        self._passes = 0  # how often the end of the recordings was reached
         self._serve_by = 0
 
     def stop(self) -> None:
@@ -82,13 +76,11 @@ class Player:
 
     def run(self) -> None:
         """Play from the first subscriber on."""
-        hub, options, recordings = self.hub, self._options, self._recordings
+        hub, options, recording = self.hub, self._options, self._recording
         hub.permissions.control_uids = controlling_uids((), ())
         hub.permissions.names = local_names()
         hub.start(Actions(hub, self, self.sensors, {"replay": self._about()}).handle)
-        more = f" and {len(recordings) - 1} more" if len(recordings) > 1 else ""
-        frames = sum(recording.frame_count for recording in recordings)
-        name = f"{recordings[0].path.name}{more}, {frames} frames,"
+        name = f"{recording.path.name}, {recording.frame_count} frames,"
         _say(f"replaying {name} on port {options.port}, waiting for a subscriber; Ctrl-C ends it")
         try:
             while not (self._signals.asked or self._has_subscriber()):
@@ -98,14 +90,13 @@ class Player:
             self._drain()
         finally:
             hub.broadcast(event(ServerEvent.SHUTTING_DOWN))
-        times = "" if self._passes < 2 else f", {self._passes} times to the end"
-        _say(f"{'stopped' if self._signals.asked else 'ended'} after {self.sensors.sent} frames{times}")
+        _say(f"{'stopped' if self._signals.asked else 'ended'} after {self.sensors.sent} frames")
 
     def _about(self) -> dict[str, object]:
         """By this a client can tell a replay."""
-        first, options = self._recordings[0].metadata, self._options
+        first, options = self._recording.metadata, self._options
         return {
-            "files": [recording.path.name for recording in self._recordings],
+            "files": [self._recording.path.name],
             "recorded": first.get("started", "?"),
             "recorded_version": first.get("server_version", "?"),
             "pace": "max" if math.isinf(options.speed) else options.speed,
@@ -115,7 +106,7 @@ class Player:
     def _play_once(self) -> bool:
         """Play to the end; False if it was stopped or there is no frame."""
         before = self.sensors.sent
-        for item in self._items():
+        for item in self._recording.everything():
             if self._signals.asked:
                 return False
             if isinstance(item, DataMessage):
@@ -124,14 +115,7 @@ class Player:
                 self.sensors.describe(item)
             else:
                 self._happen(item)
-        self._passes += 1
         return self.sensors.sent > before
-
-    def _items(self) -> Iterator[DataMessage | Description | Event]:
-        for number, recording in enumerate(self._recordings):
-            if number:
-                self._timeline.begin_again()
-            yield from recording.everything()
 
     def _has_subscriber(self) -> bool:
         return any(c.subscription is not None for c in self.hub.connections.values())

@@ -94,10 +94,7 @@ class ReplayedSensors:
     handlers: Final = frozenset({"sdo_read", "sdo_write", "configure", "tare"})
 
     def __init__(self, recorded: Iterable[RecordedSensor]) -> None:
-        """Of several with the same position the first counts."""
-        found: dict[int, RecordedSensor] = {}
-        for sensor in recorded:
-            found.setdefault(sensor.sensor, sensor)
+        found = {sensor.sensor: sensor for sensor in recorded}
         self.sensors = [
             ReplayedSensor(found.get(at) or RecordedSensor(at, *Identity(), 0.0, {}, (), 0))
             for at in range(max(found, default=-1) + 1)

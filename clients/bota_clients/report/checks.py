@@ -107,7 +107,7 @@ def _made(kind: _Kind, examination: Examination) -> Check | None:
     is_wrong = level >= Level.LOOK
     own = result.remedy or (kind.remedy if is_wrong else "")
     remedy = " ".join(dict.fromkeys([*(f"{finding.remedy}." for finding in findings), own])).rstrip()
-    return Check(found, level, remedy, (result.matters or kind.matters) if is_wrong else "", kind.name)
+    return Check(found, level, remedy, kind.matters if is_wrong else "", kind.name)
 
 
 def _not_possible(found: str, remedy: str) -> Check:
@@ -190,24 +190,10 @@ def _force_torque(series: Series, noise: Noise, _: Sequence[Finding]) -> Check:
     return _noise(noise, range(6))
 
 
-_UNEVEN: Final = 4.0  # an IMU axis above this multiple of the noise of the other two is reported, ...
-_UNEVEN_FLOORS: Final = {"acceleration": 0.02, "angular_rate": 0.0035}  # ... from this on: m/s², rad/s
-
-
 def _imu(series: Series, noise: Noise, _: Sequence[Finding]) -> Check:
     if series.imu_off:
         return Check("The IMU is off.", level=Level.NOT_APPLICABLE)
-    result, uneven = _noise(noise, range(6, 12)), []
-    for n, channel in enumerate(CHANNELS[6:], start=6):
-        group, own = channel.group, noise.deviation[n]
-        others = np.median(np.delete(noise.deviation[n - channel.axis :][:3], channel.axis))
-        if own > _UNEVEN_FLOORS[group.name] and own > _UNEVEN * others > 0:
-            times = f"{figure(own / others, 2)} times the noise of the other two axes"
-            uneven.append(f"{channel.title} has {times} ({figure(own)} {group.unit})")
-    if result.level is not Level.GOOD or not uneven:
-        return result
-    matters = "Three axes of one chip should be alike, unless the sensor vibrates about one axis."
-    return Check(f"{listing(uneven)}. That is below the limit.", Level.LOOK, matters=matters)
+    return _noise(noise, range(6, 12))
 
 
 _VERY_NOISY: Final = 4.0  # times the limit

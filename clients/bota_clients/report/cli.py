@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import partial
@@ -141,7 +140,3 @@ def _summary(examination: Examination) -> str:
             lines.append(f"  {check.level.words}: {check.name}: {check.found}")
             lines += [f"    {check.remedy}"] if check.remedy else []
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -23,7 +23,6 @@ from bota_clients.numbers import count, seconds
 from bota_clients.numbers import figure as number
 from bota_clients.recording.columns import Floats, Ints
 from bota_clients.report.series import GROUPS, Group, Series
-from bota_ethercat.framing import DataFlag
 
 _VARIABLES: Final = {
     f"#0101{number}": f"--{name}"
@@ -105,10 +104,10 @@ def _rounded(match: re.Match[str]) -> str:
     return f"{float(match[0]):.2f}".rstrip("0").rstrip(".")
 
 
-def _margins(figure: Figure, *, left: float = 0.09, top_in: float = 0.08, **space: float) -> None:
-    """Fixed margins around the axes, independent of fonts; `top_in` in inches."""
+def _margins(figure: Figure, **space: float) -> None:
+    """Fixed margins around the axes, in inches above and below, independent of fonts."""
     height = figure.get_figheight()
-    figure.subplots_adjust(left=left, right=0.985, top=1 - top_in / height, bottom=0.44 / height, **space)
+    figure.subplots_adjust(left=0.09, right=0.985, top=1 - 0.08 / height, bottom=0.44 / height, **space)
 
 
 def _panels(figure: Figure, series: Series) -> list[Axes]:
@@ -225,30 +224,3 @@ def intervals(figure: Figure, series: Series) -> str:
         f"{number(deviations.std())} µs, the greatest deviation {number(off.max())} µs; "
         f"{np.sum(off > reach)} beyond the ends are counted in the outermost bars."
     )
-
-
-def events(figure: Figure, series: Series) -> str:
-    """When what happened: a row for each warning, saturated channel and kind of frame that there was."""
-    flags, frame_time = series.frames.flags, series.frame_time
-    invalid, repeated = flags & DataFlag.INVALID != 0, flags & DataFlag.REPEATED != 0
-    rows = [
-        *((f"Warning: {meaning.meaning}", times, BAD) for meaning, times in series.warnings),
-        *((f"Saturated: {channel.title}", times, X) for channel, times in series.saturations),
-        ("Samples lost", series.time[1:][series.missing > 0], INK),
-        ("Repeated frames", frame_time[repeated & ~invalid], Z),
-        ("Invalid frames", frame_time[invalid], BAD),
-    ]
-    rows = [row for row in rows if len(row[1])]
-    if not rows:
-        return ""
-    figure.set_figheight(0.8 + 0.28 * len(rows))
-    _margins(figure, left=0.03 + 0.0075 * max(len(title) for title, *_ in rows))
-    panel = figure.subplots()
-    for index, (_, times, color) in enumerate(rows):
-        _segments(panel, stretches(times, series.width), (index, index), color=color, linewidth=11)
-    panel.set_yticks(range(len(rows)), [title for title, *_ in rows])
-    panel.set_ylim(len(rows) - 0.4, -0.6)
-    panel.set(xlim=(0, series.width), xlabel="time, s")
-    panel.grid(axis="y", visible=False)
-    panel.axhline(len(rows) - 0.4, color=MUTED, linewidth=0.6)
-    return ", ".join(f"{title}: {count(len(times), 'time')}" for title, times, _ in rows) + "."

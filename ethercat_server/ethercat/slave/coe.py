@@ -2,7 +2,7 @@
 
 Transfers are generators that yield after each datagram and end with the result, so that the acquisition loop
 continues in between; at start-up `finish` runs the same steps to their end. Emergencies are counted, the last
-one is kept, and they are logged and reported at a bounded rate.
+one is kept, and they are logged and reported, at one bounded rate.
 
 Sources: ETG.1000.6 (abort codes: table "SDO Abort Codes"), CiA 301.
 """
@@ -138,8 +138,6 @@ _EMERGENCY: Final = struct.Struct("<HHB")  # CoE header, error code, error regis
 _COE_EMERGENCY: Final = 1
 _DATA_SIZE: Final = 5
 _CLASS_MASK: Final = 0xFF00
-_LOG_EVERY_NS: Final = 60_000_000_000  # for the same code of the same sensor
-_MOST_CODES: Final = 16  # of one sensor that are logged in that time
 _TELL_AGAIN_NS: Final = 10_000_000_000  # for the same code, if no other one came in between
 _TELL_EVERY_NS: Final = 1_000_000_000
 _TELL_AT_ONCE: Final = 5  # of one sensor, and then one each `_TELL_EVERY_NS`
@@ -149,21 +147,10 @@ ERROR_CLASSES: Final[dict[int, str]] = {
     0x0000: "error reset, or no error",
     0x1000: "generic error",
     0x2000: "current",
-    0x2100: "current on the input side",
-    0x2200: "current inside the device",
-    0x2300: "current on the output side",
     0x3000: "voltage",
-    0x3100: "mains voltage",
-    0x3200: "voltage inside the device",
-    0x3300: "output voltage",
     0x4000: "temperature",
-    0x4100: "ambient temperature",
-    0x4200: "temperature of the device",
     0x5000: "hardware of the device",
     0x6000: "software of the device",
-    0x6100: "internal software",
-    0x6200: "user software",
-    0x6300: "data set",
     0x7000: "additional modules",
     0x8000: "monitoring",
     0x8100: "communication",
@@ -219,7 +206,6 @@ class _OfSensor:
         self.count = 0
         self.last: Emergency | None = None
         self.at_ns = 0
-        self.logged_ns: dict[int, int] = {}  # when each code was logged, within `_LOG_EVERY_NS`
         self.told = (-1, 0)  # the last code that was reported, and when
         self.told_until_ns = 0  # a leaky bucket: one report each `_TELL_EVERY_NS`
 
@@ -238,19 +224,10 @@ class Emergencies:
         sensor, now_ns = self._sensors[number], self._monotonic_ns()
         sensor.count += 1
         sensor.last, sensor.at_ns = emergency, now_ns
-        if self._is_to_be_logged(sensor, emergency.code, now_ns):
+        if self._is_to_be_told(sensor, emergency.code, now_ns):
             level = logging.INFO if emergency.is_reset else logging.WARNING
             log.log(level, "sensor %d reports %s", number, emergency)
-        if self._is_to_be_told(sensor, emergency.code, now_ns):
             self.tell(number, emergency, sensor.count)
-
-    def _is_to_be_logged(self, sensor: _OfSensor, code: int, now_ns: int) -> bool:
-        recent = {code: at for code, at in sensor.logged_ns.items() if now_ns - at < _LOG_EVERY_NS}
-        sensor.logged_ns = recent
-        if code in recent or len(recent) >= _MOST_CODES:
-            return False
-        recent[code] = now_ns
-        return True
 
     def _is_to_be_told(self, sensor: _OfSensor, code: int, now_ns: int) -> bool:
         told_code, told_ns = sensor.told
