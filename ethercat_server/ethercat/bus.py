@@ -108,15 +108,16 @@ class Bus(Datagrams):
 
     def enter_op(self, check_interrupt: CheckInterrupt) -> None:
         """Take all sensors to OP, exchanging process data, without which they do not go there."""
+        lrw = not any(slave.features & reg.NO_LRW for slave in self.slaves)
         for slave in self.slaves:
-            if not fit_a_frame(slave.areas):
+            if not fit_a_frame(slave.areas, lrw=lrw):
                 raise slave.unmapped()
         stations = [
             station if slave.latch_events() else None
             for station, slave in zip(self.stations, self.slaves, strict=True)
         ]
         areas = [slave.areas for slave in self.slaves]
-        self.process_data = ProcessData(areas, self.backend, stations=stations)
+        self.process_data = ProcessData(areas, self.backend, lrw=lrw, stations=stations)
         waiting = [slave.enter_op() for slave in self.slaves]
         while waiting:
             check_interrupt()

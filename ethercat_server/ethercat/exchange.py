@@ -130,17 +130,19 @@ class Frame(NamedTuple):
     content: bytearray
     inputs: list[Inputs]
     end: int  # of the process data (at least the inputs): there is the working counter
+    written: int  # end of the outputs if they have a datagram of their own, else 0
     tag: int
     counters: list[int]  # what each sensor adds to the working counter: 2 for its outputs, 1 for its inputs
 
 
-def make_frames(areas: Sequence[Sequence[Area]], stations: Sequence[int | None]) -> list[Frame]:
-    """The frames that exchange the `areas` of each sensor, by number, with an LRW each.
+def make_frames(areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool) -> list[Frame]:
+    """The frames that exchange the `areas` of each sensor, by number.
 
-    `stations` are the addresses of the sensors whose latched times are read, None for others. SetUpError if
-    the inputs of a sensor are not in one frame.
+    Without `lrw` each reads (LRD) and writes (LWR) with datagrams of their own. `stations` are the addresses
+    of the sensors whose latched times are read, None for others. SetUpError if the inputs of a sensor are not
+    in one frame.
     """
-    frames = [_frame(*span, areas, stations) for span in _spans(areas, stations)]
+    frames = [_frame(*span, areas, stations, lrw=lrw) for span in _spans(areas, stations, lrw=lrw)]
     carried = [each.number for frame in frames for each in frame.inputs]
     for number in range(len(areas)):
         if carried.count(number) != 1:
@@ -148,23 +150,26 @@ def make_frames(areas: Sequence[Sequence[Area]], stations: Sequence[int | None])
     return frames
 
 
-def fit_a_frame(areas: Sequence[Area]) -> bool:
+def fit_a_frame(areas: Sequence[Area], *, lrw: bool) -> bool:
     """Whether one frame can carry all the process data of a sensor."""
-    return _size(max(area.end for area in areas) - min(area.start for area in areas), 1) <= _LONGEST
+    return _size(max(area.end for area in areas) - min(area.start for area in areas), 1, lrw=lrw) <= _LONGEST
 
 
-def _size(length: int, latching: int) -> int:
+def _size(length: int, latching: int, *, lrw: bool) -> int:
     """Bytes of the datagrams for `length` bytes of process data and `latching` sensors' latched times."""
-    return 2 * _AROUND_DATA + length + latching * LATCHED_SIZE + TAG_SIZE
+    exchanged = (1 if lrw else 2) * (_AROUND_DATA + length)
+    return exchanged + latching * LATCHED_SIZE + _AROUND_DATA + TAG_SIZE
 
 
-def _spans(areas: Sequence[Sequence[Area]], stations: Sequence[int | None]) -> list[tuple[int, int]]:
+def _spans(
+    areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool
+) -> list[tuple[int, int]]:
     """Logical addresses of each frame: as many areas as fit one."""
     spans: list[tuple[int, int]] = []
     latching = 0
     for area, number in sorted((area, number) for number, each in enumerate(areas) for area in each):
         adds = area.kind == reg.FMMU_READ and stations[number] is not None
-        if not spans or _size(area.end - spans[-1][0], latching + adds) > _LONGEST:
+        if not spans or _size(area.end - spans[-1][0], latching + adds, lrw=lrw) > _LONGEST:
             spans.append((area.start, area.end))
             latching = 0
         spans[-1] = spans[-1][0], max(spans[-1][1], area.end)
@@ -172,12 +177,15 @@ def _spans(areas: Sequence[Sequence[Area]], stations: Sequence[int | None]) -> l
     return spans
 
 
-def _frame(start: int, end: int, areas: Sequence[Sequence[Area]], stations: Sequence[int | None]) -> Frame:
+def _frame(
+    start: int, end: int, areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool
+) -> Frame:
     """The frame for the logical addresses from `start` to `end`, with the inputs that lie in them."""
-    length = end - start
-    datagrams = [(int(Command.LRW), start & 0xFFFF, start >> 16, bytes(length))]
+    length, commands = end - start, (Command.LRW,) if lrw else (Command.LRD, Command.LWR)
+    datagrams = [(int(command), start & 0xFFFF, start >> 16, bytes(length)) for command in commands]
     read = FIRST_DATA + length
-    at = read + COUNTER_SIZE + DATAGRAM_HEADER
+    written = 0 if lrw else read + _AROUND_DATA + length
+    at = (written or read) + COUNTER_SIZE + DATAGRAM_HEADER
     data, inputs, counters = bytearray(length), [], []
     for number, each in enumerate(areas):
         kinds = {area.kind for area in each if start <= area.start < end}
@@ -198,7 +206,7 @@ def _frame(start: int, end: int, areas: Sequence[Sequence[Area]], stations: Sequ
         inputs.append(Inputs(number, FIRST_DATA + first, FIRST_DATA + last, bytes(data[first:last]), latched))
     content = build(*datagrams, (Command.NOP, 0, 0, bytes(TAG_SIZE))).ljust(SHORTEST_FRAME, b"\0")
     content[FIRST_DATA:read] = data
-    return Frame(content, inputs, read, at, counters)
+    return Frame(content, inputs, read, written, at, counters)
 
 
 # Single datagrams and SOEM use the indices below.
@@ -211,6 +219,7 @@ _LOST_NS: Final = 100_000_000
 _pack_tag_into, _unpack_tag_from = struct.Struct("<I").pack_into, struct.Struct("<I").unpack_from
 # By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 if there is none.
 _NOT_SENT: Final = (0, 0, -1)
+_IMPOSSIBLE: Final = 0xFFFF
 
 
 class Exchange(NamedTuple):
@@ -219,7 +228,7 @@ class Exchange(NamedTuple):
     sent_ns: int
     back_ns: int
     frame: bytes
-    wkc: int  # working counter
+    wkc: int  # working counter; 0xFFFF if it is impossible
     which: int  # number of the frame, of those that make up an exchange
 
 
@@ -245,18 +254,24 @@ class ProcessData:
         areas: Sequence[Sequence[Area]],
         backend: Backend,
         *,
+        lrw: bool = True,
         stations: Sequence[int | None] = (),
     ) -> None:
         """See `make_frames`."""
         self._send, self._monotonic_ns = backend.send, backend.clock.monotonic_ns
-        self._frames = frames = make_frames(areas, stations or [None] * len(areas))
-        self._command = int(Command.LRW) if frames else -1  # no frame has that
+        self._frames = frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
+        self._command = int(Command.LRW if lrw else Command.LRD) if frames else -1  # no frame has that
         self.inputs = [frame.inputs for frame in frames]
         self.wire_ns = [len(frame.content) * BYTE_NS for frame in frames]
         self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
         self.most_wkc = [sum(frame.counters) for frame in frames]
+        # The highest counters of LRD and LWR.
+        self._most = [
+            (sum(each & 1 for each in frame.counters), sum(each >> 1 for each in frame.counters))
+            for frame in frames
+        ]
         self._tagged = [(frame.content, frame.tag) for frame in frames]
-        self._offsets = [(frame.tag, frame.end) for frame in frames]
+        self._offsets = [(frame.tag, frame.end, frame.written) for frame in frames]
         self._index, self._tag = FIRST_INDEX, 0
         self._sent = [_NOT_SENT] * _INDICES
         self.in_flight = 0
@@ -302,7 +317,7 @@ class ProcessData:
             return None
         index = frame[DATAGRAM_INDEX]
         sent_ns, which, tag = self._sent[index]
-        tag_at, end = self._offsets[which]
+        tag_at, end, written = self._offsets[which]
         if len(frame) < tag_at + TAG_SIZE or _unpack_tag_from(frame, tag_at)[0] != tag:  # an older one
             return None
         if not sent_ns:
@@ -311,6 +326,10 @@ class ProcessData:
         self._sent[index], self.blocked_until_ns = (0, which, tag), 0
         self.in_flight -= 1
         wkc = frame[end] | frame[end + 1] << 8
+        if written:  # an LRW would have counted 2
+            writes = frame[written] | frame[written + 1] << 8
+            most_reads, most_writes = self._most[which]
+            wkc = wkc + 2 * writes if wkc <= most_reads and writes <= most_writes else _IMPOSSIBLE
         return Exchange(sent_ns, back_ns, frame, wkc, which)
 
     @property

@@ -258,10 +258,17 @@ class Esc:
         self.fmmus: list[Fmmu] = []  # the active ones
         # What each logical command copies, by address and length; emptied when an FMMU changes.
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
+        self.has_lrw = True
         self.station = self.event_mask = 0  # as the registers have them
         self.into_ns = 0  # from the start of a datagram until the bytes that are being copied pass
         self.record: Callable[[int, bytes], None] | None = None  # gets all that a master writes, and where
         self._events = 0
+
+    def take_lrw_away(self) -> None:
+        """Be a controller that does not know LRW."""
+        self.has_lrw = False
+        features = _U16.unpack_from(self.memory, reg.FEATURES)[0]
+        _U16.pack_into(self.memory, reg.FEATURES, features | reg.NO_LRW)
 
     def count(self, counter: int) -> None:
         """Add one to the error counter at this register; it stays at 255."""
@@ -512,6 +519,8 @@ def _physical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
 def _logical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
     key = address, length = datagram.ado << 16 | datagram.adp, datagram.length
     command = datagram.command
+    if command == Command.LRW and not esc.has_lrw:
+        return 0
     plan = esc.plans.get(key)
     if plan is None:
         found = ((fmmu, fmmu.overlap(address, length)) for fmmu in esc.fmmus)

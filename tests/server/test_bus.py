@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import pytest
@@ -22,6 +22,7 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import Asked, Exchange, Simulation, check_frames, fresh, life_of, more_if_long
 
 STATION = 0x1001
+LRW_OR_NOT = pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
 INDICES = 0x100 - FIRST_INDEX
 Answer = Callable[[bytearray], list[bytes]]
 
@@ -135,18 +136,23 @@ def test_indices_are_none_of_soems() -> None:
     assert {frame[17] for frame in wire.sent} == set(range(0x80, 0x90))
 
 
-def operational(*sensors: SensorOptions, machine: Machine | None = None) -> tuple[Bus, MemoryBackend]:
+def operational(
+    *sensors: SensorOptions, machine: Machine | None = None, lrw: bool = True
+) -> tuple[Bus, MemoryBackend]:
     backend = MemoryBackend(*sensors, machine=machine)
+    if not lrw:
+        life_of(backend, -1).esc.take_lrw_away()
     bus = Bus(backend)
     bring_up(bus, Asked(), lambda: None)
     return bus, backend
 
 
-def test_an_exchange_brings_every_sensors_process_data() -> None:
+@LRW_OR_NOT
+def test_an_exchange_brings_every_sensors_process_data(lrw: bool) -> None:
     sensors = [
         SensorOptions(serial=n, pdo_size=size, signal="constant") for n, size in enumerate((61, 77, 61))
     ]
-    bus, backend = operational(*sensors)
+    bus, backend = operational(*sensors, lrw=lrw)
     exchange = Exchange(bus)
     assert exchange() == 9
     assert bus.process_data.counters == [(3,)] * 3
@@ -258,17 +264,21 @@ def test_of_frames_that_arrive_several_times_each_counts_once(copies: int, read_
     client.fresh(20)
 
 
-def test_a_working_counter_that_cannot_be_is_no_complete_exchange() -> None:
+@LRW_OR_NOT
+def test_a_working_counter_that_cannot_be_is_no_complete_exchange(lrw: bool) -> None:
     wire = HostileWire(SensorOptions(signal="clock"))
+    if not lrw:
+        life_of(wire).esc.take_lrw_away()
     running = Simulation(backend=wire)
     running.run(0.3)
-    for counter in (4, 0xFFFF):
+    # One adds 1 for what is read, and 1 for what is written, twice in an LRW: these add up to 3, or more.
+    for counters in [(4,), (0xFFFF,)] if lrw else [(3, 0), (0, 2), (2, 1), (0xFFFF, 0xFFFF), (1, 0xFFFF)]:
 
-        def change(frame: bytes, counter: int = counter) -> list[bytes]:
+        def change(frame: bytes, counters: Sequence[int] = counters) -> list[bytes]:
             changed = bytearray(frame)
             if changed[DATAGRAM_INDEX] >= FIRST_INDEX:
-                end = parse(frame, len(frame))[0].end
-                changed[end : end + 2] = counter.to_bytes(2, "little")
+                for datagram, counter in zip(parse(frame, len(frame)), counters, strict=False):
+                    changed[datagram.end : datagram.end + 2] = counter.to_bytes(2, "little")
             return [bytes(changed)]
 
         wire.change = change
@@ -282,10 +292,13 @@ def test_a_working_counter_that_cannot_be_is_no_complete_exchange() -> None:
         check_frames(running.frames)
 
 
+@LRW_OR_NOT
 @pytest.mark.parametrize("seed", more_if_long([1], range(50)))
-def test_no_bytes_from_the_wire_end_the_loop(seed: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_no_bytes_from_the_wire_end_the_loop(seed: int, lrw: bool, caplog: pytest.LogCaptureFixture) -> None:
     chance = random.Random(seed)
     wire = HostileWire(SensorOptions(), SensorOptions(serial=2))
+    if not lrw:
+        life_of(wire).esc.take_lrw_away()
     running = Simulation(backend=wire)
     running.run(0.7)  # until event times are in use
 

@@ -179,10 +179,11 @@ def areas(count: int, size: int = 61) -> list[list[Area]]:
     return [[Area(*each, reg.FMMU_READ)] for each in inputs]
 
 
+@pytest.mark.parametrize("lrw", [True, False])
 @pytest.mark.parametrize("count", [1, 8, 15, 16, 40])
-def test_frames_carry_the_latched_times_of_the_sensors_in_them(count: int) -> None:
+def test_frames_carry_the_latched_times_of_the_sensors_in_them(count: int, lrw: bool) -> None:
     stations = [None if number % 5 == 4 else 0x1001 + number for number in range(count)]
-    frames = make_frames(areas(count), stations)
+    frames = make_frames(areas(count), stations, lrw=lrw)
     assert sorted(each.number for frame in frames for each in frame.inputs) == list(range(count))
     for frame in frames:
         assert len(frame.content) <= 1514
@@ -201,11 +202,12 @@ def test_frames_carry_the_latched_times_of_the_sensors_in_them(count: int) -> No
 
 
 def test_process_data_that_no_frame_can_carry_is_an_error() -> None:
-    assert fit_a_frame([Area(0, 1400, reg.FMMU_READ)])
-    assert not fit_a_frame([Area(0, 1480, reg.FMMU_READ)])
+    whole = [Area(0, 1400, reg.FMMU_READ)]
+    assert fit_a_frame(whole, lrw=True)
+    assert not fit_a_frame(whole, lrw=False)
     torn = [[Area(0, 61, reg.FMMU_READ), Area(2000, 2010, reg.FMMU_READ)]]
     with pytest.raises(SetUpError, match="lies among that of others"):
-        make_frames(torn, [None])
+        make_frames(torn, [None], lrw=True)
 
 
 # -- a machine that wakes late over answers: the kernel says when they had arrived, and stamps are right

@@ -13,6 +13,8 @@ FMMU_AND_SM_COUNT: Final = 0x0004  # two bytes: the number of FMMUs, the number 
 FEATURES: Final = 0x0008
 DC_AVAILABLE: Final = 1 << 2  # in FEATURES: it has a distributed clock
 DC_64_BIT: Final = 1 << 3  # in FEATURES: of 64 bits, not 32
+# In FEATURES: logical memory can be read (LRD) and written (LWR), but not both at once.
+NO_LRW: Final = 1 << 9
 STATION_ADDRESS: Final = 0x0010
 STATION_ALIAS: Final = 0x0012
 DL_CONTROL: Final = 0x0100
