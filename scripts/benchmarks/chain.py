@@ -1,4 +1,4 @@
-"""One chain of processes, for the benchmark and the demo: a virtual bus, its master, clients, canaries."""
+"""One chain of processes, for the benchmark and the demo: a virtual bus, its master, clients."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ethercat_server.errors import ServerError
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 from scripts.benchmarks import statistics
 from scripts.benchmarks.records import PORT, began
-from scripts.benchmarks.statistics import Floats, Ints
+from scripts.benchmarks.statistics import Floats
 
 OVERSAMPLING_HZ: Final = 51200  # the sensor's rate is this over its SINC length
 PROCESSES: Final = "scripts.benchmarks.processes"
@@ -52,11 +52,6 @@ class Setup:
     seconds: float
     priority: int  # SCHED_FIFO of the master; 0: ordinary scheduling
     ros: bool = True
-
-    @property
-    def period_ns(self) -> float:
-        """Nominal sample period."""
-        return 1e9 / self.rate_hz
 
     @property
     def sinc(self) -> int:
@@ -121,7 +116,6 @@ class Chain(contextlib.ExitStack):
         self.setup = setup
         self.children: list[Child] = []
         self._watched: dict[str, int] = {}  # process ids
-        self._canaries: list[Child] = []
         self._link: Client | None = None
         self.directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
         self.callback(shutil.rmtree, self.directory, ignore_errors=True)
@@ -131,7 +125,7 @@ class Chain(contextlib.ExitStack):
             print(f"{setup.rate_hz} Hz, {sensors}: {title}", file=sys.stderr, flush=True)
 
     def bus(self) -> str:
-        """Start a virtual bus and the canaries; its interface. The sensors have a CPU to themselves."""
+        """Start a virtual bus; its interface. The sensors have a CPU to themselves."""
         setup = self.setup
         errors = ",".join(str(PPM * (-1) ** position) for position in range(setup.sensors))
         arguments = f"--sensors {setup.sensors} --signal clock --sinc {setup.sinc} --ppm={errors}"
@@ -139,14 +133,6 @@ class Chain(contextlib.ExitStack):
         self.callback(self.stop)  # before the bus
         os.sched_setaffinity(bus.pid, own_cpus()[:1])
         self._watched["sensor"] = bus.pid
-        # A canary on each CPU, with a higher priority than everything else, wakes twice a sample period.
-        priority = min(99, setup.priority + 2) if setup.priority else 0
-        for cpu in sorted(os.sched_getaffinity(0)):
-            path = self.directory / f"canary-{cpu}"
-            how = (cpu, priority, setup.period_ns / 2000)
-            self._canaries.append(
-                self.python(path.name, f"{PROCESSES}.canary", path, *how, result=path, watch=False)
-            )
         return bus.ifname
 
     def start(self, name: str, *command: object, result: Path | None = None, watch: bool = True) -> Child:
@@ -192,11 +178,12 @@ class Chain(contextlib.ExitStack):
         return self._link
 
     def node(self, *parameters: str, position: int = 0) -> None:
-        """Start the ROS 2 node of a sensor, with these parameters."""
+        """Start the ROS 2 node of a sensor, with these parameters; its `wrench` is /benchmark_POSITION."""
         name = "node" if self.setup.sensors == 1 else f"node {position}"
         given = [word for each in (f"server_port:={PORT}", f"sensor:={position}", *parameters)
                  for word in ("-p", each)]  # fmt: skip
-        self.python(name, "bridge.client", "--ros-args", "-r", f"__node:=bridge_{position}", *given)
+        renamed = "-r", f"__node:=bridge_{position}", "-r", f"wrench:=/benchmark_{position}"
+        self.python(name, "bridge.client", "--ros-args", *renamed, *given)
 
     def recorder(self, kind: str, *arguments: object, priority: int = 0) -> Child:
         """Start a recorder (processes/recorder.py, or of kind `c` the program given) that ends by itself."""
@@ -242,7 +229,7 @@ class Chain(contextlib.ExitStack):
             usage |= {name: status[name] for name in ("missed_deadlines", "lost_frames")}
             usage["hand_out_us"] = status["sensors"][0]["age_us"]
         self.stop()
-        result, ages = statistics.summary(statistics.read_arrivals(path), self.setup.period_ns, self.stops())
+        result, ages = statistics.summary(statistics.read_arrivals(path))
         return {**result, **usage}, ages
 
     def stop(self) -> list[str]:
@@ -252,15 +239,6 @@ class Chain(contextlib.ExitStack):
             troubles.append(self.children.pop().stop())
         self._watched.clear()
         return [trouble for trouble in troubles if trouble]
-
-    def stops(self) -> Ints:
-        """End the canaries; when the machine stopped, (n, 2), CLOCK_MONOTONIC ns."""
-        for canary in self._canaries:
-            if canary in self.children:
-                self.children.remove(canary)
-                canary.stop()
-        pauses = [statistics.read_numbers(each.result, 2) for each in self._canaries if each.result.exists()]
-        return statistics.stops(pauses, self.setup.period_ns)
 
 
 def own_cpus() -> tuple[int, int]:

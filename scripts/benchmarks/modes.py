@@ -55,10 +55,9 @@ def _start(name: str, chain: Chain) -> Child:
     else:
         chain.server()
     if name == ROS:
-        topics = [f"/benchmark_{position}" for position in range(setup.sensors)]
-        for position, topic in enumerate(topics):
-            chain.node(f"array_topic:={topic}", f"rt_priority:={REAL_TIME}", position=position)
-        return chain.recorder("ros", *topics)
+        for position in range(setup.sensors):
+            chain.node(f"rt_priority:={REAL_TIME}", position=position)
+        return chain.recorder("ros", setup.sensors)
     return chain.recorder("tcp") if name == THIS else chain.recorder("c", yardstick, "client")
 
 
@@ -151,7 +150,8 @@ def load(setup: Setup, loops: int) -> list[Figures]:
                 chain.server()
                 if client == "wrench":
                     chain.node(f"rt_priority:={priority}")
-                recorder = chain.recorder("ros" if client == "wrench" else "tcp", priority=priority)
+                how_recorded = ("ros", 1) if client == "wrench" else ("tcp",)
+                recorder = chain.recorder(*how_recorded, priority=priority)
                 for number in range(loops):
                     chain.start(f"loop-{number}", sys.executable, "-c", "while True: pass", watch=False)
                 figures, _ = chain.measure(recorder)
@@ -175,19 +175,12 @@ def _points(row: Figures, name: str) -> str:
     return " / ".join(f"{row[name][point]:.0f}" for point in ("p50", "p99", "p999")) if row[name] else _NONE
 
 
-def _losses(row: Figures) -> str:
-    """Lost samples, of them those lost while the machine stopped."""
-    return f"{row['lost']} ({row['lost_in_stops']})" if row.get("lost") is not None else _NONE
-
-
 # Of the table of each, by heading: how a row is shown.
 TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
     "comparison": {
         "sensors": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}",
         "": lambda row: row["program"],
-        "lost (in stalls)": lambda row: (
-            f"{_losses(row)} of {row['made']}" if "made" in row else row.get("missing", "")
-        ),
+        "lost": lambda row: f"{row['lost']} of {row['made']}" if "made" in row else row.get("missing", ""),
         "age p50, µs": _shown("age_us", "p50", "age_p50"),
         "p99": _shown("age_us", "p99", "age_p99"),
         "p99.9": _shown("age_us", "p999", "age_p999"),
@@ -197,7 +190,7 @@ TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
     },
     "load": {
         "beside loops": lambda row: f"{row['rate_hz']} Hz, {row['loops']} loops: {row['chain']}",
-        "lost (in stalls)": _losses,
+        "lost": lambda row: str(row["lost"]),
         "handed out, µs": lambda row: _points(row, "hand_out_us"),
         "on arrival, µs": lambda row: _points(row, "age_us"),
     },

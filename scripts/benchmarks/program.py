@@ -34,7 +34,6 @@ from scripts.benchmarks.chain import (
 from scripts.benchmarks.modes import TABLES, answer, compare, load
 from scripts.benchmarks.records import may_be_real_time
 
-MOST_CPUS: Final = 4  # CPUs used: each of them runs a canary
 _WIDTH: Final = 108  # minimum width of the tables
 _RATES_HZ: Final = [OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512)]
 _PRIORITY: Final = 80  # SCHED_FIFO of the server, or what is in its place
@@ -53,7 +52,6 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
         console.print(
             "idle CPUs may halt (no access to /dev/cpu_dma_latency): samples are older than as root"
         )
-    os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:MOST_CPUS]))
     priority, ros = _PRIORITY if may_be_real_time() else 0, find_spec("rclpy") is not None
     if not priority:
         console.print("no real-time scheduling here (CAP_SYS_NICE): everything runs with ordinary scheduling")
@@ -67,7 +65,7 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
     content = {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "kernel": platform.release(),
-        "cpus_used": len(os.sched_getaffinity(0)),
+        "cpus": len(os.sched_getaffinity(0)),
         "python": platform.python_version(),
         "idle_states": idle_states,
         "rt_priority": priority,
@@ -135,7 +133,7 @@ def renew(path: Path, content: Mapping[str, Any]) -> None:
     check(path)
     where = (
         f"All figures on this page but those with another date are of one run: {content['date'][:10]}, "
-        f"{content['cpus_used']} CPUs, Linux {content['kernel'].split('-')[0]}, Python {content['python']}, "
+        f"{content['cpus']} CPUs, Linux {content['kernel'].split('-')[0]}, Python {content['python']}, "
         f"{'with' if content['idle_states'] else 'without'} idle states."
     )
 

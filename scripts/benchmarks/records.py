@@ -43,20 +43,15 @@ class Recording:
         return received_ns < self._until_ns
 
     def write(self) -> None:
-        """Write all records."""
-        write(self._path, self._values)
+        """Write all records, so that the file is there only when it is complete."""
+        unfinished = self._path.with_suffix(".unfinished")
+        unfinished.write_bytes(self._values.tobytes())
+        unfinished.replace(self._path)
 
 
 def began(path: Path) -> Path:
     """The file that appears when a program begins to record into `path`."""
     return path.with_suffix(".began")
-
-
-def write(path: Path, values: array[int]) -> None:
-    """Write whole numbers, so that the file is there only when it is complete."""
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_bytes(values.tobytes())
-    unfinished.replace(path)
 
 
 def steady(priority: int) -> None:

@@ -1,14 +1,13 @@
-"""What follows from the records: missing and repeated samples, which of them the machine lost, ages.
+"""What follows from the records: missing and repeated samples, ages.
 
 The virtual sensor numbers its samples, so this is the truth that `bota_ethercat.accounting` can only infer: a
-sample is lost if its number is missing between two that arrived, whoever lost it. It is lost to a stop of the
-machine if a canary slept longer than a sample period (`stops`) and that covers at least half of the time for
-which the sample was the sensor's newest. Pure functions of arrays; times are CLOCK_MONOTONIC ns.
+sample is lost if its number is missing between two that arrived, whoever lost it. Pure functions of arrays;
+times are CLOCK_MONOTONIC ns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -20,7 +19,6 @@ from scripts.benchmarks.records import COLUMNS
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
-COVERED: Final = 0.5  # the part of a sample's period that must be a stop for the sample to be lost to it
 _NUMBER_WRAP: Final = 2**24
 _INSTANT_WRAP_NS: Final = 2**20 * 1_000_000_000  # where the signal `clock` begins anew
 _POINTS: Final = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "min": 0.0, "max": 1.0}
@@ -40,14 +38,9 @@ class Arrivals(NamedTuple):
         return (self.received - self.instant).astype(np.float64)
 
 
-def read_numbers(path: Path, columns: int) -> Ints:
-    """A file of whole numbers as rows of `columns`."""
-    return np.fromfile(path, dtype=np.int64).reshape(-1, columns)
-
-
 def read_arrivals(path: Path) -> list[Arrivals]:
     """A recording, by sensor."""
-    return split(read_numbers(path, COLUMNS))
+    return split(np.fromfile(path, dtype=np.int64).reshape(-1, COLUMNS))
 
 
 def split(records: Ints) -> list[Arrivals]:
@@ -65,37 +58,12 @@ def split(records: Ints) -> list[Arrivals]:
     return found
 
 
-def stops(pauses: Iterable[Ints], period_ns: float) -> Ints:
-    """The pauses in which a canary slept longer than a sample period, overlapping ones made one."""
-    merged: list[list[int]] = []
-    for start, end in sorted(row for rows in pauses for row in rows.tolist() if row[1] - row[0] > period_ns):
-        if merged and start <= merged[-1][1]:
-            merged[-1][1] = max(merged[-1][1], end)
-        else:
-            merged.append([start, end])
-    return np.array(merged, dtype=np.int64).reshape(-1, 2)
-
-
-def in_stops(born: Floats, period_ns: float, stopped: Ints) -> int:
-    """How many of the samples, each the newest from `born` on for a period, were lost to a stop."""
-    covered = np.zeros(len(born))
-    for start, end in stopped:
-        covered += np.clip(np.minimum(born + period_ns, end) - np.maximum(born, start), 0, None)
-    return int(np.count_nonzero(covered >= COVERED * period_ns))
-
-
-def count(arrivals: Arrivals, period_ns: float, stopped: Ints) -> dict[str, int]:
+def count(arrivals: Arrivals) -> dict[str, int]:
     """Of one sensor: samples from the first to the last that arrived (`made`), and which of them arrived."""
-    numbers, first = np.unique(arrivals.number, return_index=True)
-    missing = np.setdiff1d(np.arange(numbers[0], numbers[-1] + 1), numbers, assume_unique=True)
-    born = np.interp(missing, numbers, arrivals.instant[first] - arrivals.instant[0]) + arrivals.instant[0]
-    return {
-        "made": len(numbers) + len(missing),
-        "arrivals": len(arrivals.number),
-        "lost": len(missing),
-        "lost_in_stops": in_stops(born, period_ns, stopped),
-        "repeated": len(arrivals.number) - len(numbers),
-    }
+    numbers = np.unique(arrivals.number)
+    made, taken = int(numbers[-1] - numbers[0]) + 1, len(arrivals.number)
+    lost, repeated = made - len(numbers), taken - len(numbers)
+    return {"made": made, "arrivals": taken, "lost": lost, "repeated": repeated}
 
 
 def spread_us(values_ns: Floats) -> dict[str, float] | None:
@@ -106,9 +74,9 @@ def spread_us(values_ns: Floats) -> dict[str, float] | None:
     return dict(zip(_POINTS, points.round(1).tolist(), strict=True))
 
 
-def summary(streams: Sequence[Arrivals], period_ns: float, stopped: Ints) -> tuple[dict[str, Any], Floats]:
+def summary(streams: Sequence[Arrivals]) -> tuple[dict[str, Any], Floats]:
     """The figures of all sensors together, and all ages in ns."""
-    counts = [count(stream, period_ns, stopped) for stream in streams]
+    counts = [count(stream) for stream in streams]
     ages = np.concatenate([stream.ages for stream in streams])
     errors = np.concatenate([(each.stamp - each.instant)[each.stamp != 0] for each in streams]).astype(float)
     figures: dict[str, Any] = {name: sum(each[name] for each in counts) for name in counts[0]}

@@ -2,7 +2,7 @@
 
 Both note the time before anything is decoded.
 
-Arguments: KIND FILE WARM_UP_S SECONDS PRIORITY, then of `ros` the topics of arrays.
+Arguments: KIND FILE WARM_UP_S SECONDS PRIORITY, then of `ros` the number of sensors.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from bota_ethercat.client import make_real_time
 from bota_ethercat.control import request
@@ -42,8 +42,8 @@ def tcp(recording: Recording, port: int = PORT) -> None:
                     return
 
 
-def ros(recording: Recording, *topics: str) -> None:
-    """A subscriber: of arrays, by the sensors' positions, or of `wrench`.
+def ros(recording: Recording, sensors: str) -> None:
+    """A subscriber of the `wrench` of each sensor.
 
     It waits for and takes messages itself, because rclpy's executor takes longer for that than everything
     else on the way: what is measured is to be the way to the subscriber, not the subscriber.
@@ -51,21 +51,11 @@ def ros(recording: Recording, *topics: str) -> None:
     import rclpy  # noqa: PLC0415 - the arguments come first
     from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415
     from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: PLC0415
-    from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
 
-    def wrench(message: Any) -> tuple[float, ...]:
-        force, torque = message.wrench.force, message.wrench.torque
-        return force.x, force.y, force.z, torque.x
-
-    kinds: list[tuple[Any, str, Callable[[Any], Any]]]
-    kinds = [(Float64MultiArray, topic, lambda message: message.data) for topic in topics]
-    kinds = kinds or [(WrenchStamped, "wrench", wrench)]
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
-    handles = [
-        node.create_subscription(kind, topic, lambda _message: None, _DEPTH).handle
-        for kind, topic, _ in kinds
-    ]
+    topics = [f"/benchmark_{position}" for position in range(int(sensors))]
+    handles = [node.create_subscription(WrenchStamped, topic, id, _DEPTH).handle for topic in topics]
     with node.context.handle:
         wait_set = rclpy_implementation.WaitSet(len(handles), 0, 0, 0, 0, 0, node.context.handle)
     goes_on = True
@@ -74,10 +64,12 @@ def ros(recording: Recording, *topics: str) -> None:
         for handle in handles:
             wait_set.add_subscription(handle)
         wait_set.wait(1_000_000_000)
-        for position, (handle, (kind, _, values)) in enumerate(zip(handles, kinds, strict=True)):
-            while goes_on and (taken := handle.take_message(kind, False)) is not None:
+        for position, handle in enumerate(handles):
+            while goes_on and (taken := handle.take_message(WrenchStamped, False)) is not None:
                 now = time.monotonic_ns()
-                goes_on = recording.take(position, *decode_clock(values(taken[0])), 0, now)
+                force, torque = taken[0].wrench.force, taken[0].wrench.torque
+                clock = decode_clock((force.x, force.y, force.z, torque.x))
+                goes_on = recording.take(position, *clock, 0, now)
     node.destroy_node()
     rclpy.try_shutdown()
 
