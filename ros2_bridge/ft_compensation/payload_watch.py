@@ -14,8 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_ethercat.pdo import Vector3
-from ft_compensation.quantities import Payload, length
-from ft_compensation.stationary_limits import StationaryLimits
+from ft_compensation.quantities import Payload, StationaryLimits, length
 
 _LOOK_S: Final = 0.05  # between two samples that are looked at
 _LOOKS: Final = 10  # in a window

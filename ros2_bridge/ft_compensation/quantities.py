@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the parts of compensation hand to each other: wrench, payload, and the error with a sentence."""
+"""What the parts of compensation hand to each other: wrench, payload, limits, and the error with a sentence.
+
+Without NumPy, for command lines.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
@@ -56,15 +60,6 @@ class Payload(NamedTuple):
     # Ixx Iyy Izz Ixy Ixz Iyz about the center of gravity, in axes parallel to the sensor's, kg m²: diagonal
     # and off-diagonal elements of the tensor (Ixy is minus the integral of xy), as in URDF. A point mass: 0.
     inertia: tuple[float, ...] = (0.0,) * 6
-
-    @classmethod
-    def of(cls, mass: object, center: object, inertia: object = (0.0,) * 6) -> Self:
-        """ValueError, a sentence, if these are not a number >= 0, three and six numbers."""
-        (kilograms,) = _finite((mass,), 1, "a mass")
-        if kilograms < 0.0:
-            raise ValueError(f"a mass cannot be negative: {kilograms:g} kg")
-        tensor = tuple(_finite(inertia, 6, "an inertia tensor"))
-        return cls(kilograms, vector(center, "a center of gravity"), tensor)
 
     def __str__(self) -> str:
         """For people."""
@@ -120,6 +115,42 @@ class Accelerometer(NamedTuple):
 EXACT: Final = Accelerometer()
 
 
+@dataclass(frozen=True, slots=True)
+class StationaryLimits:
+    """What counts as stationary.
+
+    `..._deviation` is the standard deviation of any one axis, `..._drift` the drift of its mean.
+    Bota's own test allows a healthy sensor 0.6 N and 0.014 Nm at SINC 51; at SINC 32 that is 0.8 N and
+    0.02 Nm. A shorter filter or a noisy environment needs more.
+    """
+
+    force_deviation: float = 0.8  # N
+    torque_deviation: float = 0.02  # Nm
+    # N: how far the means of the quarters of the window may lie apart, beyond what noise explains.
+    force_drift: float = 0.3
+    torque_drift: float = 0.01  # Nm, likewise
+    angular_rate: float = 0.05  # rad/s: length of the mean. A stationary gyroscope may read 0.03.
+    angular_rate_deviation: float = 0.02  # rad/s
+    acceleration_deviation: float = 0.3  # m/s²
+    acceleration_drift: float = 0.05  # m/s²
+    least_samples: int = 20
+
+    @property
+    def deviations(self) -> tuple[float, ...]:
+        """By axis: of force, torque, acceleration, angular rate."""
+        imu = self.acceleration_deviation, self.angular_rate_deviation
+        return _by_axis(self.force_deviation, self.torque_deviation, *imu)
+
+    @property
+    def drifts(self) -> tuple[float, ...]:
+        """By axis: of force, torque, acceleration."""
+        return _by_axis(self.force_drift, self.torque_drift, self.acceleration_drift)
+
+
+def _by_axis(*limits: float) -> tuple[float, ...]:
+    return tuple(limit for limit in limits for _ in range(3))
+
+
 def length(a: Vector3) -> float:
     """The length of a vector."""
     return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
@@ -146,6 +177,5 @@ def _finite(values: object, count: int, name: str) -> list[float]:
     except (TypeError, ValueError, OverflowError):
         numbers = []
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        of = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise ValueError(f"{name} is {of}, not {values!r:.80}")
+        raise ValueError(f"{name} is {count} finite numbers, not {values!r:.80}")
     return numbers

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from bota_ethercat.pdo import Sample, Vector3
 from bota_ethercat.sensor.warnings_register import WarningFlag
-from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, Wrench
-from ft_compensation.stationary_limits import StationaryLimits
+from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, StationaryLimits, Wrench
 
 _MOST_SAMPLES: Final = 200_000
 _BLOCKS: Final = 4

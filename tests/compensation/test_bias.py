@@ -13,9 +13,16 @@ import pytest
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.sensor.warnings_register import WarningFlag
 from ft_compensation.bias import BiasRamp, Taken, check_at_rest, estimate_bias
-from ft_compensation.quantities import NO_PAYLOAD, NO_WRENCH, ZERO, CompensationError, Payload, Wrench
+from ft_compensation.quantities import (
+    NO_PAYLOAD,
+    NO_WRENCH,
+    ZERO,
+    CompensationError,
+    Payload,
+    StationaryLimits,
+    Wrench,
+)
 from ft_compensation.stationary import NotStationaryError, StationaryMeans, StationaryWindow
-from ft_compensation.stationary_limits import StationaryLimits
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, noisy, sample
 
 RATE = 800

@@ -34,7 +34,7 @@ def test_the_fast_path_agrees_with_the_equations_in_thousands_of_cases() -> None
     rows = zip(*(part.tolist() for part in (force, torque, center, bias, mass, gravity)), strict=True)
     got = []
     for f, m, c, b, kilograms, g in rows:
-        compensator = Compensator(Payload.of(kilograms, c))
+        compensator = Compensator(Payload(kilograms, (*c,)))
         compensator.bias = Wrench.of(b)
         stages = compensator.compensate((*f,), (*m,), (-g[0], -g[1], -g[2]))
         got.append([*stages.corrected.values, *stages.tool.values, *stages.final.values])
@@ -69,21 +69,6 @@ def test_signs_are_those_of_the_sensor(seconds: float) -> None:
     contact = signals.contact_force(seconds)
     assert stages.final.force == pytest.approx(contact, abs=1e-9)
     assert stages.final.torque == pytest.approx(signals.cross(signals.CONTACT_POINT, contact), abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("mass", "center", "message"),
-    [
-        (-1.0, ZERO, "cannot be negative: -1 kg"),
-        (math.nan, ZERO, "a mass is a finite number"),
-        ("heavy", ZERO, "a mass is a finite number"),
-        (1.0, (0.0, 1.0), "a center of gravity is 3 finite numbers"),
-        (1.0, None, "a center of gravity is 3 finite numbers, not None"),
-    ],
-)
-def test_what_is_no_payload_is_a_sentence(mass: object, center: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Payload.of(mass, center)
 
 
 def test_compensation_is_quick() -> None:

@@ -13,7 +13,7 @@ from typing import Final
 from bota_clients.arguments import add_force, add_imu_units, number, parser, position
 from bota_clients.program import start
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
-from ft_compensation.stationary_limits import StationaryLimits
+from ft_compensation.quantities import StationaryLimits
 
 _LIMITS: Final = tuple(field.name for field in fields(StationaryLimits))
 

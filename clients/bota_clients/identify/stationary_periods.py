@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bota_clients.recording.columns import Columns
+from ft_compensation.quantities import StationaryLimits
 from ft_compensation.stationary import (
     BAD_WRENCH,
     CHANCE,
@@ -23,7 +24,6 @@ from ft_compensation.stationary import (
     StationaryMeans,
     stationary_means,
 )
-from ft_compensation.stationary_limits import StationaryLimits
 
 _BLOCK_S: Final = 0.1
 _BLOCK_SAMPLES: Final = 8  # at least, however slow the sensor is

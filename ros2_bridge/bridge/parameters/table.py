@@ -24,11 +24,11 @@ from ft_compensation.quantities import (
     Accelerometer,
     Payload,
     Quaternion,
+    StationaryLimits,
     Wrench,
     length,
     unit_quaternion,
 )
-from ft_compensation.stationary_limits import StationaryLimits
 
 Numbers = tuple[float, ...]
 ParameterValue = bool | int | float | str | Numbers | tuple[str, ...]

@@ -31,9 +31,8 @@ from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.outputs import WrenchFilter, WrenchTransform
 from ft_compensation.payload_watch import PayloadWatch
-from ft_compensation.quantities import ZERO, CompensationError
+from ft_compensation.quantities import ZERO, CompensationError, StationaryLimits
 from ft_compensation.stationary import StationaryWindow, triple
-from ft_compensation.stationary_limits import StationaryLimits
 
 _PATIENCE_S: Final = 1.0  # without a pose before it is a problem: TF has to arrive first
 _LOOK_S: Final = 0.001  # how often it is looked whether the pose has come
