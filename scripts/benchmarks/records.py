@@ -6,10 +6,7 @@ as it says itself, the same as the server says (0: it does not), CLOCK_MONOTONIC
 
 from __future__ import annotations
 
-import gc
 import os
-import socket
-import time
 from array import array
 from pathlib import Path
 from typing import Final
@@ -54,17 +51,6 @@ def began(path: Path) -> Path:
     return path.with_suffix(".began")
 
 
-def steady(priority: int) -> None:
-    """Make this process as steady as the server makes itself: SCHED_FIFO, or fine timers; no collector."""
-    gc.collect()  # takes 3 ms: not with a priority above what is measured
-    gc.freeze()
-    gc.disable()
-    if priority:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    else:
-        Path("/proc/self/timerslack_ns").write_text("1000", encoding="ascii")
-
-
 def may_be_real_time() -> bool:
     """Whether this process may have real-time scheduling."""
     try:
@@ -73,12 +59,3 @@ def may_be_real_time() -> bool:
         return False
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     return True
-
-
-def connect(port: int = PORT) -> socket.socket:
-    """Connect to a program on this machine as soon as it listens."""
-    while True:
-        try:
-            return socket.create_connection(("127.0.0.1", port))
-        except ConnectionRefusedError:
-            time.sleep(0.02)

@@ -8,6 +8,7 @@ Arguments: KIND FILE WARM_UP_S SECONDS PRIORITY, then of `ros` the number of sen
 from __future__ import annotations
 
 import gc
+import socket
 import sys
 import time
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from bota_ethercat.control import request
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.virtual_sensor.signals import decode_clock
-from scripts.benchmarks.records import PORT, Recording, connect
+from scripts.benchmarks.records import PORT, Recording
 
 SIZE: Final = 61
 _DEPTH: Final = 50
@@ -29,7 +30,7 @@ def tcp(recording: Recording, port: int = PORT) -> None:
     """A client of ethercat-server."""
     frames, decode = FrameDecoder(), SampleDecoder(SIZE).decode
     old = DataFlag.REPEATED | DataFlag.INVALID
-    with connect(port) as connection:
+    with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.sendall(encode_json(request("subscribe")))
         while size := connection.recv_into(frames.get_buffer()):
             now = time.monotonic_ns()

@@ -10,6 +10,7 @@ Arguments: FILE WARM_UP_S SECONDS IFACE SINC CALLS_PER_S PRIORITY
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import sys
 import time
@@ -18,8 +19,9 @@ from typing import Final
 
 import bota_driver  # type: ignore[import-not-found]
 
+from bota_ethercat.client.real_time import make_real_time
 from ethercat_server.virtual_sensor.signals import decode_clock
-from scripts.benchmarks.records import Recording, steady
+from scripts.benchmarks.records import Recording
 
 _ATTEMPTS: Final = 5
 
@@ -28,7 +30,9 @@ def main() -> None:
     """Record, then end."""
     path, warm_up_s, seconds, ifname, sinc, rate_hz, priority = sys.argv[1:]
     recording = Recording(Path(path), float(warm_up_s), float(seconds))
-    steady(int(priority))  # before the driver starts its threads, which inherit it
+    gc.disable()
+    Path("/proc/self/timerslack_ns").write_text("1000", encoding="ascii")  # as the server's
+    make_real_time(int(priority))  # before the driver starts its threads, which inherit it
     driver = active_driver(configuration(ifname, int(sinc)))
     record(driver, recording, int(1e9 / float(rate_hz)))
     recording.write()
