@@ -6,7 +6,6 @@
 #include <chrono>
 #include <string>
 #include <string_view>
-#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -15,11 +14,15 @@
 
 namespace bota_ethercat {
 
-namespace detail {
-
-/// `Client` without its constructors, so that its move operations are the ordinary ones.
-class Subscription {
+/// A subscription to the samples of one server. After the loss of the connection readings keep the last sample, whose age grows;
+/// the first sample of a new connection has `gap`, and `connection` is one more. Host names are looked up in `connect` only.
+/// What is left of one that was moved from can only be destroyed or assigned to.
+class Client {
 public:
+    /// Allocates everything that is ever needed.
+    explicit Client(Options options = {}) : connection_(options, encode_json(request(options))) {}
+    Client(std::string host, std::uint16_t port) : Client(Options{std::move(host), port}) {}
+
     /// Connect and subscribe; waits. False if it did not succeed within `timeout` or was refused: `error` says why,
     /// and `latest` and `next`, or `reconnect`, may go on trying.
     bool connect(nanoseconds timeout = std::chrono::seconds(2)) noexcept {
@@ -82,7 +85,7 @@ public:
         const std::vector<std::uint8_t>& wanted = connection_.options.sensors;
         connection_.now_ns = monotonic_now_ns();
         more_waits_ = false;
-        const std::int64_t deadline = after(connection_.now_ns, timeout);
+        const std::int64_t deadline = detail::after(connection_.now_ns, timeout);
         for (bool has_read = false; may_read() || connection_.options.reconnect == Reconnect::by_itself;) {
             const Link before = link();
             Frame frame;
@@ -125,9 +128,6 @@ public:
     std::uint64_t bad_messages() const noexcept { return bad_messages_; }
     /// For poll or epoll with other things; another one after a new connection, -1 without one.
     int fd() const noexcept { return connection_.fd(); }
-
-protected:
-    explicit Subscription(const Options& options) : connection_(options, encode_json(request(options))) {}
 
 private:
     static constexpr std::size_t kPlaces = 256;    // every value of the `sensor` byte
@@ -187,13 +187,13 @@ private:
         } else if (event.is("sensor_back") || event.is("reconfigured")) {
             sensors_[place].lost = false;
             for (std::size_t i = 0; i < description_.sensor_count; ++i)
-                if (description_.sensors[i].sensor == place) read_in_force(message, description_.sensors[i]);
+                if (description_.sensors[i].sensor == place) detail::read_in_force(message, description_.sensors[i]);
             take_in_force();
         }
     }
 
     void take_refusal(json::Value message) noexcept {
-        Message reason;
+        detail::Message reason;
         message["error"]["message"].get(reason);
         connection_.complain("the server refused: ").add(reason.view());
         if (link() != Link::subscribing) return;
@@ -202,7 +202,7 @@ private:
     }
 
     void take_description(json::Value message) noexcept {
-        if (!read_description(message, description_)) {
+        if (!detail::read_description(message, description_)) {
             refused_ = true;
             return connection_.lose("the server speaks another version of the protocol");
         }
@@ -213,7 +213,7 @@ private:
         connection_.link = Link::up;
         connection_.error.clear();
         ++connections_;
-        for (SensorState& each : sensors_) each.begin(connection_.options.every, connection_.options.fresh_only);
+        for (detail::SensorState& each : sensors_) each.begin(connection_.options.every, connection_.options.fresh_only);
         take_in_force();
     }
 
@@ -234,33 +234,13 @@ private:
         return reading;
     }
 
-    Connection connection_;
-    std::vector<SensorState> sensors_ = std::vector<SensorState>(kPlaces);
-    std::string clock_name_ = clock_name();  // ours
+    detail::Connection connection_;
+    std::vector<detail::SensorState> sensors_ = std::vector<detail::SensorState>(kPlaces);
+    std::string clock_name_ = detail::clock_name();  // ours
     Description description_;
     std::uint32_t connections_ = 0, reconfigurations_ = 0;
     std::uint64_t bad_messages_ = 0;
     bool same_clock_ = false, more_waits_ = false, refused_ = false;
-};
-
-}  // namespace detail
-
-/// A subscription to the samples of one server. After the loss of the connection readings keep the last sample, whose age grows;
-/// the first sample of a new connection has `gap`, and `connection` is one more. Host names are looked up in `connect` only.
-///
-///     bota_ethercat::Client first({"localhost", 12001}), second("localhost", 12002);
-///     first = std::move(second);  // what is left of `second` can only be destroyed or assigned to
-class Client : public detail::Subscription {
-public:
-    /// Allocates everything that is ever needed.
-    explicit Client(Options options = {}) : Subscription(options) {}
-    explicit Client(std::string host, std::uint16_t port) : Client(Options{std::move(host), port}) {}
-
-    // Neither a template nor a reference to an lvalue can be made from the braces of `Client({"localhost", 12001})`.
-    Client(Client&) = delete;
-    template <typename Other, typename = std::enable_if_t<std::is_same_v<Other, Client>>>
-    Client(Other&& other) noexcept : Subscription(std::move(other)) {}
-    Client& operator=(Client&&) noexcept = default;
 };
 
 }  // namespace bota_ethercat
