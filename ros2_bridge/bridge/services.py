@@ -317,7 +317,7 @@ class IdentifyServices:
 
 
 def details(result: Identified) -> list[str]:
-    """What `summary` leaves out, a sentence each: bias, residuals by pose, condition, next pose."""
+    """What `summary` leaves out, a sentence each: bias, residuals by pose, next pose."""
     left = [
         f"{position}: {length(residual.force):.2g} N {length(residual.torque):.2g} Nm"
         for position, residual in enumerate(result.residuals, 1)
@@ -326,7 +326,6 @@ def details(result: Identified) -> list[str]:
         f"Bias {wrench_text(result.bias)}, ± {wrench_text(result.bias_interval)}",
         *([accelerometer_text(result.accelerometer)] if result.accelerometer else []),
         f"Residuals by pose, {', '.join(left)}",
-        f"Condition {result.condition:.2f} (1.2 is ideal, beyond 10 is bad)",
         f"One more pose would help most so: {result.coverage.next_pose}",
     ]
 

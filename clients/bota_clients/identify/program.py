@@ -71,10 +71,7 @@ def show_result(console: Console, result: Identified) -> None:
         for axis, *numbers in zip("xyz" if len(values) == 3 else CROSS_AXES, values, halves, strict=True):
             table.add_row(f"{name} {axis}", *(f"{number:.{digits}f}" for number in numbers), unit)
     console.print(table)
-    console.print(
-        f"residual: {_fit(result.force_fit, 'N')}, {_fit(result.torque_fit, 'Nm')}; condition number "
-        f"{result.condition:.2f} (1.2 is ideal)"
-    )
+    console.print(f"residual: {_fit(result.force_fit, 'N')}, {_fit(result.torque_fit, 'Nm')}")
     for note in result.notes:
         console.print(f"note: {note}")
 
@@ -117,7 +114,6 @@ def as_json(
         "accelerometer": fit and {**fit.calibration._asdict(), "undetermined": fit.undetermined},
         "drift": result.drift and result.drift.values,
         "touched": result.touched,
-        "condition": result.condition,
         "gravity": result.gravity,
         "notes": result.notes,
         "poses": rows,

@@ -85,8 +85,6 @@ class Identified(NamedTuple):
     # Of the intervals: 0.95 as a rule. Student's t; each axis has the variance that its residuals show.
     confidence: float
     residuals: tuple[Wrench, ...]  # what the answer leaves of each pose, in order: measured minus modelled
-    # Of the problem with each unknown in a unit of its own size: 1.2 is ideal, beyond 10 is bad.
-    condition: float
     coverage: Coverage
     notes: tuple[str, ...]  # what a person should know, sentences: a pose that does not fit, a wide interval
     force_fit: Fit
@@ -155,7 +153,6 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95) -> Identified:
         Wrench.of(found.bias.half.tolist()),
         confidence,
         tuple(map(Wrench.of, found.residuals.tolist())),
-        _condition(equations.gravity),
         seen,
         (
             *_misfit_notes(poses, drift, touched),
@@ -270,21 +267,6 @@ def _accelerometer(parts: tuple[Value, Value, Value] | None) -> OffsetFit | None
     values = (tuple(each.tolist()) for part in parts for each in part)
     offset, offset_half, scale, scale_half, cross, cross_half = values
     return OffsetFit(Accelerometer(offset, scale, offset_half, scale_half, cross, cross_half), open_axes)
-
-
-def _condition(gravity: Array) -> float:
-    """Ratio of the best to the worst seen combination of mass and center, the bias being free.
-
-    Force equations in N with the mass, torque equations in N at an arm L with the center in units of L: L
-    cancels.
-    """
-    moved = gravity - gravity.mean(axis=0)
-    information = np.zeros((4, 4))
-    for g in moved:
-        information[0, 0] += g @ g
-        information[1:, 1:] += (g @ g) * np.eye(3) - np.outer(g, g)
-    values = np.linalg.eigvalsh(information)
-    return float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
 
 
 def _check_mass(mass: float, interval: float) -> None:

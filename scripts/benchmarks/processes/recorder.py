@@ -56,7 +56,9 @@ def ros(recording: Recording, sensors: str) -> None:
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
     topics = [f"/benchmark_{position}" for position in range(int(sensors))]
-    handles = [node.create_subscription(WrenchStamped, topic, id, _DEPTH).handle for topic in topics]
+    handles = [
+        node.create_subscription(WrenchStamped, topic, lambda _: None, _DEPTH).handle for topic in topics
+    ]
     with node.context.handle:
         wait_set = rclpy_implementation.WaitSet(len(handles), 0, 0, 0, 0, 0, node.context.handle)
     goes_on = True
