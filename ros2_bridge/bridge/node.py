@@ -57,7 +57,8 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.parameters = parameters = declare(self)
         self.stamps = stamps = Stamps(self.get_logger())
         compensated = CompensatedOutput(self, parameters, stamps, lambda: self.reader.link.info.rate_hz)
-        self.outputs = Outputs([*make_measured(self, parameters, stamps), compensated])
+        wrench, *others = make_measured(self, parameters, stamps)
+        self.outputs = Outputs([wrench, compensated, *others])  # what control loops take goes first
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
