@@ -91,7 +91,7 @@ PACKAGES: Final[dict[str, set[str]]] = {
     ros: {"bridge"}
     for ros in (
         "rclpy", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", "diagnostic_msgs", "rcl_interfaces",
-        "tf2_ros",
+        "tf2_ros", "bota_ethercat_msgs",
     )
 }  # fmt: skip
 """Everything that is not the standard library, and which modules may load it."""

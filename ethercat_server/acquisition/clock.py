@@ -498,15 +498,15 @@ class SampleClock:
         doubt_ns = _CERTAIN * math.sqrt(self.estimate.variance)
         if not self._single:
             doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
+        most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
         if unwatched_ns - least_ns < _ONE_ONLY * period_ns:
-            # It came between two looks: it is the one expected nearest to them, but none that is yet to come.
-            latest = math.floor(late + doubt_ns / period_ns)
+            # It came between two looks: it is the one expected nearest to them. By events the phase is so
+            # exact that no sample can have come before it: it was held back.
             late = ((looked_ns + looked_at_ns) / 2 - phase_ns) / period_ns
-            newest = 1 + min(round(late), latest)
+            newest = 1 + (min(round(late), most) if events is not None else round(late))
         else:
             newest = 1 + math.floor(late)
             least = math.floor((sent_ns - phase_ns - doubt_ns) / period_ns)
-            most = math.floor((sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
             lost_track = events is not None and events.is_doubtful and unwatched_ns > _MISSABLE * period_ns
             self.uncertain = self._doubtful or lost_track or (most > 0 and least < most)
         self._count(newest, late, watched_ns)

@@ -167,7 +167,7 @@ class SensorStream:
         self._gap = max(0, self._gap - 1)
         # Without an event, the slave may have held back the sample that ends a silence, or the one after it:
         # one may be missing after either.
-        if self._silent and (events := self.clock.events) is not None and events.has_none:
+        if self._silent and ((events := self.clock.events) is None or events.has_none):
             self._gap = 2
         self._silent = False
         return flags

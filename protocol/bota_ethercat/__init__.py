@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The wire protocol between server and clients, sans-IO: standard library only, no sockets, no threads.
 
 `framing` bytes to messages and back, `control` requests and replies, `accounting` what frames are and what is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One accounting of a stream: what each DATA frame is, and what is missing before it. No sockets, no clock.
 
 docs/protocol.md defines the words; the C++ header counts the same, and tests/protocol/golden/accounting.json

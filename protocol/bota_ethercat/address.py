@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a server is: HOST:PORT as written on a command line, and whose CLOCK_MONOTONIC it has."""
 
 from __future__ import annotations

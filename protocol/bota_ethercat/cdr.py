@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS 2 messages of fixed layout serialized as CDR, without ROS: what the node publishes.
 
 ROS's own conversion takes longer than handing the message to the middleware does.

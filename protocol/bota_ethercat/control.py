@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Control messages: actions and their keys, error codes, events, replies.
 
 `ACTIONS` is the table of what a request may carry; `parse_request` checks a request against it.

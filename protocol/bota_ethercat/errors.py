@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every exception that `protocol` raises."""
 
 from __future__ import annotations

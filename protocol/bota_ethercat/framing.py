@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Framing, without sockets: bytes in, messages out, and back.
 
 The rules it keeps:

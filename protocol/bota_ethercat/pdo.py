@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sensor's process data: one table of fields, and everything that follows from it.
 
 Object 0x6000, mapped as 61 bytes; newer firmware maps an orientation quaternion after it (77 bytes, as in the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Selects one sensor of a chain: by number, serial number or name."""
 
 from __future__ import annotations

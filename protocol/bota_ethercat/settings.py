@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sensor's settings by name: type, allowed values, start-up default, meaning.
 
 One table for the command line, the configuration file, the control channel and the ROS parameters. Their

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The program `ros2 run bridge client`, on PATH as `bridge-client`: arguments, signals, exit codes.
 
 Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong arguments or
@@ -7,31 +8,18 @@ Everything of ROS is imported only after the signals are in hand, so that Ctrl-C
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import MutableMapping, Sequence
-from pathlib import Path
-from typing import Final
+from collections.abc import Sequence
 
 from bridge.process import block_stop_signals
-
-# For many small messages. Only Fast DDS 2, the default of ROS 2 Jazzy, reads it; it says why itself.
-PROFILES: Final = Path(__file__).with_name("fastdds.xml")
-_PROFILES_VARIABLE: Final = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 USAGE = """\
 usage: ros2 run bridge client [--ros-args -p NAME:=VALUE ... --params-file FILE ...]
        bridge-client          [--ros-args ...]
 
 Publishes the force/torque sensor that ethercat-server serves. Parameters, topics and their
-defaults: share/bridge/config/client.yaml.
+defaults: share/bota_ethercat_bridge/config/client.yaml.
 """
-
-
-def use_own_profiles(environment: MutableMapping[str, str]) -> None:
-    """Name our file in `environment`, unless the user has named one: who tunes the middleware knows best."""
-    if not environment.get(_PROFILES_VARIABLE):
-        environment[_PROFILES_VARIABLE] = str(PROFILES)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,13 +29,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if own and own[0] in {"-h", "--help"}:
         sys.stdout.write(USAGE)
         return 0
-    use_own_profiles(os.environ)
     try:
         from bridge.node import run  # noqa: PLC0415 - rclpy takes a while to load, see above
     except ImportError as error:
-        sys.stderr.write(
-            f"bridge-client: rclpy cannot be loaded ({error}): source ROS 2, or pip install the extra 'ros'\n"
-        )
+        missing = (error.name or "").partition(".")[0]
+        remedy = "source ROS 2, or pip install the extra 'ros'"
+        if missing == "bota_ethercat":
+            remedy = "build the package bota_ethercat_protocol too"
+        sys.stderr.write(f"bridge-client: {missing} cannot be loaded ({error}): {remedy}\n")
         return 1
     return run(own)
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """/diagnostics: a thread that checks subscribers and state ten times a second, and what it reports.
 
 A thread of its own, so that neither a service that waits for the server nor the stream holds it up. It

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node: what is wired to what, and in which order it is taken apart.
 
 `run` is the program. `BridgeNode.create` and `spin` are what it does once ROS is up: with them the tests run
@@ -6,14 +7,17 @@ several nodes in one process.
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable, Sequence
-from typing import Final, Self
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, Self
 
 import rclpy
 from diagnostic_msgs.msg import KeyValue
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.exceptions import InvalidTopicNameException, ParameterException
+from rclpy.exceptions import InvalidHandle, InvalidTopicNameException, ParameterException
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
@@ -27,12 +31,18 @@ from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import Worker, call_on_stop_signal, prepare
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.publishing.messages import Stamps, make_measured
+from bridge.rclpy_internals import is_about_arguments, make_executors, refuse_what_raises
 from bridge.services import BiasServices, IdentifyServices, SensorServices
-from bridge.spinning import PartExecutor, Spinner
+from bridge.spinning import Spinner
 from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
 
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
+# What a node has, and what destroys one.
+_KINDS: Final = {
+    "publishers": "destroy_publisher", "subscriptions": "destroy_subscription", "timers": "destroy_timer",
+    "services": "destroy_service", "guards": "destroy_guard_condition",
+}  # fmt: skip
 SERVER_GOES_ON: Final = 3  # exit code: the supervisor stopped the node, but the server refused to shut down
 
 
@@ -40,41 +50,92 @@ class StartError(Exception):
     """The node cannot start with these parameters; the text is one sentence."""
 
 
-class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
-    """The node `bridge`. What ends it sets `exit_code` and calls `on_finish`."""
+@contextlib.contextmanager
+def _sentences() -> Iterator[None]:
+    """StartError for what ROS and the parameters raise."""
+    try:
+        yield
+    except (ParameterError, InvalidTopicNameException, ParameterException) as error:
+        raise StartError(" ".join(str(error).split())) from None
+    except RuntimeError as error:  # rclpy says no more, and not of what
+        raise StartError(
+            f"ROS cannot create the node's topics and services ({' '.join(str(error).split())}): check "
+            "qos_overrides, and that array_topic and the remappings give no two topics one name"
+        ) from None
+
+
+def _transition(act: Callable[[Any], object]) -> Callable[[Any, LifecycleState], TransitionCallbackReturn]:
+    """A transition of a managed node, by what it does."""
+
+    def change(node: BridgeNode, _: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            with _sentences():
+                act(node)
+        except StartError as error:
+            node.get_logger().error(str(error))
+            return TransitionCallbackReturn.ERROR
+        return TransitionCallbackReturn.SUCCESS
+
+    return change
+
+
+class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has no types
+    """The node `bridge`. What ends it sets `exit_code` and calls `on_finish`.
+
+    With the parameter `lifecycle` it is a managed node, which its transitions configure and activate.
+    """
 
     clock: Clock = SYSTEM_CLOCK
     channel: Channel | None = None  # tests have a clock and a channel of their own
+    is_open = False
 
     def __init__(self, arguments: Sequence[str] | None = None) -> None:
         """ParameterError or InvalidTopicNameException if a parameter is wrong.
 
         `arguments` (`--ros-args ...`) are for this node alone; None: those of the process.
         """
-        super().__init__("bridge", cli_args=arguments, use_global_arguments=arguments is None)
+        self.setting = threading.RLock()
+        Node.__init__(self, "bridge", cli_args=arguments, use_global_arguments=arguments is None)
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
-        self.parameters = parameters = declare(self)
+        self.parameters = declare(self)
+        # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
+        self.sensor_settings = SettingsParameters(self)
+        self.live = LiveParameters(self)
+        warn_of_others(self)
+        if self.parameters.lifecycle:
+            LifecycleNodeMixin.__init__(self)
+        refuse_what_raises(self)
+        self._kept = {entity for kind in _KINDS for entity in getattr(self, kind)}  # in every state
+        if not self.parameters.lifecycle:
+            self.configure()
+            self.open()
+
+    def configure(self) -> None:
+        """Make parameters that are not live read-only."""
+        self.live.is_fixed = True
+
+    def open(self) -> None:
+        """Make everything; nothing runs yet. Errors as at the start."""
+        self.parameters = parameters = self.live.gather({})
         self.stamps = stamps = Stamps(self.get_logger())
-        compensated = CompensatedOutput(self, parameters, stamps, lambda: self.reader.link.info.rate_hz)
+        compensated = CompensatedOutput(
+            self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock, self.fail
+        )
         wrench, *others = make_measured(self, parameters, stamps)
-        self.outputs = Outputs([wrench, compensated, *others])  # what control loops take goes first
+        self.outputs = Outputs([wrench, compensated, *others], InvalidHandle)  # control loops' topics first
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
-        link = self.reader.link
-        # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
-        self.sensor_settings = SettingsParameters(self, link)
-        live = LiveParameters(self)
-        self.compensation = CompensationControl(self, parameters, compensated, self.reader, live)
-        live.apply = self._apply
+        self.sensor_settings.link = link = self.reader.link
+        self.compensation = CompensationControl(self, parameters, compensated, self.reader, self.live)
+        self.live.apply = self._apply
         self.monitor = Monitor(
             self, parameters.limits, self.reader, self.compensation.state, self.outputs, stamps, self.fail
         )
         SensorServices(self, link, self.sensor_settings)
         BiasServices(self, self.compensation)
         IdentifyServices(self, self.compensation)
-        warn_of_others(self)
         link.on_change = self._on_link_change
         if parameters.supervisor_topic:
             self.create_subscription(
@@ -85,21 +146,57 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
                 callback_group=MutuallyExclusiveCallbackGroup(),  # received while a service waits
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
+        self.compensation.start()
+        self.is_open = True
+
+    def start(self) -> None:
+        """Start the threads."""
+        self.reader.thread.start()
+        self.monitor.thread.start()
+        self.compensation.output.frames.thread.start()
+        prepare(self.parameters.rt_priority, self.parameters.cpu, self.get_logger())
+
+    def stop(self) -> bool:
+        """Stop the threads and all that listens; False if a thread does not end in time."""
+        if not self.is_open:
+            return True
+        ended = self.monitor.stop() & self.reader.stop() & self.compensation.output.frames.stop()
+        self.compensation.choice.close()
+        return ended
+
+    def close(self) -> None:
+        """Go back to what it was before `open`."""
+        if self.is_open:
+            if not self.stop():
+                self.fail("a thread did not end in time")
+            self.compensation.forget_bias()
+        self.is_open = False
+        self.live.check = self.live.apply = lambda _: None
+        self.sensor_settings.link = None
+        self.sensor_settings.changed()
+        for kind, destroy in _KINDS.items():
+            for entity in {*getattr(self, kind)} - self._kept:
+                getattr(self, destroy)(entity)
+
+    def clean_up(self) -> None:
+        """Let all parameters be set again."""
+        self.close()
+        self.live.is_fixed = False
+
+    on_configure, on_activate = _transition(configure), _transition(lambda node: (node.open(), node.start()))
+    on_deactivate, on_cleanup = _transition(close), _transition(clean_up)
+    on_shutdown = on_error = on_cleanup  # one that fails leaves it unconfigured
 
     @classmethod
     def create(cls, arguments: Sequence[str] | None = None) -> Self:
         """A node that is ready to `spin`; StartError."""
-        try:
-            node = cls(arguments)
-            node.compensation.start()
-        except (ParameterError, InvalidTopicNameException, ParameterException) as error:
-            raise StartError(" ".join(str(error).split())) from None
-        except RuntimeError as error:  # rclpy says no more, and not of what
-            raise StartError(
-                f"ROS cannot create the node's topics and services ({' '.join(str(error).split())}): check "
-                "qos_overrides, and that array_topic and the remappings give no two topics one name"
-            ) from None
-        return node
+        with _sentences():
+            return cls(arguments)
+
+    def set_parameters_atomically(self, parameter_list: list[Any]) -> Any:
+        """As rclpy, which calls this for every request, but while no other thread sets any."""
+        with self.setting:
+            return super().set_parameters_atomically(parameter_list)
 
     def _apply(self, parameters: Parameters) -> None:
         self.stamps.update(parameters.stamp, self.reader.link)
@@ -119,7 +216,8 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         if self.exit_code is None:
             self.exit_code = exit_code
         self.on_finish()
-        self.reader.link.cancel()
+        if self.is_open:
+            self.reader.link.cancel()
 
     def fail(self, reason: str) -> None:
         """End the node with exit code 1, from any thread."""
@@ -127,11 +225,15 @@ class BridgeNode(Node):  # type: ignore[misc]  # rclpy has no types
         self.finish(1)
 
     def _on_supervisor(self, message: KeyValue) -> None:
-        if message.key != SUPERVISOR_KEY or message.value != SUPERVISOR_STOP or self.exit_code is not None:
+        link = self.reader.link
+        # All nodes are meant, or the one of this sensor or server: robots may share a domain.
+        names = [name for name in (link.info.serial, link.address) if name]
+        keys = SUPERVISOR_KEY, *(f"{SUPERVISOR_KEY}/{name}" for name in names)
+        if message.key not in keys or message.value != SUPERVISOR_STOP or self.exit_code is not None:
             return
         self.get_logger().info("the supervisor stops the force/torque sensors")
         try:
-            self.get_logger().info(self.reader.link.shut_server_down())
+            self.get_logger().info(link.shut_server_down())
         except RequestRefusedError as error:
             self.get_logger().error(str(error))
             self.finish(SERVER_GOES_ON)
@@ -148,49 +250,46 @@ def run(arguments: Sequence[str]) -> int:
             return _refuse(f"unknown argument {unknown[0]!r}: see --help", 2)
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
-        # rclpy has no public names for these.
-        wrong_arguments = type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
         text = " ".join(str(error).split())
         if "logging directory" in text:
             text += "; set HOME, or ROS_LOG_DIR to a directory for its log"
-        return _refuse(f"ROS cannot start: {text}", 2 if wrong_arguments else 1)
+        return _refuse(f"ROS cannot start: {text}", 2 if is_about_arguments(error) else 1)
     try:
         node = BridgeNode.create()
         call_on_stop_signal(lambda _signal: node.finish(0))
-        given = node.parameters.rt_priority, node.parameters.cpu
-        return spin(node, lambda: prepare(*given, node.get_logger()))
+        return spin(node)
     except StartError as error:
         return _refuse(str(error), 2)
     finally:
         rclpy.try_shutdown()
 
 
-def spin(node: BridgeNode, on_started: Callable[[], object] = lambda: None) -> int:
+def spin(node: BridgeNode) -> int:
     """Run the node until it is told to finish, and destroy it; returns its exit code.
 
-    `on_started` is called once its threads run.
+    Services may block: parameters do not wait for them, nor do supervisor and orientation.
     """
-    prompt = PartExecutor(node)
-    executor = PartExecutor(node, prompt)
-    spinner, prompt_spinner = Spinner(executor), Spinner(prompt)
+    executor, beside = make_executors(node, node.live.group)
+    spinner, spinners = Spinner(executor), {name: Spinner(each) for name, each in beside.items()}
     node.on_finish = spinner.stop
-    listener = Worker("listener", prompt_spinner.run, node.fail)
-    listener.start()
-    node.reader.thread.start()
-    node.monitor.thread.start()
+    workers = [Worker(name, each.run, node.fail) for name, each in spinners.items()]
+    for worker in workers:
+        worker.start()
+    if node.is_open:
+        node.start()
     try:
-        on_started()
         if node.exit_code is not None:  # a signal came before there was a spinner
             spinner.stop()
         spinner.run()
         return node.exit_code or 0
     finally:
-        prompt_spinner.stop()
-        if not (listener.has_ended() & node.monitor.stop() & node.reader.stop()):
+        for each in spinners.values():
+            each.stop()
+        if not all([*(worker.has_ended() for worker in workers), node.stop()]):
             node.get_logger().error("a thread did not end in time")
         else:
-            prompt.shutdown()
-        node.compensation.choice.close()
+            for part in beside.values():
+                part.shutdown()
         executor.shutdown()
         node.destroy_node()
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node's own process: stop signals, the scheduling of its threads, and threads that do not die silently.
 
 SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in every thread and one
@@ -6,8 +7,9 @@ while it waits inside ROS for the next message.
 
 The stream's thread gets `rt_priority` and `cpu`. It takes locks that know no priorities, Python's (GIL) and
 the middleware's: whoever holds one while another program has its CPU delays the stream, beside endless loops
-by 2 to 5 ms. So the threads that do so all the time get the priority just below: the monitor, the callbacks
-that wait for no others, Fast DDS. The executor of the services stays ordinary: what it does may take long.
+by 2 to 5 ms. So the threads that do so all the time get the priority just below: the monitor, frames by
+TF, the callbacks that wait for no others, Fast DDS. The executor of the services stays ordinary: what it does
+may take long.
 """
 
 from __future__ import annotations
@@ -23,12 +25,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from bota_ethercat.client.real_time import make_real_time
-
 STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
 _SAME_S: Final = 1.0
 STREAM: Final = "reader"
-BESIDE: Final = ("monitor", "listener")  # threads of the node that share Python's lock with the stream's
+BESIDE: Final = ("monitor", "listener", "frames")  # threads that share Python's lock with the stream's
 _MIDDLEWARE: Final = "dds."  # how Fast DDS names its threads
 # Longest time that the stream waits for Python's lock. A sample takes less, so it is not interrupted.
 _SWITCH_S: Final = 0.0002
@@ -79,6 +79,8 @@ def call_on_stop_signal(callback: Callable[[signal.Signals], None]) -> None:
 
 def prepare(rt_priority: int, cpu: int, log: Any) -> None:
     """Give the node's threads, which run, their scheduling as far as allowed, and log one line of it."""
+    from bota_ethercat.client.real_time import make_real_time  # noqa: PLC0415 - `client` says where it is missing
+
     if not rt_priority and cpu < 0:
         return
     stream = next((each.native_id for each in threading.enumerate() if each.name == STREAM), None)

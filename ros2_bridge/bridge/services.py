@@ -1,4 +1,6 @@
-"""The services, all `std_srvs/Trigger`; the message is the result.
+# SPDX-License-Identifier: Apache-2.0
+"""The services: `std_srvs/Trigger`, whose message is the result; where the package `bota_ethercat_msgs` is
+built, some with numbers too, as `~/typed/NAME`.
 
 Each blocks the executor, and never the stream: until the server has answered or a time-out, or for the
 `rest.duration` of a window.
@@ -7,37 +9,55 @@ Each blocks the executor, and never the stream: until the server has answered or
 from __future__ import annotations
 
 import json
+import math
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from types import SimpleNamespace
+from typing import Any, Final, NamedTuple
 
+from geometry_msgs.msg import Wrench as WrenchMessage
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from bota_ethercat.control import MAX_TARE_SAMPLES
 from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import Vector3
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.declare import SettingsParameters
-from bridge.parameters.table import AUTO
+from bridge.parameters.table import AUTO, ParameterError
 from bridge.publishing.compensated_wrench import RestWindow
+from bridge.rclpy_internals import filling
 from bridge.stream.link import (
     CONFIGURE_TIMEOUT_S,
     DESCRIBE_TIMEOUT_S,
     Link,
     RequestFailedError,
     find_sensor,
+    known_offset,
     offset_text,
 )
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
 from ft_compensation.identification.poses import Pose, coverage, pose_of
-from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, length, wrench_text
+from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, Wrench, length, vector, wrench_text
 
+TYPED: dict[str, Any] = {}
+with suppress(ImportError):  # the package is built in a workspace
+    from bota_ethercat_msgs.srv import GetSettings, Identify, Tare
+
+    TYPED |= {"tare": Tare, "sensor_tare": Tare, "get_settings": GetSettings, "identify/solve": Identify}
+
+_USUAL_HZ: Final = 800.0  # where the server does not tell
+_UNKNOWN: Final = (math.nan,) * 6
 _TARE_S: Final = 0.5  # how long a tare of the sensor averages
-_FEWEST_SAMPLES, _MOST_SAMPLES = 20, 2000
+_FEWEST_SAMPLES: Final = 20
 # The server may take so many times as long as the samples should: it takes them twice.
 _TARE_PATIENCE: Final = 6.0
 _TARE_EXTRA_S: Final = 4.0
@@ -46,27 +66,52 @@ _LOOK_S: Final = 0.05
 _SETTLED_WITHIN_S: Final = 10.0
 
 
-def _create_triggers(node: Node, prefix: str, *acts: Callable[[], str]) -> None:
-    """A service named as each act, which returns what it did; an error says why it was not done."""
+_AS_USUAL: Final = SimpleNamespace(target=WrenchMessage(), samples=0)  # what a Trigger asks for
+
+
+class Done(NamedTuple):
+    """What was done, a sentence, and the fields of a typed response; a tuple is a vector's, or a wrench's."""
+
+    text: str
+    fields: Mapping[str, object]
+
+
+def _create(node: Node, prefix: str, *acts: Callable[..., str | Done]) -> None:
+    """Services named as each act, which returns what it did; an error says why it was not done."""
     log = node.get_logger()
-    for act in acts:
 
-        def answer(_request: Any, response: Any, act: Callable[[], str] = act) -> Any:
-            try:
-                response.message, response.success = act(), True
-            except (CompensationError, RequestFailedError) as error:
-                response.message, response.success = str(error), False
-                log.warning(f"{prefix}{_name(act)} failed: {error}")
-            else:
-                if not _name(act).startswith("get_"):
-                    log.info(response.message)
+    def answer(name: str, act: Callable[..., str | Done], request: Any, response: Any) -> Any:
+        is_typed = name.startswith("typed/")
+        try:
+            done = act(request) if is_typed else act()
+        except (CompensationError, ParameterError, RequestFailedError) as error:
+            response.message = str(error)
+            log.warning(f"{name} failed: {error}")
             return response
+        response.success, response.message = True, done if isinstance(done, str) else done.text
+        for field, value in done.fields.items() if is_typed and isinstance(done, Done) else ():
+            if isinstance(value, tuple):
+                filling(getattr(response, field))(*value)
+            else:
+                setattr(response, field, value)
+        if not name.endswith("get_settings"):
+            log.info(response.message)
+        return response
 
-        node.create_service(Trigger, f"~/{prefix}{_name(act)}", answer)
+    for act in acts:
+        name = prefix + act.__name__.lstrip("_")
+        node.create_service(Trigger, f"~/{name}", partial(answer, name, act))
+        if name in TYPED:
+            node.create_service(TYPED[name], f"~/typed/{name}", partial(answer, f"typed/{name}", act))
 
 
-def _name(act: Callable[[], str]) -> str:
-    return act.__name__.lstrip("_")
+def _target(request: Any) -> Wrench:
+    """What a tare is to make of the reading; CompensationError if that is not finite."""
+    parts = request.target.force, request.target.torque
+    try:
+        return Wrench(*(vector((part.x, part.y, part.z), "a target") for part in parts))
+    except ValueError as error:
+        raise CompensationError(str(error)) from None
 
 
 class SensorServices:
@@ -75,20 +120,27 @@ class SensorServices:
     def __init__(self, node: Node, link: Link, settings: SettingsParameters) -> None:
         self._link, self._settings = link, settings
         acts = self._sensor_tare, self._get_settings, self._apply_settings, self._save_settings
-        _create_triggers(node, "", *acts)
+        _create(node, "", *acts)
 
-    def _sensor_tare(self) -> str:
-        rate_hz = self._link.info.rate_hz or 800.0
-        samples = min(max(round(_TARE_S * rate_hz), _FEWEST_SAMPLES), _MOST_SAMPLES)
+    def _sensor_tare(self, request: Any = _AS_USUAL) -> Done:
+        sensor, rate_hz = self._link.sensor, self._link.info.rate_hz or _USUAL_HZ
+        samples = _bounded(request.samples or round(_TARE_S * rate_hz))
         timeout_s = _TARE_EXTRA_S + _TARE_PATIENCE * samples / rate_hz
-        reply = self._link.ask("tare", timeout_s, sensor=self._link.sensor, samples=samples)
+        target = [*_target(request).values]
+        reply = self._link.ask("tare", timeout_s, sensor=sensor, samples=samples, target=target)
         titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
         parts = [f"{title} {offset_text(reply.get(key))}" for key, title in titles]
-        return f"sensor {self._link.sensor} tared: " + "; ".join(parts)
+        offset, spread, residual = (
+            known_offset(reply.get(key)) or _UNKNOWN for key in ("new_offset", "deviation", "residual")
+        )
+        fields = {"bias": tuple(-value for value in offset), "spread": spread, "residual": residual}
+        return Done(f"sensor {sensor} tared: " + "; ".join(parts), fields)
 
-    def _get_settings(self) -> str:
+    def _get_settings(self, _: Any = None) -> Done:
         info = find_sensor(self._link.ask("describe", DESCRIBE_TIMEOUT_S), self._link.sensor)
-        return json.dumps({**info.settings, "rate_hz": info.rate_hz})
+        settings = [Parameter(name, value=value).to_parameter_msg() for name, value in info.settings.items()]
+        fields = {"message": f"of {info}", "rate_hz": info.rate_hz, "settings": settings}
+        return Done(json.dumps({**info.settings, "rate_hz": info.rate_hz}), fields)
 
     def _apply_settings(self) -> str:
         return f"sensor {self._link.sensor} has these settings now: {json.dumps(self._settings.apply())}"
@@ -105,12 +157,12 @@ class BiasServices:
 
     def __init__(self, node: Node, control: CompensationControl) -> None:
         self._control = control
-        _create_triggers(node, "", self._tare, self._clear_tare, self._undo_tare)
+        _create(node, "", self._tare, self._clear_tare, self._undo_tare)
 
-    def _tare(self) -> str:
-        control = self._control
+    def _tare(self, request: Any = _AS_USUAL) -> Done:
+        control, target = self._control, _target(request)
         payload = control.parameters.payload
-        window = take_window(control, needs_tool=payload.mass > 0)
+        window = take_window(control, needs_tool=payload.mass > 0, samples=request.samples)
         means = window.means()
         specific_force: Vector3 | None = None
         try:
@@ -122,9 +174,8 @@ class BiasServices:
             if payload.mass:
                 raise
             specific_force = None  # not needed without a tool_mass
-        control.set_bias(
-            estimate_bias(means, payload, specific_force or ZERO), "tare", Taken(payload, specific_force)
-        )
+        bias = estimate_bias(means, payload, specific_force or ZERO).plus(target, -1.0)
+        control.set_bias(bias, "tare", Taken(payload, specific_force))
         if payload.mass:
             weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
         else:
@@ -132,7 +183,9 @@ class BiasServices:
                 "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds in "
                 "this orientation only"
             )
-        return f"bias of {means.samples} samples: {wrench_text(control.bias)}; {weight}"
+        spread, residual = means.force_spread + means.torque_spread, means.latest.plus(means.wrench, -1.0)
+        fields = {"bias": bias.values, "spread": spread, "residual": residual.values}
+        return Done(f"bias of {means.samples} samples: {wrench_text(bias)}; {weight}", fields)
 
     def _clear_tare(self) -> str:
         self._control.set_bias(NO_WRENCH, "cleared")
@@ -150,8 +203,8 @@ class IdentifyServices:
         self._poses: list[Pose] | None = None  # those taken so far; None: no identification was started
         self._sensor = self._sensor_now()  # as of its start
         self._result: Identified | None = None  # the latest solution, of the current poses
-        acts = self._start, self._add_pose, self._drop_pose, self._solve, self._apply, self._cancel
-        _create_triggers(node, "identify/", *acts)
+        acts = self._start, self._add_pose, self._drop_pose, self._solve, self._apply
+        _create(node, "identify/", *acts)
 
     def _start(self) -> str:
         if self._control.parameters.gravity_source == "none":
@@ -188,10 +241,23 @@ class IdentifyServices:
         self._result = None
         return f"the pose is dropped, {len(poses)} are left; {coverage(poses).advice}"
 
-    def _solve(self) -> str:
+    def _solve(self, _: Any = None) -> Done:
         result = self._result = identify(self._started())
         parts = [summary(result), *details(result)]
-        return ". ".join([*parts, f"{self._write(result, parts)}; identify/apply puts it in force"])
+        text = ". ".join([*parts, f"{self._write(result, parts)}; identify/apply puts it in force"])
+        fields = {
+            "poses": result.coverage.poses,
+            "confidence": result.confidence,
+            "mass": result.payload.mass,
+            "mass_interval": result.mass_interval,
+            "center": result.payload.center,
+            "center_interval": result.centre_interval,
+            "bias": result.bias.values,
+            "bias_interval": result.bias_interval.values,
+            "force_residual": result.force_fit.rms,
+            "torque_residual": result.torque_fit.rms,
+        }
+        return Done(text, fields)
 
     def _apply(self) -> str:
         if self._poses is not None:
@@ -206,11 +272,6 @@ class IdentifyServices:
             + (", accelerometer.offset and accelerometer.scale" if accelerometer else "")
             + "; to keep the tool, start the node with the file"
         )
-
-    def _cancel(self) -> str:
-        poses = self._started()
-        self._poses = self._result = None
-        return f"identification cancelled, {len(poses)} poses dropped; nothing was changed"
 
     def _started(self) -> list[Pose]:
         now = self._sensor_now()
@@ -270,8 +331,12 @@ def details(result: Identified) -> list[str]:
     ]
 
 
-def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow:
-    """The samples of the next `rest.duration`, whole, once the sensor's data has settled.
+def _bounded(samples: int) -> int:
+    return min(max(samples, _FEWEST_SAMPLES), MAX_TARE_SAMPLES)
+
+
+def take_window(control: CompensationControl, *, needs_tool: bool, samples: int = 0) -> RestWindow:
+    """The samples of the next `rest.duration`, or so many, once the sensor's data has settled.
 
     CompensationError or RequestFailedError if they do not come or mean nothing.
     """
@@ -283,6 +348,10 @@ def take_window(control: CompensationControl, *, needs_tool: bool) -> RestWindow
     _wait_settled(link)
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
     window = RestWindow(seconds, limits, control.choice.source)
+    if samples:
+        limits = replace(limits, least_samples=_bounded(samples))
+        seconds = limits.least_samples / (link.info.rate_hz or _USUAL_HZ)
+        window = RestWindow(0.0, limits, control.choice.source)
     patience_s = 1.5 * seconds + _PATIENCE_S
     deadline_s = clock.monotonic() + patience_s
     info, offset, bad = link.info, link.info.offset, control.reader.not_finite

@@ -1,4 +1,5 @@
-"""Runs an executor until it is told to stop, from any thread; and one node in two of them.
+# SPDX-License-Identifier: Apache-2.0
+"""Runs an executor until it is told to stop, from any thread.
 
 Not with rclpy's `spin_until_future_complete`: that keeps a callback for every message it has handled. Nor
 with `spin` and `shutdown`: that takes the executor's guard condition from under a thread that waits for it.
@@ -7,10 +8,8 @@ with `spin` and `shutdown`: that takes the executor's guard condition from under
 from __future__ import annotations
 
 import threading
-from typing import Any
 
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.executors import Executor, ExternalShutdownException
 
 
 class Spinner:
@@ -38,43 +37,3 @@ class Spinner:
             self._stopping = True
             if not self._ended:
                 self._executor.create_task(lambda: None)  # something to do, so that `spin_once` returns
-
-
-class PartExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy has no types
-    """For some of a node's callbacks: the prompt ones wait for no others, the ordinary ones may block.
-
-    Prompt are those in a callback group of their own. rclpy has `MultiThreadedExecutor` for that, which hands
-    every callback to a pool and waits for all of the node's services anew each time: too much beside the
-    reader, for an orientation 500 times a second.
-    """
-
-    def __init__(self, node: Node, prompt: PartExecutor | None = None) -> None:
-        """Without `prompt` it is the prompt one; with it, the ordinary one, which the node knows."""
-        self._prompt = prompt
-        super().__init__(context=node.context)
-        self._part = _Part(node, is_default=prompt is not None)
-        if prompt is not None:
-            self.add_node(node)
-
-    def get_nodes(self) -> list[Any]:
-        """The node's entities that are for this executor."""
-        return [self._part]
-
-    def wake(self) -> None:
-        """Wake both: the node has another entity, or one less."""
-        super().wake()
-        if self._prompt is not None:
-            self._prompt.wake()
-
-
-class _Part:
-    """A node as an executor sees it, with the entities that are in its default callback group, or not."""
-
-    def __init__(self, node: Node, *, is_default: bool) -> None:
-        self._node, self._is_default = node, is_default
-
-    def __getattr__(self, kind: str) -> Any:
-        """`subscriptions`, `timers`, `clients`, `services`, `guards` or `waitables`."""
-        default, wanted = self._node.default_callback_group, self._is_default
-        entities = getattr(self._node, kind)
-        return [entity for entity in entities if (entity.callback_group is default) is wanted]

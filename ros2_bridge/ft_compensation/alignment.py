@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What brings the IMU's samples to the instant and the bandwidth of force and torque.
 
 The sensor's filters delay force and torque by 0.9 ms (SINC 32) to 120 ms (SINC 512 with FIR), what its

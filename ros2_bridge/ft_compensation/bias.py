@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bias: estimated while the sensor is stationary, ramped in, and undone.
 
 Pose-aware: with a payload, its weight at the pose of the window is not part of the bias, so it stays with
@@ -152,10 +153,10 @@ class BiasRamp:
         """What that was taken with."""
         return self._course.taken
 
-    def go(self, target: Wrench, now_s: float, taken: Taken = _OF_NO_TARE) -> None:
+    def go(self, target: Wrench, now_s: float, taken: Taken = _OF_NO_TARE, *, may_undo: bool = True) -> None:
         """From the bias of `now_s` (the newest sample's time) to `target`."""
         with self._lock:
-            self._before = self.target, self.taken
+            self._before = (self.target, self.taken) if may_undo else None
             self._course = _Course(self.at(now_s), target, now_s, self.seconds, taken)
 
     def shift(self, change: Wrench) -> None:
@@ -180,7 +181,7 @@ class BiasRamp:
         with self._lock:
             before = self._before
             if before is None:
-                raise CompensationError("there is no change of the bias to undo")
+                raise CompensationError("there is no tare to undo")
             self.go(before[0], now_s, before[1])
             self._before = None
             return before[0]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the compensation of a moving tool cannot know, in N: from the IMU's samples of about a second.
 
 - Filters: by the spectrum of acceleration and angular rate, what force and torque have of them (magnitude and
@@ -23,7 +24,7 @@ from ft_compensation.quantities import length
 
 FEWEST: Final = 64  # samples
 _NEAR_LIMIT: Final = 0.95  # of the range: offset and scale shift where an axis ends
-_ABOVE_NOISE: Final = 10.0  # times the noise's power: less is noise
+_ABOVE_NOISE: Final = 16.0  # times the noise's power: so much has one of ten million bins of noise
 _GAINS: Final = 65  # frequencies at which the filters' magnitudes are computed
 _FLAT: Final = 0.002  # of the range: noise of what reads the limit
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compensated wrench filtered, and in another frame. Plain floats.
 
 `wrench_filtered`: a second-order Butterworth low-pass in direct form I. Its state is past inputs and outputs,

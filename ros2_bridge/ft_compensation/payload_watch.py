@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether the payload is still the one that is compensated: judged from what is measured in ordinary motion.
 
 Short windows of slow motion are kept, the latest of each orientation. Another mass than the compensated one

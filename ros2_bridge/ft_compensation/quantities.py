@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the parts of compensation hand to each other: wrench, payload, and the error with a sentence."""
 
 from __future__ import annotations

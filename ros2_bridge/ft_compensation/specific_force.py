@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The specific force at the tool's center of gravity: acceleration minus gravity.
 
 An accelerometer measures it: at rest it reads minus gravity. The tool, held by the sensor, loads it with

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Was the sensor stationary for the whole of a window, and what did it read meanwhile?
 
 The one criterion of tare and identification, live and in recordings, with the limits of `StationaryLimits`:
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from bota_ethercat.pdo import Sample, Vector3
 from bota_ethercat.sensor.warnings_register import WarningFlag
-from ft_compensation.quantities import ZERO, CompensationError, Wrench
+from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, Wrench
 from ft_compensation.stationary_limits import StationaryLimits
 
 _MOST_SAMPLES: Final = 200_000
@@ -53,6 +54,7 @@ class StationaryMeans(NamedTuple):
     seconds: float
     acceleration_spread: Vector3 = ZERO  # m/s²
     time_s: float | None = None  # of its middle, by the samples' clock
+    latest: Wrench = NO_WRENCH  # N, Nm: the mean of the last quarter
 
 
 class StationaryWindow:
@@ -130,7 +132,10 @@ def stationary_means(rows: Array, seconds: float, limits: StationaryLimits) -> S
         )
     f, t, a, r = (triple(mean[first : first + 3]) for first in (0, 3, 6, 9))
     of_force, of_torque, of_acceleration = (triple(spread[first : first + 3]) for first in (0, 3, 6))
-    return StationaryMeans(Wrench(f, t), a, r, of_force, of_torque, len(rows), seconds, of_acceleration)
+    latest = Wrench.of(rows[-len(rows) // _BLOCKS :, :6].mean(axis=0))
+    return StationaryMeans(
+        Wrench(f, t), a, r, of_force, of_torque, len(rows), seconds, of_acceleration, latest=latest
+    )
 
 
 def _check(values: Array, limits: tuple[float, ...], shown: Array, how: str) -> None:

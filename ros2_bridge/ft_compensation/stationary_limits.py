@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What counts as stationary; without NumPy, for command lines."""
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts the node with its parameter file; what is given as an argument wins over the file.
 
-`ros2 launch bridge bridge.launch.py --show-args` lists the arguments.
+`ros2 launch bota_ethercat_bridge bridge.launch.py --show-args` lists the arguments.
 """
 
+import os
 from pathlib import Path
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -23,8 +25,11 @@ PARAMETERS = {
     "frame_id": (TEXT, "Frame of the wrench"),
     "imu_frame_id": (TEXT, "Frame of the IMU"),
     "array_topic": (TEXT, "Topic of the Float64MultiArray; without a leading slash it is in the namespace"),
+    "lifecycle": (NUMBER, "true: a managed node, which waits for its transitions"),
 }
 IN_FILE = " (empty: as in params_file)"
+PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+REAL_TIME = 40  # SCHED_FIFO, below the 50 of a controller manager
 
 
 def start_node(context):
@@ -40,13 +45,19 @@ def start_node(context):
         for name, (value_type, _) in PARAMETERS.items()
         if value(name)
     }
+    environment = {}
+    if value("realtime").lower() in {"true", "1"}:
+        given["rt_priority"] = REAL_TIME
+        profiles = Path(__file__).parents[1] / "config" / "fastdds.xml"
+        environment = {PROFILES: os.environ.get(PROFILES) or str(profiles)}
     return [
         Node(
-            package="bridge",
+            package="bota_ethercat_bridge",
             executable="client",
             name="bridge",
             namespace=value("namespace"),
             parameters=[file, *([given] if given else [])],
+            additional_env=environment,
             ros_arguments=["--log-level", value("log_level")] if value("log_level") else [],
             respawn=LaunchConfiguration("respawn"),
             respawn_delay=2.0,
@@ -56,7 +67,7 @@ def start_node(context):
 
 
 def generate_launch_description():
-    file = PathJoinSubstitution([FindPackageShare("bridge"), "config", "client.yaml"])
+    file = PathJoinSubstitution([FindPackageShare("bota_ethercat_bridge"), "config", "client.yaml"])
     return LaunchDescription(
         [
             DeclareLaunchArgument("params_file", default_value=file, description="The node's parameters"),
@@ -64,6 +75,11 @@ def generate_launch_description():
             *(
                 DeclareLaunchArgument(name, default_value="", description=description + IN_FILE)
                 for name, (_, description) in PARAMETERS.items()
+            ),
+            DeclareLaunchArgument(
+                "realtime",
+                default_value="false",
+                description=f"true asks for SCHED_FIFO {REAL_TIME}, locked memory and our Fast DDS profile",
             ),
             DeclareLaunchArgument(
                 "respawn",

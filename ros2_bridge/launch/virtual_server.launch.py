@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts `ethercat-server` on a virtual bus, for launch files without hardware; its end ends the launch."""
 
 import shlex

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `colcon test` runs: the package is whole. What it does is tested in the repository's tests/."""
 
 import importlib

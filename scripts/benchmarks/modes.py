@@ -20,9 +20,9 @@ import numpy as np
 from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import PROCESSES, WARM_UP_S, Chain, Child, Figures, ScriptError, Setup, Turn
 from scripts.benchmarks.processes.masters import build
+from scripts.benchmarks.records import REAL_TIME
 from scripts.benchmarks.statistics import Arrivals, Floats
 
-REAL_TIME: Final = 40  # of the client, or of node and subscriber: the default of the node's `rt_priority`
 _MOST_TURNS: Final = 3
 _NONE: Final = "-"
 VENDOR: Final = Path(__file__).parents[2] / ".venv-vendor"
@@ -57,7 +57,7 @@ def _start(name: str, chain: Chain) -> Child:
     if name == ROS:
         topics = [f"/benchmark_{position}" for position in range(setup.sensors)]
         for position, topic in enumerate(topics):
-            chain.node(f"array_topic:={topic}", position=position)
+            chain.node(f"array_topic:={topic}", f"rt_priority:={REAL_TIME}", position=position)
         return chain.recorder("ros", *topics)
     return chain.recorder("tcp") if name == THIS else chain.recorder("c", yardstick, "client")
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 PORT: Final = 12001  # of the server and what is compared with it
+REAL_TIME: Final = 40  # SCHED_FIFO of clients, the node among them, as the launch file's `realtime:=true`
 COLUMNS: Final = 5
 _NS: Final = 1_000_000_000
 

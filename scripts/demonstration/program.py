@@ -29,7 +29,7 @@ from scripts.benchmarks.chain import (
     loopback_up,
     stoppable,
 )
-from scripts.benchmarks.records import PORT, may_be_real_time
+from scripts.benchmarks.records import PORT, REAL_TIME, may_be_real_time
 from scripts.demonstration.measure import FULL_RATE, Measurement, Summary, verdict
 
 TOPIC: Final = "/sensone_sensor_data"
@@ -141,7 +141,8 @@ def run(seconds: float | None) -> int:
     setup = Setup(_RATE_HZ, 1, 0.0, DEFAULT_PRIORITY if may_be_real_time() else 0)
     with Chain(setup) as chain:
         chain.start("ethercat-server", binaries / "ethercat-server", "virtual", PORT)
-        chain.start("bridge-client", binaries / "bridge-client", "--ros-args", "-p", f"server_port:={PORT}")
+        chain.start("bridge-client", binaries / "bridge-client", "--ros-args", "-p", f"server_port:={PORT}",
+                    "-p", f"rt_priority:={REAL_TIME}")  # fmt: skip
         client = chain.connect(1)
         sensor = client.description["sensors"][0]
         measurement = Measurement(float(sensor["rate_hz"]))

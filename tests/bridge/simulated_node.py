@@ -14,12 +14,14 @@ There is one thread, so the same test gives the same run.
 from __future__ import annotations
 
 import contextlib
+import copy
 import itertools
 import math
 import threading
 import uuid
 from collections import deque
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -212,7 +214,7 @@ class Topic:
         if isinstance(message, bytes):
             message = deserialize_message(message, self._publisher.msg_type)
         if self.is_heard:
-            self.messages.append(message)
+            self.messages.append(copy.deepcopy(message))
 
 
 class Guard:
@@ -237,6 +239,7 @@ class Node(Asking):
         self.name = f"/test_{uuid.uuid4().hex}/bridge"
         self.topics: dict[str, Topic] = {}
         self._triggered = list[Callable[[], object]]()
+        self.stand_ins: list[Any] = []
         self.server, self._tick_ns, self._is_busy = server, 0, False
         self._agenda: list[tuple[int, Callable[[], object]]] = []
         self._clock = SimulatedClock(server, self.step)
@@ -249,6 +252,17 @@ class Node(Asking):
             def create_publisher(self, *arguments: Any, **options: Any) -> Any:
                 topic = Topic(super().create_publisher(*arguments, **options))
                 return bench.topics.setdefault(topic.topic_name, topic)
+
+            def destroy_publisher(self, publisher: Any) -> bool:
+                return bool(super().destroy_publisher(getattr(publisher, "_publisher", publisher)))
+
+            def create_service(self, kind: Any, name: str, callback: Any, **options: Any) -> Any:
+                if hasattr(kind, "_TYPE_SUPPORT"):
+                    return super().create_service(kind, name, callback, **options)
+                full = name.replace("~", bench.name)  # ROS has no stand-ins
+                stand_in = SimpleNamespace(srv_type=kind, service_name=full, callback=callback)
+                bench.stand_ins.append(stand_in)
+                return stand_in
 
             def create_guard_condition(self, callback: Callable[[], object], *_: Any) -> Any:
                 return Guard(callback, bench._triggered)
@@ -305,6 +319,7 @@ class Node(Asking):
         reader.client._reader = None  # who asks the server waits as another thread does
         while self._triggered and not self._is_busy:
             self._triggered.pop(0)()
+        self.node.compensation.output.frames.look()
 
     def run(self, seconds: float) -> None:
         """Let so much simulated time pass."""
@@ -330,7 +345,8 @@ class Node(Asking):
 
     def call(self, name: str, request: Any) -> Any:
         """The response of one of the node's services."""
-        (service,) = [found for found in self.node.services if found.service_name == f"{self.name}/{name}"]
+        offered = [*self.node.services, *self.stand_ins]
+        (service,) = [found for found in offered if found.service_name == f"{self.name}/{name}"]
         self._is_busy = True
         try:
             response = service.callback(request, service.srv_type.Response())
@@ -370,6 +386,10 @@ class Node(Asking):
         heard = self.topics[topic if topic.startswith("/") else f"{self.name.removesuffix('bridge')}{topic}"]
         heard.is_heard = True
         return heard.messages
+
+    def unhear(self, topic: str) -> None:
+        """Subscribe no more."""
+        self.topics[f"{self.name.removesuffix('bridge')}{topic}"].is_heard = False
 
     def statuses(self) -> dict[str, Any]:
         """The next array of /diagnostics: {short name: status}."""

@@ -156,6 +156,15 @@ def test_a_tool_that_is_set_after_a_tare(
     stages.at(SIDE, bias=BIAS)
 
 
+def test_a_tool_that_is_set_during_a_tare(stages: Stages, server: Server, node: Node) -> None:
+    node.set("tool_mass", 0.0)
+    server.hold(UP, bias=BIAS)
+    node.at(0.15, lambda: node.set("tool_mass", TOOL.mass))
+    node.do("tare")
+    for up in (UP, OVER):
+        stages.at(up, bias=BIAS)
+
+
 def test_a_tare_that_is_restored_is_for_the_tool_of_now(stages: Stages, server: Server, node: Node) -> None:
     node.set("tool_mass", 0.0)
     for up in (UP, SIDE):
@@ -270,12 +279,16 @@ def test_clear_and_undo(stages: Stages, server: Server, node: Node) -> None:
     stages.settle(list(BIAS.values))
     node.do("undo_tare", "back to the bias before: Fx 3.0000")
     stages.settle(ZERO6)
-    assert node.trigger("undo_tare") == (False, "there is no change of the bias to undo")
+    node.set("bias", [1.0] * 6)
+    assert node.trigger("undo_tare") == (False, "there is no tare to undo")
+    server.hold(UP, force_x=2e6)  # counts, say
+    node.refuse("tare", "parameter bias is ", "it must be 6 numbers")
 
 
 def test_a_bias_is_ramped_in(stages: Stages, node: Node) -> None:
     node.set("bias_ramp_time", 0.6)
     stages.forget()
+    assert values(node.statuses()["compensation"])["bias_ramping"] == "false"
     node.set("bias", [0, 0, -6, 0, 0, 0])
     node.run(0.7)
     seen = [round(six(message)[2], 6) for message in stages.final]

@@ -156,20 +156,11 @@ def test_a_result_is_of_the_poses_that_there_are(started: Node, take: Take) -> N
     assert "pose 1 taken" in take(UP)
 
 
-def test_cancel_changes_nothing(started: Node, take: Take) -> None:
-    take(UP, SIDE)
-    assert started.trigger("identify/cancel") == (
-        True, "identification cancelled, 2 poses dropped; nothing was changed",
-    )  # fmt: skip
-    for service in ("add_pose", "drop_pose", "solve", "cancel"):
-        started.refuse(f"identify/{service}", "call identify/start first")
-    assert not started.trigger("identify/apply")[0]
-    assert list(started.parameters("bias")[0]) == ZERO6
-
-
 def test_it_does_not_start_without_an_orientation(node: Node) -> None:
     node.set("gravity_source", "none")
     node.refuse("identify/start", "gravity_source is none")
+    for service in ("add_pose", "drop_pose", "solve"):
+        node.refuse(f"identify/{service}", "call identify/start first")
 
 
 def test_a_tool_that_was_lost_is_a_warning_and_nothing_is_changed(node: Node, server: Server) -> None:

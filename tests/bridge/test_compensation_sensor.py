@@ -62,7 +62,7 @@ def test_nothing_of_one_sensor_is_used_for_another(sensor: Sensor, node: Node, s
     assert stages.first() == pytest.approx(BIAS.values, abs=1e-3)
     assert "another sensor is there now, serial number 2: the bias was the other's" in node.log
     assert list(node.parameters("bias")[0]) == ZERO6
-    assert node.trigger("undo_tare") == (False, "there is no change of the bias to undo")
+    assert node.trigger("undo_tare") == (False, "there is no tare to undo")
     node.refuse("identify/add_pose", "another sensor is there now, so the previous poses were dropped")
     node.refuse("identify/add_pose", "no identification was started")
     # A bias that is given is any sensor's.

@@ -291,14 +291,14 @@ def test_the_source_tf(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
         node.until(words, compensation="error")
         assert set(tf.asked) == {("world", "ft")}
         assert not any(stages.all)
-        tf.quaternion, tf.stamp_ns, tf.error = TILTED, robot.time_ns, None
+        tf.quaternion, tf.newest_ns, tf.error = TILTED, robot.time_ns, None
         stages.at(SIDE)
         tf.error = "the tree fell apart"
         node.until("older than the sample (limit 0.5 s, ", "the tree fell apart", compensation="error")
         assert stages.are_silent()
         tf.error = None
         stages.settle(ZERO6)
-        tf.stamp_ns = lambda: 0  # static transforms only: they hold at any time
+        tf.newest_ns = lambda: 0  # static transforms only: they hold at any time
         monkeypatch.setattr(time, "time_ns", robot.time_ns)
         node.run(1.0)
         stages.settle(ZERO6)

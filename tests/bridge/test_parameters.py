@@ -200,6 +200,7 @@ def test_what_is_warned_of_at_start() -> None:
     with Node(Server(), sensor=0, **{"qos_overrides./wrench.publisher.depth": 3}) as node:
         assert "unknown parameter" not in node.log
         assert "use_sim_time" not in node.log
+        node.refuse_value("use_sim_time", True, "a real sensor has no simulation time")
 
 
 @pytest.mark.parametrize(

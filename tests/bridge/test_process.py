@@ -5,10 +5,10 @@ from __future__ import annotations
 import gc
 import os
 import queue
+import re
 import signal
 import sys
 import threading
-import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,13 +20,27 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
-from bridge import process
-from bridge.client import PROFILES, use_own_profiles
+from bridge import client, process
 from bridge.spinning import Spinner
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
-from tests.bridge.simulated_node import DEFAULTS
 from tests.rights import needs_root, skip_if_forbidden
+
+
+@pytest.mark.parametrize(
+    ("missing", "remedy"),
+    [("rclpy", "source ROS 2"), ("std_msgs", "source ROS 2"), ("bota_ethercat", "build the package")],
+)
+def test_a_missing_module_is_named(
+    missing: str, remedy: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(client, "block_stop_signals", lambda: None)
+    for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bridge"}]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)
+    assert client.main([]) == 1
+    said = capsys.readouterr().err
+    assert re.match(rf"bridge-client: {missing} cannot be loaded \(.*\): {remedy}", said)
 
 
 def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,18 +66,17 @@ def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.Monkey
     assert next(signals, None) is None
 
 
-DEFAULT = DEFAULTS.rt_priority
-BELOW = DEFAULT - 1
+PRIORITY, BELOW = 40, 39
 
 
 @needs_root
 def test_the_stream_is_real_time_no_service_is(server: ScriptedServer, start_process: StartProcess) -> None:
     cpu = min(os.sched_getaffinity(0))
-    node = start_process(server.port, cpu=cpu)
+    node = start_process(server.port, cpu=cpu, rt_priority=PRIORITY)
     node.says("connected to")
     node.says("the stream has ")
     skip_if_forbidden(node.log)
-    assert f"the stream has SCHED_FIFO {DEFAULT}, CPU {cpu}, memory locked" in node.log
+    assert f"the stream has SCHED_FIFO {PRIORITY}, CPU {cpu}, memory locked" in node.log
     found: Counter[tuple[str, int, object, bool]] = Counter()
     for task in Path(f"/proc/{node.process.pid}/task").iterdir():
         name, number = (task / "comm").read_text().strip(), int(task.name)
@@ -72,11 +85,11 @@ def test_the_stream_is_real_time_no_service_is(server: ScriptedServer, start_pro
         assert number != node.process.pid or policy == os.SCHED_OTHER, "the services' executor"
     anywhere = os.cpu_count() == 1
     names = {name for name, *_ in found} - {"dds"}
-    assert sum(found[name, os.SCHED_FIFO, DEFAULT, True] for name in names) == 1
+    assert sum(found[name, os.SCHED_FIFO, PRIORITY, True] for name in names) == 1
     assert sum(found[name, os.SCHED_FIFO, BELOW, anywhere] for name in names) == len(process.BESIDE)
     assert {key[1:3] for key in found if key[0] == "dds"} == {(os.SCHED_FIFO, BELOW)}
     assert {key[1:3] for key in found} == {
-        (os.SCHED_OTHER, 0), (os.SCHED_FIFO, BELOW), (os.SCHED_FIFO, DEFAULT)
+        (os.SCHED_OTHER, 0), (os.SCHED_FIFO, BELOW), (os.SCHED_FIFO, PRIORITY)
     }  # fmt: skip
 
 
@@ -102,7 +115,7 @@ def test_a_refusal_is_a_warning_and_no_change(
         asked.append((priority, cpu, thread))
         return Scheduling(refused=(f"SCHED_FIFO {priority} (a remedy)",))
 
-    monkeypatch.setattr(process, "make_real_time", refuse)
+    monkeypatch.setattr("bota_ethercat.client.real_time.make_real_time", refuse)
     lines = Log(None)
     process.prepare(0, -1, lines)  # nothing is asked for
     assert not lines.lines
@@ -166,32 +179,18 @@ def test_a_callback_that_raises_ends_it_and_is_told(executor: SingleThreadedExec
 
 
 NAME = "FASTRTPS_DEFAULT_PROFILES_FILE"
-SPACE = "{http://www.eprosima.com}"
-READER_ASKS_AFTER_NS = 5_000_000
-
-
-def test_the_profile_and_who_names_it() -> None:
-    for before in ({}, {NAME: ""}):
-        environment = dict(before)
-        use_own_profiles(environment)
-        assert environment == {NAME: str(PROFILES)}
-    own = {NAME: "/etc/mine.xml"}
-    use_own_profiles(own)
-    assert own == {NAME: "/etc/mine.xml"}
-    writers = ET.parse(PROFILES).getroot().findall(f".//{SPACE}data_writer")
-    assert [writer.get("is_default_profile") for writer in writers] == ["true"]
-    (nanoseconds,) = writers[0].findall(f".//{SPACE}nackSupressionDuration/{SPACE}nanosec")
-    assert 0 < int(nanoseconds.text or 0) < READER_ASKS_AFTER_NS
+PROFILES = Path(__file__).parents[2] / "ros2_bridge/config/fastdds.xml"
 
 
 def test_fast_dds_understands_it(
     server: ScriptedServer, start_process: StartProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In processes: the middleware reads its profiles once. And a signal ends one as it should."""
-    monkeypatch.delenv(NAME, raising=False)
+    monkeypatch.setenv(NAME, str(PROFILES))
     node = start_process(server.port)
     node.says("connected to")
     assert "XMLPARSER" not in node.log
+    assert "the stream has " not in node.log, "real time is asked for"
     node.process.send_signal(signal.SIGTERM)
     assert node.ends() == 0
     assert "Traceback" not in node.log

@@ -64,14 +64,6 @@ def configures(scripted: Server) -> list[Any]:
     return asked
 
 
-def test_tare(node: Node, scripted: Server) -> None:
-    offsets = {"old_offset": [1, 2, 3, 4, 5, 6], "new_offset": [0.5] * 6, "residual": [1e-3] * 6}
-    scripted.answers["tare"] = lambda _: {"ok": True, **offsets}
-    node.do("sensor_tare", "old offset Fx 1.0000 Fy 2.0000", "new offset Fx 0.5000", "residual Fx 0.0010")
-    asked = scripted.requests[-1]
-    assert (asked["action"], asked["sensor"], asked["samples"]) == ("tare", 0, 50)  # half a second
-
-
 def test_a_refusal_in_the_servers_own_words(node: Node, scripted: Server) -> None:
     scripted.answers["tare"] = lambda _: refuse("sensor 0 is not at rest: hold it still", ErrorCode.NOT_READY)
     assert node.trigger("sensor_tare") == (False, "sensor 0 is not at rest: hold it still (not_ready)")

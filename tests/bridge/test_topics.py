@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import random
 import sys
@@ -12,10 +13,11 @@ import pytest
 from geometry_msgs.msg import WrenchStamped
 from rclpy.serialization import deserialize_message, serialize_message
 
-from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.pdo import encode
+from bridge import rclpy_internals
 from bridge.node import StartError
 from bridge.parameters.table import ParameterError, parse_frames
+from bridge.rclpy_internals import packer
 from ft_compensation.outputs import WrenchFilter
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.scripted_server import process_data
@@ -48,19 +50,24 @@ class Published:
         return self.topics
 
 
-@pytest.fixture(scope="module")
-def published() -> Iterator[Published]:
+@pytest.fixture(scope="module", params=["serialized here", "filled in"])
+def published(request: pytest.FixtureRequest) -> Iterator[Published]:
+    """Also as if rclpy read what is serialized here as something else."""
     server = Server()
-    with Node(
-        server,
-        frame_id="left_ft",
-        imu_frame_id="left_imu",
-        orientation_covariance="[0.1, 0.2, 0.3]",
-        linear_acceleration_covariance="[1, 2, 3, 4, 5, 6, 7, 8, 9]",
-        temperature_variance=0.25,
-        wrench_frames="[tcp 0 0 0.5]",
-        **{"filter.cutoff": 10.0},
-    ) as node:
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "filled in":
+            patch.setattr(rclpy_internals, "deserialize_message", lambda *_: None)
+        started = Node(
+            server,
+            frame_id="left_ft",
+            imu_frame_id="left_imu",
+            orientation_covariance="[0.1, 0.2, 0.3]",
+            linear_acceleration_covariance="[1, 2, 3, 4, 5, 6, 7, 8, 9]",
+            temperature_variance=0.25,
+            wrench_frames="[tcp 0 0 0.5]",
+            **{"filter.cutoff": 10.0},
+        )
+    with started as node:
         yield Published(node, server)
 
 
@@ -176,7 +183,7 @@ def test_what_is_not_finite_stays_away_from_its_topic(published: Published, valu
 def test_every_length_of_text_before_the_numbers(frame_id: str) -> None:
     wanted = WrenchStamped()
     wanted.header.frame_id = frame_id
-    packed = StampedNumbers(frame_id, 6)
+    pack = packer(copy.deepcopy(wanted), 6)
     rng = random.Random(1)
     for _ in range(50):
         numbers = [rng.uniform(-1e3, 1e3) for _ in range(6)]
@@ -184,7 +191,7 @@ def test_every_length_of_text_before_the_numbers(frame_id: str) -> None:
         wanted.header.stamp.sec, wanted.header.stamp.nanosec = divmod(stamp_ns, 10**9)
         force, torque = wanted.wrench.force, wanted.wrench.torque
         force.x, force.y, force.z, torque.x, torque.y, torque.z = numbers
-        message = packed.pack(stamp_ns, *numbers)
+        message = pack(stamp_ns, *numbers)
         assert deserialize_message(message, WrenchStamped) == wanted
         assert len(message) == len(serialize_message(wanted))  # bytes of padding may be anything
 
@@ -282,7 +289,7 @@ def test_it_can_be_configured_while_the_node_runs() -> None:
         node.run(0.5)
         assert got
         node.set("filter.cutoff", 0.0)
-        node.run(0.05)
+        assert "wrench_filtered" not in str([each.topic_name for each in node.node.publishers])
         assert not node.fresh(got, 0.2)
         node.until(compensation="ok")
 
@@ -316,9 +323,11 @@ def test_it_follows_the_sensors_rate() -> None:
         got = node.hear("wrench_filtered")
         node.until("wrench_filtered has stopped: the server does not report", compensation="error")
         assert not got
+        node.unhear("wrench_filtered")
         server.reconfigure(rate_hz=50)
         words = "filter.cutoff is 40 Hz, but must be below half of the sampling rate, 25 Hz"
         node.until(f"wrench_filtered has stopped: {words}", compensation="error")
+        node.hear("wrench_filtered")
         assert node.log.count(f"wrench_filtered has stopped: {words}") == 1
         assert not node.fresh(got, 0.2)
         server.reconfigure(rate_hz=200)
@@ -352,7 +361,7 @@ def server() -> Sensor:
 @pytest.fixture
 def tf(server: Sensor, monkeypatch: pytest.MonkeyPatch) -> FakeTf:
     fake = FakeTf(monkeypatch)
-    fake.stamp_ns, fake.height = server.time_ns, -0.2
+    fake.newest_ns, fake.height = server.time_ns, lambda _: -0.2
     return fake
 
 
@@ -364,17 +373,20 @@ def node(server: Sensor, tf: FakeTf) -> Iterator[Node]:
 
 def test_tf_is_not_listened_to_without_a_subscriber(node: Node, tf: FakeTf) -> None:
     node.hear("wrench_compensated/tcp")
+    node.run(2.0)
+    words = "wrench_compensated/base has stopped: TF has no pose of ft_sensor in base: frame does not exist"
+    node.until(words, compensation="error")  # it has never had one, which is said without a subscriber
+    tf.error = None
     node.run(0.5)
     assert tf.listening == 0
-    assert not tf.asked
+    tf.asked.clear()
     node.hear("wrench_compensated/base")
     node.run(0.5)
     assert tf.listening == 1
     assert set(tf.asked) == {("base", "ft_sensor")}
-    node.topics[node.name.replace("bridge", "wrench_compensated/base")].is_heard = False
+    node.unhear("wrench_compensated/base")
     node.run(0.5)
     assert tf.listening == 0
-    assert not list(node.node.timers)
 
 
 def test_a_frame_that_tf_does_not_know(node: Node, tf: FakeTf) -> None:
@@ -399,7 +411,8 @@ def test_a_frame_by_tf_and_a_transform_that_is_too_old(node: Node, server: Senso
     node.run_until(lambda: got, "a wrench")
     assert got[0].header.frame_id == "base"
     assert six(got[0]) == pytest.approx([5.0, 0.0, 0.0, 0.0, 0.0, 0.0], abs=1e-9)
-    tf.error = "the robot was switched off"
+    switched_off_ns = server.time_ns()
+    tf.newest_ns = lambda: switched_off_ns
     node.run(0.05)
     assert node.fresh(got, 0.04), "within orientation.stale_after"
     node.until(
@@ -412,10 +425,33 @@ def test_a_frame_by_tf_and_a_transform_that_is_too_old(node: Node, server: Senso
     node.until(compensation="ok")
     assert got
     node.set("orientation.stale_after", 0.1)
-    tf.error, tf.stamp_ns = None, lambda: server.time_ns() + 10**9
-    node.until("is 1 s newer than the sample", compensation="error")
-    tf.stamp_ns = lambda: 0  # static transforms only
+    node.until(compensation="error")
+    tf.newest_ns = lambda: 0  # static transforms only
     node.until(compensation="ok")
+
+
+@pytest.mark.parametrize(("tf_wait", "age_s"), [(0.018, 0.0), (0.008, 0.005), (0.0, 0.015)])
+def test_a_frame_has_the_pose_at_the_stamp_if_it_comes_within_the_wait(
+    server: Sensor, tf: FakeTf, tf_wait: float, age_s: float
+) -> None:
+    """The robot rises by 1 m/s, and TF is 15 ms behind: the samples of a step and a half."""
+    tf.error, tf.height = None, lambda at_ns: (at_ns - 10**18) / 1e9
+    with Node(server, wrench_frames="[base]", tf_wait=tf_wait) as node:
+        got, at_once = node.hear("wrench_compensated/base"), node.hear("wrench_compensated")
+        node.run(1.0)
+        tf.newest_ns = lambda: server.time_ns() - 15_000_000
+        got.clear()
+        for _ in range(100):
+            at_once.clear()
+            node.run(STEP_S)
+            assert [stamp_ns(message) for message in at_once] == [server.time_ns()], "the stream never waits"
+        stamps = [stamp_ns(message) for message in got]
+        assert stamps == sorted(set(stamps))
+        assert len(stamps) == 100 - round(tf_wait / STEP_S), "those of the wait are still to come"
+        heights = [message.wrench.torque.y - 1.0 for message in got[2:]]
+        pairs = zip(stamps[2:], heights, strict=True)
+        assert [5.0 * ((stamp - 10**18) / 1e9 - age_s) for stamp, _ in pairs] == pytest.approx(heights)
+        assert values(node.until(compensation="ok")["compensation"])["tf_frame_age_s"] == str(age_s)
 
 
 def test_without_tf2_ros(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -186,14 +186,14 @@ def test_a_ramp_that_is_turned_round_does_not_jump() -> None:
 
 def test_the_last_change_is_undone_once() -> None:
     ramp = BiasRamp(seconds=1.0)
-    with pytest.raises(CompensationError, match="no change of the bias to undo"):
+    with pytest.raises(CompensationError, match="no tare to undo"):
         ramp.undo(0.0)
     ramp.go(NEW, 0.0)
     ramp.go(BIAS, 5.0)
     assert ramp.undo(10.0) == ramp.target == NEW
     assert ramp.at(10.0) == BIAS
     assert ramp.at(11.0) == NEW
-    with pytest.raises(CompensationError, match="no change of the bias to undo"):
+    with pytest.raises(CompensationError, match="no tare to undo"):
         ramp.undo(20.0)
 
 

@@ -301,13 +301,6 @@ def quaternion_about(axis: Vector3, turned: float) -> tuple[float, float, float,
     return x, y, z, math.cos(turned / 2)
 
 
-def test_a_quaternion_turns_the_sensor_into_the_base() -> None:
-    """Rolled by +90° about x, the sensor's y points up: gravity is along -y."""
-    source = QuaternionGravity()
-    assert source.update(quaternion_about((1.0, 0.0, 0.0), math.pi / 2), 1.0)
-    assert source.gravity(1.0) == pytest.approx((0.0, -G, 0.0))
-
-
 def test_quaternions_agree_with_the_equations() -> None:
     draw = np.random.default_rng(3)
     source = QuaternionGravity((0.3, -0.2, -9.7))

@@ -8,7 +8,6 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +15,6 @@ from hypothesis import strategies as st
 from bota_ethercat.pdo import Vector3
 from ft_compensation.outputs import WrenchFilter, WrenchTransform, low_pass
 from ft_compensation.quantities import ZERO, Quaternion
-from tests.compensation.equations import matrix_from_quaternion
 
 RATE_HZ = 800.0
 STEP_NS = 1_250_000
@@ -160,25 +158,6 @@ def test_a_pure_torque_and_a_quaternion_that_is_nearly_one() -> None:
 def test_there_and_back_is_where_it_was(transform: WrenchTransform, force: Vector3, torque: Vector3) -> None:
     there = transform.apply(force, torque)
     assert transform.inverse().apply(*there).values == pytest.approx((*force, *torque), abs=1e-8)
-
-
-@given(VECTORS, QUATERNIONS, VECTORS, VECTORS, VECTORS, VECTORS)
-def test_power_is_the_same_in_every_frame(
-    translation: Vector3,
-    quaternion: Quaternion,
-    force: Vector3,
-    torque: Vector3,
-    velocity: Vector3,
-    rate: Vector3,
-) -> None:
-    """Of a moving body: force times velocity of the frame's origin, plus torque times angular rate."""
-    to_target = matrix_from_quaternion(quaternion)
-    omega = to_target @ rate
-    # The target's origin as a point of the body, seen from the source's, which is at `translation`.
-    moved = to_target @ velocity - np.cross(omega, translation)
-    there = WrenchTransform.of(translation, quaternion).apply(force, torque)
-    power = np.dot(force, velocity) + np.dot(torque, rate)
-    assert np.dot(there.force, moved) + np.dot(there.torque, omega) == pytest.approx(power, abs=1e-5)
 
 
 @pytest.mark.parametrize(

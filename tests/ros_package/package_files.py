@@ -1,4 +1,4 @@
-"""The ROS 2 package's files, and the commands of its documentation pages as they are written there."""
+"""The ROS 2 packages' files, and the commands of their documentation pages as they are written there."""
 
 from __future__ import annotations
 
@@ -7,15 +7,21 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "ros2_bridge"
+ALIAS = ROOT / "clients" / "bridge"
+PACKAGES = {
+    "bota_ethercat_protocol": ROOT / "protocol",
+    "bota_ethercat_bridge": PACKAGE,
+    "bridge": ALIAS,
+}
 SHARED_FOLDERS = ("config", "launch", "urdf")
 PROGRAMS = ("ros2", "colcon", "rosdep", "xacro", "rviz2", "export", "sudo")
 _FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-def shared_files() -> set[str]:
+def shared_files(package: Path) -> set[str]:
     """Every file of the shared folders, as a path within the package."""
-    paths = [path for folder in SHARED_FOLDERS for path in (PACKAGE / folder).iterdir()]
-    return {str(path.relative_to(PACKAGE)) for path in paths if path.is_file()}
+    paths = [path for folder in SHARED_FOLDERS for path in package.glob(f"{folder}/*")]
+    return {str(path.relative_to(package)) for path in paths if path.is_file()}
 
 
 def commands(page: str) -> list[str]:

@@ -19,30 +19,29 @@ from typing import Any
 
 import pytest
 
-from tests.ros_package.package_files import PACKAGE, ROOT, commands
+from tests.ros_package.package_files import ALIAS, PACKAGE, PACKAGES, ROOT, commands
 from tests.server.running import free_port, needs_bus
 
 PATIENCE_S = 30.0
 SERVER_COMMAND = f"server_command:={sys.executable} -m ethercat_server.daemon.cli"
 CLIENT = f"""#!{sys.executable}
 import sys
-sys.path[:0] = ["{ROOT}", "{PACKAGE}"]
+sys.path[:0] = ["{ROOT / "protocol"}", "{PACKAGE}"]
 from bridge.client import main
 sys.exit(main())
 """
 LAUNCH = PACKAGE / "launch"
 NODE = {
     "params_file", "namespace", "server_host", "server_port", "sensor", "frame_id", "imu_frame_id",
-    "array_topic", "respawn", "log_level",
+    "array_topic", "lifecycle", "realtime", "respawn", "log_level",
 }  # fmt: skip
 SERVER = {"server_port", "server_command", "sensor_options"}
-# Of each file, the arguments that have an effect: what a file sets itself is none.
+# Of each file, with those of what it includes.
 ARGUMENTS = {
     "bridge": NODE,
     "virtual_server": SERVER,
-    "demo": (NODE | SERVER) - {"server_host"},
-    "two_sensors": (NODE | SERVER | {"virtual"})
-    - {"namespace", "sensor", "frame_id", "imu_frame_id", "array_topic", "sensor_options"},
+    "demo": NODE | SERVER,
+    "two_sensors": NODE | SERVER | {"virtual"},
 }
 
 
@@ -50,7 +49,7 @@ class StandIn:
     """Any action or substitution: it keeps what it is given. PyPI has neither `launch` nor `launch_ros`."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
-        self.given_to_it = given
+        self.given_to_it, self.named = given, named
 
     def get_sub_entities(self) -> list[Any]:
         return []
@@ -73,8 +72,7 @@ class DeclareLaunchArgument(StandIn):
 
 class IncludeLaunchDescription(StandIn):
     def get_sub_entities(self) -> list[Any]:
-        path = self.given_to_it[0].given_to_it[0]
-        return [runpy.run_path(path)["generate_launch_description"]()]
+        return [runpy.run_path(self.given_to_it[0])["generate_launch_description"]()]
 
 
 class LaunchConfiguration(StandIn):
@@ -88,8 +86,8 @@ class Module(types.ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        if name == "load_python_launch_file_as_module":
-            return lambda path: types.SimpleNamespace(**runpy.run_path(path))
+        if name == "get_package_share_path":
+            return PACKAGES.get
         ours = LaunchDescription, DeclareLaunchArgument, IncludeLaunchDescription, LaunchConfiguration
         return next((own for own in ours if own.__name__ == name), StandIn)
 
@@ -97,23 +95,17 @@ class Module(types.ModuleType):
 @pytest.fixture
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """Launch files can be run, to list their arguments and to call their functions; nothing is started."""
-    within = (
-        "actions",
-        "conditions",
-        "event_handlers",
-        "logging",
-        "launch_description_sources",
-        "substitutions",
-    )
+    within = "actions", "conditions", "event_handlers", "logging", "substitutions"
     of_ros = "actions", "parameter_descriptions", "substitutions"
-    names = ["launch", "launch_ros", *(f"launch.{name}" for name in within)]
+    names = ["ament_index_python.packages", "launch", "launch_ros", *(f"launch.{name}" for name in within)]
     for name in (*names, *(f"launch_ros.{name}" for name in of_ros)):
         monkeypatch.setitem(sys.modules, name, Module(name))
 
 
 @pytest.mark.usefixtures("stand_in")
+@pytest.mark.parametrize("package", [PACKAGE, ALIAS], ids=["bota_ethercat_bridge", "bridge"])
 @pytest.mark.parametrize("name", ARGUMENTS)
-def test_it_offers_the_arguments_that_have_an_effect(name: str) -> None:
+def test_it_offers_its_arguments_under_both_names_of_the_package(name: str, package: Path) -> None:
     listed: list[str] = []
 
     def walk(entity: Any) -> None:
@@ -122,7 +114,7 @@ def test_it_offers_the_arguments_that_have_an_effect(name: str) -> None:
                 listed.append(inner.name)
             walk(inner)
 
-    walk(runpy.run_path(str(LAUNCH / f"{name}.launch.py"))["generate_launch_description"]())
+    walk(runpy.run_path(str(package / f"launch/{name}.launch.py"))["generate_launch_description"]())
     assert set(listed) == ARGUMENTS[name]
 
 
@@ -135,7 +127,13 @@ def test_a_parameter_file_is_found_or_refused(tmp_path: Path, monkeypatch: pytes
     # The shell leaves the ~ of `params_file:=~/robot.yaml` as it is.
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "robot.yaml").touch()
-    assert len(start_node({"params_file": "~/robot.yaml"})) == 1
+    (node,) = start_node({"params_file": "~/robot.yaml"})
+    assert node.named["parameters"] == [tmp_path / "robot.yaml"]
+    assert not node.named["additional_env"]
+    (node,) = start_node({"params_file": "~/robot.yaml", "realtime": "true"})
+    assert node.named["parameters"][1] == {"rt_priority": 40}
+    (profiles,) = node.named["additional_env"].values()
+    assert Path(profiles).samefile(PACKAGE / "config/fastdds.xml")
 
 
 def test_the_page_names_every_file_and_argument() -> None:
@@ -199,16 +197,16 @@ Launch = Callable[..., Launched]
 
 @pytest.fixture
 def launch(tmp_path: Path) -> Iterator[Launch]:
-    """Gives a function that runs a launch file, with this checkout as the package `bridge`."""
+    """Gives a function that runs a launch file, with this checkout as the package."""
     pytest.importorskip("launch_ros", reason="launch_ros is missing: source ROS 2")
     pytest.importorskip("rclpy", reason="rclpy is missing: source ROS 2")
     if shutil.which("ros2") is None:
         pytest.skip("ros2 launch is missing: source ROS 2")
     (tmp_path / "share/ament_index/resource_index/packages").mkdir(parents=True)
-    (tmp_path / "share/ament_index/resource_index/packages/bridge").touch()
-    (tmp_path / "share/bridge").symlink_to(PACKAGE)
-    (tmp_path / "lib/bridge").mkdir(parents=True)
-    client = tmp_path / "lib/bridge/client"
+    (tmp_path / "share/ament_index/resource_index/packages/bota_ethercat_bridge").touch()
+    (tmp_path / "share/bota_ethercat_bridge").symlink_to(PACKAGE)
+    (tmp_path / "lib/bota_ethercat_bridge").mkdir(parents=True)
+    client = tmp_path / "lib/bota_ethercat_bridge/client"
     client.write_text(CLIENT)
     client.chmod(0o755)
     environment = os.environ | {

@@ -2,45 +2,51 @@
 
 from __future__ import annotations
 
+import configparser
 import functools
 import os
 import re
-import runpy
 import shutil
 import subprocess
 import sys
 import tomllib
-import types
 import zipfile
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pytest
-import setuptools
 from catkin_pkg.package import parse_package
+from catkin_pkg.packages import find_packages
 
-from tests.ros_package.package_files import PACKAGE, ROOT, SHARED_FOLDERS, commands, shared_files
+from tests.ros_package.package_files import PACKAGE, PACKAGES, ROOT, SHARED_FOLDERS, commands, shared_files
 from tests.test_architecture import imports
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 MARKER = "share/ament_index/resource_index/packages"
 
 
-def test_the_manifest_and_one_version() -> None:
+def test_the_manifests_and_one_version() -> None:
     warnings: list[str] = []
-    package = parse_package(str(PACKAGE), warnings=warnings)
+    found = find_packages(str(ROOT), warnings=warnings)
     assert not warnings
-    assert (package.name, package.licenses, package.package_format) == ("bridge", ["Apache-2.0"], 3)
-    assert package.get_build_type() == "ament_python"
-    # colcon takes a package with an invalid address for plain Python.
-    assert all(re.fullmatch(r"[^@ ]+@[^@ ]+\.[a-z]+", each.email) for each in package.maintainers)
+    folders = {"clients/cpp": "bota_ethercat", "clients/ros2_control": "bota_ethercat_hardware"}
+    folders["clients/bota_ethercat_msgs"] = "bota_ethercat_msgs"
+    folders |= {str(folder.relative_to(ROOT)): name for name, folder in PACKAGES.items()}
+    assert {path: package.name for path, package in found.items()} == folders
     version = PROJECT["project"]["version"]
-    assert parse_package(str(PACKAGE)).version == version
-    assert f'version="{version}"' in (PACKAGE / "setup.py").read_text()
+    for package in found.values():
+        assert (package.version, package.licenses, package.package_format) == (version, ["Apache-2.0"], 3)
+        # colcon takes a package with an invalid address for plain Python.
+        assert all(re.fullmatch(r"[^@ ]+@[^@ ]+\.[a-z]+", each.email) for each in package.maintainers)
+        if package.name in PACKAGES:
+            assert package.get_build_type() == "ament_python"
+            metadata = setup_of(PACKAGES[package.name])["metadata"]
+            assert dict(metadata) == {"name": package.name, "version": version}
 
 
 def test_everything_that_is_imported_is_a_dependency_once() -> None:
     ours = {"bridge", "ft_compensation", "bota_ethercat", "__future__", *sys.stdlib_module_names}
+    ours.add("bota_ethercat_msgs")  # used where it is there
     # Packages that are not named as their modules; the package tf2_ros is C++.
     packages = {"tf2_ros": "tf2_ros_py", "numpy": "python3-numpy"}
     needed = {
@@ -51,53 +57,53 @@ def test_everything_that_is_imported_is_a_dependency_once() -> None:
     }
     # xacro is for the files in urdf/.
     depends = [each.name for each in parse_package(str(PACKAGE)).exec_depends]
-    assert sorted(needed | {"xacro"}) == sorted(depends)
+    assert sorted(needed | {"xacro", "bota_ethercat_protocol"}) == sorted(depends)
 
 
 def test_every_package_of_python_files_is_installed() -> None:
     find = PROJECT["tool"]["setuptools"]["packages"]["find"]
     tops = [ROOT / where / name.strip("*") for where in find["where"] for name in find["include"]]
-    for top in filter(Path.is_dir, tops):
-        for path in top.rglob("*.py"):
-            assert (path.parent / "__init__.py").exists(), path
-    assert {top.name for top in tops if top.is_dir()} == {name.strip("*") for name in find["include"]}
-    assert (PACKAGE / "bota_ethercat").samefile(ROOT / "protocol" / "bota_ethercat")
+    tops = [top for top in tops if (top / "__init__.py").exists()]
+    for path in (path for top in tops for path in top.rglob("*.py")):
+        assert (path.parent / "__init__.py").exists(), path
+    assert {top.name for top in tops} == {name.strip("*") for name in find["include"]}
     assert (PACKAGE / "resource" / "client").stat().st_mode & 0o111
 
 
-def data_files_of_pip() -> dict[str, set[str]]:
-    return {
-        target: {str(path.relative_to(PACKAGE)) for pattern in patterns for path in ROOT.glob(pattern)}
+def setup_of(package: Path) -> configparser.ConfigParser:
+    setup = configparser.ConfigParser()
+    setup.read(package / "setup.cfg")
+    return setup
+
+
+def test_both_install_the_same_everything_in_the_shared_folders() -> None:
+    pip = {
+        target: {path for pattern in patterns for path in ROOT.glob(pattern)}
         for target, patterns in PROJECT["tool"]["setuptools"]["data-files"].items()
     }
-
-
-def data_files_of_colcon(monkeypatch: pytest.MonkeyPatch) -> dict[str, set[str]]:
-    asked: dict[str, Any] = {}
-    stand_in = types.ModuleType("setuptools")
-    stand_in.__dict__["setup"] = lambda **keywords: asked.update(keywords)
-    stand_in.__dict__["find_packages"] = setuptools.find_packages
-    monkeypatch.setitem(sys.modules, "setuptools", stand_in)
-    monkeypatch.chdir(PACKAGE)
-    runpy.run_path("setup.py")
-    assert "bridge.publishing" in asked["packages"]
-    return {target: set(files) for target, files in asked["data_files"]}
-
-
-def test_both_install_the_same_everything_in_the_shared_folders(monkeypatch: pytest.MonkeyPatch) -> None:
-    pip = data_files_of_pip()
-    # colcon makes this one itself, from the entry point.
-    assert pip.pop("lib/bridge") == {"resource/client"}
-    assert pip == data_files_of_colcon(monkeypatch)
-    assert pip[MARKER] == {"resource/bridge"}
-    assert pip["share/bridge"] == {"package.xml"}
-    for folder in SHARED_FOLDERS:
-        files = {file for file in shared_files() if Path(file).parent.name == folder}
-        assert pip[f"share/bridge/{folder}"] == files != set()
+    expected: dict[str, set[Path]] = {MARKER: set()}
+    for name, package in PACKAGES.items():
+        colcon = {
+            target: set(package.glob(pattern))
+            for target, pattern in setup_of(package)["options.data_files"].items()
+        }
+        assert colcon.pop(MARKER) == {package / "resource" / name}
+        expected[MARKER].add(package / "resource" / name)
+        assert colcon == {f"share/{name}": {package / "package.xml"}} | {
+            f"share/{name}/{folder}": {
+                package / file for file in shared_files(package) if file.startswith(folder)
+            }
+            for folder in SHARED_FOLDERS
+            if (package / folder).exists()
+        }
+        expected |= colcon
+    # colcon makes these itself, from the entry points.
+    expected |= {f"lib/{name}": {PACKAGE / "resource/client"} for name in ("bota_ethercat_bridge", "bridge")}
+    assert pip == expected
     # A new folder has to be named in both, or it is installed by neither.
     folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] not in "._"}
-    code = {"bridge", "ft_compensation", "bota_ethercat", "resource", "test"}
-    assert folders - {"bridge.egg-info"} == {*SHARED_FOLDERS, *code}
+    code = {"bridge", "ft_compensation", "resource", "test"}
+    assert {name for name in folders if not name.endswith(".egg-info")} == {*SHARED_FOLDERS, *code}
 
 
 @pytest.mark.long
@@ -123,18 +129,19 @@ def test_what_is_for_an_index_is_built_and_checked_and_has_its_files_where_ros_l
     run("twine", "check", "--strict", wheel, source)
     with zipfile.ZipFile(wheel) as archive:
         names = {name.partition(".data/data/")[2] for name in archive.namelist()}
-    assert {f"share/bridge/{file}" for file in shared_files()} <= names
-    assert {f"{MARKER}/bridge", "share/bridge/package.xml", "lib/bridge/client"} <= names
+    for name, package in PACKAGES.items():
+        assert {f"share/{name}/{file}" for file in {"package.xml", *shared_files(package)}} <= names
+        assert f"{MARKER}/{name}" in names
 
     bota = tmp_path / "bota"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", bota], check=True)
     pip = [sys.executable, "-m", "pip", f"--python={bota}/bin/python", "install", "--quiet"]
     subprocess.run([*pip, "--no-deps", "--no-index", wheel], check=True)
     (export,) = [command for command in commands("ros2-workspace.md") if command.startswith("export")]
-    shell = f'{export}; cd "${{AMENT_PREFIX_PATH%%:*}}" && ls {MARKER}/bridge && lib/bridge/client --help'
+    shell = f'{export}; cd "${{AMENT_PREFIX_PATH%%:*}}" && for each in lib/*/client; do $each --help; done'
     environment = os.environ | {"HOME": str(tmp_path)}
     used = subprocess.run(["bash", "-c", shell], env=environment, check=True, capture_output=True, text=True)
-    assert "usage: ros2 run bridge client" in used.stdout
+    assert used.stdout.count("usage: ros2 run bridge client") == 2
 
 
 # Topics of the node in the root namespace, with what a layout plots of them.

@@ -1,4 +1,4 @@
-"""colcon builds, installs and tests the package."""
+"""colcon builds, installs and tests the packages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from catkin_pkg.packages import find_packages
 
-from tests.ros_package.package_files import PACKAGE, ROOT, commands, shared_files
+from tests.clients.cpp_programs import CLIENT as CPP
+from tests.ros_package.package_files import PACKAGES, ROOT, commands, shared_files
 
 # What colcon needs for a Python package comes from PyPI; setuptools 80 has lost what --symlink-install needs.
 TOOLS = ("colcon-common-extensions", "rosdep", "setuptools<80", "pytest")
@@ -40,10 +41,9 @@ def clean_environment() -> dict[str, str]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("how", [(), ("--symlink-install",)], ids=["copied", "linked"])
+@pytest.mark.parametrize("how", [(), ("--symlink-install",)], ids=["archives", "linked"])
 def test_a_workspace_with_only_this_repository(colcon: Path, tmp_path: Path, how: tuple[str, ...]) -> None:
-    (tmp_path / "src").mkdir()
-    (tmp_path / "src/repository").symlink_to(ROOT)
+    """Whole and linked, or with an archive of each package's own folder, as a release has it."""
     environment = clean_environment() | {"PATH": f"{colcon}:{os.environ['PATH']}", "PYTHONWARNINGS": ""}
 
     def run(*command: str | Path) -> str:
@@ -53,38 +53,48 @@ def test_a_workspace_with_only_this_repository(colcon: Path, tmp_path: Path, how
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    listed = [line.split() for line in run("colcon", "list").splitlines()]
-    assert ["bota_ethercat", "src/repository/clients/cpp", "(ros.cmake)"] in listed
-    assert ["bridge", "src/repository/ros2_bridge", "(ros.ament_python)"] in listed
-    assert {name for name, *_ in listed} <= {"bridge", "bota_ethercat", "bota_ethercat_hardware"}
-    cpp = [] if shutil.which("cmake") is None else ["bota_ethercat"]
-    run("colcon", "build", *how, "--packages-select", "bridge", *cpp)
-    installed = tmp_path / "install/bridge"
-    for file in shared_files():
-        copy = installed / "share/bridge" / file
-        assert copy.read_bytes() == (PACKAGE / file).read_bytes()
-        assert bool(how) == (copy.resolve() == PACKAGE / file)
-    assert (installed / "share/bridge/package.xml").exists()
-    assert (installed / "share/ament_index/resource_index/packages/bridge").exists()
-    # In the sourced workspace, from elsewhere: with the package's own protocol, and for `ros2 run` to find.
+    folders = PACKAGES | {"bota_ethercat": CPP}
+    if how:
+        (tmp_path / "src").symlink_to(ROOT)
+    else:
+        for name, folder in folders.items():
+            (tmp_path / "src" / name).mkdir(parents=True)
+            archive = f"git -C {ROOT} archive HEAD:{folder.relative_to(ROOT)} | tar x -C src/{name}"
+            run("bash", "-c", f"set -o pipefail; {archive}")
+    listed = {name: kind for name, _, kind in map(str.split, run("colcon", "list").splitlines())}
+    for optional in ("bota_ethercat_hardware", "bota_ethercat_msgs"):
+        listed.pop(optional, None)
+    assert listed == {**dict.fromkeys(PACKAGES, "(ros.ament_python)"), "bota_ethercat": "(ros.cmake)"}
+    names = [name for name in folders if name != "bota_ethercat" or shutil.which("cmake")]
+    run("colcon", "build", *how, "--packages-select", *names)
+    # In the sourced workspace, from elsewhere.
     sourced = f"cd / && . {tmp_path}/install/setup.sh && "
-    assert run("sh", "-c", sourced + "echo $AMENT_PREFIX_PATH").strip() == str(installed)
-    used = run("sh", "-c", sourced + f"{installed}/lib/bridge/client --help")
-    assert used.startswith("usage: ros2 run bridge client")
-    asked = 'python3 -c "from bridge.client import PROFILES; print(PROFILES.read_text())"'
-    assert "nackSupressionDuration" in run("sh", "-c", sourced + asked)
-    run("colcon", "test", "--return-code-on-test-failure", "--packages-select", "bridge")
+    prefixes = run("sh", "-c", sourced + "echo $AMENT_PREFIX_PATH").strip().split(":")
+    assert sorted(prefixes) == sorted(f"{tmp_path}/install/{name}" for name in names)
+    for name in names:
+        installed = tmp_path / "install" / name
+        assert (installed / "share/ament_index/resource_index/packages" / name).exists()
+        source = folders[name] if how else tmp_path / "src" / name
+        for file in {"package.xml", *shared_files(source)}:
+            copy = installed / "share" / name / file
+            assert copy.read_bytes() == (source / file).read_bytes()
+            linked = copy.resolve() == (source / file).resolve()
+            assert linked == (bool(how) and name in PACKAGES)  # CMake copies
+    for name in ("bridge", "bota_ethercat_bridge"):  # For `ros2 run` to find.
+        used = run("sh", "-c", sourced + f"{tmp_path}/install/{name}/lib/{name}/client --help")
+        assert used.startswith("usage: ros2 run bridge client")
+    run("colcon", "test", "--return-code-on-test-failure", "--packages-select", *names)
     assert "0 errors, 0 failures" in run("colcon", "test-result")
 
 
-def test_the_link_makes_no_loop_in_a_workspace_inside_the_repository(tmp_path: Path) -> None:
+def test_the_links_make_no_loop_in_a_workspace_inside_the_repository(tmp_path: Path) -> None:
     """rosdep searches with catkin_pkg, which follows links and refuses a package that it finds twice."""
-    (tmp_path / "ros2_bridge").mkdir()
-    shutil.copy(PACKAGE / "package.xml", tmp_path / "ros2_bridge")
+    for folder in PACKAGES.values():
+        shutil.copytree(folder, tmp_path / folder.relative_to(ROOT), symlinks=True)
     (link,) = [command for command in commands("ros2-workspace.md") if "ln -s" in command]
     for _ in range(2):  # A second time, which must not put a link into the package.
         subprocess.run(
             ["bash", "-c", link], cwd=tmp_path, env=os.environ | {"HOME": str(tmp_path)}, check=True
         )
-    assert [path.name for path in (tmp_path / "ros2_bridge").iterdir()] == ["package.xml"]
-    assert list(find_packages(str(tmp_path / "ws/src"))) == ["bridge"]
+    found = find_packages(str(tmp_path / "ws/src"))
+    assert sorted(package.name for package in found.values()) == sorted(PACKAGES)

@@ -231,9 +231,11 @@ def test_a_run_is_repeated_by_its_seed() -> None:
     assert run(1) != run(2)
 
 
-@pytest.mark.parametrize("seed", more_if_long([4], range(1, 13)))
-def test_what_a_stuck_sensor_leaves_out_is_flagged(seed: int) -> None:
-    running, draw = simulation(Machine(seed=seed)), random.Random(seed)
+@pytest.mark.parametrize(
+    ("seed", "dc"), more_if_long([(4, ""), (4, "none")], [(n, "") for n in range(1, 25)])
+)
+def test_what_a_stuck_sensor_leaves_out_is_flagged(seed: int, dc: str) -> None:
+    running, draw = simulation(Machine(seed=seed), dc=dc), random.Random(seed)
     running.run(2.0)
     for _ in range(24):  # it is freed at any instant of its period, before and after polls
         running.at(0.0, "stick")

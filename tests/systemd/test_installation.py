@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import configparser
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -15,7 +16,6 @@ import pytest
 from packaging.requirements import Requirement
 
 from bota_ethercat.settings import check_settings, start_up_defaults
-from bridge.parameters.table import PARAMETERS
 from ethercat_server.daemon.options import EMPTY, SERVER_SETTINGS, parse_options, read_config
 from ethercat_server.ethercat import nic
 from ethercat_server.process import realtime
@@ -397,11 +397,10 @@ def test_a_unit_says(unit: Path, key: str, expected: list[str]) -> None:
     assert values(unit, key) == expected
 
 
-def test_the_nodes_real_time_priority_is_below_the_servers() -> None:
+def test_the_nodes_real_time_priority_is_below_the_servers(installed: tuple[Stage, str]) -> None:
     (limit,) = values(BRIDGE_UNIT, "LimitRTPRIO")
-    (node,) = (row.default for row in PARAMETERS if row.name == "rt_priority")
-    assert isinstance(node, int)
-    assert node <= int(limit) < realtime.DEFAULT_PRIORITY
+    (node,) = re.findall(r"rt_priority: (\d+)", installed[0].files()["/etc/ethercat-server/bridge.yaml"])
+    assert 0 < int(node) <= int(limit) < realtime.DEFAULT_PRIORITY
 
 
 def test_a_usage_error_is_not_tried_again_and_each_service_has_a_user_of_its_own() -> None:

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A control loop at 1 kHz: a velocity that follows the force felt at the sensor, and zero when the force is not known.
 //
 //     control_loop [--server HOST:PORT] [--hz 1000]        (without --server: $BOTA_SERVER)

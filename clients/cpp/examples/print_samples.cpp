@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Prints every sample in order, in SI units: `print_samples [--server HOST:PORT]`, else from $BOTA_SERVER. The shortest useful program.
 #include <bota_ethercat.hpp>
 

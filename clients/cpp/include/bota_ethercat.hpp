@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Samples of Bota Systems EtherCAT force/torque sensors from ethercat-server, for controllers in C++17.
 //
 //     bota_ethercat::Client sensor("localhost", 12001);

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # mypy: ignore-errors
 """A simulated sensor, a controller manager at 1 kHz, and an arm that gives way to the force measured."""
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The plugin `bota_ethercat_hardware/ForceTorqueSensor`: a SensorLoop as a component of ros2_control.
 //
 // Reading goes on while the component is inactive, where trouble is only seen (NaN, `condition`); once active, trouble that

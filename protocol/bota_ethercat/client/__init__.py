@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The client: samples, conditions, requests and events over TCP, and real-time scheduling."""
 
 from bota_ethercat.client.client import Client, NoSampleError, connect

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The TCP connection under a client, in steps that need not block; the only file here that opens a socket."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The client for programs that are not on ROS; the node, the recorder and the monitor are built on it, too.
 
     from bota_ethercat import connect

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a client knows of one sensor: its newest frame, its newest sample, and what that is worth now.
 
 Conditions, their numbers and the rules are those of the C++ header (`reading.hpp`).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real-time scheduling of a client: SCHED_FIFO and a CPU for one thread, memory that is never paged out.
 
 Beside programs that use every CPU, an ordinary client has its samples some milliseconds late. Each right is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The client's side of the protocol without sockets: bytes in; samples, replies and events out.
 
 The rules it keeps:

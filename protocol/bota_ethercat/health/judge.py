@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Judges what was observed of a sensor's stream. Every sentence of a verdict is here, and nowhere else.
 
 Losses explain a low rate, and silence explains repeated and invalid frames: what is explained is not found.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observes the frames of one sensor over a time that ends now. Every frame is used."""
 
 from __future__ import annotations

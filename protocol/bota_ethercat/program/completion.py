@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`--print-completion SHELL`: what the shell needs to complete a program's options, written by shtab."""
 
 from __future__ import annotations

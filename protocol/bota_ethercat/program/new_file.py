@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A text file that is written whole or not at all, and that replaces nothing without --force."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Standard output and error that take every character: what the terminal's encoding lacks is spelled."""
 
 from __future__ import annotations

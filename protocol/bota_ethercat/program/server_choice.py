@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which server a program uses: `--server`, else $BOTA_SERVER, else the user's file, else this machine's."""
 
 from __future__ import annotations

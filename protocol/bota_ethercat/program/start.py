@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts a program: Ctrl-C is never a traceback, whatever is being imported, and output never fails.
 
 Few imports, for Python's own handler raises KeyboardInterrupt in the middle of them. While a program loads,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a tare changed last in each sensor, so that it can be undone: a file of this user's, by serial number.
 
 $XDG_STATE_HOME/bota-ethercat-bridge/tares.json, or below ~/.local/state.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The installed version."""
 
 from importlib.metadata import PackageNotFoundError, version

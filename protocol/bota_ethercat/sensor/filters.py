@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sensor's filters: rate, cut-off and delay of each setting, from Bota's manual.
 
 Bota's publications differ in the cut-off frequencies: use these to compare settings, not as a specification.

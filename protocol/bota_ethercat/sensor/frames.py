@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a sensor's frames are, from the drawings in Bota's URDFs; no rotation between them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What settings mean in words and figures: sampling rate, cut-off frequency, delay.
 
 Cut-off frequencies are those of `filters`; what it lacks is called not in the table. Delays are `response`'s.

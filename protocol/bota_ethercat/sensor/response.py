@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the sensor's filters do to a signal: delay and magnitude of each channel, and how that is known.
 
 Force and torque: Bota publishes rate and -3 dB point (`filters`), no delay. With the FIR filter off the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The CoE base data types that `sdo_read` and `sdo_write` may name, and their values as JSON has them."""
 
 from __future__ import annotations

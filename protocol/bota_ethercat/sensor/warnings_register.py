@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sensor's warnings register ("Warnings Errors Fatal"): what each bit means and what to do about it.
 
 Source: Table III.3 of the design note.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """JSON texts as both kinds of connection carry them: one object, bounded, strict JSON without NaN."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Text and rows from files and the network, made safe to print: one line, no control characters."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the compensation is to do: parameters made into a `Plan`, the bias with its history, the source.
 
 Lives in the executor's thread, but for `link_changed`. The parameter `bias` is the bias: every
@@ -64,6 +65,7 @@ class CompensationControl:
         self._motion: tuple[float, MotionError | None] = -math.inf, None
         self._watched: object = None
         live.check = self._check
+        self._setting = node.setting
         self._guard = node.create_guard_condition(self._follow_sensor)
 
     def start(self) -> None:
@@ -87,6 +89,11 @@ class CompensationControl:
         """The one in force, or being ramped in."""
         return self._ramp.target
 
+    @property
+    def _sample_s(self) -> float:
+        """The newest sample's time, by the server's monotonic clock, also while nobody has subscribed."""
+        return self.reader.accounting.new_ns * 1e-9
+
     def state(self) -> CompensationState:
         """How things are, for the diagnostics' thread."""
         output, source, parameters = self.output, self.choice.source, self.parameters
@@ -107,6 +114,7 @@ class CompensationControl:
             {
                 "gravity_source": source.describe,
                 "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
+                "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
                 "accelerometer_force": "" if bound is None else round(bound, 3),
                 "motion_force": "" if motion is None else round(motion.filters, 3),
                 "tool_mass": round(payload.mass, 4),
@@ -114,7 +122,7 @@ class CompensationControl:
                 "tared": bias != NO_WRENCH,
                 "bias": _numbers(bias.values),
                 "bias_from": self.origin,
-                "bias_ramping": not self._ramp.arrived(output.time_s),
+                "bias_ramping": not self._ramp.arrived(self._sample_s),
                 "subscribed": has_subscribers,
                 "compensated": output.published,
                 "withheld": output.withheld,
@@ -178,15 +186,27 @@ class CompensationControl:
 
     def set_bias(self, bias: Wrench, origin: str, taken: Taken | None = None) -> None:
         """Put a bias in force, `taken` by a tare."""
-        self.own_offset.begin(bias, is_measured=origin in _MEASURED)
-        self._put(origin, taken, bias=[*bias.values])
+        with self._setting:
+            if taken is not None:  # the tool may have been set since
+                change, taken = taken.weighed(self.parameters.payload)
+                bias = bias.plus(change)
+            self.own_offset.begin(bias, is_measured=origin in _MEASURED)
+            self._put(origin, taken, bias=[*bias.values])
 
     def undo_bias(self) -> Wrench:
         """Go back to the bias before, and return it; CompensationError if there is none."""
-        before = self._ramp.undo(self.output.time_s)
+        before = self._ramp.undo(self._sample_s)
         self.set_bias(before, "undone")
         self.origin = "undone"
         return before
+
+    def forget_bias(self) -> None:
+        """One that was measured is not for the next time: the sensor may be another."""
+        if self.origin != _FROM_PARAMETER and self.bias != NO_WRENCH:
+            self._log.warning(
+                "the bias was measured before, and is zero now: tare when the node is active again"
+            )
+            self.set_bias(NO_WRENCH, "cleared")
 
     def set_payload(self, payload: Payload, bias: Wrench, accelerometer: Accelerometer | None = None) -> None:
         """Put an identified payload, its bias and the accelerometer's correction in force, all at once."""
@@ -201,11 +221,12 @@ class CompensationControl:
 
     def _put(self, origin: str, taken: Taken | None = None, **values: Any) -> None:
         """Set parameters, the bias among them."""
-        self._next = origin, taken
-        try:
-            self._live.put(**values)
-        finally:
-            self._next = _FROM_PARAMETER, None
+        with self._setting:
+            self._next = origin, taken
+            try:
+                self._live.put(**values)
+            finally:
+                self._next = _FROM_PARAMETER, None
 
     def _check(self, wanted: Parameters) -> None:
         """ParameterError if they cannot be had here."""
@@ -227,7 +248,9 @@ class CompensationControl:
             if wanted.payload != was.payload:
                 self._ramp = self._ramp.weighed(wanted.payload)
             if is_wish:
-                self._ramp.go(wanted.bias, self.output.time_s, taken or Taken())
+                self._ramp.go(
+                    wanted.bias, self._sample_s, taken or Taken(), may_undo=origin != _FROM_PARAMETER
+                )
                 self.own_offset.begin(wanted.bias, is_measured=origin in _MEASURED)
                 self.origin = origin
             self._make_plan()
@@ -259,27 +282,31 @@ class CompensationControl:
 
     def _follow_sensor(self) -> None:
         """The bias, and what was before it, are not another sensor's; a fixed one stays."""
-        while not self._is_same_sensor():
-            serial = self.link.info.serial
-            if self._serial is not None:
-                bias = self.bias
-                if self.origin != _FROM_PARAMETER:
-                    self._log.warning(
-                        f"another sensor is there now, serial number {serial}: the bias was the other's and "
-                        "is zero now; tare"
-                    )
-                    bias, self.origin = NO_WRENCH, _FROM_PARAMETER
-                self._ramp = BiasRamp(bias, self.parameters.bias_ramp_time)
-            self.own_offset.begin(self.bias)
-            self._serial = serial
-            self._open_source()
-            self._make_plan()
-        self._follow_offset()
-        if self.bias != self.parameters.bias:
-            self._live.put(bias=[*self.bias.values])  # shifted, or zero again
-        self._hold()
-        if not self._is_same_sensor():
-            self.link_changed()
+        with self._setting:
+            while not self._is_same_sensor():
+                serial = self.link.info.serial
+                if self._serial is not None:
+                    bias = self.bias
+                    if self.origin != _FROM_PARAMETER:
+                        self._log.warning(
+                            f"another sensor is there now, serial number {serial}: the bias was the other's "
+                            "and is zero now; tare"
+                        )
+                        bias, self.origin = NO_WRENCH, _FROM_PARAMETER
+                    self._ramp = BiasRamp(bias, self.parameters.bias_ramp_time)
+                self.own_offset.begin(self.bias)
+                self._serial = serial
+                self._open_source()
+                self._make_plan()
+            self._follow_offset()
+            if self.bias != self.parameters.bias:
+                try:
+                    self._live.put(bias=[*self.bias.values])  # shifted, or zero again
+                except ParameterError as error:
+                    self._log.error(str(error))
+            self._hold()
+            if not self._is_same_sensor():
+                self.link_changed()
 
     def _follow_offset(self) -> None:
         """Shift the bias by the change of the sensor's own offset, from the next sample on; any thread."""

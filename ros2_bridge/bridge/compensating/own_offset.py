@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The offset of the sensor's own, and how its changes affect the node's bias."""
 
 from __future__ import annotations

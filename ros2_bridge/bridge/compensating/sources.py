@@ -1,7 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
 """The specific force at the tool, sample by sample: from the sensor's IMU, or from the robot (messages, TF).
 
 Messages of the robot have a callback group of their own, which waits for no service: a pose that is not taken
-is stale. TF is looked up at intervals, also for other frames of the wrench.
+is stale. TF is looked up at intervals.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from geometry_msgs.msg import PoseStamped, QuaternionStamped
 from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
 from sensor_msgs.msg import Imu
 
 from bota_ethercat.pdo import Sample, Vector3
@@ -232,9 +234,6 @@ class Pose(NamedTuple):
     stamp_ns: int  # since the Unix epoch; 0: static, it holds at any time
 
 
-LookUp = Callable[[str, str], Pose]  # of the second frame in the first, the latest; UnusableError
-
-
 def stamp_ns(stamp: Any) -> int:
     """A message's time, ns since the Unix epoch; 0 if it has none."""
     return int(stamp.sec) * _NS_PER_S + int(stamp.nanosec)
@@ -251,18 +250,28 @@ def check_tf(wanted: str = "parameter gravity_source is 'tf'", instead: str = "t
         ) from None
 
 
-def follow_tf(node: Node, group: CallbackGroup, look: Callable[[LookUp], object]) -> Callable[[], None]:
-    """Listen to TF, in a callback group of tf2_ros's, and call `look` every _TF_PERIOD_S, until what is
-    returned is called."""
-    from rclpy.time import Time  # noqa: PLC0415
-    from tf2_ros import Buffer, TransformException, TransformListener  # noqa: PLC0415 - see check_tf
+class Tf:
+    """The transforms that `node` hears, in a callback group of tf2_ros's, until `close`."""
 
-    buffer = Buffer()
-    listener = TransformListener(buffer, node, spin_thread=False)
+    def __init__(self, node: Node) -> None:
+        from tf2_ros import Buffer, TransformListener  # noqa: PLC0415 - see check_tf
 
-    def look_up(base: str, frame: str) -> Pose:
+        self._buffer = Buffer()
+        self._listener = TransformListener(self._buffer, node, spin_thread=False)
+
+    def close(self) -> None:
+        """Listen no longer."""
+        self._listener.unregister()
+
+    def look_up(self, base: str, frame: str, at_ns: int = 0) -> Pose:
+        """Of the second frame in the first at this time, ns since the Unix epoch; 0: the latest.
+
+        UnusableError if there is none, or none yet.
+        """
+        from tf2_ros import TransformException  # noqa: PLC0415
+
         try:
-            found = buffer.lookup_transform(base, frame, Time())
+            found = self._buffer.lookup_transform(base, frame, Time(nanoseconds=at_ns))
             t, q = found.transform.translation, found.transform.rotation
             rotation = unit_quaternion((q.x, q.y, q.z, q.w))
         except (TransformException, ValueError) as error:
@@ -270,25 +279,22 @@ def follow_tf(node: Node, group: CallbackGroup, look: Callable[[LookUp], object]
             raise UnusableError(f"TF has no pose of {frame} in {base}: {why}") from None
         return Pose((t.x, t.y, t.z), rotation, stamp_ns(found.header.stamp))
 
-    timer = node.create_timer(_TF_PERIOD_S, lambda: look(look_up), group)
-
-    def close() -> None:
-        node.destroy_timer(timer)
-        listener.unregister()
-
-    return close
-
 
 def open_tf(node: Node, wanted: Parameters, group: CallbackGroup, link: Link) -> RobotSource:
     """A source that looks up the orientation of the sensor in TF."""
     base, frame = wanted.orientation_base_frame, wanted.frame_id
-    source = RobotSource(wanted, f"TF from {base} to {frame}", link)
+    source, tf = RobotSource(wanted, f"TF from {base} to {frame}", link), Tf(node)
 
-    def read(look_up: LookUp) -> Oriented:
-        _, rotation, stamp = look_up(base, frame)
+    def read() -> Oriented:
+        _, rotation, stamp = tf.look_up(base, frame)
         return Oriented(rotation, stamp or time.time_ns())  # static transforms hold at any time, so now
 
-    source.close = follow_tf(node, group, lambda look_up: source.take(lambda: read(look_up)))
+    def close() -> None:
+        node.destroy_timer(timer)
+        tf.close()
+
+    timer = node.create_timer(_TF_PERIOD_S, lambda: source.take(read), group)
+    source.close = close
     return source
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The table's parameters and the sensor's settings on the node: declared with what was given, and set while
 it runs.
 
@@ -10,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -18,13 +19,14 @@ from bota_ethercat.errors import SettingError
 from bota_ethercat.settings import SETTINGS, Setting, SettingValue, check_settings, known_settings
 from bota_ethercat.text.did_you_mean import did_you_mean
 from bridge.parameters.table import PARAMETERS, ParameterError, Parameters, Row, gather
+from bridge.rclpy_internals import given_parameters
 from bridge.stream.link import CONFIGURE_TIMEOUT_S, Link, RequestFailedError
 
 _PREFIX: Final = "settings."
+_NO_SIM_TIME: Final = "a real sensor has no simulation time"
 # Prefixes of parameters that rclpy itself may declare.
 _OF_OTHERS: Final = ("qos_overrides.", "use_sim_time", "start_type_description_service")
-_LIVE: Final = {row.name: row for row in PARAMETERS if row.live}
-_TYPES: Final = {type_.value for type_ in Parameter.Type}
+_ROWS: Final = {row.name: row for row in PARAMETERS}
 
 
 def declare(node: Node) -> Parameters:
@@ -38,7 +40,10 @@ def declare(node: Node) -> Parameters:
     parameters = gather(values)
     values["server_port"] = parameters.server_port
     for row in PARAMETERS:
-        node.declare_parameter(row.name, values[row.name], descriptor(row), ignore_override=True)
+        described = descriptor(row)
+        if parameters.lifecycle and row.name != "lifecycle":
+            described.read_only = False  # as long as the node is not configured: `LiveParameters`
+        node.declare_parameter(row.name, values[row.name], described, ignore_override=True)
     return parameters
 
 
@@ -46,15 +51,15 @@ def warn_of_others(node: Node) -> None:
     """Warn of given parameters that the node does not have; call it once all are declared."""
     # Not the node's own list, which leaves out settings without a value.
     names = [row.name for row in PARAMETERS] + [_PREFIX + name for name in SETTINGS]
-    for given in node._parameter_overrides:  # rclpy has no public name
+    for given in given_parameters(node):
         if node.has_parameter(given) or given.startswith(_OF_OTHERS):
             continue
         guess = did_you_mean(given, names) or "; ros2 param list shows the valid names"
         node.get_logger().warning(f"unknown parameter {given} is ignored{guess}")
     if node.get_parameter("use_sim_time").value is True:
         node.get_logger().warning(
-            "use_sim_time is true, but a real sensor has no simulation time: stamps are wall-clock time, and "
-            "those of orientations must be too"
+            f"use_sim_time is true, but {_NO_SIM_TIME}: stamps are wall-clock time, and those of "
+            "orientations must be too"
         )
 
 
@@ -73,19 +78,22 @@ def descriptor(row: Row) -> ParameterDescriptor:
 
 
 class LiveParameters:
-    """Lives in the executor's thread."""
+    """Lives in the threads that set parameters, one at a time."""
+
+    is_fixed = False  # whether those that are not live are read-only
 
     def __init__(self, node: Node) -> None:
         """The parameters must have been declared."""
         self._node = node
+        self.group = MutuallyExclusiveCallbackGroup()  # of requests: they do not wait for other services
+        for service in node.services:
+            service.callback_group = self.group
+            self.group.add_entity(service)
         self.check: Callable[[Parameters], object] = lambda _: None  # may refuse new values: ParameterError
         self.apply: Callable[[Parameters], object] = lambda _: None  # gets the new values
         node.add_pre_set_parameters_callback(_convert)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._after_set)
-        for service in node.services:
-            if service.srv_type in (SetParameters, SetParametersAtomically):
-                service.callback = _refuse_unknown_types(service.callback)
 
     def put(self, **values: Any) -> None:
         """Set parameters from within; ParameterError if that is refused."""
@@ -95,32 +103,26 @@ class LiveParameters:
             raise ParameterError(result.reason)
 
     def _on_set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        changed = {parameter.name: parameter.value for parameter in parameters if parameter.name in _LIVE}
+        changed = {parameter.name: parameter.value for parameter in parameters if parameter.name in _ROWS}
+        if any(parameter.name == "use_sim_time" and parameter.value is True for parameter in parameters):
+            return SetParametersResult(successful=False, reason=f"use_sim_time must be false: {_NO_SIM_TIME}")
         try:
-            if changed:
-                self.check(self._gather(changed))
+            for name in changed:
+                if self.is_fixed and not _ROWS[name].live:
+                    raise ParameterError(f"parameter {name} is read-only while the node is configured")
+            self.check(self.gather(changed))
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _after_set(self, parameters: Sequence[Parameter]) -> None:
-        if any(parameter.name in _LIVE for parameter in parameters):
-            self.apply(self._gather({}))
+        if any(parameter.name in _ROWS for parameter in parameters):
+            self.apply(self.gather({}))
 
-    def _gather(self, changed: dict[str, Any]) -> Parameters:
+    def gather(self, changed: dict[str, Any]) -> Parameters:
+        """The values, with these changed; ParameterError if they cannot be."""
         values = {row.name: self._node.get_parameter(row.name).value for row in PARAMETERS} | changed
         return gather({row.name: row.check(values[row.name]) for row in PARAMETERS})
-
-
-def _refuse_unknown_types(set_parameters: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """rclpy's callback of a service, which raises where anybody sends a type that there is not."""
-
-    def callback(request: Any, response: Any) -> Any:
-        if {parameter.value.type for parameter in request.parameters} <= _TYPES:
-            return set_parameters(request, response)
-        return response  # nothing was set
-
-    return callback
 
 
 def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:
@@ -128,7 +130,7 @@ def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:
     converted = []
     for parameter in parameters:
         try:
-            value: Any = _LIVE[parameter.name].check(parameter.value)
+            value: Any = _ROWS[parameter.name].check(parameter.value)
         except (KeyError, ParameterError):  # of others, or refused soon, with a sentence
             converted.append(parameter)
         else:
@@ -146,8 +148,9 @@ class SettingsParameters:
     and what was set since, in force together. Lives in the executor's thread, but for `changed`.
     """
 
-    def __init__(self, node: Node, link: Link) -> None:
-        self._node, self._link = node, link
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self.link: Link | None = None  # None: the node is not active
         self._wanted: dict[str, SettingValue] = {}  # what this node's user gave at start or set since
         self._following = True
         for setting in SETTINGS.values():
@@ -194,18 +197,19 @@ class SettingsParameters:
 
     def _follow(self) -> None:
         """Make the parameters what the settings are."""
-        in_force = self._link.info.settings
-        self._following = True
-        try:
-            for setting in SETTINGS.values():
-                shown = self._node.get_parameter(_PREFIX + setting.name).value
-                value = in_force.get(setting.name)
-                if value is None and shown is not None:
-                    self._unset(setting)
-                elif value is not None and (value != shown or type(value) is not type(shown)):
-                    self._node.set_parameters([Parameter(_PREFIX + setting.name, value=value)])
-        finally:
-            self._following = False
+        in_force = self.link.info.settings if self.link else {}
+        with self._node.setting:
+            self._following = True
+            try:
+                for setting in SETTINGS.values():
+                    shown = self._node.get_parameter(_PREFIX + setting.name).value
+                    value = in_force.get(setting.name)
+                    if value is None and shown is not None:
+                        self._unset(setting)
+                    elif value is not None and (value != shown or type(value) is not type(shown)):
+                        self._node.set_parameters([Parameter(_PREFIX + setting.name, value=value)])
+            finally:
+                self._following = False
 
     def _on_set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         wanted = {p.name.removeprefix(_PREFIX): p.value for p in parameters if p.name.startswith(_PREFIX)}
@@ -219,7 +223,9 @@ class SettingsParameters:
         return SetParametersResult(successful=True)
 
     def _configure(self, wanted: dict[str, SettingValue]) -> None:
-        reply = self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=self._link.sensor, settings=wanted)
+        if (link := self.link) is None:
+            raise RequestFailedError("the node is not active: activate it first")
+        reply = link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=link.sensor, settings=wanted)
         in_force = known_settings(reply.get("settings"))
         for name, value in wanted.items():
             if (held := in_force.get(name)) != value:

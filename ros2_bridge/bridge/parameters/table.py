@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node's parameters: one table, from which they are declared, checked, described and documented. No ROS.
 
 A wrong value ends the node at start, or is refused while it runs, with one sentence. The sensor's settings
@@ -117,12 +118,14 @@ PARAMETERS: Final = (
     Row("server_port", _PORT, "TCP port of ethercat-server", 1, 65535, live=False),
     Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535, live=False),
     Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255, live=False),
-    Row("rt_priority", 40,
+    Row("rt_priority", 0,
         "SCHED_FIFO priority of the stream's thread, if allowed; 0 = as the node was started",
         0, HIGHEST_PRIORITY, live=False),
     Row("cpu", -1, "CPU of the stream's thread; -1 = any", -1, 1023, live=False),
     Row("publishing_frequency", 0.0, "Most messages a second, no low-pass; 0 = every sample", 0, 1e6),
     Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray", live=False),
+    Row("lifecycle", False, "Managed by transitions (configure, activate); false = active at once",
+        live=False),
     Row("supervisor_topic", "/supervisor_status_data", "Topic that stops server and node; empty = none",
         live=False, optional=True),
     Row("stamp", "sample",
@@ -133,6 +136,8 @@ PARAMETERS: Final = (
     Row("wrench_frames", NO_TEXTS,
         "Frames of wrench_compensated/NAME: NAME (by TF), or 'NAME x y z [qx qy qz qw]' in frame_id, m",
         live=False),
+    Row("tf_wait", 0.02,
+        "Longest wait for TF's pose at the sample's stamp, s; then, and with 0, the latest is used", 0, 0.5),
     Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages", live=False),
     Row("imu_raw_units", ImuUnits.G_DPS.value, "What the sensor sends acceleration and angular rate in",
         choices=tuple(units.value for units in ImuUnits), live=False),
@@ -218,6 +223,7 @@ class Parameters(NamedTuple):
     cpu: int
     publishing_frequency: float
     array_topic: str
+    lifecycle: bool
     supervisor_topic: str
     stamp: str
     imu_units: ImuUnits
@@ -229,6 +235,7 @@ class Parameters(NamedTuple):
     temperature_variance: float
     limits: Limits
     wrench_frames: tuple[WrenchFrame, ...]
+    tf_wait: float
     payload: Payload
     gravity: Vector3
     bias: Wrench

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ROS messages of what the sensor measures, which are published in serialized form.
 
 An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has
@@ -6,8 +7,6 @@ subscribed, so it must not block and should not allocate.
 
 from __future__ import annotations
 
-import struct
-from array import array
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final
@@ -16,14 +15,13 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, Temperature
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension
+from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension
 
-from bota_ethercat.cdr import StampedNumbers
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Sample
 from bridge.parameters.table import Numbers, Parameters
+from bridge.rclpy_internals import packer
 from bridge.stream.link import Link
 from bridge.stream.reader import Output
 
@@ -33,7 +31,7 @@ _ARRAY_SIZE: Final = len(ARRAY_LABEL.split())
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
 _NO_ORIENTATION: Final = (-1.0, *(0.0,) * 8)  # REP 145: the covariance of a missing orientation
 _DEPTH: Final = 10  # short: what a subscriber is too slow for is replaced by newer samples
-Send = Callable[[bytes], None]
+Send = Callable[[Any], None]  # a message, or one serialized
 Publish = Callable[[Sample, DataMessage], None]
 Make = Callable[[Send, Parameters, "Stamps"], Publish]
 
@@ -50,12 +48,16 @@ class Topic:
     """A publisher, and whether anybody has subscribed."""
 
     def __init__(self, node: Node, message_type: Any, topic: str) -> None:
-        self._publisher = create_publisher(node, message_type, topic)
+        self._node, self._publisher = node, create_publisher(node, message_type, topic)
         self._send: Send = self._publisher.publish
 
     def is_wanted(self) -> bool:
         """Whether anybody has subscribed."""
         return bool(self._publisher.get_subscription_count())
+
+    def close(self) -> None:
+        """Advertise it no more; a message that is being published raises InvalidHandle."""
+        self._node.destroy_publisher(self._publisher)
 
 
 class Stamps:
@@ -120,23 +122,23 @@ def make_measured(node: Node, parameters: Parameters, stamps: Stamps) -> list[Ou
 
 def _array(send: Send, _: Parameters, __: Stamps) -> Publish:
     """`std_msgs/Float64MultiArray`: N, Nm, m/s², rad/s, in the order of ARRAY_LABEL; it has no header."""
-    message, values = Float64MultiArray(), struct.Struct(f"<{_ARRAY_SIZE}d")
+    message = Float64MultiArray()
     message.layout.dim = [MultiArrayDimension(label=ARRAY_LABEL, size=_ARRAY_SIZE, stride=_ARRAY_SIZE)]
-    message.data = array("d", bytes(values.size))
-    layout, pack = serialize_message(message)[: -values.size], values.pack
-    return lambda sample, _: send(layout + pack(*sample.array))
+    message.data = [0.0] * _ARRAY_SIZE
+    pack = packer(message, _ARRAY_SIZE)
+    return lambda sample, _: send(pack(*sample.array))
 
 
 def _wrench(send: Send, parameters: Parameters, stamps: Stamps) -> Publish:
     """`geometry_msgs/WrenchStamped`: N and Nm, in the sensor's frame."""
-    pack = StampedNumbers(parameters.frame_id, 6).pack
+    pack = packer(WrenchStamped(header=Header(frame_id=parameters.frame_id)), 6)
     return lambda sample, frame: send(pack(frame.stamp_ns - stamps.wrench_ns, *sample.force, *sample.torque))
 
 
 def _imu(send: Send, parameters: Parameters, stamps: Stamps, *, oriented: bool = False) -> Publish:
     """`sensor_msgs/Imu`: m/s² and rad/s; `oriented`: with the sensor's own estimate of its orientation, and
     nothing where there is none."""
-    pack = StampedNumbers(parameters.imu_frame_id, 37).pack
+    pack = packer(Imu(header=Header(frame_id=parameters.imu_frame_id)), 37)
     of_orientation = _covariance(parameters.orientation_covariance) if oriented else _NO_ORIENTATION
     of_rate = _covariance(parameters.angular_velocity_covariance)
     of_acceleration = _covariance(parameters.linear_acceleration_covariance)
@@ -156,7 +158,8 @@ def _imu(send: Send, parameters: Parameters, stamps: Stamps, *, oriented: bool =
 
 def _temperature(send: Send, parameters: Parameters, _: Stamps) -> Publish:
     """`sensor_msgs/Temperature`: °C, inside the sensor."""
-    pack, variance = StampedNumbers(parameters.frame_id, 2).pack, parameters.temperature_variance
+    pack = packer(Temperature(header=Header(frame_id=parameters.frame_id)), 2)
+    variance = parameters.temperature_variance
     return lambda sample, frame: send(pack(frame.stamp_ns, sample.temperature, variance))
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Selects the frames to publish: each new one once and in order. No sockets, no ROS.
 
 The rules it keeps:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is known of the server and the sensor, and requests.
 
 The reader writes it, and the monitor what it has asked for; every thread may read it without a lock:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reader: the thread that the node's client receives in, which publishes at once. Nothing else touches
 the stream.
 
@@ -118,13 +119,15 @@ class Output(Protocol):
 class Outputs:
     """All outputs. `wanted` are those that were so at the last `refresh`."""
 
-    def __init__(self, outputs: Sequence[Output]) -> None:
-        self.all = tuple(outputs)
+    def __init__(self, outputs: Sequence[Output], closed: type[Exception]) -> None:
+        """`closed` is what one raises whose topic has just been closed."""
+        self.all, self.closed = tuple(outputs), closed
         self.wanted: tuple[Output, ...] = ()
 
     def refresh(self) -> None:
         """Look who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
-        self.wanted = tuple(output for output in self.all if output.is_wanted())
+        with contextlib.suppress(self.closed):
+            self.wanted = tuple(output for output in self.all if output.is_wanted())
 
     def publish_finite(self, sample: Sample, frame: DataMessage) -> None:
         """Publish a sample that is not finite everywhere where it is."""
@@ -216,11 +219,15 @@ class Reader:
                     f"a sample with the impossible time {frame.stamp_ns} ns was not published", **_SOMETIMES
                 )
             elif sample.is_finite:
-                for output in self._outputs.wanted:
-                    output.publish(sample, frame)
+                try:
+                    for output in self._outputs.wanted:
+                        output.publish(sample, frame)
+                except self._outputs.closed:  # nobody misses it
+                    pass
                 watch.sample, watch.stamp_ns = sample, frame.stamp_ns
             else:
-                self._outputs.publish_finite(sample, frame)
+                with contextlib.suppress(self._outputs.closed):
+                    self._outputs.publish_finite(sample, frame)
                 self.not_finite += 1
                 self._log.warning(
                     f"a sample with numbers that are not finite was not published ({self.not_finite} so far)",

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How much later force and torque are than the accelerometer, in a recording of a sensor that was shaken.
 
 Nothing touches the tool, so the force is a linear function of what the IMU felt some time before: of the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The equations of the poses and their answer, with intervals.
 
 In every pose: force = m g + bias force, torque = c x g + bias torque, with c = m times the center of gravity.
@@ -31,6 +32,7 @@ _LEAST_SHARE: Final = 0.3
 _NOTHING: Final = 1e-9  # kg: no mass at all has its center anywhere
 _OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
 _ROW, _OTHER = np.nonzero(~np.eye(3, dtype=bool))  # of the cross-axis terms, as CROSS_AXES
+_FARTHEST: Final = 0.3  # of an accelerometer's axes: farther off, it or the given gravity has other axes
 _LENGTH_ROUNDS: Final = 3
 _ROUNDS: Final = 9
 _CONVERGED: Final = 1e-7
@@ -49,9 +51,8 @@ class Estimate(NamedTuple):
     mass: Value  # (1,), kg
     center: Value  # (3,), m
     bias: Value  # (6,), N and Nm
-    offset: Value | None  # (3,), m/s², of the accelerometer; None where gravity is not from it
-    scale: Value | None  # (3,): what its axes read per m/s²
-    cross_axis: Value | None  # (6,)
+    # Of the accelerometer: offset (3,), m/s², scale (3,): what its axes read per m/s², cross-axis terms (6,).
+    calibration: tuple[Value, Value, Value] | None  # None where gravity is not from it
     shift: Value | None  # (6,), N and Nm for each unit of the regressor
     gravity: Array  # (n, 3), m/s²: as far as known now
     residuals: Array  # (n, 6), N and Nm: measured minus modelled
@@ -78,7 +79,7 @@ def estimate(
         gravity = np.broadcast_to(gravity, (*many, *gravity.shape[-2:]))
         acceleration = None if acceleration is None else np.broadcast_to(acceleration, gravity.shape)
     measured = np.swapaxes(wrench, -1, -2)
-    scale = offset = cross_axis = shift = None
+    calibration = shift = None
     if acceleration is None:
         solution = _alone(gravity, measured, regressor)
     else:
@@ -103,20 +104,43 @@ def estimate(
         first, second, third = (
             slice(linear + begin, linear + end) for begin, end in ((0, 3), (3, 6), (6, 12))
         )
-        offset = Value(answer[..., first], half[..., first])
-        scale = Value(1.0 + answer[..., second], half[..., second])
-        cross_axis = Value(answer[..., third], half[..., third])
+        calibration = (
+            Value(answer[..., first], half[..., first]),
+            Value(1.0 + answer[..., second], half[..., second]),
+            Value(answer[..., third], half[..., third]),
+        )
     return Estimate(
         Value(mass, half[..., :1]),
         Value(center, half[..., 4:7]),
         Value(answer[..., [1, 2, 3, 7, 8, 9]], half[..., [1, 2, 3, 7, 8, 9]]),
-        offset,
-        scale,
-        cross_axis,
+        calibration,
         shift,
         gravity,
         wrench - np.swapaxes(_times(_design(gravity, regressor), answer[..., :linear]), -1, -2),
         solution.degrees[..., :6],
+    )
+
+
+def calibrate(acceleration: Array, gravity: Array, confidence: float) -> tuple[Value, Value, Value] | None:
+    """Offset, scale and cross-axis terms of an accelerometer that reads (n, 3) where gravity is known (n, 3).
+
+    Each axis of the specific force, -gravity, is an affine function of the three that are read, by least
+    squares, with an interval to first order. None where the poses do not determine them.
+    """
+    rows = np.column_stack([acceleration, np.ones(len(acceleration))])
+    degrees = len(rows) - 4
+    answer, _, rank, _ = np.linalg.lstsq(rows, -gravity, rcond=1e-3)
+    straight = answer[:3].T
+    if degrees < 1 or rank < 4 or not (np.abs(straight - np.eye(3)) < _FARTHEST).all():
+        return None
+    variance = ((gravity + rows @ answer) ** 2).sum(axis=0) / degrees
+    spread = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))[:, np.newaxis] * variance)
+    half = two_sided(confidence, degrees) * spread
+    scale = 1.0 / np.diag(straight)
+    return (
+        Value(-np.linalg.solve(straight, answer[3]), half[3]),
+        Value(scale, np.diag(half) * scale**2),
+        Value(-straight[_ROW, _OTHER] * scale[_OTHER], half[_OTHER, _ROW] * scale[_OTHER]),
     )
 
 

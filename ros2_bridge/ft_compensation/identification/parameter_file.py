@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Payload and bias as a YAML file in the form of ROS 2 parameters, to start the node with."""
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from ft_compensation.identification.payload import Identified
 def write_yaml(path: Path, result: Identified, comment: str = "", gravity: Vector3 | None = None) -> None:
     """Write what was identified, or replace it, with `comment` on top; FileError if that fails.
 
-    `gravity` is in the base frame, m/s²; without it the file does not say how the base stands. Where gravity
-    was not from the accelerometer, the file leaves that one alone.
+    `gravity` is in the base frame, m/s²; without it the file does not say how the base stands. Where the
+    accelerometer was not identified, the file leaves it alone.
     """
     rows: list[tuple[str, Sequence[float], str]] = [
         ("tool_center_of_gravity", result.payload.center, "m, in the sensor's frame"),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Payload identification: mass, center of gravity, bias and the accelerometer's offset from static poses.
 
 Checks what is given, has `estimation` solve it, and judges how well the poses fit one payload. Two things are
@@ -15,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from ft_compensation.identification.estimation import Estimate, estimate
+from ft_compensation.identification.estimation import Estimate, Value, calibrate, estimate
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
 from ft_compensation.identification.weighted import Array
 from ft_compensation.quantities import (
@@ -44,6 +45,7 @@ _SAME_POSE: Final = 0.97  # cosine
 _FEWEST_IN_TIME: Final = 6  # poses: fewer leave nothing to tell drift from a payload
 _SECONDS_A_MINUTE: Final = 60.0
 _TINY: Final = 1e-12
+_PARALLEL: Final = 1e-3  # (m/s²)²: gravity along what was read is from the accelerometer
 _NEGLIGIBLE: Final = 0.01  # of the weight: a residual below it is not worth a word
 _RARE: Final = 3.09  # standard deviations that noise exceeds once in a thousand times
 
@@ -89,7 +91,7 @@ class Identified(NamedTuple):
     notes: tuple[str, ...]  # what a person should know, sentences: a pose that does not fit, a wide interval
     force_fit: Fit
     torque_fit: Fit
-    accelerometer: OffsetFit | None  # None where gravity is not from it: it is not touched then
+    accelerometer: OffsetFit | None  # None where the poses do not have what it read: it is not touched then
     # Of the bias, a minute; None if time explains nothing. `bias` is that of the last pose then.
     drift: Wrench | None = None
     touched: int | None = None  # index of the pose that does not fit the others
@@ -99,9 +101,9 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95) -> Identified:
     """Mass, center of gravity and bias from `poses`.
 
     At least four, with gravity in directions that do not lie on one line; six with each axis of the sensor
-    once up and once down are best. If every pose has its `acceleration`, the accelerometer is identified too;
-    if every one has its time, a drift of the bias. IdentificationError, a sentence, where the poses do not
-    suffice: by the intervals that result.
+    once up and once down are best. If every pose has its `acceleration`, the accelerometer is identified too,
+    by gravity alone where that is from something else; if every one has its time, a drift of the bias.
+    IdentificationError, a sentence, where the poses do not suffice: by the intervals that result.
     """
     if len(poses) > MOST_POSES:
         raise IdentificationError(f"{len(poses)} poses are more than the {MOST_POSES} that are taken")
@@ -142,7 +144,7 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95) -> Identified:
             f"{_millimeters(payload.center, centre_interval)}; "
             f"{seen.next_pose if touched is None else touched}"
         )
-    accelerometer = _accelerometer(found)
+    accelerometer = _accelerometer(equations.calibrated(found, confidence))
     undetermined = accelerometer.undetermined if accelerometer else ""
     return Identified(
         payload,
@@ -177,6 +179,9 @@ class _Equations:
         self.gravity = np.array([pose.gravity for pose in poses])
         read = [pose.acceleration for pose in poses if pose.acceleration is not None]
         self._acceleration = np.array(read) if len(read) == len(poses) else None
+        self._known = self._acceleration is not None and not np.allclose(
+            np.cross(self._acceleration, self.gravity), 0.0, atol=_PARALLEL
+        )
         self._noise = float(
             np.mean([length(pose.acceleration_spread) ** 2 / 3.0 / pose.samples for pose in poses])
         )
@@ -188,7 +193,14 @@ class _Equations:
 
     def solve(self, confidence: float, regressor: Array | None = None) -> Estimate:
         """The estimate; of several regressors (k, n), each for itself."""
-        return estimate(self.wrench, self.gravity, confidence, self._acceleration, self._noise, regressor)
+        read = None if self._known else self._acceleration
+        return estimate(self.wrench, self.gravity, confidence, read, self._noise, regressor)
+
+    def calibrated(self, found: Estimate, confidence: float) -> tuple[Value, Value, Value] | None:
+        """Offset, scale and cross-axis terms of the accelerometer."""
+        if self._known and self._acceleration is not None:
+            return calibrate(self._acceleration, self.gravity, confidence)
+        return found.calibration
 
 
 class _Touched(NamedTuple):
@@ -250,13 +262,12 @@ def _chance(before: Estimate, after: Estimate) -> Array:
     return np.asarray(share**half * (1.0 + half * rest * (1.0 + 0.5 * (half + 1.0) * rest)))
 
 
-def _accelerometer(found: Estimate) -> OffsetFit | None:
-    parts = found.offset, found.scale, found.cross_axis
-    if found.offset is None or found.scale is None or found.cross_axis is None:
+def _accelerometer(parts: tuple[Value, Value, Value] | None) -> OffsetFit | None:
+    if parts is None:
         return None
     limit = _UNKNOWN * NORMAL_95 * OFFSET_PRIOR
-    open_axes = "".join(axis for axis, half in zip("xyz", found.offset.half, strict=True) if half > limit)
-    values = (tuple(each.tolist()) for part in parts if part is not None for each in (part.value, part.half))
+    open_axes = "".join(axis for axis, half in zip("xyz", parts[0].half, strict=True) if half > limit)
+    values = (tuple(each.tolist()) for part in parts for each in part)
     offset, offset_half, scale, scale_half, cross, cross_half = values
     return OffsetFit(Accelerometer(offset, scale, offset_half, scale_half, cross, cross_half), open_axes)
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Static poses for payload identification: what they have seen so far, and which one to take next.
 
 What counts is where gravity points in the sensor's frame. A turn about the vertical changes nothing.
@@ -32,8 +33,9 @@ class Pose(NamedTuple):
     force_spread: Vector3 = ZERO  # standard deviation of single samples, N
     torque_spread: Vector3 = ZERO  # likewise, Nm
     samples: int = 1
-    # What the accelerometer read, m/s², where `gravity` is from it; None where it is from something else.
-    acceleration: Vector3 | None = None
+    acceleration: Vector3 | None = (
+        None  # what the accelerometer read, m/s²; None if it is not to be identified
+    )
     acceleration_spread: Vector3 = ZERO  # standard deviation of single samples, m/s²
     time_s: float | None = None  # when, by the clock of the other poses
 
@@ -53,14 +55,16 @@ def pose_of(
     `gravity` (in the sensor's frame, m/s²) is from the window's own accelerometer, with length `magnitude`,
     unless it is given. CompensationError if the accelerometer reads nothing like g.
     """
-    acceleration = None
+    acceleration: Vector3 | None = means.acceleration
+    x, y, z = means.acceleration
     if gravity is None:
-        acceleration = x, y, z = means.acceleration
-        check_at_rest(acceleration, magnitude, _LARGEST_OFFSET)
-        scale = -magnitude / length(acceleration)  # only the direction is taken from it
+        check_at_rest(means.acceleration, magnitude, _LARGEST_OFFSET)
+        scale = -magnitude / length(means.acceleration)  # only the direction is taken from it
         gravity = x * scale, y * scale, z * scale
     elif not length(gravity) > 0.0:
         raise CompensationError("a pose without gravity says nothing about a payload")
+    elif abs(length(means.acceleration) - magnitude) > _LARGEST_OFFSET:
+        acceleration = None  # off, or broken
     return Pose(
         means.wrench, gravity, means.force_spread, means.torque_spread, means.samples,
         acceleration, means.acceleration_spread, means.time_s,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Least squares with a variance of its own for every group of equations, estimated from the residuals.
 
 The variances are those of the restricted maximum likelihood (REML), since a few poses leave few degrees of

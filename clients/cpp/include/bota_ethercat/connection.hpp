@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Which server (`Options`, `choose_server`), and the connection to it: from a host name to messages, without blocking.
 #pragma once
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // `Control`: requests to a server, each on a connection of its own.
 #pragma once
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Version 1 of the protocol (docs/protocol.md): a sensor's process data as `Sample`, the framing, a server's description.
 #pragma once
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // What a controller is told: `Condition`, `Reading`, `Counters`; and what they are made of, `StreamAccounting`, `SensorState`.
 #pragma once
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The stream of samples: `Client`, all that a controller needs. The top of bota_ethercat.hpp has units, threads, real time.
 #pragma once
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // Weight and inertia of the tool, to be subtracted from force and torque (docs/compensation.md):
 //
 //     tool force = -m s,  s = s_imu + alpha x d + omega x (omega x d)

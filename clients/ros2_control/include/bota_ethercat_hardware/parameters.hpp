@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // The parameters of a <hardware> tag: one table of names, defaults and what is allowed. Wrong ones are refused in a sentence.
 #pragma once
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 // A sensor in a control loop, without ROS: connect and check it, then `read` it once a cycle. Controllers see a `Gate`.
 //
 //     SensorLoop loop(parameters, log);

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node knows of rclpy beyond its documentation: all of it is here, and each has a fallback.
+
+Executors and parameters are so for the versions of `RIGHT_FOR` only. A message that is serialized here must
+be read by rclpy as the one that is meant, whatever its version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from operator import setitem
+from struct import Struct
+from typing import Any, Final
+
+from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
+
+from bota_ethercat.cdr import StampedNumbers
+
+RIGHT_FOR: Final = ("7.1.", "9.1.")  # Jazzy, Kilted
+_THREADS: Final = 4  # of the documented executor: a service, the supervisor, an orientation, TF
+
+
+def is_known() -> bool:
+    """Whether rclpy's version is one of RIGHT_FOR."""
+    with suppress(PackageNotFoundError):
+        return version("rclpy").startswith(RIGHT_FOR)
+    return False
+
+
+def is_about_arguments(error: Exception) -> bool:
+    """Whether `rclpy.init` refused the arguments; it has no public names for these."""
+    return type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
+
+
+# Serialized messages.
+
+
+def packer(message: Any, count: int) -> Callable[..., Any]:
+    """What makes of `count` float64, and of a stamp (ns since 1970) before them if there is a header, what
+    `publish` takes.
+
+    That is serialized here if rclpy reads it as it should, but for bytes of padding; else it is `message`.
+    """
+    fill, numbers = filling(message), [*map(float, range(count))]
+    if not hasattr(message, "header"):
+        layout, pack = serialize_message(message)[: -8 * count], Struct(f"<{count}d").pack
+        return fill if not _is_read(layout + pack(*numbers), fill(*numbers)) else lambda *v: layout + pack(*v)
+    packed, stamp = StampedNumbers(message.header.frame_id, count).pack, message.header.stamp
+
+    def filled(stamp_ns: int, *values: float) -> Any:
+        stamp.sec, stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+        return fill(*values)
+
+    example_ns = 1_234_567_890_123_456_789
+    return packed if _is_read(packed(example_ns, *numbers), filled(example_ns, *numbers)) else filled
+
+
+def _is_read(serialized: bytes, message: Any) -> bool:
+    with suppress(Exception):  # the middleware's
+        return bool(deserialize_message(serialized, type(message)) == message)
+    return False
+
+
+def filling(message: Any) -> Callable[..., Any]:
+    """The documented way: the message, its float64 filled in one by one, in order; always the same object."""
+    puts = [*_puts(message)]
+
+    def fill(*values: float) -> Any:
+        for put, value in zip(puts, values, strict=True):
+            put(value)
+        return message
+
+    return fill
+
+
+def _puts(part: Any) -> Iterator[Callable[[float], object]]:
+    for name, kind in part.get_fields_and_field_types().items():
+        value = getattr(part, name)
+        if kind == "double":
+            yield partial(setattr, part, name)
+        elif kind.startswith(("double[", "sequence<double")):
+            yield from (partial(setitem, value, index) for index in range(len(value)))
+        elif hasattr(value, "get_fields_and_field_types"):
+            yield from _puts(value)
+
+
+# Executors.
+
+
+def make_executors(node: Node, parameters: Any) -> tuple[Executor, dict[str, Executor]]:
+    """One for the ordinary callbacks of the node, which may block, and by a thread's name those that wait for
+    no others: for requests in the callback group `parameters`, and for all other groups.
+
+    rclpy has `MultiThreadedExecutor` for that, which hands every callback to a pool and waits for all of the
+    node's services anew each time: too much beside the reader, for an orientation 500 times a second. It is
+    what an unknown version gets, and nothing is left for the others then.
+    """
+    if is_known():
+        ordinary = node.default_callback_group
+        beside = {
+            "listener": _PartExecutor(node, lambda group: group not in (ordinary, parameters)),
+            "parameters": _PartExecutor(node, lambda group: group is parameters),
+        }
+        return _PartExecutor(node, lambda group: group is ordinary, *beside.values()), {**beside}
+    executor = MultiThreadedExecutor(_THREADS, context=node.context)
+    executor.add_node(node)
+    return executor, {}
+
+
+class _PartExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy has no types
+    """For those of a node's callbacks whose groups it wants."""
+
+    def __init__(self, node: Node, wants: Callable[[Any], bool], *others: _PartExecutor) -> None:
+        """With the `others` it is the one that the node knows."""
+        self._others = others
+        super().__init__(context=node.context)
+        self._part = _Part(node, wants)
+        if others:
+            self.add_node(node)
+
+    def get_nodes(self) -> list[Any]:
+        """The node's entities that are for this executor."""
+        return [self._part]
+
+    def wake(self) -> None:
+        """Wake all: the node has another entity, or one less."""
+        super().wake()
+        for other in self._others:
+            other.wake()
+
+
+class _Part:
+    """A node as an executor sees it, with the entities whose callback groups it wants."""
+
+    def __init__(self, node: Node, wants: Callable[[Any], bool]) -> None:
+        self._node, self._wants = node, wants
+
+    def __getattr__(self, kind: str) -> Any:
+        """`subscriptions`, `timers`, `clients`, `services`, `guards` or `waitables`."""
+        return [entity for entity in getattr(self._node, kind) if self._wants(entity.callback_group)]
+
+
+# Parameters.
+
+
+def given_parameters(node: Node) -> list[str]:
+    """The names of all that were given to the node, declared or not; of an unknown version, none."""
+    return [*node._parameter_overrides] if is_known() else []
+
+
+def refuse_what_raises(node: Node) -> None:
+    """A type of parameter that there is not, a transition that a state does not have: at that rclpy raises,
+    which would end the node. Here they grant nothing."""
+    for service in node.services if is_known() else ():
+        service.callback = _refusing(service.callback)
+
+
+def _refusing(act: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    def callback(request: Any, response: Any) -> Any:
+        with suppress(ValueError, RuntimeError):
+            return act(request, response)
+        return response
+
+    return callback
