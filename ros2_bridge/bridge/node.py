@@ -122,7 +122,8 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         compensated = CompensatedOutput(
             self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock, self.fail
         )
-        self.outputs = Outputs([*make_measured(self, parameters, stamps), compensated], InvalidHandle)
+        wrench, *others = make_measured(self, parameters, stamps)
+        self.outputs = Outputs([wrench, compensated, *others], InvalidHandle)  # control loops' topics first
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )

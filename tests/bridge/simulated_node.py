@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import itertools
 import math
 import threading
 import uuid
@@ -45,6 +46,7 @@ UP, SIDE, OVER = (0, 0, 1), (1, 0, 0), (0, 0, -1)
 ZERO6 = [0.0] * 6
 QUICK: dict[str, object] = {"rest.duration": 0.3, "bias_ramp_time": 0.0}
 DEFAULTS = gather({row.name: row.default for row in PARAMETERS})
+TURNS = itertools.count()
 STEP_S = 0.01  # time passes in steps of this length: a sample each
 
 
@@ -199,6 +201,7 @@ class Topic:
         self._publisher = publisher
         self.is_heard = False
         self.messages: list[Any] = []
+        self.turn = 0  # of the latest message, counted over all topics
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._publisher, name)
@@ -207,6 +210,7 @@ class Topic:
         return int(self.is_heard)
 
     def publish(self, message: Any) -> None:
+        self.turn = next(TURNS)
         if isinstance(message, bytes):
             message = deserialize_message(message, self._publisher.msg_type)
         if self.is_heard:

@@ -40,7 +40,7 @@ class Published:
     """What the node makes of single samples."""
 
     def __init__(self, node: Node, server: Server) -> None:
-        self._node, self._server = node, server
+        self.node, self._server = node, server
         self.topics = {name: node.hear(name) for name in TOPICS}
         node.run(0.2)
 
@@ -50,7 +50,7 @@ class Published:
             messages.clear()
         for sample in samples:
             self._server.once(**sample)
-        self._node.run(len(samples) * STEP_S)
+        self.node.run(len(samples) * STEP_S)
         return self.topics
 
 
@@ -85,6 +85,11 @@ def test_every_topic_of_one_sample(published: Published) -> None:
     heard = published.of({"process_data": data, "stamp_ns": stamp})
     one = {name: messages[0] for name, messages in heard.items() if messages}
     assert one.keys() == {*TOPICS} - {"imu/data"}, "there is no orientation"
+    prefix = published.node.name.removesuffix("bridge")
+    assert sorted(one, key=lambda name: published.node.topics[f"{prefix}{name}"].turn) == [
+        "wrench", "wrench_compensated/tcp", "wrench_filtered",  # control loops take these
+        "sensone_sensor_data", "imu/data_raw", "temperature",
+    ]  # fmt: skip
     array, wrench, imu = one["sensone_sensor_data"], one["wrench"], one["imu/data_raw"]
     si = [*RAW[:6], *(v * 9.80665 for v in RAW[6:9]), *(math.radians(v) for v in RAW[9:])]
     assert list(array.data) == pytest.approx(si, rel=1e-12)

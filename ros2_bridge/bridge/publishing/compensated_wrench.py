@@ -350,15 +350,13 @@ class CompensatedOutput:
     ) -> None:  # fmt: skip
         """ParameterError if a frame cannot be had. For `rate_hz` and `on_failure` see the parts."""
         stages = {"wrench_compensated": "final", "compensation/bias": "bias", "compensation/tool": "tool"}
-        frame_id = parameters.frame_id
         frames = make_frames(node, parameters, stamps, clock)
         self.frames = TfFrames(node, frames, clock, on_failure)
         self._filtered = FilteredTopic(node, parameters, stamps, rate_hz)
-        self._all: tuple[WrenchTopic | FilteredTopic, ...] = (
-            *(WrenchTopic(node, topic, frame_id, stamps, stage) for topic, stage in stages.items()),
-            *frames,
-            self._filtered,
+        final, *subtracted = (
+            WrenchTopic(node, topic, parameters.frame_id, stamps, stage) for topic, stage in stages.items()
         )
+        self._all: tuple[WrenchTopic | FilteredTopic, ...] = (final, *frames, self._filtered, *subtracted)
         self._wanted: tuple[WrenchTopic | FilteredTopic, ...] = ()
         self.has_subscribers = False  # as of the last look
         self.plan = Plan(Source(), Compensator(), BiasRamp(), has_tool=False)
@@ -426,12 +424,12 @@ class CompensatedOutput:
             return
         self.is_stopped = False
         stages = self._stages(plan, sample, specific_force, time_s)
-        if (watch := plan.watch) is not None and watch.is_due(time_s):
-            gravity = -specific_force[0], -specific_force[1], -specific_force[2]
-            watch.look(stages.final.force, gravity, sample.angular_rate, time_s)
         for topic in self._wanted:
             topic.send(*stages[topic.index], frame)
         self.published += 1
+        if (watch := plan.watch) is not None and watch.is_due(time_s):
+            gravity = -specific_force[0], -specific_force[1], -specific_force[2]
+            watch.look(stages.final.force, gravity, sample.angular_rate, time_s)
 
     @staticmethod
     def _stages(plan: Plan, sample: Sample, specific_force: Vector3, time_s: float) -> Stages:

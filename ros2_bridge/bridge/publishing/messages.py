@@ -108,11 +108,11 @@ class MeasuredTopic(Topic):
 
 
 def make_measured(node: Node, parameters: Parameters, stamps: Stamps) -> list[Output]:
-    """The topics of what the sensor measures."""
+    """The topics of what the sensor measures, `wrench` first."""
     wrench, motion = ("force", "torque"), ("acceleration", "angular_rate")
     topics: tuple[tuple[str, Any, Sequence[str], Make], ...] = (
-        (parameters.array_topic, Float64MultiArray, (*wrench, *motion), _array),
         ("wrench", WrenchStamped, wrench, _wrench),
+        (parameters.array_topic, Float64MultiArray, (*wrench, *motion), _array),
         ("imu/data_raw", Imu, motion, _imu),
         ("imu/data", Imu, (*motion, "orientation"), partial(_imu, oriented=True)),
         ("temperature", Temperature, ("temperature",), _temperature),
