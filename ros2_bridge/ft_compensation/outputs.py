@@ -5,10 +5,7 @@
 which mean the same whatever the coefficients, so a new cut-off makes no step. At the first sample, and after
 a pause longer than the filter's memory, the state is what a constant load would have left: no transient.
 
-Another frame: rotated, and its torque about the other frame's origin. Force and torque of one load, seen from
-frame B instead of S (R takes vectors of S to B, t is the origin of S in B): f_B = R f_S, and m_B = R m_S +
-cross(t, f_B), because a force that acts at a distance has a torque. Frames at rest to each other or not: this
-holds at each instant.
+Another frame: rotated, and its torque about the other frame's origin (docs/ros2.md), whether it moves or not.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The specific force at the tool's center of gravity: acceleration minus gravity.
 
-An accelerometer measures it: at rest it reads minus gravity. The tool, held by the sensor, loads it with
-
-    F = -m s,  M = r x F        s = a - g, at the center of gravity; r: the center of gravity
-
-With an IMU elsewhere on the same rigid body, s = s_imu + alpha x d + omega x (omega x d), d from the IMU to
-the center of gravity. Nobody needs to know where gravity points.
+An accelerometer measures it: at rest it reads minus gravity. docs/compensation.md has the model; d is from
+the IMU to the center of gravity. Nobody needs to know where gravity points.
 
 Without the accelerometer, gravity in the sensor's frame is known by the orientation that a robot tells.
 Between two orientations, and for those that come late, the gyroscope turns gravity on. It is known until the

@@ -1,15 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Was the sensor stationary for the whole of a window, and what did it read meanwhile?
 
-The one criterion of tare and identification, live and in recordings, with the limits of `StationaryLimits`:
-
-- Every axis' standard deviation: it sees what shakes, swings or is touched within the window.
-- The drift of its mean, of the quarters of the window, beyond what their noise makes by chance: it sees what
-  is too slow for the standard deviation, a cable that settles or a robot that creeps. Means of noise rarely
-  differ by more than CHANCE of their standard errors.
-- The mean angular rate: a steady turn moves no mean of the others if it is about the vertical.
-
-One bad sample spoils the window. The server's own tare has another criterion: it knows no IMU's calibration.
+The one criterion of tare and identification, live and in recordings (docs/compensation.md). Standard
+deviations see what shakes or is touched, drift a cable that settles or a robot that creeps, the mean angular
+rate a turn about the vertical. One bad sample spoils the window. The server's own tare has another
+criterion: it knows no IMU's calibration.
 """
 
 from __future__ import annotations
@@ -26,7 +21,7 @@ from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, Stati
 
 _MOST_SAMPLES: Final = 200_000
 _BLOCKS: Final = 4
-CHANCE: Final = 5.0
+CHANCE: Final = 5.0  # standard errors: means of noise rarely differ by more
 _NO_LIMIT: Final = 1e-12
 _NAMES: Final = ("force", "torque", "acceleration", "angular rate")
 _UNITS: Final = ("N", "Nm", "m/s²", "rad/s")
@@ -46,11 +41,9 @@ class StationaryMeans(NamedTuple):
 
     wrench: Wrench  # N, Nm
     acceleration: Vector3  # m/s²; minus gravity in the sensor's frame
-    angular_rate: Vector3  # rad/s: the gyroscope's offset, if the sensor did not turn slowly
     force_spread: Vector3  # N
     torque_spread: Vector3  # Nm
     samples: int
-    seconds: float
     acceleration_spread: Vector3 = ZERO  # m/s²
     time_s: float | None = None  # of its middle, by the samples' clock
     latest: Wrench = NO_WRENCH  # N, Nm: the mean of the last quarter
@@ -100,11 +93,11 @@ class StationaryWindow:
                 f"only {self.count} new samples came in {seconds:.2g} s, at least "
                 f"{self.limits.least_samples} are needed"
             )
-        means = stationary_means(np.array(self._rows), seconds, self.limits)
+        means = stationary_means(np.array(self._rows), self.limits)
         return means._replace(time_s=self._last_s - 0.5 * seconds)
 
 
-def stationary_means(rows: Array, seconds: float, limits: StationaryLimits) -> StationaryMeans:
+def stationary_means(rows: Array, limits: StationaryLimits) -> StationaryMeans:
     """The means of `rows` (n, 12): force, torque, acceleration, angular rate.
 
     NotStationaryError if the sensor moved.
@@ -129,12 +122,10 @@ def stationary_means(rows: Array, seconds: float, limits: StationaryLimits) -> S
             f"the sensor turns: its mean angular rate is {rate:.2g} rad/s, the limit is "
             f"{limits.angular_rate:g} rad/s"
         )
-    f, t, a, r = (triple(mean[first : first + 3]) for first in (0, 3, 6, 9))
+    f, t, a = (triple(mean[first : first + 3]) for first in (0, 3, 6))
     of_force, of_torque, of_acceleration = (triple(spread[first : first + 3]) for first in (0, 3, 6))
     latest = Wrench.of(rows[-len(rows) // _BLOCKS :, :6].mean(axis=0))
-    return StationaryMeans(
-        Wrench(f, t), a, r, of_force, of_torque, len(rows), seconds, of_acceleration, latest=latest
-    )
+    return StationaryMeans(Wrench(f, t), a, of_force, of_torque, len(rows), of_acceleration, latest=latest)
 
 
 def _check(values: Array, limits: tuple[float, ...], shown: Array, how: str) -> None:

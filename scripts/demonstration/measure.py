@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from bota_ethercat.accounting import FrameKind, StreamAccounting
 from bota_ethercat.framing import DataMessage
@@ -37,7 +36,6 @@ class Summary(NamedTuple):
     lost_before: int  # samples that were lost, or withheld from the client, before that
     repeated: int
     age_ms: Sequence[float]  # of messages at the subscriber: median, 99th percentile
-    tcp_age_ms: Sequence[float]
     all_finite: bool
     all_decoded_right: bool
 
@@ -58,13 +56,12 @@ class Measurement:
         # Messages, those of a sample that an earlier one had, those that equal no sample.
         self.messages = self.repeated = self._not_finite = self._unknown = 0
         self.age_ns = 0  # of the newest message on its arrival
-        # Of each sample that came from the server: when it was made, and its age then.
-        self._made_ns, self._tcp_ages_ns = array("q"), array("q")
+        self._made_ns = array("q")  # of each sample that came from the server: when it was made
         self._known: dict[tuple[float, ...], int] = {}  # by its values: its index there
         self._waiting: deque[tuple[tuple[float, ...], int]] = deque()  # messages whose sample has not come
         self._indices, self._arrived_ns = array("q"), array("q")  # of the samples that came as messages
 
-    def take_frame(self, frame: DataMessage, now_ns: int) -> None:
+    def take_frame(self, frame: DataMessage) -> None:
         """A frame came from the server."""
         if self._stream.take(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
             return
@@ -75,7 +72,6 @@ class Measurement:
         if len(self._known) > _REMEMBERED:
             del self._known[next(iter(self._known))]
         self._made_ns.append(frame.monotonic_ns)
-        self._tcp_ages_ns.append(now_ns - frame.monotonic_ns)
         self._look_up()
 
     def take_message(self, values: Sequence[float], now_ns: int) -> None:
@@ -121,6 +117,8 @@ class Measurement:
         index, made, arrived = (
             np.array(a, np.int64) for a in (self._indices, self._made_ns, self._arrived_ns)
         )
+        ages = arrived - made[index]
+        points = np.percentile(ages if ages.size else [0], (50, 99), method="higher")
         seconds = np.ptp(arrived) / 1e9 if self.began else 0.0
         return Summary(
             messages=self.messages,
@@ -128,18 +126,11 @@ class Measurement:
             lost=self.lost,
             lost_before=self.lost_before,
             repeated=self.repeated,
-            age_ms=_median_and_p99_ms(arrived - made[index]),
-            tcp_age_ms=_median_and_p99_ms(self._tcp_ages_ns),
+            age_ms=[float(point) / 1e6 for point in points],
             all_finite=self._not_finite == 0,
             # Where samples were withheld from the server's client, a message may be one of them.
             all_decoded_right=self._unknown <= self._stream.counts.missing,
         )
-
-
-def _median_and_p99_ms(ages_ns: ArrayLike) -> list[float]:
-    ages = np.asarray(ages_ns)
-    points = np.percentile(ages if ages.size else [0], (50, 99), method="higher")
-    return [float(point) / 1e6 for point in points]
 
 
 def verdict(summary: Summary, nominal_hz: float) -> str | None:

@@ -52,9 +52,8 @@ def listening(client: Client, measurement: Measurement, lock: threading.Lock) ->
 
     def receive() -> None:
         for frame in client.frames():
-            now_ns = time.monotonic_ns()
             with lock:
-                measurement.take_frame(frame, now_ns)
+                measurement.take_frame(frame)
 
     def on_message(message: Any) -> None:
         now_ns = time.monotonic_ns()
@@ -118,8 +117,6 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
         ("Repeated", summary.repeated),
         ("Age at the subscriber, p50", f"{summary.age_ms[0]:.2f} ms"),
         ("Age at the subscriber, p99", f"{summary.age_ms[1]:.2f} ms"),
-        ("Age at a TCP client, p50", f"{summary.tcp_age_ms[0]:.2f} ms"),
-        ("Age at a TCP client, p99", f"{summary.tcp_age_ms[1]:.2f} ms"),
         ("All finite", "yes" if summary.all_finite else "NO"),
         ("All decoded right", "yes" if summary.all_decoded_right else "NO"),
     ):

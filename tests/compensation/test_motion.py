@@ -227,7 +227,7 @@ def at_rest(up: Vector3, tool: Payload, imu: Imperfection, bias: Wrench) -> Stat
     force, torque, acceleration = (
         tuple(part[0].tolist()) for part in (felt.force, felt.torque, felt.acceleration)
     )
-    return StationaryMeans(Wrench(force, torque).plus(bias), acceleration, ZERO, ZERO, ZERO, 800, 1.0)
+    return StationaryMeans(Wrench(force, torque).plus(bias), acceleration, ZERO, ZERO, 800)
 
 
 @pytest.mark.parametrize("seed", more_if_long([0], range(10)))

@@ -400,7 +400,7 @@ def test_advice_always_leads_to_an_answer(seed: int) -> None:
 
 def still(up: Up) -> StationaryMeans:
     x, y, z = (-part for part in gravity_for(up))
-    return StationaryMeans(load(up), (x, y, z), (0.0,) * 3, (0.3,) * 3, (0.007,) * 3, 800, 1.0)
+    return StationaryMeans(load(up), (x, y, z), (0.3,) * 3, (0.007,) * 3, 800)
 
 
 def test_a_pose_that_is_none_and_gravity_of_another_source() -> None:

@@ -63,7 +63,7 @@ def find_stationary_periods(
             if seconds < least_seconds:
                 continue
             try:
-                means = stationary_means(rows[first:last], seconds, limits)
+                means = stationary_means(rows[first:last], limits)
             except NotStationaryError as error:
                 rejected.append(f"{times[first]:.1f} s to {times[last - 1]:.1f} s: {error}")
             else:

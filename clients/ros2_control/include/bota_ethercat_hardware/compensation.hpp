@@ -1,11 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Weight and inertia of the tool, to be subtracted from force and torque (docs/compensation.md):
-//
-//     tool force = -m s,  s = s_imu + alpha x d + omega x (omega x d)
-//     tool torque = c x tool force - J alpha - omega x J omega
-//
-// s: specific force (acceleration minus gravity) at the center of gravity c, d from the IMU to c, all at the instant of force and
-// torque. As ros2_bridge/ft_compensation: alignment, specific_force, compensator.
+// Weight and inertia of the tool, to be subtracted from force and torque, at their instant. docs/compensation.md has the model.
+// As ros2_bridge/ft_compensation: alignment, specific_force, compensator.
 #pragma once
 
 #include <algorithm>
