@@ -3,10 +3,8 @@
 
 The sensor's filters delay force and torque by 0.9 ms (SINC 32) to 120 ms (SINC 512 with FIR), what its
 accelerometer measures by 1.9 ms and its gyroscope by 2.9 ms (`bota_ethercat.sensor.response`). A polynomial
-through the latest samples is evaluated at the instant that force and torque are of: mostly between two
-samples, by at most 2 ms after the newest where the IMU is later than the force. With FIR on, the IMU passes
-the same window too. Angular acceleration is the slope of a parabola, 1.5 ms before the newest sample at the
-latest: nearer, and with a shorter one, noise grows steeply. By default it is 2.5 ms late for that.
+through the latest samples is evaluated at the instant that force and torque are of (docs/compensation.md).
+The slope of a parabola is taken 1.5 ms before the newest sample at the latest: nearer, noise grows steeply.
 """
 
 from __future__ import annotations

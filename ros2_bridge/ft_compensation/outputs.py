@@ -14,7 +14,7 @@ import math
 from typing import Final, NamedTuple, Self
 
 from bota_ethercat.pdo import Vector3
-from ft_compensation.quantities import ZERO, CompensationError, Quaternion, Wrench, unit_quaternion
+from ft_compensation.quantities import CompensationError, Quaternion, Wrench, unit_quaternion
 
 LEAST_CUTOFF_HZ: Final = 0.05
 Six = tuple[float, ...]  # Fx Fy Fz (N) Mx My Mz (Nm)
@@ -87,14 +87,13 @@ class WrenchFilter:
 
 
 Rotation = tuple[Vector3, Vector3, Vector3]  # a rotation matrix, row by row
-_IDENTITY: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class WrenchTransform(NamedTuple):
     """From a source frame to a target frame."""
 
-    rotation: Rotation = _IDENTITY  # takes vectors of the source frame to the target frame
-    translation: Vector3 = ZERO  # the origin of the source frame in the target frame, m
+    rotation: Rotation  # takes vectors of the source frame to the target frame
+    translation: Vector3  # the origin of the source frame in the target frame, m
 
     @classmethod
     def of(cls, translation: Vector3, quaternion: Quaternion) -> Self:

@@ -99,11 +99,6 @@ class Accelerometer(NamedTuple):
     cross_axis: Six = (0.0,) * 6  # in the order of CROSS_AXES
     cross_axis_interval: Six = (_SCALE_95,) * 6
 
-    @property
-    def is_exact(self) -> bool:
-        """Whether there is nothing to correct."""
-        return self[:2] == EXACT[:2] and not any(self.cross_axis)
-
     def correct(self, acceleration: Vector3) -> Vector3:
         """The truth, m/s², of what was read."""
         (x, y, z), (ox, oy, oz), (sx, sy, sz) = acceleration, self.offset, self.scale

@@ -44,7 +44,7 @@ class ImuSpecificForce:
         self.lever = lever
         # Angular rate (rad/s) and acceleration (rad/s²) of the latest sample, at force and torque's instant.
         self.turning = STILL
-        self._correct = None if accelerometer.is_exact else accelerometer.correct
+        self._correct = accelerometer.correct
         self.align(alignment or align({}))
 
     def align(self, alignment: Alignment) -> None:
@@ -62,9 +62,7 @@ class ImuSpecificForce:
         None if it is not finite, or if the sensor turns and what was before the sample, and so how fast it
         spins up, is not known.
         """
-        if self._correct is not None:
-            acceleration = self._correct(acceleration)
-        row = (*acceleration, *angular_rate)
+        row = (*self._correct(acceleration), *angular_rate)
         total = sum(row)
         if total - total != 0.0:  # NaN or infinity
             self._time_s = -math.inf

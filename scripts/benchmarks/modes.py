@@ -150,8 +150,8 @@ def load(setup: Setup, loops: int) -> list[Figures]:
                 chain.server()
                 if client == "wrench":
                     chain.node(f"rt_priority:={priority}")
-                how_recorded = ("ros", 1) if client == "wrench" else ("tcp",)
-                recorder = chain.recorder(*how_recorded, priority=priority)
+                kind = ("ros", 1) if client == "wrench" else ("tcp",)
+                recorder = chain.recorder(*kind, priority=priority)
                 for number in range(loops):
                     chain.start(f"loop-{number}", sys.executable, "-c", "while True: pass", watch=False)
                 figures, _ = chain.measure(recorder)
