@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 import rclpy
 from diagnostic_msgs.msg import KeyValue
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.exceptions import InvalidHandle, InvalidTopicNameException, ParameterException
+from rclpy.exceptions import InvalidTopicNameException, ParameterException
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -123,7 +123,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock, self.fail
         )
         wrench, *others = make_measured(self, parameters, stamps)
-        self.outputs = Outputs([wrench, compensated, *others], InvalidHandle)  # control loops' topics first
+        self.outputs = Outputs([wrench, compensated, *others])  # control loops' topics first
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
