@@ -65,11 +65,11 @@ def _sentences() -> Iterator[None]:
 
 
 def _transition(act: Callable[[Any], object]) -> Callable[[Any, LifecycleState], TransitionCallbackReturn]:
-    """A transition of a managed node, by what it does."""
+    """A transition of a managed node, by what it does while no other thread sets parameters."""
 
     def change(node: BridgeNode, _: LifecycleState) -> TransitionCallbackReturn:
         try:
-            with _sentences():
+            with node.setting, _sentences():
                 act(node)
         except StartError as error:
             node.get_logger().error(str(error))

@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 import uuid
+from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import KeyValue
@@ -202,7 +203,20 @@ def test_a_managed_node(server: ScriptedServer, listener: Listener, start: Start
     node.says("parameter orientation.topic is")
     assert listener.set_parameter("gravity_source", "imu") == (True, "")
     change(Transition.TRANSITION_CONFIGURE)
-    assert change(Transition.TRANSITION_ACTIVATE) == topics
+    cutoff = [Parameter("filter.cutoff", value=20.0)]
+    setting = threading.Thread(target=node.node.set_parameters_atomically, args=(cutoff,))
+    make = node.node.create_publisher
+
+    def set_meanwhile(*arguments: Any, **options: Any) -> Any:
+        node.node.create_publisher = make
+        setting.start()
+        setting.join(0.2)  # it has to wait
+        return make(*arguments, **options)
+
+    node.node.create_publisher = set_meanwhile
+    change(Transition.TRANSITION_ACTIVATE)
+    setting.join()
+    topics.add("wrench_filtered")
     assert change(Transition.TRANSITION_ACTIVE_SHUTDOWN) == topics
 
 
