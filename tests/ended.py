@@ -24,6 +24,7 @@ class Result(NamedTuple):
 
     @property
     def json(self) -> dict[str, Any]:
+        assert self.out.isascii(), "valid JSON in whatever encoding it is written"
         found: dict[str, Any] = json.loads(self.out)
         return found
 

@@ -111,7 +111,7 @@ def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:
     """The whole report as one object."""
     found = {**header, "verdict": verdict(findings).key, "worst": NAMES[worst(findings)]}
     found |= {"findings": [f.as_json() for f in findings]}
-    return json.dumps(found, indent=2, ensure_ascii=False, default=str)
+    return json.dumps(found, indent=2, default=str)
 
 
 _LEVEL_WIDTH: Final = max(map(len, NAMES.values()))

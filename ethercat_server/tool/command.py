@@ -109,7 +109,7 @@ def say(text: str) -> None:
 
 def say_json(value: dict[str, Any], *, indent: int | None = 2) -> None:
     """One JSON object; infinite and NaN become null."""
-    say(json.dumps(finite(value), indent=indent, ensure_ascii=False, allow_nan=False))
+    say(json.dumps(finite(value), indent=indent, allow_nan=False))
 
 
 def report(as_json: bool, opened: Sensors, found: Found, values: dict[str, Any], *lines: str) -> None:

@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 import rclpy
 from diagnostic_msgs.msg import KeyValue
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.exceptions import InvalidHandle, InvalidTopicNameException, ParameterException
+from rclpy.exceptions import InvalidTopicNameException, ParameterException
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -65,11 +65,11 @@ def _sentences() -> Iterator[None]:
 
 
 def _transition(act: Callable[[Any], object]) -> Callable[[Any, LifecycleState], TransitionCallbackReturn]:
-    """A transition of a managed node, by what it does."""
+    """A transition of a managed node, by what it does while no other thread sets parameters."""
 
     def change(node: BridgeNode, _: LifecycleState) -> TransitionCallbackReturn:
         try:
-            with _sentences():
+            with node.setting, _sentences():
                 act(node)
         except StartError as error:
             node.get_logger().error(str(error))
@@ -123,7 +123,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock, self.fail
         )
         wrench, *others = make_measured(self, parameters, stamps)
-        self.outputs = Outputs([wrench, compensated, *others], InvalidHandle)  # control loops' topics first
+        self.outputs = Outputs([wrench, compensated, *others])  # control loops' topics first
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )

@@ -210,6 +210,7 @@ class Topic:
         return int(self.is_heard)
 
     def publish(self, message: Any) -> None:
+        self._publisher.get_subscription_count()  # InvalidHandle once it is destroyed
         self.turn = next(TURNS)
         if isinstance(message, bytes):
             message = deserialize_message(message, self._publisher.msg_type)

@@ -292,6 +292,9 @@ def test_it_can_be_configured_while_the_node_runs() -> None:
         got = node.hear("wrench_filtered")
         node.run(0.5)
         assert got
+        arrays = node.hear("sensone_sensor_data")
+        node.topics[f"{prefix}wrench_filtered"].destroy()  # while a sample is published
+        assert node.fresh(arrays, 0.1), "it is on the topics that come after it"
         node.set("filter.cutoff", 0.0)
         assert "wrench_filtered" not in str([each.topic_name for each in node.node.publishers])
         assert not node.fresh(got, 0.2)

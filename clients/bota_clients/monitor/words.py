@@ -166,7 +166,7 @@ def json_line(state: State, unix_s: float) -> str:
         "sensors": [_sensor(sensor) for sensor in state.sensors],
         "clients": [client._asdict() for client in state.clients],
     }
-    return json.dumps(finite(found), allow_nan=False, ensure_ascii=True)
+    return json.dumps(finite(found), allow_nan=False)
 
 
 def _sensor(sensor: SensorState) -> dict[str, Any]:

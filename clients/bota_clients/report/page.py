@@ -111,5 +111,5 @@ def as_json(examinations: Sequence[Examination]) -> str:
             }
             for each in examinations
         ],
-        indent=1, ensure_ascii=False,
+        indent=1,
     )  # fmt: skip

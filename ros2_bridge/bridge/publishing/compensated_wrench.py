@@ -11,11 +11,13 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from std_msgs.msg import Header
 
@@ -258,9 +260,9 @@ class FilteredTopic:
 
     def is_wanted(self) -> bool:
         """Whether it is configured and anybody has subscribed."""
-        if self._topic is None:
-            return False
-        wanted = self._topic.is_wanted()
+        wanted = False
+        with suppress(InvalidHandle):  # it has just been closed
+            wanted = (topic := self._topic) is not None and topic.is_wanted()
         if not wanted and self._rate_hz():
             self._is_ready()  # so that delay or problem are told before there is a subscriber
         return wanted
@@ -297,7 +299,9 @@ class FilteredTopic:
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         """Filter a sample and publish it."""
         if (topic := self._topic) is not None and self._is_ready():
-            topic.send(*self._filter.step(force, torque, frame.monotonic_ns), frame)
+            filtered = self._filter.step(force, torque, frame.monotonic_ns)
+            with suppress(InvalidHandle):  # it has just been closed
+                topic.send(*filtered, frame)
 
 
 class Plan(NamedTuple):

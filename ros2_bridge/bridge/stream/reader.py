@@ -119,15 +119,13 @@ class Output(Protocol):
 class Outputs:
     """All outputs. `wanted` are those that were so at the last `refresh`."""
 
-    def __init__(self, outputs: Sequence[Output], closed: type[Exception]) -> None:
-        """`closed` is what one raises whose topic has just been closed."""
-        self.all, self.closed = tuple(outputs), closed
+    def __init__(self, outputs: Sequence[Output]) -> None:
+        self.all = tuple(outputs)
         self.wanted: tuple[Output, ...] = ()
 
     def refresh(self) -> None:
         """Look who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
-        with contextlib.suppress(self.closed):
-            self.wanted = tuple(output for output in self.all if output.is_wanted())
+        self.wanted = tuple(output for output in self.all if output.is_wanted())
 
     def publish_finite(self, sample: Sample, frame: DataMessage) -> None:
         """Publish a sample that is not finite everywhere where it is."""
@@ -219,15 +217,11 @@ class Reader:
                     f"a sample with the impossible time {frame.stamp_ns} ns was not published", **_SOMETIMES
                 )
             elif sample.is_finite:
-                try:
-                    for output in self._outputs.wanted:
-                        output.publish(sample, frame)
-                except self._outputs.closed:  # nobody misses it
-                    pass
+                for output in self._outputs.wanted:
+                    output.publish(sample, frame)
                 watch.sample, watch.stamp_ns = sample, frame.stamp_ns
             else:
-                with contextlib.suppress(self._outputs.closed):
-                    self._outputs.publish_finite(sample, frame)
+                self._outputs.publish_finite(sample, frame)
                 self.not_finite += 1
                 self._log.warning(
                     f"a sample with numbers that are not finite was not published ({self.not_finite} so far)",
