@@ -217,7 +217,9 @@ def test_it_streams_and_recovers_without_privileges(
         sensor.command("power on")
         client.wait_event("sensor_back")
         veth.ip("link", "set", veth.near, "down")
-        assert f"{veth.near} is down" in client.wait_event("sensor_lost")["reason"]
+        # On a busy machine the sensor's process may have been starved and lost before.
+        while f"{veth.near} is down" not in client.wait_event("sensor_lost")["reason"]:
+            client.wait_event("sensor_back")
         veth.ip("link", "set", veth.near, "up")
         client.wait_event("sensor_back")
         client.fresh(50)
