@@ -23,6 +23,7 @@ def test_the_way_of_a_sample_is_short(clock: str) -> None:
     assert one["mean_calls"] <= 27
 
 
+@pytest.mark.long
 def test_another_subscriber_costs_its_own_frame_only() -> None:
     one, four = once("", 1), once("", 4)
     assert four["lines"] - one["lines"] <= 3 * 18

@@ -182,6 +182,7 @@ NAME = "FASTRTPS_DEFAULT_PROFILES_FILE"
 PROFILES = Path(__file__).parents[2] / "ros2_bridge/config/fastdds.xml"
 
 
+@pytest.mark.long
 def test_fast_dds_understands_it(
     server: ScriptedServer, start_process: StartProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

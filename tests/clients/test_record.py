@@ -186,6 +186,7 @@ def test_what_was_lost_is_said(frames: list[DataMessage], sentence: str) -> None
     assert tally.losses() == sentence
 
 
+@pytest.mark.long
 def test_a_moment_without_running(out: Path) -> None:
     """A process, to be stopped by SIGSTOP."""
     with served(sinc_length=512) as server:

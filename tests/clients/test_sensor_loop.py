@@ -518,6 +518,7 @@ def test_another_sensor_in_its_place_is_refused(running: Loop) -> None:
 # -- a real server
 
 
+@pytest.mark.long
 def test_a_server_killed_and_started_again(running: Loop) -> None:
     with contextlib.ExitStack() as ends:
         first = ends.enter_context(served(sinc_length=512))

@@ -128,6 +128,7 @@ def measuring(ifname: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     pytest.fail(said)
 
 
+@pytest.mark.long
 def test_stopped_while_it_measures_it_leaves_nothing_behind(bench: Bench) -> None:
     """A signal from outside, sockets, and another doctor's look at them."""
     veth, sensor = bench

@@ -176,6 +176,7 @@ def test_a_flood_floods_neither_log_nor_clients_nor_the_bus(log: pytest.LogCaptu
     assert simulation.streams[0].lost_samples == 0
 
 
+@pytest.mark.long
 def test_a_flood_of_different_codes_is_bounded_too(log: pytest.LogCaptureFixture) -> None:
     simulation = Simulation(settings=SLOW)
     flood(simulation, 50.0, 0.1, codes=1000)

@@ -250,6 +250,7 @@ def test_a_snapshot_is_restored_as_far_as_it_differs(bench: SimulatedBus, tmp_pa
     assert "nothing to restore" in tool_here("restore", near, path).out
 
 
+@pytest.mark.long
 def test_a_snapshot_replaces_a_file_only_if_forced_and_once_it_is_complete(
     chain: SimulatedBus, tmp_path: Path
 ) -> None:
