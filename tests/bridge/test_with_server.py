@@ -180,6 +180,7 @@ def test_a_server_that_starts_again(node: Node, server: WholeServer) -> None:
     assert stamp_ns(wrenches[0]) > started_ns
 
 
+@pytest.mark.long
 def test_from_poses_to_the_force_of_the_environment(tmp_path: Path) -> None:
     """Identification and compensation as a user does them; the accelerometer is the only source."""
     server = WholeServer(SensorOptions(signal="poses"))

@@ -237,6 +237,7 @@ def test_figures_and_spans_of_time() -> None:
 # In a browser.
 
 
+@pytest.mark.long
 @needs_chromium
 def test_chromium_draws_it_in_the_light_and_in_the_dark_and_prints_it(page: str, tmp_path: Path) -> None:
     source = tmp_path / "report.html"
