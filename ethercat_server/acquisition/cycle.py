@@ -35,7 +35,6 @@ _BUDGET: Final = 1 / 4  # fraction of the time that exchanges may take
 _LARGEST_WAIT: Final = 0.3  # longest time that a poll waits for another, in shortest sample periods
 # Read for every sample: as an attribute of its Enum it takes ten times as long.
 _STREAMING: Final = SensorState.STREAMING
-_unpack_latched = LATCHED.unpack_from
 # Longest time by which polls are brought forward because this machine wakes late.
 _LONGEST_LEAD_NS: Final = 200_000.0
 
@@ -248,7 +247,7 @@ class Cycle:
             if not complete or sensor.state is not _STREAMING or data == untouched:
                 made = stream.invalid(wkc, back)
             else:
-                made = stream.take(data, exchange, _unpack_latched(frame, at) if at else None)
+                made = stream.take(data, exchange, LATCHED.unpack_from(frame, at) if at else None)
             if made is not None:
                 new.append(made)
         if new:
