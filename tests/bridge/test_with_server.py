@@ -17,14 +17,16 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 
 from bota_ethercat.errors import UnreachableError
+from bota_ethercat.world import Felt
 from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import CONSTANT, TOOL_CENTRE, TOOL_MASS
+from ethercat_server.virtual_sensor.signals import CONSTANT, TOOL_CENTRE, TOOL_MASS, scene
 from tests.bridge.real_node import PATIENCE_S, Listener, StartProcess
 from tests.bridge.simulated_node import HEALTHY, STEP_S, Node, Wire, level, six, stamp_ns, values
 from tests.server.running import needs_bus
 from tests.server.running import server as server_process
 from tests.simulation import Simulation
+from tests.virtual_sensor.motions import poses, turning
 
 # Standard deviation of a force at SINC 512: 0.3 N at 51, falling with the length to the power of 0.62.
 NOISE_N = 0.072
@@ -81,7 +83,7 @@ class WholeServer:
 
 @pytest.fixture
 def server() -> WholeServer:
-    return WholeServer(SensorOptions(signal="poses", pdo_size=77))
+    return WholeServer(SensorOptions(world=poses, pdo_size=77))
 
 
 @pytest.fixture
@@ -183,7 +185,12 @@ def test_a_server_that_starts_again(node: Node, server: WholeServer) -> None:
 @pytest.mark.long
 def test_from_poses_to_the_force_of_the_environment(tmp_path: Path) -> None:
     """Identification and compensation as a user does them; the accelerometer is the only source."""
-    server = WholeServer(SensorOptions(signal="poses"))
+    worlds = [poses]
+
+    def world(seconds: float) -> Felt:
+        return worlds[-1](seconds)
+
+    server = WholeServer(SensorOptions(world=world))
     with Node(server, **{"identify.file": tmp_path / "payload.yaml"}) as node:
         node.run(0.1)
         node.do("identify/start")
@@ -200,7 +207,7 @@ def test_from_poses_to_the_force_of_the_environment(tmp_path: Path) -> None:
         mass, center = node.parameters("tool_mass", "tool_center_of_gravity")
         assert mass == pytest.approx(TOOL_MASS, rel=0.01)
         assert list(center) == pytest.approx(TOOL_CENTRE, abs=0.002)
-        server.simulation.command("signal turn")
+        worlds.append(turning)
         wrenches = node.hear("wrench_compensated")
         node.run(2.0)
         wrenches.clear()
@@ -212,11 +219,11 @@ def test_from_poses_to_the_force_of_the_environment(tmp_path: Path) -> None:
         assert max(rms) < 1.5 * NOISE_N
         beyond = sum(abs(part) > 3 * NOISE_N for row in rows for part in row)
         assert beyond < 0.01 * 3 * len(rows)  # of noise alone 0.27 % would be
-        # What the environment does shows: in the scene the tool touches something after 5 s.
-        server.simulation.command("signal scene")
+        # What the environment does shows: in the scene the tool touches something every 7 s.
+        worlds.append(scene)
         node.run(1.0)
         wrenches.clear()
-        node.run(5.0)
+        node.run(7.0)
         assert min(six(message)[2] for message in wrenches) < -10.0
 
 
