@@ -55,7 +55,7 @@ def missing(shown: list[str], said: str) -> list[str]:
     """Lines of which `said` has none like it, in this order: the same words, with any numbers."""
     left, found = said.splitlines(), []
     for line in shown:
-        words = [NUMBER.sub("\0", re.sub(r"/home/\w+", "", word)) for word in line.split()]
+        words = [NUMBER.sub("\0", re.sub(r"/home/\w+", "", word)) for word in line.split() if word != "..."]
         like = re.compile(".*?".join(re.escape(word).replace("\0", NUMBER.pattern) for word in words))
         place = next((place for place, each in enumerate(left) if like.search(each)), None)
         if place is None:
@@ -103,11 +103,11 @@ class Desk:
         return self.said(name), int(code.read_text())
 
     def start(self, terminal: str, command: str) -> None:
-        """One that goes on."""
+        """One that goes on; again where a busy machine starved the virtual sensor."""
         keys = self.folder / terminal
         os.mkfifo(keys)
         (self.folder / f"{terminal}.out").touch()
-        self._send(f"{command.partition('  #')[0]} <>{keys} >{keys}.out 2>&1 &")
+        self._send(f"until {command.partition('  #')[0]}; do sleep 1; done <>{keys} >{keys}.out 2>&1 &")
 
     def type(self, terminal: str, line: str) -> None:
         self._send(f"echo {line} >{self.folder}/{terminal}")
