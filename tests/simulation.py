@@ -60,8 +60,8 @@ from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
-from ethercat_server.virtual_sensor.signals import ClockReading, decode_clock
 from ethercat_server.virtual_sensor.world import ToldWorld, World
+from scripts.benchmarks.records import ClockReading, decode_clock
 from tests.server.running import OLD, Commanded, FramedClient
 
 PATIENCE_S = 60.0  # simulated time that anything may take

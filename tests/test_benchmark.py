@@ -24,12 +24,11 @@ from rich.console import Console
 from bota_ethercat.framing import DataMessage, FrameDecoder
 from bota_ethercat.pdo import SampleDecoder, encode
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import decode_clock
 from scripts.benchmarks import modes, statistics
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.chain import ScriptError, Turn
 from scripts.benchmarks.processes import masters, recorder
-from scripts.benchmarks.records import Recording, began
+from scripts.benchmarks.records import Recording, began, decode_clock
 from scripts.benchmarks.statistics import Arrivals
 from tests.clients.running import signalled
 from tests.served_simulation import served

@@ -1,116 +1,67 @@
-"""examples/mujoco in simulated time: through the virtual sensor, the server and the client."""
+"""docs/examples: what of them can be tried here."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+import re
+import shutil
+import subprocess
+import tomllib
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
+import yaml
 
-from bota_ethercat.client import Client, Condition, Reading
-from bota_ethercat.world import Felt
-from examples.mujoco import identify
-from examples.mujoco.touch import FORCE, HOLE, Row, Touch, draw
-from tests.simulation import PATIENCE_S, MemoryChannel, Simulation
+from bota_ethercat.framing import DataFlag
+from ethercat_server.daemon.options import parse_options
+from tests.bridge.scripted_server import ScriptedServer
+from tests.server.running import PATIENCE_S
+from tests.systemd.test_installation import CAPABILITIES
 
-WALL = 15_000.0  # N/m
-
-
-class SpringArm:
-    """A tip that moves as it is told, before a wall of springs with a hole."""
-
-    rotation = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-
-    def __init__(self) -> None:
-        self.velocity, self.tip = np.zeros(3), np.array([HOLE[0] - 0.002, 0.0, HOLE[2] - 0.01])
-
-    def step(self, _seconds: float) -> Felt:
-        """A world."""
-        self.tip = self.tip + 1e-3 * self.velocity
-        in_hole = abs(self.tip[2] - HOLE[2]) < 0.001
-        force = 0.0 if in_hole else -WALL * max(0.0, self.tip[0] - HOLE[0])
-        return Felt((*(self.rotation.T @ (force, 0.0, 0.0)), 0.0, 0.0, 0.0))
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "docs" / "examples"
 
 
-def arm() -> Any:
-    """The one in MuJoCo."""
-    from examples.mujoco.arm import Arm
-
-    return Arm()
-
-
-ROBOTS = [SpringArm, pytest.param(arm, marks=pytest.mark.long)]
-
-
-def simulated(robot: Any) -> Simulation:
-    """The server's sensor on this robot; a slow one on the springs, which is quicker to simulate."""
-    return Simulation(world=robot.step, settings={"sinc_length": 128 if type(robot) is SpringArm else 64})
-
-
-def perform(simulation: Simulation, task: Any, until: Callable[[Reading], object] = lambda _: False) -> None:
-    """Have the task done in this simulation, or until something is so of a reading."""
-    with Client(12001, channel=MemoryChannel(simulation)).connect() as sensor:
-        while not task.done:
-            passed_s = (simulation.clock.now_ns - simulation.started_ns) * 1e-9
-            assert passed_s < PATIENCE_S
-            reading = sensor.latest(timeout_s=0.005)
-            task.update(reading, passed_s)
-            if until(reading):
-                return
-
-
-def touched(rows: list[Row]) -> int:
-    """The first row in which the wall was felt."""
-    return next(number for number, row in enumerate(rows) if row.force > FORCE / 2)
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_it_presses_with_10_n_and_finds_the_hole(robot: Callable[[], Any], tmp_path: Path) -> None:
-    made = robot()
-    touch = Touch(made)
-    perform(simulated(made), touch)
-    first = touch.rows[touched(touch.rows)].seconds
-    pressing = [row.force for row in touch.rows if first + 0.5 < row.seconds < first + 2.0]
-    assert np.mean(pressing) == pytest.approx(FORCE, abs=0.5)
-    assert np.nanmax([row.force for row in touch.rows]) < 15.0
-    assert abs(made.tip[2] - HOLE[2]) < 0.001
-    assert made.tip[0] > HOLE[0] + 0.01
-    if robot is arm:
-        draw(tmp_path / "touch.png", touch.rows)
-        assert (tmp_path / "touch.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_it_stops_while_the_sensor_is_disconnected(robot: Callable[[], Any]) -> None:
-    made = robot()
-    simulation, touch = simulated(made), Touch(made)
-    perform(simulation, touch, lambda _: touch.rows and touch.rows[-1].force > FORCE / 2)
-    simulation.command("disconnect")
-    perform(simulation, touch, lambda reading: reading.condition is Condition.SENSOR_LOST)
-    assert not made.velocity.any()
-    blind = [row for row in touch.rows[touched(touch.rows) :] if row.condition is not Condition.FRESH]
-    simulation.command("connect")
-    perform(simulation, touch)
-    assert np.nanmax([row.force for row in touch.rows]) < 15.0
-    assert math.dist(blind[0].tip, blind[-1].tip) < 0.0005
-
-
-def test_a_controller_that_is_wrong_by_sign_diverges() -> None:
-    made = SpringArm()
-    simulation, touch = simulated(made), Touch(made)
-    made.rotation = -made.rotation
-    perform(simulation, touch, lambda _: touch.rows and abs(touch.rows[-1].force) > 5 * FORCE)
-    assert made.tip[0] > HOLE[0]
+def test_containers_have_the_services_capabilities_and_commands_and_sources_that_exist() -> None:
+    services = yaml.safe_load((EXAMPLES / "compose.yaml").read_text())["services"]
+    server, node = services.pop("server"), services.pop("node")
+    assert not services
+    assert [f"CAP_{name}" for name in server["cap_add"]] == list(CAPABILITIES)
+    assert "cap_add" not in node
+    program, *arguments = server["command"]
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert program in scripts
+    assert parse_options(arguments).port == 12001
+    for service in (server, node):
+        assert service["cap_drop"] == ["ALL"]
+        assert service["network_mode"] == "host"
+        context = EXAMPLES / service["build"]["context"]
+        for source in re.findall(r"^COPY (\S+) ", service["build"]["dockerfile_inline"], re.MULTILINE):
+            assert (context / source).exists()
 
 
 @pytest.mark.long
-def test_the_arm_identifies_its_tool() -> None:
-    made = arm()
-    task = identify.Identification(made)
-    perform(simulated(made), task)
-    payload = task.result().payload
-    assert payload.mass == pytest.approx(identify.MASS, abs=0.01)
-    assert math.dist(payload.center, identify.CENTER) < 0.002
+def test_octave_gets_the_newest_wrench_and_nan_for_one_that_is_not_valid() -> None:
+    octave = shutil.which("octave-cli")
+    if octave is None or not [*Path("/usr/share/octave/packages").glob("instrument-control-*")]:
+        pytest.skip("octave is missing: sudo apt install octave octave-instrument-control")
+    with ScriptedServer() as server:
+        script = f"""
+            for number = 1:2
+                [wrench, stamp] = bota_wrench("127.0.0.1", {server.port});
+                printf("%g ", wrench, stamp), disp(""), fflush(stdout);
+            end
+        """
+        with subprocess.Popen(
+            [octave, "--quiet", "--eval", script], cwd=EXAMPLES, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            for flags, wrench in (
+                (DataFlag(0), "1.5 1.5625 1.625 1.6875 1.75 1.8125"),
+                (DataFlag.INVALID, "NaN NaN NaN NaN NaN NaN"),
+            ):
+                assert server.subscribed.wait(PATIENCE_S)
+                newest = server.frame(1.5, flags, stamp_ns=1_500_000_000)
+                server.send_raw(server.frame(0.0) + newest)
+                assert process.stdout.readline().split() == [*wrench.split(), "1.5"]
+        assert process.returncode == 0
+        assert [request["action"] for request in server.requests] == ["subscribe"]

@@ -186,3 +186,7 @@ def main(
         print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
         return 1
     return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

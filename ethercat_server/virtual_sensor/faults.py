@@ -23,6 +23,7 @@ from ethercat_server.virtual_sensor.esc import SiiInterface
 from ethercat_server.virtual_sensor.options import Command, UsageError, real, whole
 from ethercat_server.virtual_sensor.sampler import CHANNELS, MOST_SKIPPED
 from ethercat_server.virtual_sensor.sensor import Firmware, VirtualSensor
+from ethercat_server.virtual_sensor.signals import SIGNALS
 
 LONGEST_LINE: Final = 1000
 PPM_LIMIT: Final = 100_000.0
@@ -198,6 +199,8 @@ COMMANDS: Final[tuple[Command, ...]] = (
             (real(0, MOST_SKIPPED),)),
     Command("ppm X [@N]", "set the error of the sensor's clock", lambda c, ppm: c.sensor.set_ppm(ppm),
             (real(-PPM_LIMIT, PPM_LIMIT),)),
+    Command("signal NAME [@N]", "measure another signal, from its beginning",
+            lambda c, name: c.sensor.set_signal(name), (_one_of("signal", SIGNALS),)),
     Command("dc WORD [VALUE] ... [@N]", "a fault of the distributed clock, as in --dc; `dc ok` ends it",
             Call._dc, (str, str)),
     Command("stats", "counters and states, as JSON",

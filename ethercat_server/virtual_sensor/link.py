@@ -104,9 +104,7 @@ def run(
         poller = select.poll()
         poller.register(raw, select.POLLIN)
         channel = stack.enter_context(CommandChannel(bus, poller, control_path, commands))
-        world = stack.enter_context(bound(world_path, socket.SOCK_DGRAM)) if world_path else None
-        if world is not None:
-            poller.register(world, select.POLLIN)
+        world = stack.enter_context(bound(world_path, socket.SOCK_DGRAM, poller)) if world_path else None
         # All that is loaded need never be looked through again, which takes some 20 ms.
         gc.collect()
         gc.freeze()
@@ -157,9 +155,8 @@ class CommandChannel(contextlib.ExitStack):
         self._pending: dict[int, bytes] = {}  # the beginning of a line, by descriptor
         self.ended = False  # the text stream has
         if control_path is not None:
-            self._listener = self.enter_context(bound(control_path, socket.SOCK_STREAM))
+            self._listener = self.enter_context(bound(control_path, socket.SOCK_STREAM, poller))
             self._listener.listen()
-            poller.register(self._listener, select.POLLIN)
         if commands is not None:
             with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
                 self._pending[commands.fileno()] = b""
@@ -232,8 +229,8 @@ class CommandChannel(contextlib.ExitStack):
 
 
 @contextlib.contextmanager
-def bound(path: str, kind: socket.SocketKind) -> Iterator[socket.socket]:
-    """A Unix socket that others of this user find at `path` until the end; LinkError if it cannot be."""
+def bound(path: str, kind: socket.SocketKind, poller: select.poll) -> Iterator[socket.socket]:
+    """A Unix socket that this user's programs find at `path` until the end; LinkError if it cannot be."""
     with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, kind) as probe:
         # Remove a stale socket, left by a killed process; nothing else.
         if stat.S_ISSOCK(Path(path).stat().st_mode) and probe.connect_ex(path) != 0:
@@ -246,6 +243,7 @@ def bound(path: str, kind: socket.SocketKind) -> Iterator[socket.socket]:
         except OSError as error:
             raise LinkError(f"cannot create the Unix socket {path!r}: {error.strerror or error}") from None
         try:
+            poller.register(made, select.POLLIN)
             yield made
         finally:
             with contextlib.suppress(OSError):

@@ -15,7 +15,7 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import FORMULAS, Formula, Reading, reading_of, scene
+from ethercat_server.virtual_sensor.signals import FORMULAS, SCENES, Formula, Reading, reading_of
 from ethercat_server.virtual_sensor.world import Measured, ToldWorld
 
 _PPM_SCALE = 10**12  # ppm in steps of one millionth
@@ -122,14 +122,17 @@ class Sampler:
         self._skipped, self._skip_after = 0, 0
         self._number, self._data = -1, b""
         self._prepared_number, self._prepared = -1, b""
-        self._told = options.world if isinstance(options.world, ToldWorld) else None
-        self._signal_start = now() if self._told is None else 0
-        self._signal: Measured | Formula
-        if options.world is None and options.signal in FORMULAS:
-            self._signal = FORMULAS[options.signal]
-        else:
-            self._signal = Measured(options.world or scene, options.seed, options.noise)
-        self.exact = self._signal.exact  # unaffected by settings, offsets and noise
+        self.measure(options)
+
+    def measure(self, options: SensorOptions) -> None:
+        """Measure the signal in `options`, which begins with the next sample."""
+        world = options.world or SCENES.get(options.signal)
+        self._told = world if isinstance(world, ToldWorld) else None
+        self._signal_start = self.clock.instant(self._number + 1) if self._told is None else 0
+        self._signal: Measured | Formula = (
+            FORMULAS[options.signal] if world is None else Measured(world, options.seed, options.noise)
+        )
+        self.exact = isinstance(self._signal, Formula) and self._signal.exact  # settings do not affect it
         self.settings_changed()
 
     def number_at(self, instant: int) -> int:

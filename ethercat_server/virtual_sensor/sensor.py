@@ -15,7 +15,6 @@ from ethercat_server.virtual_sensor.dictionary import Dictionary, Flash, sensor_
 from ethercat_server.virtual_sensor.distributed_clock import parse_clock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sampler import Sampler
-from ethercat_server.virtual_sensor.world import ToldWorld
 
 _REPETITION_NS: Final = 300_000_000
 _WRITES_REMEMBERED: Final = 200
@@ -147,6 +146,12 @@ class VirtualSensor:
             self.life.esc.clock.settle()
             self.life.sampler.set_ppm(ppm)
 
+    def set_signal(self, signal: str) -> None:
+        """Measure another signal, now and after a power cycle."""
+        self.options = replace(self.options, signal=signal, world=None)
+        if self.life is not None:
+            self.life.sampler.measure(self.options)
+
     def statistics(self) -> dict[str, Any]:
         """Its part of what the command `stats` reports."""
         life = self.life
@@ -158,7 +163,7 @@ class VirtualSensor:
             "samples_made": life.sampler.made if life else 0,
             "sinc_length": life.sampler.clock.sinc_length if life else None,
             "ppm": self.options.ppm,
-            "world": self.options.world.counts if isinstance(self.options.world, ToldWorld) else None,
+            "world": getattr(self.options.world, "counts", None),
             "calibration_writes": self.calibration_writes,
             "sdo_write_count": self.sdo_write_count,
             "sdo_writes": list(self.sdo_writes),

@@ -12,10 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from bota_ethercat.pdo import STANDARD_GRAVITY
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.world import Felt
-
-Vector = tuple[float, float, float]
 
 
 class Reading(NamedTuple):
@@ -73,34 +71,18 @@ FORMULAS: Final = {
 }
 
 
-class ClockReading(NamedTuple):
-    """Content of a sample of the signal `clock`."""
-
-    number: int  # modulo 2**24
-    instant_ns: int  # modulo 2**20 s
-
-
-def decode_clock(force_torque: Sequence[float]) -> ClockReading:
-    """Sample number and instant from force x, y, z and torque x of the signal `clock`.
-
-    Takes the values as they came off the bus. For tests and benchmarks.
-    """
-    number, seconds, micros, nanos = (int(value) for value in force_torque[:4])
-    return ClockReading(number, seconds * 10**9 + micros * 1000 + nanos)
-
-
-def cross(a: Vector, b: Vector) -> Vector:
+def cross(a: Vector3, b: Vector3) -> Vector3:
     """The vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _cosines_and_sines(angles: Vector) -> tuple[float, float, float, float, float, float]:
+def _cosines_and_sines(angles: Vector3) -> tuple[float, float, float, float, float, float]:
     yaw, pitch, roll = angles
     cos, sin = math.cos, math.sin
     return cos(yaw), sin(yaw), cos(pitch), sin(pitch), cos(roll), sin(roll)
 
 
-def quaternion(attitude: Vector) -> tuple[float, ...]:
+def quaternion(attitude: Vector3) -> tuple[float, ...]:
     """The attitude as x, y, z, w."""
     cy, sy, cp, sp, cr, sr = _cosines_and_sines((attitude[0] / 2, attitude[1] / 2, attitude[2] / 2))
     return (
@@ -111,18 +93,7 @@ def quaternion(attitude: Vector) -> tuple[float, ...]:
     )
 
 
-def angular_rate(attitude: Vector, rates: Vector) -> Vector:
-    """Angular velocity in the sensor's frame, rad/s, from the derivatives of yaw, pitch and roll."""
-    _, _, cp, sp, cr, sr = _cosines_and_sines(attitude)
-    yaw_rate, pitch_rate, roll_rate = rates
-    return (
-        roll_rate - yaw_rate * sp,
-        pitch_rate * cr + yaw_rate * cp * sr,
-        -pitch_rate * sr + yaw_rate * cp * cr,
-    )
-
-
-def to_sensor(attitude: Vector, vector: Vector) -> Vector:
+def to_sensor(attitude: Vector3, vector: Vector3) -> Vector3:
     """A world vector in the sensor's frame."""
     cy, sy, cp, sp, cr, sr = _cosines_and_sines(attitude)
     x, y, z = vector
@@ -138,20 +109,20 @@ _SWINGS = ((0.5, 0.31), (0.45, 0.23), (0.6, 0.37))
 # Amplitude (m/s²) and angular frequency of the wrist's acceleration along each world axis.
 _SHAKE = ((0.15, 1.7), (0.10, 2.3), (0.20, 1.1))
 TOOL_MASS = 0.8  # kg
-TOOL_CENTRE: Vector = (0.004, -0.006, 0.055)  # center of gravity in the sensor's frame, m
-CONTACT_POINT: Vector = (0.0, 0.0, 0.12)  # on the tool, m
+TOOL_CENTRE: Vector3 = (0.004, -0.006, 0.055)  # center of gravity in the sensor's frame, m
+CONTACT_POINT: Vector3 = (0.0, 0.0, 0.12)  # on the tool, m
 CONTACT_START, CONTACT_LENGTH, CONTACT_PERIOD = 5.0, 0.6, 7.0  # s: of the first; from one to the next
-CONTACT_FORCE: Vector = (3.0, -2.0, -12.0)  # at its peak, N, in the sensor's frame
+CONTACT_FORCE: Vector3 = (3.0, -2.0, -12.0)  # at its peak, N, in the sensor's frame
 
 
-def sway(seconds: float) -> tuple[Vector, Vector]:
+def sway(seconds: float) -> tuple[Vector3, Vector3]:
     """Never stationary: yaw, pitch and roll swing."""
     yaw, pitch, roll = (a * math.sin(w * seconds) for a, w in _SWINGS)
     yaw_rate, pitch_rate, roll_rate = (a * w * math.cos(w * seconds) for a, w in _SWINGS)
     return (yaw, pitch, roll), (yaw_rate, pitch_rate, roll_rate)
 
 
-def contact_force(seconds: float) -> Vector:
+def contact_force(seconds: float) -> Vector3:
     """Force of the contact in `scene` at `CONTACT_POINT`, N; zero most of the time."""
     phase = (seconds - CONTACT_START) % CONTACT_PERIOD
     touches = seconds >= CONTACT_START and phase < CONTACT_LENGTH
@@ -160,17 +131,24 @@ def contact_force(seconds: float) -> Vector:
     return x * push, y * push, z * push
 
 
-def carry(attitude: Vector, rates: Vector, acceleration: Vector = (0.0, 0.0, 0.0)) -> Felt:
+def carry(attitude: Vector3, rates: Vector3, acceleration: Vector3 = (0.0, 0.0, 0.0)) -> Felt:
     """What a sensor with the tool feels: `rates` are the attitude's derivatives, rad/s; acceleration, m/s².
 
     Specific force f = R^T (a - g), so +1 g upward when stationary; tool force F = m R^T (g - a) = -m f;
     torque r x F. The tool's own rotational inertia and the lever arm to the IMU are neglected.
     """
+    _, _, cp, sp, cr, sr = _cosines_and_sines(attitude)
+    yaw_rate, pitch_rate, roll_rate = rates
+    turning = (
+        roll_rate - yaw_rate * sp,
+        pitch_rate * cr + yaw_rate * cp * sr,
+        -pitch_rate * sr + yaw_rate * cp * cr,
+    )
     ax, ay, az = acceleration
     specific = fx, fy, fz = to_sensor(attitude, (ax, ay, az + STANDARD_GRAVITY))
     weight = (-TOOL_MASS * fx, -TOOL_MASS * fy, -TOOL_MASS * fz)
     load = (*weight, *cross(TOOL_CENTRE, weight))
-    return Felt(load, specific, angular_rate(attitude, rates), attitude=attitude)
+    return Felt(load, specific, turning, attitude=attitude)
 
 
 def scene(seconds: float) -> Felt:
@@ -181,4 +159,24 @@ def scene(seconds: float) -> Felt:
     return felt._replace(wrench=tuple(map(operator.add, felt.wrench, touched)))
 
 
-SIGNALS: Final = ("scene", *FORMULAS)
+POSE_LENGTH, MOVE_LENGTH = 3.0, 2.0  # duration of a pose, and of the move to the next, s
+# Pitch and roll, in right angles: the axes +z, +y, -z, -y, +x and -x of the sensor point up.
+_POSES: Final = ((0, 0), (0, 1), (0, 2), (0, 3), (-1, 4), (1, 4), (0, 4))  # the last is the first again
+
+
+def poses(seconds: float) -> Felt:
+    """The tool held in six poses, one after another."""
+    number, passed = divmod(seconds, POSE_LENGTH + MOVE_LENGTH)
+    here, following = _POSES[int(number) % 6], _POSES[int(number) % 6 + 1]
+    s = max(0.0, passed - POSE_LENGTH) / MOVE_LENGTH
+    # Smooth from standstill to standstill.
+    share, rate = s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2 / MOVE_LENGTH
+    (pitch, pitch_rate), (roll, roll_rate) = (
+        (math.pi / 2 * (a + share * (b - a)), math.pi / 2 * rate * (b - a))
+        for a, b in zip(here, following, strict=True)
+    )
+    return carry((0.0, pitch, roll), (0.0, pitch_rate, roll_rate))
+
+
+SCENES: Final = {"scene": scene, "poses": poses}
+SIGNALS: Final = (*SCENES, *FORMULAS)

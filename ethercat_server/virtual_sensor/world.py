@@ -61,8 +61,6 @@ class ToldWorld:
 class Measured:
     """A world as the sensor measures it, once it has filters."""
 
-    exact = False
-
     def __init__(self, world: World, seed: int, noise: bool) -> None:
         self._world, self._noise = world, noise
         self._gauss = random.Random(seed).gauss
@@ -77,7 +75,7 @@ class Measured:
         # Standard deviations of force (N) and torque (Nm) with FIR off: a longer filter makes them quieter.
         ratio = sinc_length / _REFERENCE_SINC
         self.deviations = tuple(deviation * ratio**-power for deviation, power in _NOISE)
-        fir, acceleration, rate = wanted[1:]
+        _, fir, acceleration, rate = wanted
         period_s = sinc_length / BASE_SAMPLING_RATE_HZ
         self._load_filter = LoadFilter(
             lambda seconds: self._world(seconds).wrench, self._load_noise, period_s, fir=bool(fir)

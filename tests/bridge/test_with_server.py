@@ -20,13 +20,13 @@ from bota_ethercat.errors import UnreachableError
 from bota_ethercat.world import Felt
 from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import CONSTANT, TOOL_CENTRE, TOOL_MASS, scene
+from ethercat_server.virtual_sensor.signals import CONSTANT, TOOL_CENTRE, TOOL_MASS, poses, scene
 from tests.bridge.real_node import PATIENCE_S, Listener, StartProcess
 from tests.bridge.simulated_node import HEALTHY, STEP_S, Node, Wire, level, six, stamp_ns, values
 from tests.server.running import needs_bus
 from tests.server.running import server as server_process
 from tests.simulation import Simulation
-from tests.virtual_sensor.motions import poses, turning
+from tests.virtual_sensor.motions import turning
 
 # Standard deviation of a force at SINC 512: 0.3 N at 51, falling with the length to the power of 0.62.
 NOISE_N = 0.072
@@ -83,7 +83,7 @@ class WholeServer:
 
 @pytest.fixture
 def server() -> WholeServer:
-    return WholeServer(SensorOptions(world=poses, pdo_size=77))
+    return WholeServer(SensorOptions(signal="poses", pdo_size=77))
 
 
 @pytest.fixture

@@ -27,19 +27,19 @@ from ethercat_server.virtual_sensor import signals
 from ethercat_server.virtual_sensor.dictionary import Flash
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
+from ethercat_server.virtual_sensor.signals import MOVE_LENGTH, POSE_LENGTH
 from ft_compensation.quantities import Payload
 from tests.clients.recordings import START_NS, describe, record, writer
 from tests.compensation import motion
 from tests.compensation.making import written_parameters
 from tests.ended import run_here
 from tests.json_schema import problems
-from tests.virtual_sensor.motions import MOVE_LENGTH, POSE_LENGTH, POSES, poses
 
 SINC = 512  # 100 Hz: quick to simulate
 # What the sensor adds to its readings (object 0x8000): the bias that is to be found. N, Nm.
 OFFSET = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)
 CYCLE = POSE_LENGTH + MOVE_LENGTH
-POSES_TAKE = len(POSES) * CYCLE
+POSES_TAKE = 6 * CYCLE
 
 
 def process_data(options: SensorOptions, seconds: float) -> Iterator[tuple[float, int, bytes]]:
@@ -67,7 +67,7 @@ def frames(stream: Iterable[tuple[float, int, bytes]], sensor: int = 0) -> list[
 @functools.cache
 def posed() -> list[DataMessage]:
     """Six poses, moves between."""
-    return frames(process_data(SensorOptions(world=poses), POSES_TAKE))
+    return frames(process_data(SensorOptions(signal="poses"), POSES_TAKE))
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def periods(path: Path, least_seconds: float = 1.0) -> list[StationaryPeriod]:
 
 def test_it_finds_the_poses_by_itself(recording: Path) -> None:
     found = periods(recording)
-    assert len(found) == len(POSES)
+    assert len(found) == 6
     for number, still in enumerate(found):
         assert number * CYCLE <= still.begin_s <= number * CYCLE + 0.3
         assert POSE_LENGTH - 0.5 <= still.seconds <= POSE_LENGTH + 0.2

@@ -19,8 +19,9 @@ from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from bota_ethercat.sensor.meaning import meaning
+from ethercat_server.virtual_sensor.signals import poses
 from tests.clients.simulated import Script, decoded, described, sensor, simulate, subject_of
-from tests.virtual_sensor.motions import measured, poses, turning
+from tests.virtual_sensor.motions import measured, turning
 
 SLOW = 512  # SINC length for what does not depend on the rate: 100 Hz
 SINC, SECONDS = 128, 7  # of `healthy`: 400 Hz

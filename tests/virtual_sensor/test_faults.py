@@ -14,7 +14,8 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.faults import COMMANDS, QuitCommand, obey
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import CONSTANT, decode_clock
+from ethercat_server.virtual_sensor.signals import CONSTANT
+from scripts.benchmarks.records import decode_clock
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, Abort, RawMaster, chain, do
 
 PERIOD = 1_250_000
@@ -265,6 +266,23 @@ def test_an_eeprom_that_cannot_be_read() -> None:
         do(master, f"sii {result}")
         assert status() == bits
     assert obey(master.bus, "sii sometimes").startswith("error: ")
+
+
+def test_another_signal_begins_with_the_next_sample_and_outlasts_a_power_cycle() -> None:
+    master = RawMaster(SensorOptions(signal="clock")).go(OP)
+    master.wait(7 * PERIOD + PERIOD // 2)
+    before = master.inputs()
+    do(master, "signal poses")
+    assert master.inputs() == before, "what was given away does not change"
+    master.wait(PERIOD)
+    for _ in range(2):
+        weight = RAW.decode(master.inputs()).force[2]
+        assert weight == pytest.approx(-0.8 * 9.80665, abs=1.5), "the first pose, from its beginning"
+        master.wait(3_500 * 1_000_000)
+        assert RAW.decode(master.inputs()).angular_rate[0] > 0.1, "moving to the second one"
+        do(master, "power cycle 0")
+        master.wait(10**6)
+        master.go(OP)
 
 
 def test_stats_tell_what_was_written() -> None:

@@ -20,14 +20,14 @@ from ethercat_server.virtual_sensor.sampler import SampleClock
 from ethercat_server.virtual_sensor.signals import (
     CONSTANT,
     carry,
-    decode_clock,
+    poses,
     scene,
     sway,
     to_sensor,
 )
 from ethercat_server.virtual_sensor.world import World
-from tests.virtual_sensor import motions
-from tests.virtual_sensor.motions import measured, poses, turning
+from scripts.benchmarks.records import decode_clock
+from tests.virtual_sensor.motions import TURN_LENGTH, measured, turning
 from tests.virtual_sensor.raw_master import OP, PREOP, RawMaster, do
 
 PERIOD = 1_250_000  # 64 / 51200 s in ns
@@ -272,10 +272,9 @@ def test_poses_are_held_still_with_each_axis_up_and_down() -> None:
     assert poses(0.0).acceleration == pytest.approx((0, 0, STANDARD_GRAVITY)), "at rest it points up"
     assert poses(0.0).wrench[2] == pytest.approx(-signals.TOOL_MASS * STANDARD_GRAVITY)
     ups = {f"{sign}{axis}": number for number, axis in enumerate("xyz") for sign in "+-"}
-    assert sorted(name for name, _ in motions.POSES) == sorted(ups)
-    cycle = motions.POSE_LENGTH + motions.MOVE_LENGTH
-    for number, (name, _) in enumerate(motions.POSES * 2):
-        for seconds in (0.0, 0.5 * motions.POSE_LENGTH, motions.POSE_LENGTH - 1e-6):
+    cycle = signals.POSE_LENGTH + signals.MOVE_LENGTH
+    for number, name in enumerate(("+z", "+y", "-z", "-y", "+x", "-x") * 2):
+        for seconds in (0.0, 0.5 * signals.POSE_LENGTH, signals.POSE_LENGTH - 1e-6):
             felt = poses(number * cycle + seconds)
             wanted = [0.0, 0.0, 0.0]
             wanted[ups[name]] = STANDARD_GRAVITY if name[0] == "+" else -STANDARD_GRAVITY
@@ -284,9 +283,9 @@ def test_poses_are_held_still_with_each_axis_up_and_down() -> None:
 
 
 def test_moves_between_poses_begin_and_end_at_rest_and_within_the_gyroscopes_range() -> None:
-    cycle = motions.POSE_LENGTH + motions.MOVE_LENGTH
-    for number in range(len(motions.POSES)):
-        moving = [number * cycle + motions.POSE_LENGTH + k * motions.MOVE_LENGTH / 200 for k in range(200)]
+    cycle = signals.POSE_LENGTH + signals.MOVE_LENGTH
+    for number in range(6):
+        moving = [number * cycle + signals.POSE_LENGTH + k * signals.MOVE_LENGTH / 200 for k in range(200)]
         rates = [math.degrees(math.hypot(*poses(seconds).angular_rate)) for seconds in moving]
         assert rates[0] == 0.0
         assert rates[-1] < 1.0
@@ -294,7 +293,7 @@ def test_moves_between_poses_begin_and_end_at_rest_and_within_the_gyroscopes_ran
 
 
 def test_the_turn_goes_all_the_way_round_slowly() -> None:
-    felt = [turning(k * motions.TURN_LENGTH / 100) for k in range(101)]
+    felt = [turning(k * TURN_LENGTH / 100) for k in range(101)]
     assert felt[100].acceleration == pytest.approx(felt[0].acceleration)
     for axis in range(3):
         swept = [each.acceleration[axis] for each in felt]
