@@ -116,6 +116,7 @@ PRESSED = {
     which: {"stiffest_wall": wall, "overshoot": above}
     for which, wall, above in zip(contact.FILTERS, (200.0, 300.0, 40.0), (4.5, 2.5, None), strict=True)
 }
+PRESSING = ("this", contact.POLLING)
 ROWS: list[dict[str, Any]] = [
     {**ABOUT, "program": "this", **COUNTS, "age_us": AGES, "cpu_percent": {"server": 9.0}},
     {**ABOUT, "program": "bare C", **COUNTS, "age_us": {"p50": 40.0, "p99": 60.0}},
@@ -129,7 +130,7 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     content = {
         "date": "2026-11-23T01:02:03", "cpus": 2, "kernel": "6.1.0-x", "python": "3.11.2",
         "idle_states": True, "comparison": ROWS, "load": [{**ABOUT, **COUNTS, **load}],
-        "contact": [{"program": name, "age_p50_us": 60.0, "filters": PRESSED} for name in ("this", contact.POLLING)],
+        "contact": [{"program": each, "age_p50_us": 60, "filters": PRESSED} for each in PRESSING],
     }  # fmt: skip
     page = tmp_path / "page.md"
     names = ("contact", "comparison", "load")
