@@ -174,8 +174,7 @@ def _points(row: Figures, name: str) -> str:
 # Of the table of each, by heading: how a row is shown.
 TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
     "comparison": {
-        "sensors": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}",
-        "": lambda row: row["program"],
+        "sensors: program": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}: {row['program']}",
         "lost": lambda row: f"{row['lost']} of {row['made']}" if "made" in row else row.get("missing", ""),
         "age p50, µs": _shown("age_us", "p50", "age_p50"),
         "p99": _shown("age_us", "p99", "age_p99"),
