@@ -32,9 +32,7 @@ Answer = Callable[[bytearray], list[bytes]]
 def take_lrw_away(life: Firmware) -> None:
     """Let it have a controller that does not know LRW."""
     life.esc.has_lrw = False
-    life.esc.memory[reg.FEATURES : reg.FEATURES + 2] = (
-        int.from_bytes(life.esc.memory[reg.FEATURES : reg.FEATURES + 2], "little") | reg.NO_LRW
-    ).to_bytes(2, "little")
+    life.esc.memory[reg.FEATURES + 1] |= reg.NO_LRW >> 8
 
 
 class ScriptedWire:
