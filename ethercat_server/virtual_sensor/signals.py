@@ -93,17 +93,6 @@ def quaternion(attitude: Vector3) -> tuple[float, ...]:
     )
 
 
-def to_sensor(attitude: Vector3, vector: Vector3) -> Vector3:
-    """A world vector in the sensor's frame."""
-    cy, sy, cp, sp, cr, sr = _cosines_and_sines(attitude)
-    x, y, z = vector
-    return (
-        cy * cp * x + sy * cp * y - sp * z,
-        (cy * sp * sr - sy * cr) * x + (sy * sp * sr + cy * cr) * y + cp * sr * z,
-        (cy * sp * cr + sy * sr) * x + (sy * sp * cr - cy * sr) * y + cp * cr * z,
-    )
-
-
 # Amplitude (rad) and angular frequency (rad/s) of yaw, pitch and roll.
 _SWINGS = ((0.5, 0.31), (0.45, 0.23), (0.6, 0.37))
 # Amplitude (m/s²) and angular frequency of the wrist's acceleration along each world axis.
@@ -137,24 +126,28 @@ def carry(attitude: Vector3, rates: Vector3, acceleration: Vector3 = (0.0, 0.0, 
     Specific force f = R^T (a - g), so +1 g upward when stationary; tool force F = m R^T (g - a) = -m f;
     torque r x F. The tool's own rotational inertia and the lever arm to the IMU are neglected.
     """
-    _, _, cp, sp, cr, sr = _cosines_and_sines(attitude)
+    cy, sy, cp, sp, cr, sr = _cosines_and_sines(attitude)
     yaw_rate, pitch_rate, roll_rate = rates
     turning = (
         roll_rate - yaw_rate * sp,
         pitch_rate * cr + yaw_rate * cp * sr,
         -pitch_rate * sr + yaw_rate * cp * cr,
     )
-    ax, ay, az = acceleration
-    specific = fx, fy, fz = to_sensor(attitude, (ax, ay, az + STANDARD_GRAVITY))
+    x, y, z = acceleration
+    z += STANDARD_GRAVITY
+    fx = cy * cp * x + sy * cp * y - sp * z
+    fy = (cy * sp * sr - sy * cr) * x + (sy * sp * sr + cy * cr) * y + cp * sr * z
+    fz = (cy * sp * cr + sy * sr) * x + (sy * sp * cr - cy * sr) * y + cp * cr * z
     weight = (-TOOL_MASS * fx, -TOOL_MASS * fy, -TOOL_MASS * fz)
-    load = (*weight, *cross(TOOL_CENTRE, weight))
-    return Felt(load, specific, turning, attitude=attitude)
+    return Felt((*weight, *cross(TOOL_CENTRE, weight)), (fx, fy, fz), turning, attitude=attitude)
 
 
 def scene(seconds: float) -> Felt:
     """A tool on a swaying wrist, which is accelerated, too, and touches something now and then."""
     ax, ay, az = (a * math.sin(w * seconds) for a, w in _SHAKE)
     felt, contact = carry(*sway(seconds), (ax, ay, az)), contact_force(seconds)
+    if not any(contact):
+        return felt
     touched = (*contact, *cross(CONTACT_POINT, contact))
     return felt._replace(wrench=tuple(map(operator.add, felt.wrench, touched)))
 
