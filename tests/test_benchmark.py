@@ -7,12 +7,8 @@ import json
 import math
 import os
 import shutil
-import signal
-import socket
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,19 +17,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bota_ethercat.framing import DataMessage, FrameDecoder
-from bota_ethercat.pdo import SampleDecoder, encode
-from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import decode_clock
 from scripts.benchmarks import modes, statistics
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.chain import ScriptError, Turn
-from scripts.benchmarks.processes import masters, recorder
 from scripts.benchmarks.records import Recording, began
 from scripts.benchmarks.statistics import Arrivals
-from tests.clients.running import signalled
-from tests.served_simulation import served
-from tests.server.running import PATIENCE_S, needs_bus
+from tests.server.running import needs_bus
 
 ROOT = Path(__file__).parent.parent
 PERIOD = 1_250_000
@@ -153,34 +142,6 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
 # -- its programs
 
 
-def clock_data(number: int, instant: int | None = None) -> bytes:
-    """Process data as the signal `clock` has it."""
-    whole, rest = divmod(instant or time.monotonic_ns(), 10**9)
-    values = (number, whole % 2**20, rest // 1000, rest % 1000)
-    return encode(61, dict(zip(("force.x", "force.y", "force.z", "torque.x"), values, strict=True)))
-
-
-def recorded(kind: str, path: Path, seconds: float, *options: object) -> threading.Thread:
-    """A recorder in a thread."""
-
-    def run() -> None:
-        recording = Recording(path, 0.0, seconds)
-        recorder.KINDS[kind](recording, *options)
-        recording.write()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    return thread
-
-
-@pytest.fixture(scope="module")
-def c_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    try:
-        return masters.build(tmp_path_factory.mktemp("yardstick"))
-    except ScriptError as error:
-        pytest.skip(str(error))
-
-
 def test_recording_begins_after_the_warm_up(tmp_path: Path) -> None:
     path = tmp_path / "records"
     recording = Recording(path, warm_up_s=1.0, seconds=2.0)
@@ -191,64 +152,6 @@ def test_recording_begins_after_the_warm_up(tmp_path: Path) -> None:
     recording.write()
     assert sorted(each.name for each in tmp_path.iterdir()) == ["records", "records.began"]
     assert np.fromfile(path, np.int64)[4::5].tolist() == [n * 500_000_000 for n in range(2, 7)]
-
-
-@pytest.mark.parametrize("client", ["Python", "C"])
-def test_a_client_records_every_sample_and_its_age(
-    client: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    path = tmp_path / "records"
-    with served(SensorOptions(signal="clock"), sinc_length=256) as running:
-        if client == "Python":
-            recorded("tcp", path, 0.1, running.port).join(PATIENCE_S)
-        else:
-            command = [request.getfixturevalue("c_program"), "client", str(running.port), path, "0", "0.1"]
-            subprocess.run(command, check=True, timeout=PATIENCE_S)
-    assert began(path).exists()
-    figures, ages = statistics.summary(statistics.read_arrivals(path))
-    assert figures["made"] == figures["arrivals"] + figures["lost"] > 1
-    assert figures["repeated"] == 0
-    assert figures["stamp_error_us"]
-    assert ages.min() > 0
-
-
-def test_the_c_master_looks_once_at_each_sample_and_not_before_it_is_there(c_program: Path) -> None:
-    """Of two sensors, the second half a period after the first; one answer in 16 is lost."""
-    period = 5_000_000
-    start = time.monotonic_ns() - 10**9
-    raw, bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-    connection, client = socket.socketpair()
-    arguments = (raw.fileno(), connection.fileno(), 200, 0, 2, 2)
-    command = [str(c_program), "master", *map(str, arguments)]
-    asked: list[int] = []
-    with raw, bus, connection, client:
-        running = subprocess.Popen(command, pass_fds=(raw.fileno(), connection.fileno()))
-        bus.settimeout(PATIENCE_S)
-        while len(asked) < 50:
-            frame = bytearray(bus.recv(1514))
-            now = time.monotonic_ns()
-            asked.append(frame[17])
-            if len(asked) % 16:
-                for i in range(2):
-                    number = (now - start - i * period // 2) // period
-                    at = 28 + 61 * i
-                    frame[at : at + 61] = clock_data(number, start + i * period // 2 + number * period)
-                bus.send(frame)
-        running.terminate()
-        running.wait(PATIENCE_S)
-        received = client.recv(65536)
-    assert asked == [(asked[0] + n) % 256 for n in range(50)]
-    messages = [received[at : at + 94] for at in range(0, len(received), 94)]
-    for sensor in range(2):
-        decoder = FrameDecoder()
-        decoder.feed(b"".join(message for message in messages if message[29] == sensor))
-        data = [message for message in decoder if isinstance(message, DataMessage)]
-        assert [message.sequence for message in data] == list(range(len(data)))
-        numbers = [
-            int(decode_clock(SampleDecoder(61).decode(message.process_data).array).number) for message in data
-        ]
-        assert numbers == sorted(set(numbers)), "each once"
-    assert len(messages) > 40, "hardly an exchange was in vain"
 
 
 # -- runs
@@ -323,19 +226,3 @@ def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     assert {"server", "node 0", "node 1"} < set(programs[2, "this, ROS"]["cpu_percent"])
     project = programs[1, "this"]
     assert project["repeated"] == 0
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_it_can_be_stopped(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made, measuring = tmp_path / "made", threading.Event()
-
-    def measure(*_: object, **__: object) -> None:
-        made.mkdir()
-        measuring.set()
-        time.sleep(PATIENCE_S)
-
-    monkeypatch.setenv("DEMO_DIRECTORY", str(made))
-    monkeypatch.setattr(benchmark, "run", measure)
-    monkeypatch.setattr(sys, "argv", ["benchmark"])
-    assert signalled(lambda _: benchmark.main(), number, measuring.is_set) == 130
-    assert not made.exists()
