@@ -185,6 +185,8 @@ def test_a_server_that_does_not_answer(node: Node, server: Server) -> None:
     server.answers["status"] = answer
     server.send_json({"reply": "status", "id": owed[0]["id"], **status()})
     node.until(**HEALTHY)
+    server.answers["status"], server.paused = owed.append, True  # as if it were stopped
+    node.until("No new sample for", "the server does not answer", stream="error", clock="stale")
 
 
 def test_a_server_that_is_gone_and_comes_back(node: Node, server: Server) -> None:

@@ -44,6 +44,8 @@ def test_settings_given_at_start_or_set_since_are_applied_on_request(node: Node,
     node.set("settings.fir", True)
     node.do("apply_settings")
     assert asked == [{"sinc_length": 64}, {"fir": True}, {"sinc_length": 64, "fir": True}]
+    node.do("save_settings")
+    assert scripted.requests[-1]["save"] is True
     scripted.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
     assert node.trigger("apply_settings") == (False, "not for uid 7 (denied)")
     scripted.reconfigure()
