@@ -12,6 +12,7 @@ import math
 from itertools import chain
 from typing import Final
 
+from bota_ethercat.health.sentences import STOOD_STILL
 from bota_ethercat.pdo import is_finite, layout_for
 from ethercat_server.acquisition.clock import PLAUSIBLE_PULL, SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
@@ -91,8 +92,7 @@ class Causes:
         if now_ns - self._frame_ns < _RECENT_NS:
             otherwise = f"check for another EtherCAT master, whose frames arrive on {self._ifname}"
         elif now_ns - self._stall_ns < _RECENT_NS and self._stalled_ns > _STALL_NS:
-            stalled_ms = self._stalled_ns / 1e6
-            otherwise = f"this computer stood still for {stalled_ms:.0f} ms, check it with ethercat-doctor"
+            otherwise = f"this {STOOD_STILL.format(f' for {self._stalled_ns / 1e6:.0f} ms')}"
         return f"{reason}: {otherwise}" if otherwise else reason
 
     def check(self) -> None:

@@ -44,9 +44,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         hub.permissions.control_uids = control_uids | {os.geteuid()}
         hub.permissions.names = names
         hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
-        server = Server(
-            bus, hub, options, signals.check, watchdog=notifier, extra={"interface": options.ifname}
-        )
+        server = Server(bus, hub, options, signals.check, watchdog=notifier, extra={"interface": ifname})
         server.cycle.every_second = lambda: notifier.update(server)
         signals.call(server.stop)
         for sensor in server.sensors:

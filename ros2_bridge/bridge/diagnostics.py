@@ -258,11 +258,7 @@ class Monitor:
     def _judge_link(self, problems: Problems, now_s: float, answer_s: float) -> DiagnosticStatus:
         link = self._link
         if not link.is_connected:
-            text = f"not connected to {link.address}: {link.problem}"
-            if not link.is_reachable:
-                text = f"no server at {link.address}: {link.problem}; start ethercat-server there, or set "
-                text += "server_host and server_port to where it is"
-            problems = [(Level.TROUBLE, f"{text} (the node keeps trying)")]
+            problems = [(Level.TROUBLE, f"{link.absence} (the node keeps trying)")]
         elif answer_s > _SLOW_ANSWER_S:
             text = f"the server at {link.address} has not answered for {answer_s:.0f} s"
             problems = [(Level.LOOK, f"{text}: it is stopped or overloaded")]

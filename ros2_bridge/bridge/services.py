@@ -343,7 +343,7 @@ def take_window(control: CompensationControl, *, needs_tool: bool, samples: int 
         raise CompensationError(conflict)
     link, clock = control.link, control.link.clock
     if not link.is_connected:
-        raise CompensationError(f"{link.absence}, so there are no samples")
+        raise CompensationError(f"there are no samples: {link.absence}")
     _wait_settled(link)
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
     window = RestWindow(seconds, limits, control.choice.source)

@@ -35,7 +35,7 @@ from tests.server.running import PATIENCE_S
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ([], "usage: ethercat-doctor"),
+        ([], "name an interface, or a server: no server at localhost:12001 (Connection refused)"),
         (["ens5", "--colour"], "usage: ethercat-doctor"),
         (["ens5", "--seconds", "soon"], "invalid number value"),
         (["ens5", "--seconds", "-1"], "from 0 to 3600"),

@@ -20,6 +20,7 @@ from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.judge import Observation, emergency, judge, saturated_axes
 from bota_ethercat.health.observer import COMMON, StreamObserver
+from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.sensor.response import delays_ms
@@ -401,17 +402,15 @@ class Model:
         """An event of the server."""
         with self._lock:
             self._heard_s = now_s
-            position = whole(event.get("sensor"))
-            name, said = text(event.get("event")), text(event.get("message"))
+            name, said = text(event.get("event")), event_sentence(event)
             if (sensor := self._sensor(event)) is not None:
                 if name == Event.SENSOR_LOST:
-                    sensor.lost = said or "The server has lost this sensor"
+                    sensor.lost = said
                 elif name == Event.SENSOR_BACK:
                     sensor.lost = None
                 elif name == Event.OFFSET_CHANGED:  # the zero has moved
                     sensor.peaks = None
-            where = "" if position is None else f" {position}"
-            self._events.append(f"{clock_text()} {name}{where}{': ' + said if said else ''}")
+            self._events.append(f"{clock_text()} {said}")
 
     def reset(self) -> None:
         """Reset peaks and past warnings."""

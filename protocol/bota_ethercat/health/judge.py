@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
+from bota_ethercat.health.sentences import STOOD_STILL
 from bota_ethercat.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
 from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain
 from bota_ethercat.text.untrusted import number, printable, whole
@@ -63,7 +64,7 @@ _ERROR_CLASS: Final = 0xFF00
 # AL states that are, or may be, those of a sensor that streams.
 _STREAMING: Final = frozenset({"OP", "?", ""})
 _CABLE: Final = "Check its cable and power"
-_STOOD_STILL: Final = "The server's computer stood still meanwhile, check it with ethercat-doctor"
+_STOOD_STILL: Final = f"The server's {STOOD_STILL.format(' meanwhile')}"
 # Missed deadlines that amount to this time explain why a sensor did not answer, or left OP.
 _STANDSTILL_S: Final = 0.02
 
