@@ -8,6 +8,7 @@ import logging
 import os
 from collections.abc import Sequence
 
+from ethercat_server.daemon.histories import kept
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
 from ethercat_server.daemon.service import Notifier
 from ethercat_server.ethercat.soem import open_bus
@@ -60,7 +61,8 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         notifier.send("READY=1")
         notifier.update(server)
         try:
-            server.run()
+            with kept([stream.drift for stream in server.streams if stream.drift is not None]):
+                server.run()
         finally:
             notifier.send("STOPPING=1")
         log.info("shutting down: the sensors go to INIT")

@@ -19,6 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from bota_ethercat.errors import ConnectionFailedError
+from bota_ethercat.health.history import drift
 from bota_ethercat.health.judge import SATURATIONS, Observation, emergency, judge
 from bota_ethercat.health.observer import p99
 from bota_ethercat.health.verdict import About, Level, Limits
@@ -223,6 +224,7 @@ class Monitor:
             state=link.info.state,
             server_silent=answer_s > _SLOW_ANSWER_S / 2,
             emergency=emergency(self._row.get("emergency")),
+            drift=drift(self._row, self.limits),
             settings=link.info.settings,
         )
         findings = judge(seen, self.limits).findings

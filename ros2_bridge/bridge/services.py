@@ -25,7 +25,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from bota_ethercat.control import MAX_TARE_SAMPLES
+from bota_ethercat.control import MAX_TARE_SAMPLES, known_six
 from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import Vector3
 from bridge.compensating.control import CompensationControl
@@ -39,7 +39,6 @@ from bridge.stream.link import (
     Link,
     RequestFailedError,
     find_sensor,
-    known_offset,
     offset_text,
 )
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
@@ -131,7 +130,7 @@ class SensorServices:
         titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
         parts = [f"{title} {offset_text(reply.get(key))}" for key, title in titles]
         offset, spread, residual = (
-            known_offset(reply.get(key)) or _UNKNOWN for key in ("new_offset", "deviation", "residual")
+            known_six(reply.get(key)) or _UNKNOWN for key in ("new_offset", "deviation", "residual")
         )
         fields = {"bias": tuple(-value for value in offset), "spread": spread, "residual": residual}
         return Done(f"sensor {sensor} tared: " + "; ".join(parts), fields)

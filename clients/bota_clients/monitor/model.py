@@ -18,6 +18,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health import history
 from bota_ethercat.health.judge import Observation, emergency, judge, saturated_axes
 from bota_ethercat.health.observer import COMMON, StreamObserver
 from bota_ethercat.health.sentences import event_sentence
@@ -28,7 +29,6 @@ from bota_ethercat.settings import SETTINGS, SettingValue
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import number, rows, text, whole
 
-AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 SILENT_S: Final = LIMITS.stale_after  # a server normally sends a frame per sample period
 _WRENCH: Final = tuple(COMMON.index(f.name) for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
 _WINDOW_NS: Final = 5 * 10**9  # of rate, jitter and age
@@ -118,6 +118,7 @@ class SensorState:
     lost_on_bus: int | None = None
     recoveries: int | None = None
     hand_out_us: Spread | None = None  # age when the server hands them out
+    zero: str = ""  # how far it has drifted, and how it goes by temperature, in words
 
     @property
     def units(self) -> tuple[str, str]:
@@ -264,6 +265,7 @@ class _Sensor:
             is_lost=self.lost is not None,
             state=text(self._row.get("state")),
             emergency=said if now_s - at_s < LIMITS.emergency_s else "",
+            drift=history.drift(self._status, LIMITS),
             settings=_mapping(self._row.get("settings")),
         )
 
@@ -302,6 +304,7 @@ class _Sensor:
             lost_on_bus=whole(status.get("lost_samples")),
             recoveries=whole(status.get("recoveries")),
             hand_out_us=_spread(self._hand_out),
+            zero="; ".join(filter(None, (history.drift(status), history.temperature_line(status)))),
             **self._stream(_ns(now_s)),
         )
 

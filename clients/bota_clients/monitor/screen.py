@@ -18,7 +18,8 @@ from rich.text import Text
 
 from bota_clients import numbers
 from bota_clients.monitor import words
-from bota_clients.monitor.model import AXES, Alert, Range, SensorState, State
+from bota_clients.monitor.model import Alert, Range, SensorState, State
+from bota_ethercat.health.history import AXES
 
 KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
@@ -204,6 +205,7 @@ def _panel(sensor: SensorState, width: int, *, bars: bool = True) -> list[Text]:
         *_imu(sensor),
         _field("Stream", stream),
         _field("Delay", words.delays(sensor)),
+        *([_field("Zero", sensor.zero)] if sensor.zero else []),
         lost,
         clock,
     ]

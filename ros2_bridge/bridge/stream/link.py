@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.client.client import Client
 from bota_ethercat.client.session import Disconnected
-from bota_ethercat.control import Event, six_numbers
+from bota_ethercat.control import Event, known_six
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError
 from bota_ethercat.health.sentences import event_sentence, no_server
 from bota_ethercat.settings import SettingValue, known_settings
@@ -137,7 +137,7 @@ class Link:
         elif event != Event.OFFSET_CHANGED:
             return True
         if "offset" in message:
-            self._change(offset=known_offset(message["offset"]))
+            self._change(offset=known_six(message["offset"]))
         self.on_change()
         return True
 
@@ -220,17 +220,9 @@ def known_delays(delay_ms: object) -> Mapping[str, float]:
     return {channel: ms for channel, ms in found.items() if ms is not None and 0 <= ms <= LONGEST_DELAY_MS}
 
 
-def known_offset(offset: object) -> tuple[float, ...] | None:
-    """The sensor's own offset from a message; None if missing or invalid."""
-    try:
-        return six_numbers(offset)
-    except ValueError:
-        return None
-
-
 def offset_text(offset: object) -> str:
     """An offset from a message for people."""
-    known = known_offset(offset)
+    known = known_six(offset)
     return "unknown" if known is None else wrench_text(Wrench.of(known))
 
 
@@ -247,7 +239,7 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
                 settings=known_settings(row.get("settings")),
                 delay_ms=known_delays(row.get("delay_ms")),
                 settling=row.get("settling") is True,
-                offset=known_offset(row.get("offset")),
+                offset=known_six(row.get("offset")),
             )
     there = ", ".join(printable(row.get("sensor"), 10) for row in found[:16]) or "none"
     raise RequestFailedError(
