@@ -64,6 +64,7 @@ class Drift:
         self._part, self._parts = Part(_SUMS), list[Part]()
         self._first: list[Found] | None = None
         self._joined = False  # whether the last window was believed
+        self._unusable = True  # until the next second, so that nothing is from before
 
     def end_run(self) -> None:
         """Keep what was learned until now."""
@@ -76,7 +77,7 @@ class Drift:
 
     def add(self, columns: Sequence[Sequence[float]]) -> None:
         """Some samples, by field of the process data."""
-        if self.sensor.settling or self.sensor.settings.get("calibration_matrix") is False:
+        if self._unusable:
             return
         load = columns[LOAD]
         self._part.add_columns([*load, *columns[RATE], *columns[_ACCELERATION], columns[_TEMPERATURE]])
@@ -85,6 +86,8 @@ class Drift:
     def second(self) -> None:
         """A second has passed."""
         self.history.second()
+        sensor = self.sensor
+        self._unusable = sensor.settling or sensor.settings.get("calibration_matrix") is False
         part, self._part = self._part, Part(_SUMS)
         self._parts = [*self._parts, part] if part.taken else []
         if len(self._parts) == PARTS:

@@ -11,6 +11,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
+from operator import neg
 from statistics import fmean
 from typing import Any, Final
 
@@ -51,9 +52,8 @@ class History:
 
     def see(self, wrench: Sequence[Sequence[float]], *, saturated: bool) -> None:
         """Some samples, by axis."""
-        for axis, values in enumerate(wrench):
-            if (largest := max(map(abs, values))) > self.peak[axis]:
-                self.peak[axis], self.changed = largest, True
+        before, self.peak = self.peak, list(map(max, self.peak, map(max, wrench), map(neg, map(min, wrench))))
+        self.changed |= self.peak != before
         self._saturated |= saturated
 
     def second(self) -> None:

@@ -17,7 +17,8 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Sequence
-from operator import mul
+from itertools import repeat
+from operator import add, mul
 from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.control import ErrorCode
@@ -168,9 +169,9 @@ class Part:
     def add_columns(self, columns: Sequence[Sequence[float]]) -> None:
         """Add samples, by channel."""
         self.taken += len(columns[0])
-        for channel, column in enumerate(columns):
-            self.sums[channel] += sum(column)
-            self.squares[channel] += sum(map(mul, column, column))
+        self.sums = list(map(add, self.sums, map(sum, columns)))
+        squares = map(map, repeat(mul), columns, columns)
+        self.squares = list(map(add, self.squares, map(sum, squares)))
 
 
 def _moments(parts: Sequence[Part], channel: int) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from bota_ethercat.health import history as words
+from bota_ethercat.health.judge import Observation, judge
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.pdo import PDO_FIELDS
 from ethercat_server.acquisition.drift import Drift
@@ -71,7 +72,9 @@ def test_drift_since_the_tare_is_told_with_the_axis_the_time_and_the_temperature
     arm = Arm()
     arm.warm_up(0.12)
     row = arm.drift.as_json()
-    assert words.drift(row, LIMITS) == "Fz has drifted 1.2 N since the tare 20 min ago, 10 K warmer"
+    told = words.drift(row, LIMITS)
+    assert told == "Fz has drifted 1.2 N since the tare 20 min ago, 10 K warmer"
+    assert str(judge(Observation(drift=told))) == f"Worth a look: {told}: re-tare advised"
     arm.drift.begin("tare")
     arm.rest(80)
     assert words.drift(arm.drift.as_json(), LIMITS) == ""

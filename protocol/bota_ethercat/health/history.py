@@ -49,6 +49,15 @@ def temperature_line(row: Mapping[str, Any]) -> str:
     return f"by temperature, of {whole(found.get('runs'))} runs: {axes or 'nothing'}"
 
 
+def line_slope(row: Mapping[str, Any]) -> list[float] | None:
+    """N/K and Nm/K by axis, 0 where the line is not told from none; None if there is no line."""
+    found = _mapping(row.get("temperature_line"))
+    slope, interval = known_six(found.get("slope")), known_six(found.get("interval"))
+    if slope is None or interval is None:
+        return None
+    return [value if abs(value) > half else 0.0 for value, half in zip(slope, interval, strict=True)]
+
+
 def overload(row: Mapping[str, Any]) -> tuple[str, bool]:
     """The largest wrench, and whether the sensor was ever overloaded; empty if that is not known."""
     found = _mapping(row.get("history"))

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Mapping
 from typing import Any, Final
 
 from rclpy.node import Node
 
+from bota_ethercat.health.history import line_slope
 from bridge.compensating.sources import IMU_IS_OFF, SourceChoice
 from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import LiveParameters
@@ -31,6 +33,7 @@ _FROM_PARAMETER: Final = "parameter"
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
 _NOTHING_CURRENT: Final = "no current orientation"
 _MOTION_S: Final = 1.0  # how often it is looked up what motion leaves
+_LEAST_K: Final = 0.2  # change of temperature that shifts the bias; less is noise
 _LEAST_TOLD_N: Final = 0.2  # about the noise of a force
 _ANOTHER_SENSOR: Final = "the bias may be another sensor's"
 
@@ -46,6 +49,7 @@ class OwnOffset:
         # The offset that the bias was taken with; None if it was never known.
         self._of_bias: Wrench | None = None
         self._appeared = False  # whether the offset became known only after the bias was taken
+        self._by_temperature = NO_WRENCH  # by how much the bias was shifted since it was taken
         # Whether there is a bias. Zero may be one: what a tare finds where the sensor reads nothing.
         self._has_bias = False
 
@@ -58,7 +62,11 @@ class OwnOffset:
     def begin(self, bias: Wrench, *, is_measured: bool = False) -> None:
         """`bias` goes with the current offset. Zero is no bias, unless it was measured."""
         self._has_bias = is_measured or bias != NO_WRENCH
-        self._of_bias, self._appeared = self.now, False
+        self._of_bias, self._appeared, self._by_temperature = self.now, False, NO_WRENCH
+
+    def warm(self, change: Wrench) -> None:
+        """The bias is shifted by this, as temperature has it; none is until the next tare of the sensor."""
+        self._by_temperature = self._by_temperature.plus(change)
 
     def follow(self) -> Wrench | None:
         """The shift of the bias that the current offset requires, once; None: no shift."""
@@ -67,7 +75,8 @@ class OwnOffset:
             return None
         self._of_bias = now
         if not self._has_bias:
-            return None
+            taken_back, self._by_temperature = self._by_temperature, NO_WRENCH
+            return NO_WRENCH.plus(taken_back, -1.0) if taken_back != NO_WRENCH else None
         self._appeared = self._appeared or before is None
         return None if before is None else now.plus(before, -1.0)
 
@@ -104,6 +113,7 @@ class CompensationControl:
         self.own_offset = OwnOffset(self.link)
         # Origin of the bias that is being put in force, and what it was taken with if by a tare.
         self._next: tuple[str, Taken | None] = (_FROM_PARAMETER, None)
+        self._celsius: float | None = None  # up to which temperature the bias follows the line
         self.choice.check(parameters)
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
         self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
@@ -364,6 +374,19 @@ class CompensationControl:
             self._log.info(
                 f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
             )
+            self._guard.trigger()
+
+    def follow_temperature(self, row: Mapping[str, Any], celsius: float) -> None:
+        """Shift the bias along the line in this row of `status`, if that is wanted; any thread."""
+        slope = line_slope(row) if self.parameters.temperature_line else None
+        if slope is None or self._celsius is None:
+            self._celsius = None if slope is None else celsius
+        elif abs(celsius - self._celsius) >= _LEAST_K:
+            change = Wrench.of([value * (celsius - self._celsius) for value in slope])
+            self._celsius = celsius
+            with self._shifting:
+                self._ramp.shift(change)
+                self.own_offset.warm(change)
             self._guard.trigger()
 
 
