@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import add
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
@@ -41,7 +42,7 @@ _SUMS: Final = len(CHANNELS) + 4
 _CONE: Final = math.cos(math.radians(1.0))
 _LEAST_UP: Final = 0.5  # g, or m/s² of firmware that sends those: without an IMU it is 0
 _SLOW_S: Final = 20.0  # in this time drift stays steady
-_LEAST_SPAN_K: Final = 3.0  # of a run, so that a slope is of temperature
+_LEAST_SPREAD_K: Final = 1.0  # standard deviation of temperature in a run: a warm-up by 3.5 K
 _LEAST_WINDOWS: Final = 20
 _LONGEST_RUN_S: Final = 86400.0
 # With these on, force and torque are not the sensor's own.
@@ -54,7 +55,7 @@ class Drift:
     def __init__(self, sensor: Sensor, clock: Clock) -> None:
         self.history = History()
         self.sensor, self._clock = sensor, clock
-        self._run = _Run(self._now_s())
+        self._begin_run()
         self.begin("start")
 
     def begin(self, cause: str) -> None:
@@ -67,10 +68,17 @@ class Drift:
         self._unusable = True  # until the next second, so that nothing is from before
 
     def end_run(self) -> None:
-        """Keep what was learned until now."""
-        if slope := self._run.slope():
-            self.history.add_run(slope)
-        self._run = _Run(self._now_s())
+        """Keep what was learned until now: slopes of lines through the offsets, least squares."""
+        count, x, xx, *of_axes = self._run
+        below = count * xx - x * x
+        if count >= _LEAST_WINDOWS and below > (count * _LEAST_SPREAD_K) ** 2:
+            axes = zip(of_axes[:6], of_axes[6:], strict=True)
+            self.history.add_run([(count * xy - x * y) / below for y, xy in axes])
+        self._begin_run()
+
+    def _begin_run(self) -> None:
+        # How many windows, sums of K and K², of N and Nm, of their products with K.
+        self._run, self._run_began_s = [0.0] * 15, self._now_s()
 
     def _now_s(self) -> float:
         return self._clock.monotonic_ns() * 1e-9
@@ -115,10 +123,12 @@ class Drift:
     def _take(self, window: list[Found]) -> None:
         self._first = self._first or window
         self._last, self._last_s = window, self._now_s()
-        if self._last_s - self._run.began_s > _LONGEST_RUN_S:
+        if self._last_s - self._run_began_s > _LONGEST_RUN_S:
             self.end_run()
         if not any(self.sensor.settings.get(name) for name in _NOT_PLAIN):
-            self._run.add(*self._moved())
+            kelvin, wrench = self._moved()
+            row = (1.0, kelvin, kelvin * kelvin, *wrench, *(kelvin * value for value in wrench))
+            self._run = list(map(add, self._run, row))
 
     def _moved(self) -> tuple[float, list[float]]:
         """K, and N and Nm, since the first window."""
@@ -136,26 +146,3 @@ class Drift:
             ago_s = round(self._now_s() - self._since_s)
             drift = {"since": self._cause, "ago_s": ago_s, "kelvin": kelvin, "wrench": wrench}
         return {"drift": drift, "temperature_line": self.history.line, "history": self.history.as_json()}
-
-
-class _Run:
-    """A line through offsets by temperature, least squares, in sums."""
-
-    def __init__(self, began_s: float) -> None:
-        self.began_s = began_s
-        self._count, self._x, self._xx, self._low, self._high = 0, 0.0, 0.0, 0.0, 0.0
-        self._y, self._xy = [0.0] * 6, [0.0] * 6
-
-    def add(self, kelvin: float, wrench: Sequence[float]) -> None:
-        self._count, self._x, self._xx = self._count + 1, self._x + kelvin, self._xx + kelvin * kelvin
-        self._low, self._high = min(self._low, kelvin), max(self._high, kelvin)
-        for axis, value in enumerate(wrench):
-            self._y[axis] += value
-            self._xy[axis] += kelvin * value
-
-    def slope(self) -> list[float]:
-        """N/K and Nm/K; empty if there was too little of time or temperature."""
-        if self._count < _LEAST_WINDOWS or self._high - self._low < _LEAST_SPAN_K:
-            return []
-        below = self._count * self._xx - self._x * self._x
-        return [(self._count * xy - self._x * y) / below for y, xy in zip(self._y, self._xy, strict=True)]

@@ -7,19 +7,16 @@ residuals would promise too much.
 
 from __future__ import annotations
 
-import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from operator import neg
 from statistics import fmean
 from typing import Any, Final
 
 from bota_ethercat.control import known_six
-from bota_ethercat.text.json_text import finite
 from bota_ethercat.text.untrusted import number, whole
 
-LONGEST: Final = 20_000  # bytes of a file
 _MOST_RUNS: Final = 32  # the newest
 _STEEPEST: Final = 1e3  # N/K; no sensor's
 # Student's t, 95 % two-sided, for 2 degrees of freedom and more; the last one for all others.
@@ -34,13 +31,8 @@ class History:
         changed: whether there is something to write.
     """
 
-    def __init__(self, text: str = "") -> None:
-        """From a file, whatever is in it; what is not understood is left out."""
-        try:
-            found = json.loads(text)
-        except (ValueError, RecursionError):
-            found = None
-        given: dict[str, Any] = finite(found) if isinstance(found, dict) else {}
+    def __init__(self, given: Mapping[str, Any] = {}) -> None:
+        """As `kept` gave it, or whatever a file holds: what is not understood is left out."""
         self.since = number(given.get("since")) or round(time.time())
         self.peak = list(known_six(given.get("peak")) or (0.0,) * 6)
         self.saturations = whole(given.get("saturations")) or 0
@@ -81,6 +73,6 @@ class History:
         """For `status`."""
         return {key: getattr(self, key) for key in ("since", "peak", "saturations", "saturated_at")}
 
-    def text(self) -> str:
-        """What the file holds."""
-        return json.dumps({**self.as_json(), "runs": self._runs})
+    def kept(self) -> dict[str, Any]:
+        """For a file."""
+        return {**self.as_json(), "runs": self._runs}

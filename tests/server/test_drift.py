@@ -18,7 +18,6 @@ from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.pdo import PDO_FIELDS
 from ethercat_server.acquisition.drift import Drift
 from ethercat_server.daemon.histories import kept
-from ethercat_server.sensor.history import LONGEST, History
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import ManualClock, Simulation
@@ -185,28 +184,28 @@ def test_overload_is_counted_and_the_line_of_a_restored_history_goes_on(
 @pytest.mark.parametrize(
     "text",
     ["", "[", "[]", '{"runs": 3, "peak": "x", "since": {}, "saturations": [], "saturated_at": NaN}',
-     '{"runs": [[1e400, 0, 0, 0, 0, 0], [1e300, 0, 0, 0, 0, 0], null, []], "peak": [1]}', "[" * 9999],
+     '{"runs": [[1e400, 0, 0, 0, 0, 0], [1e300, 0, 0, 0, 0, 0], null, []], "peak": [1]}', "[" * 9999,
+     '{"peak": [1, 1, 1, 1, 1, 1]}' + " " * (1 << 20)],
 )  # fmt: skip
-def test_a_hostile_file_is_a_new_history(text: str) -> None:
-    history = History(text)
-    assert (history.line, history.peak, history.saturations) == (None, [0.0] * 6, 0)
-    assert json.loads(history.text())["saturated_at"] is None
-
-
-def test_a_history_stays_small_and_what_is_large_is_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    arm = Arm()
-    for n in range(100):
-        arm.drift.history.add_run([n / 3] * 6)
-    assert len(arm.drift.history.text()) < LONGEST / 3
-    (tmp_path / "sensor-7.json").write_text(json.dumps({"peak": [1.0] * 6}) + " " * LONGEST)
+def test_a_hostile_file_is_a_new_history(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    (tmp_path / "sensor-7.json").write_text(text)
+    arm = Arm()
     with kept([arm.drift]):
-        assert arm.drift.history.peak == [0.0] * 6
+        history = arm.drift.history
+        assert (history.line, history.peak, history.saturations) == (None, [0.0] * 6, 0)
+        assert json.loads(json.dumps(history.kept(), allow_nan=False))["saturated_at"] is None
+
+
+def test_a_history_stays_small_and_a_folder_that_cannot_be_written_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", "/proc/nowhere")
+    arm = Arm()
     with kept([arm.drift]):
-        arm.drift.history.add_run([0.0] * 6)
+        for n in range(100):
+            arm.drift.history.add_run([n / 3] * 6)
+        assert len(json.dumps(arm.drift.history.kept())) < 10_000
     assert "the history of sensor 0 is not kept" in caplog.text
 
 
