@@ -15,6 +15,7 @@ from statistics import fmean
 from typing import Any, Final
 
 from bota_ethercat.control import known_six
+from bota_ethercat.text.json_text import finite
 from bota_ethercat.text.untrusted import number, whole
 
 _MOST_RUNS: Final = 32  # the newest
@@ -33,6 +34,7 @@ class History:
 
     def __init__(self, given: Mapping[str, Any] = {}) -> None:
         """As `kept` gave it, or whatever a file holds: what is not understood is left out."""
+        given = finite(given)
         self.since = number(given.get("since")) or round(time.time())
         self.peak = list(known_six(given.get("peak")) or (0.0,) * 6)
         self.saturations = whole(given.get("saturations")) or 0

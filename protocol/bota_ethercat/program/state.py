@@ -9,8 +9,6 @@ import os
 from pathlib import Path
 from typing import Any, Final
 
-from bota_ethercat.text.json_text import finite
-
 _LONGEST: Final = 1 << 20  # bytes that a file may have
 
 
@@ -26,14 +24,14 @@ def folder() -> Path:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The object, without numbers that are not finite; empty if there is none of ours."""
+    """The object, which may be another program's; empty if there is none."""
     try:
         if not path.is_file() or path.stat().st_size > _LONGEST:
             return {}
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
-    return finite(found) if isinstance(found, dict) else {}
+    return found if isinstance(found, dict) else {}
 
 
 def write(path: Path, kept: dict[str, Any]) -> None:
