@@ -88,7 +88,7 @@ class Drift:
         if self._unusable:
             return
         load = columns[LOAD]
-        self._part.add_columns([*load, *columns[RATE], *columns[_ACCELERATION], columns[_TEMPERATURE]])
+        self._part.add([*load, *columns[RATE], *columns[_ACCELERATION], columns[_TEMPERATURE]])
         self.history.see(load, saturated=any(columns[_SATURATED]))
 
     def second(self) -> None:

@@ -159,14 +159,7 @@ class Part:
         self.sums = [0.0] * channels
         self.squares = [0.0] * channels
 
-    def add(self, row: Sequence[float]) -> None:
-        """Add a sample."""
-        self.taken += 1
-        for channel, value in enumerate(row):
-            self.sums[channel] += value
-            self.squares[channel] += value * value
-
-    def add_columns(self, columns: Sequence[Sequence[float]]) -> None:
+    def add(self, columns: Sequence[Sequence[float]]) -> None:
         """Add samples, by channel."""
         self.taken += len(columns[0])
         self.sums = list(map(add, self.sums, map(sum, columns)))
@@ -216,8 +209,7 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
             )
         first = first or row
         # From the first on, so that a large load does not drown its small changes.
-        row = [value - start for value, start in zip(row, first, strict=True)]
-        parts[PARTS * taken // samples].add(row)
+        parts[PARTS * taken // samples].add([(v - start,) for v, start in zip(row, first, strict=True)])
         taken += 1
     return [found_in(parts, channel, start) for channel, start in enumerate(first)]
 

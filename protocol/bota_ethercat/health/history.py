@@ -40,12 +40,13 @@ def drift(row: Mapping[str, Any], limits: Limits | None = None) -> str:
 
 def temperature_line(row: Mapping[str, Any]) -> str:
     """How the zero goes by temperature, with 95 % intervals; empty if that is not known."""
-    found = _mapping(row.get("temperature_line"))
-    slope, interval = known_six(found.get("slope")), known_six(found.get("interval"))
-    if slope is None or interval is None:
+    found, slope = _mapping(row.get("temperature_line")), line_slope(row)
+    if slope is None:
         return ""
-    known = [each for each in zip(AXES, slope, interval, _UNITS, strict=True) if abs(each[1]) > each[2]]
-    axes = ", ".join(f"{axis} {value:+.3f} ± {half:.3f} {unit}/K" for axis, value, half, unit in known)
+    each = zip(AXES, slope, found["interval"], _UNITS, strict=True)
+    axes = ", ".join(
+        f"{axis} {value:+.3f} ± {half:.3f} {unit}/K" for axis, value, half, unit in each if value
+    )
     return f"by temperature, of {whole(found.get('runs'))} runs: {axes or 'nothing'}"
 
 
