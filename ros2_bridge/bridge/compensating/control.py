@@ -49,9 +49,8 @@ class OwnOffset:
         # The offset that the bias was taken with; None if it was never known.
         self._of_bias: Wrench | None = None
         self._appeared = False  # whether the offset became known only after the bias was taken
-        self._by_temperature = NO_WRENCH  # by how much the bias was shifted since it was taken
         # Whether there is a bias. Zero may be one: what a tare finds where the sensor reads nothing.
-        self._has_bias = False
+        self.has_bias = False
 
     @property
     def now(self) -> Wrench | None:
@@ -61,12 +60,8 @@ class OwnOffset:
 
     def begin(self, bias: Wrench, *, is_measured: bool = False) -> None:
         """`bias` goes with the current offset. Zero is no bias, unless it was measured."""
-        self._has_bias = is_measured or bias != NO_WRENCH
-        self._of_bias, self._appeared, self._by_temperature = self.now, False, NO_WRENCH
-
-    def warm(self, change: Wrench) -> None:
-        """The bias is shifted by this, as temperature has it; none is until the next tare of the sensor."""
-        self._by_temperature = self._by_temperature.plus(change)
+        self.has_bias = is_measured or bias != NO_WRENCH
+        self._of_bias, self._appeared = self.now, False
 
     def follow(self) -> Wrench | None:
         """The shift of the bias that the current offset requires, once; None: no shift."""
@@ -74,15 +69,14 @@ class OwnOffset:
         if now is None or now == before:
             return None
         self._of_bias = now
-        if not self._has_bias:
-            taken_back, self._by_temperature = self._by_temperature, NO_WRENCH
-            return NO_WRENCH.plus(taken_back, -1.0) if taken_back != NO_WRENCH else None
+        if not self.has_bias:
+            return None
         self._appeared = self._appeared or before is None
         return None if before is None else now.plus(before, -1.0)
 
     def doubt(self) -> str:
         """Why the bias may no longer fit the sensor, a sentence; empty if it does."""
-        if not self._has_bias or not self._link.is_connected:
+        if not self.has_bias or not self._link.is_connected:
             return ""
         if self._appeared:
             return "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare"
@@ -377,8 +371,8 @@ class CompensationControl:
             self._guard.trigger()
 
     def follow_temperature(self, row: Mapping[str, Any], celsius: float) -> None:
-        """Shift the bias along the line in this row of `status`, if that is wanted; any thread."""
-        slope = line_slope(row) if self.parameters.temperature_line else None
+        """Shift a bias along the line in this row of `status`, if that is wanted; any thread."""
+        slope = line_slope(row) if self.parameters.temperature_line and self.own_offset.has_bias else None
         if slope is None or self._celsius is None:
             self._celsius = None if slope is None else celsius
         elif abs(celsius - self._celsius) >= _LEAST_K:
@@ -386,7 +380,6 @@ class CompensationControl:
             self._celsius = celsius
             with self._shifting:
                 self._ramp.shift(change)
-                self.own_offset.warm(change)
             self._guard.trigger()
 
 
