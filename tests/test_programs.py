@@ -128,14 +128,12 @@ def test_help_begins_with_three_examples_that_are_understood(
     main = importlib.import_module(started[0]).main
     head, *rows, end, usage = run_here(main, "--help").out.splitlines()[:6]
     assert (head, end, usage.split()[:2]) == ("examples:", "", ["usage:", name])
-    understood = []
 
     def only_once(parse: Callable[..., Any]) -> Callable[..., Any]:
         def parsed(self: Parser, *given: Any) -> Any:
             found = parse(self, *given)
             if name != "ethercat-sensor" or self.prog != name:  # it parses the subcommand's name first
-                understood.append(found)
-                raise SystemExit(0)
+                raise SystemExit(42)
             return found
 
         return parsed
@@ -143,10 +141,8 @@ def test_help_begins_with_three_examples_that_are_understood(
     for method in ("parse_args", "parse_intermixed_args"):
         monkeypatch.setattr(Parser, method, only_once(getattr(Parser, method)))
     for row in rows:
-        command = shlex.split(row.strip().removeprefix("sudo "), comments=True)
-        assert command[0] == name
-        assert run_here(main, *command[1:]).code == 0, row
-    assert len(understood) == 3
+        _, *arguments = shlex.split(row.removeprefix("sudo "), comments=True)
+        assert run_here(main, *arguments).code == 42, row
 
 
 def test_help_needs_nothing_of_the_extra() -> None:

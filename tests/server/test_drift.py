@@ -41,14 +41,12 @@ class Arm:
         seconds: int,
         force_z: At = lambda _: 0.0,
         temperature: At = lambda _: 30.0,
-        *,
         up: tuple[float, float, float] = LEVEL,
-        noise: float = 0.05,
     ) -> None:
         """Let time pass, by functions of the seconds since this began."""
         for second in range(seconds):
             rows = dict.fromkeys(NAMES, [0.0] * 4)
-            rows["force.z"] = [force_z(second + n / 4) + self._random.gauss(0, noise) for n in range(4)]
+            rows["force.z"] = [force_z(second + n / 4) + self._random.gauss(0, 0.05) for n in range(4)]
             rows["temperature"] = [temperature(second)] * 4
             rows |= {f"acceleration.{axis}": [value] * 4 for axis, value in zip("xyz", up, strict=True)}
             self.clock.sleep(1.0)
@@ -94,23 +92,17 @@ def in_another_pose(arm: Arm) -> None:
 
 
 def in_motion(arm: Arm) -> None:
-    arm.rest(300, lambda s: 2.0 + 3 * math.sin(s), noise=0.0)
+    arm.rest(300, lambda s: 2.0 + 3 * math.sin(s))
 
 
 def without_an_imu(arm: Arm) -> None:
     arm.rest(300, lambda _: 2.0, up=(0.0, 0.0, 0.0))
 
 
-def while_it_is_lost(arm: Arm) -> None:
-    arm.clock.sleep(300.0)
-    arm.drift.second()
-
-
 @pytest.mark.parametrize(
     "what",
-    [by_a_contact, by_a_contact_that_comes_in_a_minute, in_another_pose, in_motion, without_an_imu,
-     while_it_is_lost],
-)  # fmt: skip
+    [by_a_contact, by_a_contact_that_comes_in_a_minute, in_another_pose, in_motion, without_an_imu],
+)
 def test_what_may_be_a_contact_is_not_believed_until_the_wrench_is_back(what: Callable[[Arm], None]) -> None:
     arm = Arm()
     arm.rest(80)
@@ -136,6 +128,9 @@ def test_the_line_by_temperature_takes_three_runs_and_its_interval_is_how_they_d
         arm.warm_up(slope)
     arm.drift.end_run()
     assert arm.drift.history.line is None
+    arm.sensor.settings = {"temperature_compensation": True}
+    arm.warm_up(1.0)  # that it compensates itself, so it is no run
+    arm.sensor.settings = {}
     arm.warm_up(0.12)
     arm.drift.begin("tare")
     arm.rest(240)  # without a change of temperature there is nothing to learn
@@ -144,15 +139,6 @@ def test_the_line_by_temperature_takes_three_runs_and_its_interval_is_how_they_d
     assert (line["runs"], line["slope"][2]) == (3, pytest.approx(0.12, abs=0.003))
     assert line["interval"][2] == pytest.approx(4.30 * 0.02 / math.sqrt(3), rel=0.1)
     assert words.temperature_line({"temperature_line": line}).startswith("by temperature, of 3 runs: Fz +0.1")
-
-
-def test_a_sensor_that_compensates_for_temperature_itself_teaches_nothing() -> None:
-    arm = Arm()
-    arm.sensor.settings = {"temperature_compensation": True}
-    for _ in range(3):
-        arm.warm_up(0.1)
-    arm.drift.end_run()
-    assert arm.drift.history.line is None
 
 
 def test_overload_is_counted_and_the_line_of_a_restored_history_goes_on(
