@@ -63,6 +63,7 @@ class Drift:
         self.end_run()
         self._cause, self._since_s = cause, self._now_s()
         self._part, self._parts = Part(_SUMS), list[Part]()
+        self._full, self._found = list[Part](), list[Found]()  # a window, and what of it is known
         self._first: list[Found] | None = None
         self._joined = False  # whether the last window was believed
         self._unusable = True  # until the next second, so that nothing is from before
@@ -90,6 +91,8 @@ class Drift:
         load = columns[LOAD]
         self._part.add([*load, *columns[RATE], *columns[_ACCELERATION], columns[_TEMPERATURE]])
         self.history.see(load, saturated=any(columns[_SATURATED]))
+        if self._full:
+            self._examine()
 
     def second(self) -> None:
         """A second has passed."""
@@ -99,11 +102,16 @@ class Drift:
         part, self._part = self._part, Part(_SUMS)
         self._parts = [*self._parts, part] if part.taken else []
         if len(self._parts) == PARTS:
-            window = [found_in(self._parts, channel) for channel in range(_SUMS)]
-            self._parts = []
-            self._joined = self._believes(window)
+            self._full, self._parts, self._found = self._parts, [], []
+
+    def _examine(self) -> None:
+        """One channel of a full window: all at once would delay an exchange."""
+        self._found.append(found_in(self._full, len(self._found)))
+        if len(self._found) == _SUMS:
+            self._full = []
+            self._joined = self._believes(self._found)
             if self._joined:
-                self._take(window)
+                self._take(self._found)
 
     def _believes(self, window: Sequence[Found]) -> bool:
         up = [found.mean for found in window[_UP]]

@@ -15,7 +15,6 @@ exchange.
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Callable, Sequence
 from itertools import repeat
 from operator import add, mul
@@ -180,8 +179,9 @@ def found_in(parts: Sequence[Part], channel: int, start: float = 0.0) -> Found:
     mean, variance = _moments(parts, channel)
     (one, noise), (other, more_noise) = _moments(first, channel), _moments(parts[PARTS // 2 :], channel)
     by_chance = _BY_CHANCE * math.sqrt((noise + more_noise) / sum(part.taken for part in first))
-    of_parts = statistics.stdev(_moments([part], channel)[0] for part in parts)
-    error = max(math.sqrt(variance / samples), of_parts / math.sqrt(PARTS))
+    means = [part.sums[channel] / part.taken for part in parts]
+    of_parts = math.dist(means, [sum(means) / PARTS] * PARTS) / math.sqrt(PARTS * (PARTS - 1))
+    error = max(math.sqrt(variance / samples), of_parts)
     return Found(start + mean, math.sqrt(variance), abs(other - one), by_chance, error)
 
 
