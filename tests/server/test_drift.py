@@ -79,36 +79,29 @@ def test_drift_since_the_tare_is_told_with_the_axis_the_time_and_the_temperature
     assert arm.moved == pytest.approx(0, abs=0.05)
 
 
-def by_a_contact(arm: Arm) -> None:
-    arm.rest(300, lambda _: 2.0)
-
-
-def by_a_contact_that_comes_in_a_minute(arm: Arm) -> None:
-    arm.rest(60, lambda s: s / 30)
-    arm.rest(240, lambda _: 2.0)
-
-
-def in_another_pose(arm: Arm) -> None:
-    arm.rest(300, lambda _: 2.0, up=(0.0, math.sin(0.03), math.cos(0.03)))
-
-
-def in_motion(arm: Arm) -> None:
-    arm.rest(300, lambda s: 2.0 + 3 * math.sin(s))
-
-
-def without_an_imu(arm: Arm) -> None:
-    arm.rest(300, lambda _: 2.0, up=(0.0, 0.0, 0.0))
+def grip(seconds: float) -> At:
+    """A contact of 2 N that comes in this time."""
+    return lambda s: 2.0 * min(s / seconds, 1.0)
 
 
 @pytest.mark.parametrize(
-    "what",
-    [by_a_contact, by_a_contact_that_comes_in_a_minute, in_another_pose, in_motion, without_an_imu],
+    ("force_z", "up"),
+    [
+        (grip(0.1), LEVEL),
+        (grip(60.0), LEVEL),
+        (grip(300.0), (0.0, math.sin(0.03), math.cos(0.03))),
+        (grip(300.0), (0.0, 0.0, 0.0)),
+        (lambda s: 2.0 + 3 * math.sin(s), LEVEL),
+    ],
+    ids=["contact", "slow contact", "another pose", "no IMU", "motion"],
 )
-def test_what_may_be_a_contact_is_not_believed_until_the_wrench_is_back(what: Callable[[Arm], None]) -> None:
+def test_what_may_be_a_contact_is_not_believed_until_the_wrench_is_back(
+    force_z: At, up: tuple[float, float, float]
+) -> None:
     arm = Arm()
     arm.rest(80)
-    what(arm)
-    assert arm.moved == pytest.approx(0, abs=0.3), "what drifts so slowly is steady for a tare, too"
+    arm.rest(300, force_z, up=up)
+    assert arm.moved == pytest.approx(0, abs=0.3), "what a tare calls steady, too"
     arm.rest(16, lambda _: 5.0)
     arm.rest(600, lambda s: s / 600)
     assert arm.moved == pytest.approx(1.0, abs=0.1), "it goes on once it is back"
