@@ -61,9 +61,9 @@ class Arm:
         return None if found is None else found["wrench"][2]
 
     def warm_up(self, newtons_per_kelvin: float) -> None:
-        """10 K in 20 minutes, from a tare on."""
+        """10 K in 10 minutes, from a tare on."""
         self.drift.begin("tare")
-        self.rest(1200, lambda s: newtons_per_kelvin * 10 * s / 1200, lambda s: 30 + 10 * s / 1200)
+        self.rest(600, lambda s: newtons_per_kelvin * 10 * s / 600, lambda s: 30 + 10 * s / 600)
 
 
 def test_drift_since_the_tare_is_told_with_the_axis_the_time_and_the_temperature() -> None:
@@ -71,7 +71,7 @@ def test_drift_since_the_tare_is_told_with_the_axis_the_time_and_the_temperature
     arm.warm_up(0.12)
     row = arm.drift.as_json()
     told = words.drift(row, LIMITS)
-    assert told == "Fz has drifted 1.2 N since the tare 20 min ago, 10 K warmer"
+    assert told == "Fz has drifted 1.2 N since the tare 10 min ago, 10 K warmer"
     assert str(judge(Observation(drift=told))) == f"Worth a look: {told}: re-tare advised"
     arm.drift.begin("tare")
     arm.rest(80)
@@ -123,7 +123,7 @@ def test_the_line_by_temperature_takes_three_runs_and_its_interval_is_how_they_d
     arm.drift.end_run()
     assert arm.drift.history.line is None
     arm.sensor.settings = {"temperature_compensation": True}
-    arm.warm_up(1.0)  # that it compensates itself, so it is no run
+    arm.warm_up(0.5)  # that it compensates itself, so it is no run
     arm.sensor.settings = {}
     arm.warm_up(0.12)
     arm.drift.begin("tare")

@@ -128,6 +128,7 @@ def test_the_control_socket(
     assert f"no virtual sensor of yours listens at {path} (No such file" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.bus
 def test_without_a_place_it_listens_where_commands_are_sent_to(
     veth: tuple[str, str], start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -141,6 +142,7 @@ def test_without_a_place_it_listens_where_commands_are_sent_to(
 
 
 @rights.needs_root
+@pytest.mark.long
 @pytest.mark.bus
 def test_it_is_scheduled_above_a_server_or_says_that_it_is_not(veth: tuple[str, str], start: Start) -> None:
     assert os.sched_getscheduler(start(veth[0]).process.pid) == os.SCHED_FIFO
