@@ -28,10 +28,12 @@ from bota_clients.recording.reader import (
 )
 from bota_clients.report.series import Subject, subject
 from bota_ethercat.address import Address
+from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import history
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.sensor_choice import SensorChoice
+from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
 _MOST_EVENTS_NAMED: Final = 10
@@ -182,7 +184,9 @@ def of_server(
             show(completed=passed)
             recorder.put(source.batch(min(_BATCH_S, seconds - passed)))
         recorder.stop("")
-        past = {row.get("sensor"): row for row in rows(source.ask("status").get("sensors"))}
+        past: dict[object, JsonObject] = {}
+        with contextlib.suppress(ProtocolError):  # the stream is enough
+            past = {row.get("sensor"): row for row in rows(source.ask("status").get("sensors"))}
         subjects = of_recording(path, choice, imu_units, str(address))
         return [each.with_remarks(_past(past.get(each.position, {}))) for each in subjects]
 
