@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -28,6 +27,7 @@ from std_srvs.srv import Trigger
 from bota_ethercat.control import MAX_TARE_SAMPLES, known_six
 from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import Vector3
+from bota_ethercat.program import state
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.declare import SettingsParameters
 from bridge.parameters.table import AUTO, ParameterError
@@ -301,12 +301,9 @@ class IdentifyServices:
     def _path(self) -> Path:
         path = self._control.parameters.identify_file
         if path == AUTO:
-            state = os.environ.get("XDG_STATE_HOME", "")
-            # The XDG specification says that a relative path is to be ignored.
-            directory = state if Path(state).is_absolute() else "~/.local/state"
             serial = self._control.link.info.serial
             name = f"sensor-{serial if serial.isalnum() else 'unknown'}-payload.yaml"
-            path = f"{directory}/bota-ethercat-bridge/{name}"
+            path = f"{state.folder()}/{name}"
         try:
             return Path(path).expanduser()
         except RuntimeError:
