@@ -13,6 +13,7 @@ import select
 import socket
 import stat
 import struct
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -44,6 +45,7 @@ _STEP: Final = 0.001
 _QUICK: Final = 1 / 16
 _MOST_CONNECTIONS: Final = 16
 _CHUNK: Final = 4096
+_ANSWER_S: Final = 5.0
 
 
 class LinkError(Exception):
@@ -91,8 +93,8 @@ def run(
     """Answer EtherCAT frames on `ifname` until stopped.
 
     Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the end of `commands` if
-    `exit_on_eof`. LinkError if interface or paths cannot be used, or the interface disappears; one that is
-    only down is waited for.
+    `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is only down is waited
+    for), or a path cannot; without `control_path` `own_socket` is used, if it is free.
     """
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
@@ -154,8 +156,9 @@ class CommandChannel(contextlib.ExitStack):
         self.callback(self._hang_up)
         self._pending: dict[int, bytes] = {}  # the beginning of a line, by descriptor
         self.ended = False  # the text stream has
-        if control_path is not None:
-            self._listener = self.enter_context(bound(control_path, socket.SOCK_STREAM, poller))
+        with contextlib.suppress(LinkError) if control_path is None else contextlib.nullcontext():
+            listener = bound(control_path or own_socket(), socket.SOCK_STREAM, poller)
+            self._listener = self.enter_context(listener)
             self._listener.listen()
         if commands is not None:
             with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
@@ -226,6 +229,24 @@ class CommandChannel(contextlib.ExitStack):
             rest = b""
         self._pending[descriptor] = rest
         return [line[:LONGEST_LINE].decode(errors="replace") for line in lines if line.strip()]
+
+
+def own_socket() -> str:
+    """Where this user's virtual sensor takes commands if no other place is given."""
+    folder, uid = "/run/user", os.geteuid()
+    folder = f"{folder}/{uid}" if Path(f"{folder}/{uid}").is_dir() else tempfile.gettempdir()
+    return f"{folder}/ethercat-virtual-sensor-{uid}"
+
+
+def send(path: str, command: str) -> str:
+    """The answer to a command of a virtual sensor that listens there, this user's or root's; OSError."""
+    if Path(path).stat().st_uid not in (0, os.geteuid()):
+        raise PermissionError(errno.EPERM, "it is another user's")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        sock.settimeout(_ANSWER_S)
+        sock.connect(path)
+        sock.sendall(command.encode() + b"\n")
+        return sock.makefile(encoding="utf-8").readline().strip()
 
 
 @contextlib.contextmanager
