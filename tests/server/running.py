@@ -359,7 +359,7 @@ def another_machine(veth: Veth) -> Iterator[list[str]]:
 
 @contextlib.contextmanager
 def virtual_sensor(
-    *arguments: str, module: str = "ethercat_server.virtual_sensor", first: tuple[str, ...] = ()
+    *arguments: str, module: str = "ethercat_server.virtual_sensor.cli", first: tuple[str, ...] = ()
 ) -> Iterator[tuple[Veth, VirtualSensor]]:
     """A veth pair with a virtual sensor on its far end: `module first... IFACE arguments...`."""
     with Veth() as veth:

@@ -19,7 +19,7 @@ from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.sensor.objects.dictionary import Access
 from ethercat_server.virtual_sensor.dictionary import sensor_entries
-from ethercat_server.virtual_sensor.signals import decode_clock
+from scripts.benchmarks.records import decode_clock
 from tests.server.running import VirtualSensor, wait_until
 from tests.virtual_sensor.conftest import Start
 
