@@ -91,8 +91,12 @@ class Asked:
     sensor_name: str | None = None
     force = False
 
-    def __init__(self, settings: Mapping[str, SettingValue] = {}, *, keep_unset: bool = False) -> None:
+    def __init__(
+        self, settings: Mapping[str, SettingValue] = {}, *, keep_unset: bool = False,
+        terminals: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         self._settings = dict(settings)
+        self.terminals = terminals
         self.keep_unset = keep_unset
 
     def wanted_settings(self, _position: int, _name: str, _serial: int) -> dict[str, SettingValue]:

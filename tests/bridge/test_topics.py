@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from bota_ethercat.framing import MessageType, encode_data
 from bota_ethercat.pdo import encode
 from bridge import rclpy_internals
 from bridge.node import StartError
@@ -494,3 +495,23 @@ def test_with_compat_bota_names_frames_and_tare_are_those_of_botas_driver() -> N
         assert six(node.fresh(wrenches, 0.1)[0]) == pytest.approx(ZERO6, abs=1e-6)
         frames = wrenches[-1].header.frame_id, motions[-1].header.frame_id
         assert frames == ("bota_ft_sensor_wrench", "bota_ft_sensor_imu")
+
+
+def test_terminals_are_published_as_numbers_and_with_names_and_stamp() -> None:
+    """Of a terminal that the server does not read, or whose values are not valid, nothing is."""
+    server = Server()
+    entries = (("Status", "u8", 0, 8), ("Value", "i16", 8, 16), ("Input", "bool", 24, 1))
+    layout = [dict(zip(("name", "type", "bit_offset", "bit_length"), row, strict=True)) for row in entries]
+    server.description["terminals"] = [{"terminal": 0, "layout": layout}]
+    with Node(server, terminals=1) as node:
+        arrays, stamped = node.hear("terminal_0"), node.hear("terminal_0/stamped")
+        node.run(0.2)
+        assert [each.get("terminals") for each in server.requests if each["action"] == "subscribe"] == [[0]]
+        for number, stamp, flags in ((0, 5, 1), (0, 6, 2), (0, 10**10, 0), (7, 8, 0)):
+            data = bytes.fromhex("07feff01")
+            server.send_raw(encode_data(0, stamp * 10**9, 1, number, flags, 1, data, MessageType.TERMINAL))
+        node.run(0.2)
+    (array,), (message,) = arrays, stamped
+    assert ([*array.data], array.layout.dim[0].label) == ([7.0, -2.0, 1.0], "Status, Value, Input")
+    assert ([*message.position], [*message.name]) == ([7.0, -2.0, 1.0], ["Status", "Value", "Input"])
+    assert stamp_ns(message) == 5 * 10**9
