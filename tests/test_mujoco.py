@@ -1,4 +1,4 @@
-"""examples/mujoco in simulated time: through the virtual sensor, the server and the client."""
+"""docs/examples/mujoco in simulated time: through the virtual sensor, the server and the client."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 
 from bota_ethercat.client import Client, Condition, Reading
 from bota_ethercat.world import Felt
-from examples.mujoco import identify
-from examples.mujoco.touch import FORCE, HOLE, Row, Touch, draw
+from docs.examples.mujoco import identify
+from docs.examples.mujoco.touch import FORCE, HOLE, Row, Touch, draw
 from tests.simulation import PATIENCE_S, MemoryChannel, Simulation
 
 WALL = 15_000.0  # N/m
@@ -37,7 +37,7 @@ class SpringArm:
 
 def arm() -> Any:
     """The one in MuJoCo."""
-    from examples.mujoco.arm import Arm
+    from docs.examples.mujoco.arm import Arm
 
     return Arm()
 

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import mujoco
 from bota_ethercat.client import Reading, World, connect
 from bota_ethercat.world import Felt
 

@@ -1,7 +1,7 @@
 """An arm turns its tool into six poses; mass and center of gravity are identified from what is measured.
 
 ethercat-server virtual 12001 --virtual "--world /tmp/world"
-python -m examples.mujoco.identify
+python -m docs.examples.mujoco.identify
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Identification:
 
 def main() -> None:
     """The command line."""
-    from examples.mujoco.arm import Arm, arguments, perform  # noqa: PLC0415 - the task does without MuJoCo
+    from docs.examples.mujoco.arm import Arm, arguments, perform  # noqa: PLC0415 - the task does without MuJoCo
 
     options, arm = arguments(str(__doc__)).parse_args(), Arm()
     task = Identification(arm)

@@ -1,7 +1,7 @@
 """An arm touches a wall with 10 N, slides along it to a hole, and puts its peg in, by admittance control.
 
     ethercat-server virtual 12001 --virtual "--world /tmp/world"
-    python -m examples.mujoco.touch --picture touch.png
+    python -m docs.examples.mujoco.touch --picture touch.png
 
 The controller knows the sensor by the TCP client only, as with a real one.
 """
@@ -118,7 +118,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
 
 def main() -> None:
     """The command line."""
-    from examples.mujoco.arm import Arm, arguments, perform  # noqa: PLC0415 - the controller does without MuJoCo
+    from docs.examples.mujoco.arm import Arm, arguments, perform  # noqa: PLC0415 - the controller does without MuJoCo
 
     parser = arguments(str(__doc__))
     parser.add_argument("--picture", type=Path, metavar="FILE", help="of force and position over time")
