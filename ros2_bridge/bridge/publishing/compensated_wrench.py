@@ -184,6 +184,7 @@ class TfFrames:
         self._is_wanted = False
         self._tf: Tf | None = None
         self._stopping, self._arrived = threading.Event(), threading.Event()
+        self._listening = threading.Lock()
         self.thread = Worker("frames", self._run, on_failure)
         self._guard = node.create_guard_condition(self._listen, MutuallyExclusiveCallbackGroup())
         for topic in self._topics:
@@ -203,11 +204,14 @@ class TfFrames:
 
     def _listen(self) -> None:
         """Listen to TF, or no longer; for the executor's thread."""
-        if self._is_wanted and self._tf is None:
-            self._tf = Tf(self._node)
-        elif not self._is_wanted and self._tf is not None:
-            self._tf.close()
-            self._tf = None
+        with self._listening:
+            if self._stopping.is_set():  # the node destroys what it has
+                return
+            if self._is_wanted and self._tf is None:
+                self._tf = Tf(self._node)
+            elif not self._is_wanted and self._tf is not None:
+                self._tf.close()
+                self._tf = None
 
     def look(self) -> bool:
         """Publish what can be. True: a sample waits for its pose."""
@@ -227,7 +231,8 @@ class TfFrames:
 
     def stop(self) -> bool:
         """Stop and wait for the thread; False if it does not end in time."""
-        self._stopping.set()
+        with self._listening:
+            self._stopping.set()
         self._arrived.set()
         return self.thread.has_ended()
 
