@@ -53,7 +53,7 @@ def start_node(context):
         if value(name)
     }
     environment = {}
-    if value("realtime").lower() in {"true", "1"}:
+    if value("realtime") == "true":
         given["rt_priority"] = REAL_TIME
         profiles = Path(__file__).parents[1] / "config" / "fastdds.xml"
         environment = {PROFILES: os.environ.get(PROFILES) or str(profiles)}
@@ -93,6 +93,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "realtime",
                 default_value="false",
+                choices=["true", "false"],
                 description=f"true asks for SCHED_FIFO {REAL_TIME}, locked memory and our Fast DDS profile",
             ),
             DeclareLaunchArgument(

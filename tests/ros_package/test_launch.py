@@ -251,6 +251,7 @@ def test_namespace_log_level_respawn_and_text_that_looks_like_a_number(launch: L
     launched.says(r"\[left.bridge\]: no server at 127:")
     quiet = launch("bridge.launch.py", "log_level:=error", "server_port:=70000", "respawn:=true")
     quiet.says("parameter server_port is 70000", "--log-level error", times=2)
+    launch("bridge.launch.py", "realtime:=yes").says('"realtime" provided value "yes" is not valid')
 
 
 @pytest.mark.ros
