@@ -30,7 +30,10 @@ PARAMETERS = {
 IN_FILE = " (empty: as in params_file)"
 # Other drivers: the node's name and its names of our topics; config/compat_NAME.yaml has the parameters.
 COMPATIBLE = {"bota": ("bota_ft_sensor", [("wrench_compensated", "~/wrench"), ("imu/data_raw", "~/imu")])}
-PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+PROFILES = {  # of Fast DDS 2 (Jazzy), and 3
+    "FASTRTPS_DEFAULT_PROFILES_FILE": "fastdds.xml",
+    "FASTDDS_DEFAULT_PROFILES_FILE": "fastdds3.xml",
+}
 REAL_TIME = 40  # SCHED_FIFO, below the 50 of a controller manager
 
 
@@ -55,8 +58,9 @@ def start_node(context):
     environment = {}
     if value("realtime") == "true":
         given["rt_priority"] = REAL_TIME
-        profiles = Path(__file__).parents[1] / "config" / "fastdds.xml"
-        environment = {PROFILES: os.environ.get(PROFILES) or str(profiles)}
+        if not any(map(os.environ.get, PROFILES)):
+            config = Path(__file__).parents[1] / "config"
+            environment = {variable: str(config / file) for variable, file in PROFILES.items()}
     return [
         Node(
             package="bota_ethercat_bridge",

@@ -132,8 +132,13 @@ def test_a_parameter_file_is_found_or_refused(tmp_path: Path, monkeypatch: pytes
     assert not node.named["additional_env"]
     (node,) = start_node({"params_file": "~/robot.yaml", "realtime": "true"})
     assert node.named["parameters"][1] == {"rt_priority": 40}
-    (profiles,) = node.named["additional_env"].values()
-    assert Path(profiles).samefile(PACKAGE / "config/fastdds.xml")
+    profiles = node.named["additional_env"]
+    assert [Path(file).read_text() for file in profiles.values()] == [
+        (PACKAGE / "config" / file).read_text() for file in ("fastdds.xml", "fastdds3.xml")
+    ]
+    monkeypatch.setenv("FASTDDS_DEFAULT_PROFILES_FILE", "of the user")
+    (node,) = start_node({"params_file": "~/robot.yaml", "realtime": "true"})
+    assert not node.named["additional_env"]
     (node,) = start_node({"params_file": "~/robot.yaml", "compat": "bota"})  # what that is: tests/bridge
     assert (node.named["name"], len(node.named["parameters"])) == ("bota_ft_sensor", 2)
 
