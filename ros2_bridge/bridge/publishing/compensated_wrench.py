@@ -184,7 +184,6 @@ class TfFrames:
         self._is_wanted = False
         self._tf: Tf | None = None
         self._stopping, self._arrived = threading.Event(), threading.Event()
-        self._listening = threading.Lock()
         self.thread = Worker("frames", self._run, on_failure)
         self._guard = node.create_guard_condition(self._listen, MutuallyExclusiveCallbackGroup())
         for topic in self._topics:
@@ -204,8 +203,8 @@ class TfFrames:
 
     def _listen(self) -> None:
         """Listen to TF, or no longer; for the executor's thread."""
-        with self._listening:
-            if self._stopping.is_set():  # the node destroys what it has
+        with self._node.setting:  # not while it is deactivated
+            if self._stopping.is_set():
                 return
             if self._is_wanted and self._tf is None:
                 self._tf = Tf(self._node)
@@ -231,8 +230,7 @@ class TfFrames:
 
     def stop(self) -> bool:
         """Stop and wait for the thread; False if it does not end in time."""
-        with self._listening:
-            self._stopping.set()
+        self._stopping.set()
         self._arrived.set()
         return self.thread.has_ended()
 
