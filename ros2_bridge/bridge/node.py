@@ -72,8 +72,9 @@ def _transition(act: Callable[[Any], object]) -> Callable[[Any, LifecycleState],
         try:
             with node.setting, _sentences():
                 act(node)
-        except StartError as error:
-            node.get_logger().error(str(error))
+        except Exception as error:  # noqa: BLE001 - rclpy would answer the same, without a word
+            text = str(error) if isinstance(error, StartError) else f"the transition failed: {error!r}"
+            node.get_logger().error(text)
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 

@@ -17,6 +17,7 @@ from bota_ethercat.pdo import encode
 from bridge import rclpy_internals
 from bridge.node import StartError
 from bridge.parameters.table import ParameterError, parse_frames
+from bridge.process import Worker
 from ft_compensation.outputs import WrenchFilter
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.scripted_server import process_data
@@ -357,7 +358,9 @@ def node(server: Sensor, tf: FakeTf) -> Iterator[Node]:
         yield started
 
 
-def test_tf_is_not_listened_to_without_a_subscriber(node: Node, tf: FakeTf) -> None:
+def test_tf_is_not_listened_to_without_a_subscriber(
+    node: Node, tf: FakeTf, monkeypatch: pytest.MonkeyPatch
+) -> None:
     node.hear("wrench_compensated/tcp")
     node.run(2.0)
     words = "wrench_compensated/base has stopped: TF has no pose of ft_sensor in base: frame does not exist"
@@ -371,6 +374,11 @@ def test_tf_is_not_listened_to_without_a_subscriber(node: Node, tf: FakeTf) -> N
     assert tf.listening == 1
     assert set(tf.asked) == {("base", "ft_sensor")}
     node.unhear("wrench_compensated/base")
+    node.run(0.5)
+    assert tf.listening == 0
+    monkeypatch.setattr(Worker, "has_ended", lambda _: True)  # not begun here
+    node.node.compensation.output.frames.stop()  # as a managed node that is deactivated
+    node.hear("wrench_compensated/base")
     node.run(0.5)
     assert tf.listening == 0
 

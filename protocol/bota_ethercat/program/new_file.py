@@ -32,6 +32,8 @@ class NewFile:
     def __init__(self, path: Path, *, force: bool) -> None:
         self._path, self._force = path, force
         with self._errors():
+            with contextlib.suppress(FileNotFoundError):
+                path.stat()  # of other errors `exists` says nothing since Python 3.14
             refuse_existing(path, force=force)
             if path.exists() and not path.is_file():
                 self._target = self._beside = path
