@@ -20,6 +20,8 @@ from bota_ethercat.program.version import VERSION
 from tests.ros_package.package_files import PACKAGES, ROOT, commands, shared_files
 from tests.server.running import free_port, needs_bus
 
+pytestmark = pytest.mark.timeout(600)  # virtual environments are made
+
 CLIENT, BRIDGE = "bota-ethercat", "bota-ethercat-bridge"
 DATED: Final = "## [0.1.0] - 2026-01-01\n"
 MARKER: Final = "share/ament_index/resource_index/packages"
