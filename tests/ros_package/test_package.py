@@ -36,6 +36,7 @@ def test_the_manifests_and_one_version() -> None:
         assert (package.version, package.licenses, package.package_format) == (version, ["Apache-2.0"], 3)
         # colcon takes a package with an invalid address for plain Python.
         assert all(re.fullmatch(r"[^@ ]+@[^@ ]+\.[a-z]+", each.email) for each in package.maintainers)
+        assert not any("example" in each.email for each in package.maintainers)
         if package.name in PACKAGES:
             assert package.get_build_type() == "ament_python"
             metadata = setup_of(PACKAGES[package.name])["metadata"]
