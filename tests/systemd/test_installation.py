@@ -128,6 +128,7 @@ def test_a_dry_run_says_what_would_be_done() -> None:
         (["ens5", "80"], "port '80' must be from 1024 to 65535"),
         (["ens5", "65536"], "port '65536' must be from 1024 to 65535"),
         (["--build"], "--build takes a folder"),
+        (["--bridge", "--keep-environment", "ens5"], "--bridge installs programs, --keep-environment none"),
         (["--quick", "ens5"], "unknown option --quick"),
         (["--uninstall", "ens5"], "--uninstall takes no arguments"),
     ],
