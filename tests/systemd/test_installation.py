@@ -180,6 +180,7 @@ accounts() { cut -d: -f 1,3,4 /etc/passwd; cut -d: -f 1,3 /etc/group; }
 before=$(everything; accounts)
 scripts/install-service ens5 13000
 echo "users $(getent passwd ethercat ethercat-bridge | grep -c nologin)"
+[ /opt/ethercat-server/bin/python -ef /usr/bin/python3 ]  # gets its updates
 setpriv --reuid=ethercat --regid=ethercat --clear-groups /opt/ethercat-server/bin/ethercat-server --version
 echo "# mine" >>$config/ens5.env
 scripts/install-service --keep-environment ens5 14000
