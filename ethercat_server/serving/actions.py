@@ -13,8 +13,8 @@ from typing import Any, Final, Protocol
 from bota_ethercat.address import boot_id
 from bota_ethercat.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from bota_ethercat.errors import RequestError
+from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server import __version__
 from ethercat_server.serving.connection import Connection, Subscription
 from ethercat_server.serving.hub import Hub
 
@@ -101,20 +101,20 @@ class Actions:
         rows = [sensor.describe() for sensor in self._sensors]
         if len(rows) > _MOST_EXPLAINED:
             rows = [{key: value for key, value in row.items() if key != "meaning"} for row in rows]
-        return reply(request, protocol=PROTOCOL_VERSION, version=__version__, sensors=rows, **self._extra)
+        return reply(request, protocol=PROTOCOL_VERSION, version=VERSION, sensors=rows, **self._extra)
 
     def _subscribe(self, connection: Connection, request: Request) -> JsonObject:
-        numbers = request.values["sensors"]
-        absent = [number for number in numbers or () if number >= len(self._sensors)]
-        if absent:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST,
-                f"the key 'sensors' names sensor {absent[0]}, but the bus has {len(self._sensors)}, "
-                "counted from 0",
-            )
-        connection.subscription = Subscription(
-            len(self._sensors), numbers, request.values["every"], request.values["fresh_only"]
-        )
+        wanted: list[bool] = []
+        for kind, rows in ("sensor", self._sensors), ("terminal", self._extra.get("terminals", ())):
+            numbers = request.values[f"{kind}s"]
+            if absent := [number for number in numbers or () if number >= len(rows)]:
+                raise RequestError(
+                    ErrorCode.BAD_REQUEST,
+                    f"the key '{kind}s' names {kind} {absent[0]}, but the bus has {len(rows)}, counted "
+                    "from 0",
+                )
+            wanted += [numbers is None or number in numbers for number in range(len(rows))]
+        connection.subscription = Subscription(wanted, request.values["every"], request.values["fresh_only"])
         self._hub.subscriptions_changed()
         return self._describe(connection, request)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
@@ -10,10 +11,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
+from bota_ethercat.program.arguments import Parser
 from bota_ethercat.settings import SETTINGS
-from ethercat_server import __version__
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import look_up
+from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from ethercat_server.process.signals import signals_call
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
@@ -29,7 +31,9 @@ from ethercat_server.virtual_sensor.options import (
     whole,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
+from ethercat_server.virtual_sensor.world import FAULT, LOST, ToldWorld
 
+_PROGRAM: Final = "ethercat-virtual-sensor"
 _SERIAL_NUMBERS: Final = 100  # for each bus: more than it has slaves
 
 
@@ -51,16 +55,16 @@ def _sinc_length(text: str) -> int:
 
 _ALONG_THE_CHAIN: Final = ("model", "serial", "ppm", "dc")
 _SEVERAL = "; several, comma separated or repeated, for a chain"
-# Name, metavar, default, parser, help.
-_OPTIONS: Final[tuple[tuple[str, str, str | None, Callable[[str], Any], str], ...]] = (
-    ("chain", "SLAVES", None, parse_chain, f"all slaves in wire order: {SENSOR}, {', '.join(KINDS)}; "
+# Name, metavar, parser, help.
+_OPTIONS: Final[tuple[tuple[str, str, Callable[[str], Any], str], ...]] = (
+    ("chain", "SLAVES", parse_chain, f"all slaves in wire order: {SENSOR}, {', '.join(KINDS)}; "
      "KIND:STATE if another master has left one in this AL state"),
-    ("sensors", "N", None, whole(1, MOST_SLAVES), "sensors on the bus (default: as many as named, or 1)"),
-    ("model", "NAME", None, _model, f"default {MODELS[0]}{_SEVERAL}"),
-    ("serial", "N", None, whole(0, 2**32 - 1), f"default: by the interface's MAC address{_SEVERAL}"),
-    ("sinc", "N", None, _sinc_length, "SINC length after power-on (default 64)"),
-    ("ppm", "X", None, real(-PPM_LIMIT, PPM_LIMIT), f"clock error{_SEVERAL}"),
-    ("dc", "WORD[=VALUE][+...]", None, _clock, f"distributed clock, see below{_SEVERAL}"),
+    ("sensors", "N", whole(1, MOST_SLAVES), "sensors on the bus (default: as many as named, or 1)"),
+    ("model", "NAME", _model, f"default {MODELS[0]}{_SEVERAL}"),
+    ("serial", "N", whole(0, 2**32 - 1), f"default: by the interface's MAC address{_SEVERAL}"),
+    ("sinc", "N", _sinc_length, "SINC length after power-on (default 64)"),
+    ("ppm", "X", real(-PPM_LIMIT, PPM_LIMIT), f"clock error{_SEVERAL}"),
+    ("dc", "WORD[=VALUE][+...]", _clock, f"distributed clock, see below{_SEVERAL}"),
 )  # fmt: skip
 
 
@@ -68,24 +72,28 @@ def build_parser() -> argparse.ArgumentParser:
     """The command line."""
     commands = "\n".join(f"  {c.usage:34} {c.meaning}" for c in COMMANDS)
     words = "\n".join(f"  {w.usage:34} {w.meaning}" for w in CLOCK_WORDS)
-    parser = argparse.ArgumentParser(
-        prog="ethercat-virtual-sensor",
-        description="Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
+    parser = Parser(
+        _PROGRAM,
+        "Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
         "and other slaves beside them.",
-        epilog=f"commands, one per line on stdin or on the --control socket:\n{commands}\n\n"
+        f"commands, one per line on stdin or on the --control socket, or with --send:\n{commands}\n\n"
         f"of a distributed clock, in --dc or as a command:\n{words}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("iface", metavar="IFACE", help="interface, for instance one end of a veth pair")
-    for name, metavar, default, _, meaning in _OPTIONS:
+    parser.add_argument("iface", metavar="IFACE", nargs="?", help="interface, one end of a veth pair")
+    for name, metavar, _, meaning in _OPTIONS:
         action = "append" if name in _ALONG_THE_CHAIN else "store"
-        parser.add_argument(f"--{name}", metavar=metavar, default=default, action=action, help=meaning)
+        parser.add_argument(f"--{name}", metavar=metavar, action=action, help=meaning)
     parser.add_argument("--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data")
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
-    parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of the scene")
-    parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
+    parser.add_argument("--world", metavar="PATH", help="measure what datagrams to this Unix socket say")
+    parser.add_argument("--world-lost", choices=LOST, default=FAULT, help="when it stops (default fault)")
+    parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of scene and world")
+    parser.add_argument(
+        "--control", metavar="PATH", help=f"Unix socket for commands (default {link.own_socket()})"
+    )
+    parser.add_argument("--send", metavar="COMMAND", help="have the one that listens there obey, and end")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
 
@@ -100,7 +108,7 @@ def _number_of(ifname: str) -> int:
 def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[SlaveOptions, ...]:
     """The slaves that parsed arguments ask for; UsageError if they are contradictory."""
     given: dict[str, Any] = {}
-    for name, _, _, parse, _ in _OPTIONS:
+    for name, _, parse, _ in _OPTIONS:
         text = getattr(args, name.replace("-", "_"))
         try:
             if name in _ALONG_THE_CHAIN:
@@ -134,6 +142,7 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
             ppm=of("ppm", position, 0.0),
             dc=of("dc", position, ""),
             signal=args.signal,
+            world=ToldWorld(args.world_lost) if args.world else None,
             noise=args.noise == "on",
             seed=position,
         )
@@ -143,27 +152,45 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
 
 
 def main(
-    argv: Sequence[str] | None = None, on_open: Callable[[], None] = lambda: None, number: int = 0
+    argv: Sequence[str] | None = None,
+    on_open: Callable[[], None] = lambda: None,
+    number: int = 0,
+    priority: int = DEFAULT_PRIORITY + 1,
 ) -> int:
     """Run the virtual sensor: 0 when ended, 1 on failure, 2 for wrong arguments.
 
     `on_open` is called once its interface is open, before it reads anything. The default serial numbers go by
-    `number`, or by the interface's MAC address.
+    `number`, or by the interface's MAC address. `priority` is that of SCHED_FIFO, above a master's: real
+    sensors do not wait for a CPU; 0 for ordinary scheduling.
     """
-    args = build_parser().parse_args(argv)
+    parser = build_parser()
+    args = parser.parse_args(argv)
+    if args.send is not None:
+        return _send(args.control or link.own_socket(), args.send)
+    if args.iface is None:
+        parser.error("name an interface, or a command with --send")
     try:
         slaves = options_from(args, _SERIAL_NUMBERS * (number or _number_of(args.iface)) or 1)
     except UsageError as error:
-        print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
+        _say(error)
         return 2
     stopped = threading.Event()
     models = [slave.model for slave in slaves if isinstance(slave, SensorOptions)]
     foreign = [slave.kind for slave in slaves if isinstance(slave, ForeignOptions)]
     ready = (
         f"ready: {len(models)} sensor(s) {', '.join(dict.fromkeys(models))} on {args.iface}, "
-        f"{args.pdo} bytes of process data, signal {args.signal}"
+        f"{args.pdo} bytes of process data, signal {args.world or args.signal}"
         + (f", beside {', '.join(foreign)}" if foreign else "")
     )
+
+    def opened() -> None:
+        try:
+            if priority:
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        except PermissionError:
+            _say(f"not granted: real-time priority {priority} (CAP_SYS_NICE); samples may come late")
+        on_open()
+
     try:
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)  # reading from the terminal must not suspend it
         with signals_call(stopped.set):
@@ -172,12 +199,32 @@ def main(
                 slaves,
                 stop=stopped,
                 control_path=args.control,
+                world_path=args.world,
                 commands=sys.stdin,
                 exit_on_eof=args.exit_on_eof,
-                on_open=on_open,
+                on_open=opened,
                 on_ready=lambda: print(ready, flush=True),
             )
     except link.LinkError as error:
-        print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
+        _say(error)
         return 1
     return 0
+
+
+def _say(sentence: object) -> None:
+    print(f"{_PROGRAM}: {sentence}", file=sys.stderr)
+
+
+def _send(path: str, command: str) -> int:
+    """Exit code 0 if the virtual sensor that listens there has obeyed."""
+    try:
+        answer = link.send(path, command)
+    except OSError as error:
+        _say(f"no virtual sensor of yours listens at {path} ({error.strerror}): start one, or give --control")
+        return 1
+    print(answer)
+    return int(not answer.startswith("ok"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -31,6 +31,7 @@ from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import Worker, call_on_stop_signal, prepare
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.publishing.messages import Stamps, make_measured
+from bridge.publishing.terminals import TerminalTopics
 from bridge.rclpy_internals import is_about_arguments, make_executors, refuse_what_raises
 from bridge.services import BiasServices, IdentifyServices, SensorServices
 from bridge.spinning import Spinner
@@ -127,12 +128,14 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
+        self.reader.on_terminal = TerminalTopics(self, parameters.terminals, self.reader.client).publish
         self.sensor_settings.link = link = self.reader.link
         self.compensation = CompensationControl(self, parameters, compensated, self.reader, self.live)
         self.live.apply = self._apply
         self.monitor = Monitor(
             self, parameters.limits, self.reader, self.compensation.state, self.outputs, stamps, self.fail
         )
+        self.monitor.on_status = self.compensation.follow_temperature
         SensorServices(self, link, self.sensor_settings)
         BiasServices(self, self.compensation)
         IdentifyServices(self, self.compensation)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import ast
-import copy
 import math
-import random
 import re
 import sys
 from collections.abc import Iterator
@@ -13,14 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from geometry_msgs.msg import WrenchStamped
-from rclpy.serialization import deserialize_message, serialize_message
 
+from bota_ethercat.framing import MessageType, encode_data
 from bota_ethercat.pdo import encode
 from bridge import rclpy_internals
 from bridge.node import StartError
 from bridge.parameters.table import ParameterError, parse_frames
-from bridge.rclpy_internals import packer
 from ft_compensation.outputs import WrenchFilter
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.scripted_server import process_data
@@ -182,23 +178,6 @@ def test_what_is_not_finite_stays_away_from_its_topic(published: Published, valu
     got = [message.linear_acceleration.z for message in heard["imu/data_raw"]]
     assert got == pytest.approx([0.0, 0.0, 0.0, 4.0 * 9.80665])
     assert not heard["imu/data"]
-
-
-@pytest.mark.parametrize("frame_id", ["", "a", "ft", "fts", "arm", "ft_sensor", "ü" * 37])
-def test_every_length_of_text_before_the_numbers(frame_id: str) -> None:
-    wanted = WrenchStamped()
-    wanted.header.frame_id = frame_id
-    pack = packer(copy.deepcopy(wanted), 6)
-    rng = random.Random(1)
-    for _ in range(50):
-        numbers = [rng.uniform(-1e3, 1e3) for _ in range(6)]
-        stamp_ns = rng.randrange(2**31 * 10**9)
-        wanted.header.stamp.sec, wanted.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        force, torque = wanted.wrench.force, wanted.wrench.torque
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = numbers
-        message = pack(stamp_ns, *numbers)
-        assert deserialize_message(message, WrenchStamped) == wanted
-        assert len(message) == len(serialize_message(wanted))  # bytes of padding may be anything
 
 
 # Filtered, and in other frames: configured, subscribed, changed while it runs.
@@ -533,3 +512,23 @@ def test_with_compat_bota_names_frames_and_tare_are_those_of_botas_driver() -> N
         assert six(node.fresh(wrenches, 0.1)[0]) == pytest.approx(ZERO6, abs=1e-6)
         frames = wrenches[-1].header.frame_id, motions[-1].header.frame_id
         assert frames == ("bota_ft_sensor_wrench", "bota_ft_sensor_imu")
+
+
+def test_terminals_are_published_as_numbers_and_with_names_and_stamp() -> None:
+    """Of a terminal that the server does not read, or whose values are not valid, nothing is."""
+    server = Server()
+    entries = (("Status", "u8", 0, 8), ("Value", "i16", 8, 16), ("Input", "bool", 24, 1))
+    layout = [dict(zip(("name", "type", "bit_offset", "bit_length"), row, strict=True)) for row in entries]
+    server.description["terminals"] = [{"terminal": 0, "layout": layout}]
+    with Node(server, terminals=1) as node:
+        arrays, stamped = node.hear("terminal_0"), node.hear("terminal_0/stamped")
+        node.run(0.2)
+        assert [each.get("terminals") for each in server.requests if each["action"] == "subscribe"] == [[0]]
+        for number, stamp, flags in ((0, 5, 1), (0, 6, 2), (0, 10**10, 0), (7, 8, 0)):
+            data = bytes.fromhex("07feff01")
+            server.send_raw(encode_data(0, stamp * 10**9, 1, number, flags, 1, data, MessageType.TERMINAL))
+        node.run(0.2)
+    (array,), (message,) = arrays, stamped
+    assert ([*array.data], array.layout.dim[0].label) == ([7.0, -2.0, 1.0], "Status, Value, Input")
+    assert ([*message.position], [*message.name]) == ([7.0, -2.0, 1.0], ["Status", "Value", "Input"])
+    assert stamp_ns(message) == 5 * 10**9

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import socket
 import subprocess
 import tomllib
 from collections.abc import Callable, Iterator
@@ -12,9 +13,9 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from catkin_pkg.package import parse_package
 
 from bota_ethercat.client.reading import Condition
+from bota_ethercat.world import Felt, encode
 from tests.clients.cpp_programs import (
     CLIENT,
     HEADERS,
@@ -140,6 +141,16 @@ def test_every_header_alone(tmp_path: Path) -> None:
     build(tmp_path / "alone.cpp", PLAIN, tuple(sources))
 
 
+def test_a_world_sends_what_the_python_one_does(tmp_path: Path) -> None:
+    command = [str(driver_program()), "world", str(tmp_path / "world")]
+    assert subprocess.run(command, check=False).returncode == 1, "no sensor"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sensor:
+        sensor.bind(command[-1])
+        subprocess.run(command, check=True)
+        felt = Felt((1, 2, 3, 4, 5, 6), (7, 8, 9), (10, 11, 12), 13)
+        assert sensor.recv(200) == encode(0.5, felt, 2)
+
+
 # -- real time, in the words of the Python client
 
 
@@ -221,11 +232,3 @@ def test_cmake_installs_the_headers_and_a_program_finds_them(tmp_path: Path) -> 
 def test_the_version_is_the_projects() -> None:
     text = (CLIENT / "CMakeLists.txt").read_text()
     assert f"project(bota_ethercat VERSION {PROJECT['version']} " in text
-
-
-def test_the_package_needs_nothing_but_cmake() -> None:
-    """rosdep and colcon read package.xml."""
-    package = parse_package(CLIENT)
-    assert package.get_build_type() == "cmake"
-    assert [need.name for need in package.buildtool_depends] == ["cmake"]
-    assert not [*package.build_depends, *package.exec_depends, *package.test_depends]

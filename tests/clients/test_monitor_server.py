@@ -147,7 +147,7 @@ def test_once_without_a_server_is_exit_1_and_one_sentence(run: Run) -> None:
     assert (code, out) == (1, "")
     assert err == (
         f"ethercat-monitor: no server at localhost:{port} (Connection refused): start ethercat-server, "
-        "or give its HOST:PORT\n"
+        "or give its address\n"
     )
 
 
@@ -321,7 +321,7 @@ def test_a_tare_says_what_is_left_and_is_undone_and_cleared() -> None:
 
 
 def test_tare_says_why_not() -> None:
-    with simulated_bus("--signal", "turn") as bus, simulated_server(bus) as server:
+    with simulated_bus() as bus, simulated_server(bus) as server:
         text, bad = tare(Address("localhost", 1), 0)
         assert bad
         assert re.match("Sensor 0 was not tared: .*not at rest", text)

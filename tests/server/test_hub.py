@@ -60,9 +60,8 @@ class Served:
         request = parse_request(message)
         if request.action == "subscribe":
             values = request.values
-            connection.subscription = Subscription(
-                2, values["sensors"], values["every"], values["fresh_only"]
-            )
+            wanted = [number in (values["sensors"] or (0, 1)) for number in range(2)]
+            connection.subscription = Subscription(wanted, values["every"], values["fresh_only"])
             self.hub.subscriptions_changed()
         return reply(request)
 
@@ -403,7 +402,7 @@ def test_an_idle_connection_of_who_has_most_goes_first(served: Served) -> None:
 
     for client in crowd[:6]:
         client.uid = 1003
-        client.subscription = Subscription(1, None, 1, fresh_only=True)
+        client.subscription = Subscription([True], 1, fresh_only=True)
     assert served.is_closed(served.connect(3000)), "none is idle"
     crowd[4].subscription = None
     served.connect(3000)

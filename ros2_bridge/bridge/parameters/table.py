@@ -118,6 +118,8 @@ PARAMETERS: Final = (
     Row("server_port", _PORT, "TCP port of ethercat-server", 1, 65535, live=False),
     Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535, live=False),
     Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255, live=False),
+    Row("terminals", 0, "How many of the server's terminals are published: terminal_0, terminal_1, ...",
+        0, 255, live=False),
     Row("rt_priority", 0,
         "SCHED_FIFO priority of the stream's thread, if allowed; 0 = as the node was started",
         0, HIGHEST_PRIORITY, live=False),
@@ -161,6 +163,8 @@ PARAMETERS: Final = (
         "Gravity, m/s², in the base frame: that of the orientations", 0, 100, lengths=(3,)),
     Row("bias", (0.0,) * 6,
         "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6, lengths=(6,)),
+    Row("temperature_line", False,
+        "Shift the bias along the sensor's line of offset by temperature, once the server has learned it"),
     Row("bias_ramp_time", 0.5, "Seconds in which a new bias replaces the old one; 0 = at once", 0, 60),
     Row("imu_position", ZERO,
         "Position in frame_id of the IMU that gravity_source names, m; zeros = that of the sensor's model",
@@ -219,6 +223,7 @@ class Parameters(NamedTuple):
     server_host: str
     server_port: int
     sensor: int
+    terminals: int
     rt_priority: int
     cpu: int
     publishing_frequency: float
@@ -239,6 +244,7 @@ class Parameters(NamedTuple):
     payload: Payload
     gravity: Vector3
     bias: Wrench
+    temperature_line: bool
     bias_ramp_time: float
     imu_position: Vector3
     on_saturation: str
