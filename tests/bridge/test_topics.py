@@ -22,6 +22,7 @@ from ft_compensation.outputs import WrenchFilter
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.scripted_server import process_data
 from tests.bridge.simulated_node import RATE_HZ, STEP_S, UP, ZERO6, Node, Server, six, stamp_ns, values
+from tests.public_names import listed
 
 PACKAGE = Path(__file__).parents[2] / "ros2_bridge"
 QUATERNION = {"orientation.x": 0.5, "orientation.y": -0.5, "orientation.z": 0.5, "orientation.w": 0.5}
@@ -484,6 +485,22 @@ def test_every_topic_is_reliable_unless_its_qos_is_overridden() -> None:
     assert got.pop("mine") == ("BEST_EFFORT", "VOLATILE", 10)
     assert {"wrench_compensated", "wrench_filtered", "tcp", "data_raw", "diagnostics"} <= got.keys()
     assert got == dict.fromkeys(got, ("RELIABLE", "VOLATILE", 10))
+
+
+def test_topics_and_services_are_those_listed() -> None:
+    """In tests/public_names.txt, which docs/stability.md promises to keep."""
+    with Node(Sensor(), **{"filter.cutoff": 10.0}) as node:
+        namespace = node.name.removesuffix("bridge")
+        publishers = node.node.get_publisher_names_and_types_by_node("bridge", namespace[:-1])
+        subscribed = [each.topic_name for each in node.node.subscriptions]
+        services = [each.srv_name for each in node.node.services]
+        made = [each.service_name for each in node.stand_ins]
+    topics = {f"ROS: topic {name}" for name in [*(name for name, _ in publishers), *subscribed]}
+    names = topics | {f"ROS: service {name}" for name in [*services, *made]}
+    ours = {name.replace(namespace + "bridge", "~").replace(namespace, "") for name in names}
+    others = re.compile("parameter|rosout|get_type_description|typed/")  # rclpy's; typed only where built
+    ours = {name for name in ours if not others.search(name)}
+    assert sorted(ours) == listed(ros=True)
 
 
 def test_with_compat_bota_names_frames_and_tare_are_those_of_botas_driver() -> None:
