@@ -99,10 +99,11 @@ def test_a_repeated_sample_is_as_old_as_when_it_was_returned_first() -> None:
 AGES = {"p50": 80.0, "p99": 120.0, "p999": 150.0}
 ABOUT = {"rate_hz": 800, "sensors": 1}
 COUNTS = {"made": 200, "lost": 1}
+RATIOS = dict(zip(modes.RATIOS, (2, 3, 4, 5), strict=True))
 ROWS: list[dict[str, Any]] = [
     {**ABOUT, "program": "this", **COUNTS, "age_us": AGES, "cpu_percent": {"server": 9.0}},
+    {**ABOUT, "program": "this, C client", **COUNTS, "age_us": AGES, "ratio": RATIOS},
     {**ABOUT, "program": "bare C", **COUNTS, "age_us": {"p50": 40.0, "p99": 60.0}},
-    {**ABOUT, "program": "this / C, C client", "ratio": dict(zip(modes.RATIOS, (2, 3, 4, 5), strict=True))},
     {**ABOUT, "program": "Bota's driver", "missing": "it cannot be had"},
 ]
 
@@ -125,6 +126,7 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
         )
         assert "A bare C program: 40 µs (p99 60)." in text
         assert "are of one run: 2026-11-23, 2 CPUs, Linux 6.1.0, Python 3.11.2, with idle states." in text
+        assert "| 800 Hz, 1: this, C client | 1 of 200 | 80.0 (2.00) | 120 (3.00) | 150 (4.00) |" in text
         row = "| 800 Hz, 4 loops: TCP, ordinary | 1 | 80 / 120 / 150 | 80 / 120 / 150 |"
         assert text.endswith(f"{row}\n<!-- end -->\nbelow\n")
     for wrong in ("no place", text * 2, text.replace("load", "others")):
@@ -177,7 +179,7 @@ def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     text = Path(page).read_text()
-    for what in ("400 Hz, 2 | this, ROS", "400 Hz, 4 loops: wrench, "):
+    for what in ("400 Hz, 2: this, ROS", "400 Hz, 4 loops: wrench, "):
         assert f"| {what}" in text, what
     content = json.loads((tmp_path / "b.json").read_text())
     assert all(map(math.isfinite, numbers(content)))

@@ -9,13 +9,14 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import add_force, add_imu_units, parser, position
+from bota_clients.arguments import add_force, add_imu_units, position
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
 from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
+from bota_ethercat.program.arguments import Parser
 from bota_ethercat.program.new_file import NewFile
 
 _PROGRAM: Final = "ethercat-export"
@@ -50,7 +51,7 @@ class ExportOptions(argparse.Namespace):
 
 def parse_options(argv: Sequence[str] | None) -> ExportOptions:
     """Read the command line; argparse exits with 2 if it is wrong."""
-    made = parser(
+    made = Parser(
         _PROGRAM,
         "Writes the samples of a recording as CSV: a line of names with units, then one per sample.",
         "For pandas.read_csv(FILE, parse_dates=['stamp_utc']), MATLAB's readtable, or a spreadsheet.",

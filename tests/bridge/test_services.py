@@ -148,7 +148,7 @@ def test_without_a_server(node: Node, scripted: Server) -> None:
     node.refuse("sensor_tare", "the server at localhost:12001 is gone: the connection ended before the reply")
     node.run(0.1)
     assert node.parameters(*NAMES) == [None] * 4
-    refused = "there is no server at localhost:12001"
+    refused = "no server at localhost:12001"
     for done, text in (
         node.trigger("sensor_tare"),
         node.trigger("tare"),

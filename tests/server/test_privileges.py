@@ -260,6 +260,24 @@ def confined(capabilities: Iterable[str]) -> dict[str, Any]:
     return {"under": [*rights.readable(), *become(capabilities)], "python": rights.PYTHON}
 
 
+@pytest.mark.long
+@on_a_bus
+def test_an_ordinary_user_has_a_virtual_bus_in_namespaces_of_its_own() -> None:
+    limits = confined(())
+    user = ("setpriv", f"--reuid={NOBODY.pw_uid}", f"--regid={NOBODY.pw_gid}", "--clear-groups")
+    rights.need(*user, "unshare", "--user", "--net")
+    with server("virtual", **limits) as found:
+        assert rows_of(found.process.pid)["Uid"].split() == [str(NOBODY.pw_uid)] * 4
+        assert found.ifname not in dict(socket.if_nameindex()).values()
+        for uid in (None, NOBODY.pw_uid):
+            with found.connect(uid) as client:
+                assert client.ask("subscribe")["interface"] == found.ifname
+                client.fresh(50)
+                assert client.ask("configure", settings={"fir": uid is None})["ok"]
+        found.signal(signal.SIGTERM)
+        assert found.wait() == 0
+
+
 @on_a_bus
 def test_the_units_capabilities_are_enough_for_everything(spare: Veth) -> None:
     (ambient,) = values(SERVER_UNIT, "AmbientCapabilities")
