@@ -50,15 +50,6 @@ def test_eeprom_shows_the_words_and_what_they_mean(bench: SimulatedBus) -> None:
     assert found["fmmus"] == [1, 2, 3]
 
 
-def test_eeprom_of_a_chain(chain: SimulatedBus) -> None:
-    found = told("eeprom", chain.near)["slaves"]
-    # Each slave's own name, though pysoem gives the second one the first one's.
-    assert [row["name"] for row in found] == ["BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8"]
-    assert [row["sync_managers"][3]["size"] for row in found] == [77, 77]
-    only = told("eeprom", chain.near, "--sensor", "20")["slaves"]
-    assert [row["sensor"] for row in only] == [1]
-
-
 def test_every_object_is_read_and_decoded(bench: SimulatedBus) -> None:
     found = told("objects", bench.near)["sensors"][0]
     assert (found["name"], found["serial"]) == ("BFT-SENS-ECAT-M8", 4711)
