@@ -30,7 +30,6 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
-from tests.clients.pictures import DOCS
 from tests.clients.running import frames_in
 from tests.rights import NO_OTHER_USER
 from tests.served_simulation import ServedSimulation, served
