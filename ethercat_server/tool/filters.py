@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat.program.arguments import number
 from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
 from bota_ethercat.sensor.response import Response, Source, force_torque_response, noise_bandwidth
 from bota_ethercat.settings import start_up_defaults
@@ -18,6 +19,7 @@ from ethercat_server.tool.command import DONE, Command, argument, columns, say, 
 FREQUENCIES_HZ: Final = (5, 10, 20, 50)
 DESIGNED_DEG: Final = 60.0  # phase margin of the loop if its sensor were ideal
 LEAST_DEG: Final = 30.0  # of it that a recommended setting leaves
+_HERTZ: Final = number(0.1, 100_000)
 # What Bota's own test allows at two SINC lengths: standard deviation of Fx and Fy, N.
 _NOISE_LIMITS: Final = ((51, 0.6), (1024, 0.1))
 
@@ -103,13 +105,6 @@ def recommend(found: Sequence[Choice], loop_hz: float) -> tuple[Choice, str]:
     )
 
 
-def _hertz(text: str) -> float:
-    value = float(text)
-    if not 0.1 <= value <= 100_000:
-        raise argparse.ArgumentTypeError("from 0.1 to 100000")
-    return value
-
-
 def _filters(args: argparse.Namespace) -> int:
     bandwidth_hz = args.bandwidth or args.loop / 10
     found = choices(bandwidth_hz)
@@ -135,8 +130,8 @@ COMMANDS = (
     Command(
         "filters", "filters for a control loop: noise, delay, phase margin; needs no sensor",
         (
-            argument("--loop", "rate of the control loop", metavar="HZ", type=_hertz, required=True),
-            argument("--bandwidth", "its bandwidth (default: loop / 10)", metavar="HZ", type=_hertz),
+            argument("--loop", "rate of the control loop", metavar="HZ", type=_HERTZ, required=True),
+            argument("--bandwidth", "its bandwidth (default: loop / 10)", metavar="HZ", type=_HERTZ),
         ),
         _filters,
     ),

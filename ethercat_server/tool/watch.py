@@ -14,6 +14,7 @@ from bota_ethercat.health.judge import Observation, judge
 from bota_ethercat.health.observer import COMMON, StreamObserver
 from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS
+from bota_ethercat.program.arguments import seconds
 from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import number, whole
@@ -119,16 +120,6 @@ def _line(row: dict[str, Any]) -> str:
     return "  ".join([*parts, *(f"{each['severity']}: {each['meaning']}" for each in row["warnings"])])
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < 1e9:
-        raise ValueError(text)
-    return value
-
-
-_positive.__name__ = "positive number"
-
-
 def _watch(args: argparse.Namespace) -> int:
     if args.samples is not None and args.samples < 1:
         raise UsageError(f"--samples {args.samples}: it must be 1 or more")
@@ -162,8 +153,8 @@ COMMANDS: Final = (
         (
             *sensor_arguments(all_if_none=True),
             argument("--samples", "stop after N samples of each sensor", type=int, metavar="N"),
-            argument("--seconds", "stop after S seconds", type=_positive, metavar="S"),
-            argument("--interval", "time between two lines (%(default)s)", type=_positive, metavar="S",
+            argument("--seconds", "stop after S seconds", type=seconds, metavar="S"),
+            argument("--interval", "time between two lines (%(default)s)", type=seconds, metavar="S",
                      default=1.0),
         ),
         _watch,

@@ -21,7 +21,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bota_clients.arguments import number
+from bota_ethercat.program.arguments import number
 from scripts.benchmarks import contact, path
 from scripts.benchmarks.chain import (
     OVERSAMPLING_HZ,

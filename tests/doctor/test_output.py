@@ -38,7 +38,7 @@ from tests.server.running import PATIENCE_S
     [
         ([], "name an interface, or a server: no server at localhost:12001 (Connection refused)"),
         (["ens5", "--colour"], "usage: ethercat-doctor"),
-        (["ens5", "--seconds", "soon"], "invalid number value"),
+        (["ens5", "--seconds", "soon"], "must be from 0 to 3600"),
         (["ens5", "--seconds", "-1"], "from 0 to 3600"),
         (["ens5", "--cpu", "4000"], "--cpu 4000: this machine has the processors 0 to"),
         (["ens5", "--rt-priority", "100"], "--rt-priority: must be a whole number from 0 to 99, not '100'"),

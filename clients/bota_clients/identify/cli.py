@@ -10,10 +10,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import add_force, add_imu_units, number, position
+from bota_clients.arguments import add_force, add_imu_units, position
 from bota_clients.program import start
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, number
 from ft_compensation.quantities import StationaryLimits
 
 _LIMITS: Final = tuple(field.name for field in fields(StationaryLimits))
