@@ -21,7 +21,7 @@ from bota_ethercat.health import history
 from bota_ethercat.health.judge import Observation, emergency, judge
 from bota_ethercat.health.observer import StreamObserver
 from bota_ethercat.health.verdict import LIMITS, Level
-from bota_ethercat.text.untrusted import number
+from bota_ethercat.text.untrusted import mapping, number
 from ethercat_server.access.adapters import Holder, find_holder, links
 from ethercat_server.access.private_server import open_interface
 from ethercat_server.access.sensors import Sensors
@@ -329,7 +329,6 @@ class ServerView:
     def observation(self, position: int) -> Observation:
         """What was seen of a sensor's stream."""
         described, after = self.described[position], self.after["sensors"][position]
-        settings = described.get("settings")
         fates = [event["event"] for event in self._events if event.get("sensor") == position]
         return (
             self._observers[position]
@@ -344,7 +343,7 @@ class ServerView:
                 state=str(described["state"]),
                 emergency=emergency(after.get("emergency")),
                 drift=history.drift(after, LIMITS),
-                settings=settings if isinstance(settings, dict) else {},
+                settings=mapping(described.get("settings")),
             )
         )
 

@@ -15,6 +15,7 @@ import pytest
 
 from bota_clients.report.checks import Check, Examination
 from bota_clients.report.series import CHANNELS, Subject, limit_origin, noise_limit, subject
+from bota_clients.report.subjects import past
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
@@ -353,3 +354,9 @@ def test_limits_are_botas_at_the_published_lengths_and_between_them_in_between()
     assert "own test limits for SINC 51" in limit_origin(51)
     assert "interpolated between" in limit_origin(64)
     assert "extrapolated from" in limit_origin(32)
+
+
+def test_what_the_server_says_of_the_past_is_not_trusted() -> None:
+    drift = {"wrench": [2.0, 0, 0, 0, 0, 0], "ago_s": 60, "kelvin": 0}
+    status = {"sensors": [{"sensor": []}, {"sensor": 0, "drift": drift, "history": 7}]}
+    assert past(status, 0) == ["Fx has drifted 2.0 N since the start 1 min ago."]

@@ -27,7 +27,7 @@ from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import SETTINGS, SettingValue
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import number, rows, text, whole
+from bota_ethercat.text.untrusted import mapping, number, rows, text, whole
 
 SILENT_S: Final = LIMITS.stale_after  # a server normally sends a frame per sample period
 _WRENCH: Final = tuple(COMMON.index(f.name) for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
@@ -252,7 +252,7 @@ class _Sensor:
             self._seen[finding.key] = worst, now_s
 
     def _observation(self, now_s: float) -> Observation:
-        mode = _mapping(self._status.get("clock")).get("mode")
+        mode = mapping(self._status.get("clock")).get("mode")
         said, at_s = self._emergency
         grown = {name: by for name, (by, then_s) in self._grown.items() if now_s - then_s < _JUDGED_S}
         seen = self.observer.observation(_ns(now_s), _JUDGED_NS)
@@ -266,7 +266,7 @@ class _Sensor:
             state=text(self._row.get("state")),
             emergency=said if now_s - at_s < LIMITS.emergency_s else "",
             drift=history.drift(self._status, LIMITS),
-            settings=_mapping(self._row.get("settings")),
+            settings=mapping(self._row.get("settings")),
         )
 
     def state(self, now_s: float, *, server_speaks: bool) -> SensorState:
@@ -283,7 +283,7 @@ class _Sensor:
             if key not in keys
         ]
         row, status, clock = self._row, self._status, self._status.get("clock")
-        settings = _mapping(row.get("settings"))
+        settings = mapping(row.get("settings"))
         sample = self._newest and SampleDecoder(len(self._newest), self._imu_units).decode(self._newest)
         return SensorState(
             position=self.position,
@@ -386,7 +386,7 @@ class Model:
         """A reply to `status`."""
         with self._lock:
             self._heard_s = now_s
-            ages: Any = _mapping(status.get("last_10s")).get("age_us")
+            ages: Any = mapping(status.get("last_10s")).get("age_us")
             for place, row in enumerate(rows(status.get("sensors"))):
                 if (sensor := self._sensor(row)) is not None:
                     hand_out = ages[place] if isinstance(ages, list) and place < len(ages) else None
@@ -433,7 +433,7 @@ class Model:
             if now_s > self._message_ends_s:
                 self._message = None
             status, connected = self._status, self._server.connected
-            timing = _mapping(status.get("last_10s")) or status
+            timing = mapping(status.get("last_10s")) or status
             up_s = number(status.get("uptime_s"))
             server = replace(
                 self._server,
@@ -458,7 +458,7 @@ class Model:
 
     def _describe(self, description: JsonObject, now_s: float, *, anew: bool) -> None:
         replay = description.get("replay")
-        files = _mapping(replay).get("files")
+        files = mapping(replay).get("files")
         name = text(files[0]) if isinstance(files, list) and files else "a recording"
         replayed = name if isinstance(replay, dict) else ""
         self._server = replace(self._server, version=text(description.get("version")), replay=replayed)
@@ -490,12 +490,8 @@ def _widest(one: Range, other: Range) -> Range:
 
 def _spread(values: Any) -> Spread | None:
     """The distribution in a reply to `status`; None if there is none."""
-    middle, end = number(_mapping(values).get("p50")), number(_mapping(values).get("p99"))
+    middle, end = number(mapping(values).get("p50")), number(mapping(values).get("p99"))
     return None if middle is None or end is None else Spread(middle, end)
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, dict) else {}
 
 
 def _ns(seconds: float) -> int:

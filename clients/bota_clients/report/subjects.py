@@ -33,7 +33,6 @@ from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import history
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.sensor_choice import SensorChoice
-from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
 _MOST_EVENTS_NAMED: Final = 10
@@ -184,17 +183,17 @@ def of_server(
             show(completed=passed)
             recorder.put(source.batch(min(_BATCH_S, seconds - passed)))
         recorder.stop("")
-        past: dict[object, JsonObject] = {}
+        status: Mapping[str, Any] = {}
         with contextlib.suppress(ProtocolError):  # the stream is enough
-            past = {row.get("sensor"): row for row in rows(source.ask("status").get("sensors"))}
+            status = source.ask("status")
         subjects = of_recording(path, choice, imu_units, str(address))
-        return [each.with_remarks(_past(past.get(each.position, {}))) for each in subjects]
+        return [each.with_remarks(past(status, each.position)) for each in subjects]
 
 
-def _past(row: Mapping[str, Any]) -> list[str]:
-    """What the server knows of a sensor's past."""
+def past(status: Mapping[str, Any], position: int) -> list[str]:
+    """What the server knows of a sensor's past, from its reply to `status`: sentences."""
+    row = next((row for row in rows(status.get("sensors")) if row.get("sensor") == position), {})
     overload, overloaded = history.overload(row)
     texts = [history.drift(row), history.temperature_line(row), overload]
-    return [f"{text[0].upper()}{text[1:]}." for text in texts if text] + (
-        ["Have it checked for damage by overload."] if overloaded else []
-    )
+    texts += ["have it checked for damage by overload"] if overloaded else []
+    return [f"{text[0].upper()}{text[1:]}." for text in texts if text]
