@@ -8,9 +8,7 @@ run; one that comes again changes nothing.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +18,8 @@ import numpy as np
 
 from ethercat_server.virtual_sensor.filters import LoadFilter
 from scripts.benchmarks import modes
-from scripts.benchmarks.chain import OVERSAMPLING_HZ, Figures, ScriptError, Setup, Turn
+from scripts.benchmarks.chain import OVERSAMPLING_HZ, Figures, Setup, Turn
 from scripts.benchmarks.modes import BARE_C, DRIVER, THIS
-from scripts.benchmarks.processes import masters
 from scripts.benchmarks.statistics import Floats
 
 FORCE: Final = 10.0  # N that is wanted
@@ -111,12 +108,8 @@ def stiffest(sinc: int, fir: bool, delivery: Delivery) -> float:
 
 def measure(setup: Setup, with_driver: bool, picture: Path | None) -> list[Figures]:
     """A row for each program; the picture, if there is to be one."""
-    names = [THIS]
-    with contextlib.suppress(ScriptError):
-        masters.build(Path(os.environ["DEMO_DIRECTORY"]))
-        names.append(BARE_C)
-    if with_driver and [*modes.VENDOR.glob("has-bota-driver*")]:
-        names.append(DRIVER)
+    missing = modes.find_missing(with_driver)
+    names = [name for name in (THIS, BARE_C, DRIVER)[: 2 + with_driver] if name not in missing]
     delivered = {}
     for sinc in {sinc for sinc, _ in FILTERS.values()}:
         at = replace(setup, rate_hz=OVERSAMPLING_HZ // sinc)

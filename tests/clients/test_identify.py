@@ -90,7 +90,7 @@ def refused(*arguments: object) -> str:
 
 def periods(path: Path, least_seconds: float = 1.0) -> list[StationaryPeriod]:
     with open_recording(path) as opened:
-        found, rejected = find_stationary_periods(columns(opened), least_seconds)
+        found, rejected = find_stationary_periods(columns(opened.frames()), least_seconds)
     assert rejected == []
     return found
 

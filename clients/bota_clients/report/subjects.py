@@ -90,24 +90,19 @@ def _meant(sensor: RecordedSensor, choice: SensorChoice | None) -> list[int]:
     ]
 
 
-class _Frames:
-    """The frames of one sensor, and how many of them came before each entry of its history."""
+def _frames(recording: Recording, sensor: int, before: list[int]) -> Iterator[DataMessage]:
+    """The frames of a sensor; `before` gets how many of them came before each entry of its history.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self.before: list[int] = []
-
-    def frames(self, sensor: int | None = None) -> Iterator[DataMessage]:
-        """Its frames. The order in the file decides what came first, because clocks differ."""
-        assert sensor is not None
-        histories, so_far = Histories(), 0
-        for item in self._recording.everything(sensor):
-            if isinstance(item, DataMessage):
-                so_far += 1
-                yield item
-            else:
-                histories.take(item)
-                self.before += [so_far] * (len(histories.of(sensor)) - len(self.before))
+    The order in the file decides what came first, because clocks differ.
+    """
+    histories, so_far = Histories(), 0
+    for item in recording.everything(sensor):
+        if isinstance(item, DataMessage):
+            so_far += 1
+            yield item
+        else:
+            histories.take(item)
+            before += [so_far] * (len(histories.of(sensor)) - len(before))
 
 
 def _subject(
@@ -118,12 +113,12 @@ def _subject(
     source: str,
 ) -> Subject:
     """Its longest stretch without a change of settings or sensor."""
-    counted, history = _Frames(recording), sensor.history
-    frames = columns(counted, sensor.sensor, imu_units)
+    before, history = list[int](), sensor.history
+    frames = columns(_frames(recording, sensor.sensor, before), imu_units)
     row, values, remarks = sensor._asdict(), None, list[str]()
     if history:
         # The first settings were in effect before they were received.
-        ends = [0, *counted.before[1:], len(frames)]
+        ends = [0, *before[1:], len(frames)]
         longest = max(_meant(sensor, choice), key=lambda number: ends[number + 1] - ends[number])
         kept, numbers = history[longest], np.arange(len(frames))
         row |= {**kept.identity._asdict(), "rate_hz": kept.rate_hz}
