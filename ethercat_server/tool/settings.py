@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
 from bota_ethercat.errors import SettingError
+from bota_ethercat.pdo import AXES
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.tare_memory import former, remember
 from bota_ethercat.sensor.meaning import meaning, value_meaning
@@ -172,8 +173,6 @@ def _save(args: argparse.Namespace) -> int:
 
 # -- tare
 
-_AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-
 
 def _tare(args: argparse.Namespace) -> int:
     if not 1 <= args.samples <= MAX_TARE_SAMPLES:
@@ -196,7 +195,7 @@ def _tare(args: argparse.Namespace) -> int:
     except OSError as error:
         note(f"--undo will not know this tare: {error.strerror or error}")
     rows: list[tuple[str, ...]] = [("", *(key.replace("_", " ") for key in keys), "")]
-    for n, axis in enumerate(_AXES):
+    for n, axis in enumerate(AXES):
         rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
     lines = columns(rows, indent=2), _lasts(opened, _TARE_IN_SERVER)
     report(args.json, opened, found, {key: tared[key] for key in keys}, *lines)
@@ -420,7 +419,7 @@ COMMANDS: Final = (
         (
             *_SENSOR,
             argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
-            argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=_AXES),
+            argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=AXES),
             one_of(
                 argument("--undo", "restore the offset of before the last tare"),
                 argument("--clear", "set the offset to zero"),

@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from bota_ethercat.control import known_six
 from bota_ethercat.health.verdict import LIMITS, Limits
+from bota_ethercat.pdo import AXES
 from bota_ethercat.text.untrusted import mapping, number, whole
 
-AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _UNITS: Final = ("N", "N", "N", "Nm", "Nm", "Nm")
 _SINCE: Final = {"tare": "the tare", "change": "its settings changed", "return": "it came back"}
 _LAST_DAY: Final = 4e9  # s of the Unix epoch

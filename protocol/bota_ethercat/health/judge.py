@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
-from bota_ethercat.health.history import AXES
 from bota_ethercat.health.sentences import STOOD_STILL
 from bota_ethercat.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
+from bota_ethercat.pdo import AXES
 from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain
 from bota_ethercat.text.untrusted import mapping, number, printable, whole
 
