@@ -213,7 +213,7 @@ def _taken_back(opened: Sensors, found: Found, *, undo: bool) -> dict[str, Seque
         try:
             after = former(found.identity.serial, before, str(found))
         except ValueError as error:
-            raise BusError(f"{error}: use --clear, or tare again") from None
+            raise BusError(str(error)) from None
     with signals_held_back():
         try:
             finish(write_offset(sdo, after), clock=opened.clock)

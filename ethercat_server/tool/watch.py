@@ -11,7 +11,7 @@ from typing import Any, Final
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.judge import Observation, judge
-from bota_ethercat.health.observer import COMMON, StreamObserver
+from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
 from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.program.arguments import seconds
@@ -89,10 +89,10 @@ def _follow(opened: Sensors, args: argparse.Namespace, watched: Mapping[int, _Wa
     awaited = set[int]()
     for frames, events in opened.stream(sensors=list(watched), fresh_only=False):
         settling = {event["sensor"] for event in events if _tell(opened, event, watched)}
+        came = by_sensor(frames)
         for sensor, each in watched.items():
             left = 0 if sensor in awaited | settling else most - each.samples
-            of_one = [frame for frame in frames if frame.sensor == sensor]
-            each.take(of_one, opened.clock.monotonic_ns(), left)
+            each.take(came.get(sensor, []), opened.clock.monotonic_ns(), left)
         if end.passed or all(each.samples >= most for each in watched.values()):
             return
         opened.wait_settled(settling)

@@ -12,15 +12,13 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import groupby
-from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import history
 from bota_ethercat.health.judge import Observation, emergency, judge, saturated_axes
-from bota_ethercat.health.observer import COMMON, StreamObserver
+from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
 from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
@@ -35,7 +33,6 @@ _WINDOW_NS: Final = 5 * 10**9  # of rate, jitter and age
 _JUDGED_NS: Final = 10**9  # of a verdict
 _JUDGED_S: Final = _JUDGED_NS * 1e-9
 _MESSAGE_S: Final = 30.0
-_POSITION: Final = attrgetter("sensor")
 
 
 class Range(NamedTuple):
@@ -372,9 +369,9 @@ class Model:
         with self._lock:
             if frames:
                 self._heard_s = now_s
-            for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
+            for position, of_one in by_sensor(frames).items():
                 if position in self._sensors:
-                    self._sensors[position].take(list(of_one), now_s)
+                    self._sensors[position].take(of_one, now_s)
 
     def note_age(self, frame: DataMessage, now_ns: int) -> None:
         """This frame arrived exactly at this CLOCK_MONOTONIC."""

@@ -20,11 +20,8 @@ _LAST_DAY: Final = 4e9  # s of the Unix epoch
 def drift(row: Mapping[str, Any], limits: Limits | None = None) -> str:
     """How far the zero has drifted; with `limits`, empty unless that is worth a look."""
     found, least = mapping(row.get("drift")), limits or LIMITS
-    wrench, ago_s, kelvin = (
-        known_six(found.get("wrench")),
-        number(found.get("ago_s")),
-        number(found.get("kelvin")),
-    )
+    wrench, ago_s = known_six(found.get("wrench")), number(found.get("ago_s"))
+    kelvin = number(found.get("kelvin"))
     if wrench is None or ago_s is None or kelvin is None:
         return ""
     share = [abs(v) / (least.drift_force if n < 3 else least.drift_torque) for n, v in enumerate(wrench)]
@@ -62,11 +59,8 @@ def line_slope(row: Mapping[str, Any]) -> list[float] | None:
 def overload(row: Mapping[str, Any]) -> tuple[str, bool]:
     """The largest wrench, and whether the sensor was ever overloaded; empty if that is not known."""
     found = mapping(row.get("history"))
-    peak, since, last = (
-        known_six(found.get("peak")),
-        _day(found.get("since")),
-        _day(found.get("saturated_at")),
-    )
+    peak = known_six(found.get("peak"))
+    since, last = _day(found.get("since")), _day(found.get("saturated_at"))
     if peak is None or not since:
         return "", False
     largest = ", ".join(f"{a} {value:.3g} {u}" for a, value, u in zip(AXES, peak, _UNITS, strict=True))
