@@ -1,7 +1,7 @@
 """What a fresh sample is worth in contact: a simulated axis presses on a wall, by samples as old as measured.
 
 The axis follows the commanded velocity with a lag; the controller commands, once a millisecond, a velocity
-in proportion to the force that lacks by the newest sample. Samples pass through the virtual sensor's filters,
+proportional to the force error of the newest sample. Samples pass through the virtual sensor's filters,
 without noise. When each arrives, and which are lost, is as with the program that delivered samples in this
 run; one that comes again changes nothing.
 """
@@ -22,8 +22,8 @@ from scripts.benchmarks.chain import OVERSAMPLING_HZ, Figures, Setup, Turn
 from scripts.benchmarks.modes import BARE_C, DRIVER, THIS
 from scripts.benchmarks.statistics import Floats
 
-FORCE: Final = 10.0  # N that is wanted
-GAIN: Final = 0.002  # m/s for each N that lacks
+FORCE: Final = 10.0  # set point, N
+GAIN: Final = 0.002  # m/s for each N of error
 APPROACH: Final = 0.02  # m/s at most
 LAG_S: Final = 0.002  # of the axis behind its command
 CYCLE_S: Final = 0.001  # of the controller
@@ -89,7 +89,7 @@ def press(wall: float, sinc: int, fir: bool, delivery: Delivery) -> Floats:
 
 
 def overshoot(forces: Floats) -> float:
-    """Above the wanted force, N."""
+    """Above the set point, N."""
     return max(0.0, float(forces.max()) - FORCE)
 
 

@@ -115,7 +115,7 @@ class SensorState:
     lost_on_bus: int | None = None
     recoveries: int | None = None
     hand_out_us: Spread | None = None  # age when the server hands them out
-    zero: str = ""  # how far it has drifted, and how it goes by temperature, in words
+    zero: str = ""  # its drift, and its slope by temperature, in words
 
     @property
     def units(self) -> tuple[str, str]:

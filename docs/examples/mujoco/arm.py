@@ -32,7 +32,7 @@ _LARGEST_LAG_S: Final = 0.05  # behind which no step is made up for
 class Arm:
     """Six position-controlled joints in MuJoCo, one step a millisecond.
 
-    `velocity` (3,), m/s, is what the tip is to have, in the base's frame, without turning.
+    `velocity` (3,), m/s, is commanded of the tip, in the base's frame, without turning.
     """
 
     def __init__(self) -> None:

@@ -36,7 +36,7 @@ def drift(row: Mapping[str, Any], limits: Limits | None = None) -> str:
 
 
 def temperature_line(row: Mapping[str, Any]) -> str:
-    """How the zero goes by temperature, with 95 % intervals; empty if that is not known."""
+    """The slope of the offset by temperature, with 95 % intervals; empty if that is not known."""
     found, slope = mapping(row.get("temperature_line")), line_slope(row)
     if slope is None:
         return ""
@@ -48,7 +48,7 @@ def temperature_line(row: Mapping[str, Any]) -> str:
 
 
 def line_slope(row: Mapping[str, Any]) -> list[float] | None:
-    """N/K and Nm/K by axis, 0 where the line is not told from none; None if there is no line."""
+    """N/K and Nm/K by axis, 0 where it is not significant; None if there is no line."""
     found = mapping(row.get("temperature_line"))
     slope, interval = known_six(found.get("slope")), known_six(found.get("interval"))
     if slope is None or interval is None:
