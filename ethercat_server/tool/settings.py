@@ -37,7 +37,6 @@ from ethercat_server.tool.command import (
     Command,
     argument,
     columns,
-    one_of,
     report,
     sensor_arguments,
     sensor_of,
@@ -177,6 +176,8 @@ def _save(args: argparse.Namespace) -> int:
 def _tare(args: argparse.Namespace) -> int:
     if not 1 <= args.samples <= MAX_TARE_SAMPLES:
         raise UsageError(f"--samples {args.samples}: it must be from 1 to {MAX_TARE_SAMPLES}")
+    if args.undo and args.clear:
+        raise UsageError("--undo and --clear exclude each other: give one of them")
     if not all(map(math.isfinite, args.target)):
         raise UsageError("--target must be six finite numbers: Fx Fy Fz in N, Mx My Mz in Nm")
     try:
@@ -420,10 +421,8 @@ COMMANDS: Final = (
             *_SENSOR,
             argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
             argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=AXES),
-            one_of(
-                argument("--undo", "restore the offset of before the last tare"),
-                argument("--clear", "set the offset to zero"),
-            ),
+            argument("--undo", "restore the offset of before the last tare"),
+            argument("--clear", "set the offset to zero"),
         ),
         _tare,
     ),

@@ -199,6 +199,6 @@ def _solve(
     if not poses:
         return poses, None, error
     try:
-        return poses, identify([pose for _, pose in poses], confidence=options.confidence), None
+        return poses, identify([pose for _, pose in poses]), None
     except CompensationError as refusal:
         return poses, None, str(refusal)
