@@ -359,6 +359,5 @@ def test_limits_are_botas_at_the_published_lengths_and_between_them_in_between()
 
 
 def test_what_the_server_says_of_the_past_is_not_trusted() -> None:
-    drift = {"wrench": [2.0, 0, 0, 0, 0, 0], "ago_s": 60, "kelvin": 0}
-    status = {"sensors": [{"sensor": []}, {"sensor": 0, "drift": drift, "history": 7}]}
-    assert past(status, 0) == ["Fx has drifted 2.0 N since the start 1 min ago."]
+    row = {"sensor": 0, "drift": {"wrench": [2, 0, 0, 0, 0, 0], "ago_s": 60, "kelvin": 0}, "history": 7}
+    assert past({"sensors": [{"sensor": []}, row]}, 0) == ["Fx has drifted 2.0 N since the start 1 min ago."]
