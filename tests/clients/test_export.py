@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from bota_clients import export as program
-from bota_clients.export import COLUMNS, main
+from bota_clients.export import table as program
+from bota_clients.export.cli import main
+from bota_clients.export.table import COLUMNS
 from bota_ethercat.framing import DataFlag
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
 from tests.ended import Result, run_here

@@ -25,6 +25,7 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import rows, visible
 
 _MAX_NOTES: Final = 1_000_000  # descriptions and events
+_BATCH: Final = 65536  # frames
 _LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions
 
 
@@ -209,6 +210,25 @@ class Recording(McapFile):
     def everything(self, sensor: int | None = None) -> Iterator[DataMessage | Description | Event]:
         """Descriptions, events and the frames of the sensor at this position, or of all, as they came."""
         return self._read(self._channels(sensor) | self._noted)
+
+    def batches(self, sensor: int) -> Iterator[tuple[Settings, list[DataMessage]]]:
+        """Frames of the sensor at this position, a few thousand at once, with the settings in force."""
+        histories, frames = Histories(), list[DataMessage]()
+        known = [each.history for each in self.sensors if each.sensor == sensor and each.history]
+        settings = known[0][0] if known else Settings()
+        for item in self.everything(sensor):
+            if isinstance(item, DataMessage):
+                frames.append(item)
+                if len(frames) < _BATCH:
+                    continue
+            else:
+                histories.take(item)
+            if frames:
+                yield settings, frames
+                frames = []
+            settings = (histories.of(sensor) or (settings,))[-1]
+        if frames:
+            yield settings, frames
 
     def _channels(self, sensor: int | None) -> set[int]:
         return {number for number, position in self._sensor_of.items() if sensor in (None, position)}

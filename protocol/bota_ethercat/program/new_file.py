@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A text file that is written whole or not at all, and that replaces nothing without --force."""
+"""A file that is written whole or not at all, and that replaces nothing without --force."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import BinaryIO, Final, Self, cast
 
 from bota_ethercat.errors import FileError
 
@@ -40,6 +40,11 @@ class NewFile:
                 self._beside = self._target.with_name(f".unfinished-{secrets.token_hex(4)}")
             self._in_place = self._beside == self._target
             self._file = self._beside.open("w" if self._in_place else "x", encoding="utf-8", newline="\n")
+
+    @property
+    def binary(self) -> BinaryIO:
+        """To write bytes into the file, instead of `write`; with the errors of the system."""
+        return cast(BinaryIO, self._file.buffer)
 
     def write(self, text: str) -> None:
         """Add text."""

@@ -1,24 +1,25 @@
-"""`ethercat-export`: a recording as CSV, for pandas, MATLAB and spreadsheets."""
+"""A recording as CSV, for pandas, MATLAB and spreadsheets."""
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from functools import cache, partial
-from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import add_force, add_imu_units, parser, position
+from rich.console import Console
+from rich.progress import track
+
 from bota_clients.errors import RecordingError
+from bota_clients.export.cli import PROGRAM, ExportOptions
 from bota_clients.numbers import count
-from bota_clients.program import interrupt_on_signals, say, start
+from bota_clients.program import interrupt_on_signals, say
+from bota_clients.recording.reader import open_recording
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
 from bota_ethercat.program.new_file import NewFile
 
-_PROGRAM: Final = "ethercat-export"
 _SECOND: Final = 1_000_000_000
 _VECTORS: Final = (("force", "N"), ("torque", "Nm"), ("acceleration", "m_s2"), ("angular_rate", "rad_s"))
 _FLAGS: Final = (DataFlag.GAP, DataFlag.REPEATED, DataFlag.INVALID)
@@ -34,39 +35,7 @@ COLUMNS: Final = (
     *_REGISTERS,
 )  # fmt: skip
 
-_say = partial(say, _PROGRAM)
-
-
-class ExportOptions(argparse.Namespace):
-    """What to export, and where to."""
-
-    recording: Path
-    output: Path
-    sensor: int | None
-    all: bool
-    imu_units: ImuUnits
-    force: bool
-
-
-def parse_options(argv: Sequence[str] | None) -> ExportOptions:
-    """Read the command line; argparse exits with 2 if it is wrong."""
-    made = parser(
-        _PROGRAM,
-        "Writes the samples of a recording as CSV: a line of names with units, then one per sample.",
-        "For pandas.read_csv(FILE, parse_dates=['stamp_utc']), MATLAB's readtable, or a spreadsheet.",
-    )
-    add = made.add_argument
-    add("recording", type=Path, metavar="FILE.mcap", help="a recording of ethercat-record")
-    add("output", type=Path, nargs="?", metavar="OUT.csv", help="file to write (default: FILE.csv)")
-    add("--sensor", type=position, metavar="N", help="only the sensor at this position on the bus")
-    add("--all", action="store_true", help="also frames that are no new sample: repeated, invalid")
-    add_imu_units(made)
-    add_force(made)
-    options = made.parse_args(argv, ExportOptions())
-    options.output = options.output or options.recording.with_suffix(".csv")
-    if options.output.absolute() == options.recording.absolute():
-        made.error("the table would overwrite the recording: give another name")
-    return options
+_say = partial(say, PROGRAM)
 
 
 class Table:
@@ -124,11 +93,6 @@ def _seconds(ns: int) -> str:
 
 def run(options: ExportOptions) -> int:
     """Export; returns the exit code. Ctrl-C ends it at any time and leaves no file."""
-    from rich.console import Console  # noqa: PLC0415 - needs the extra, and so do these
-    from rich.progress import track  # noqa: PLC0415
-
-    from bota_clients.recording.reader import open_recording  # noqa: PLC0415
-
     interrupt_on_signals()
     table, console = Table(options.imu_units, everything=options.all), Console(stderr=True)
     try:
@@ -153,8 +117,3 @@ def run(options: ExportOptions) -> int:
     left = f"; {count(table.left_out, 'frame')} without a new sample left out" if table.left_out else ""
     _say(f"{options.output}: {count(table.written, 'sample')}{left}")
     return 0
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Export; returns the exit code."""
-    return start(_PROGRAM, "export", parse_options(argv))

@@ -1,0 +1,252 @@
+"""When camera frames were taken: read from a table, a bag or a rate, and put on the server's clock.
+
+Frames are stamped by a wall clock, which may be set meanwhile. Every DATA frame has the stamps of both clocks
+of the server, so a recording has the history of their offset: by this the frames' stamps are put on
+CLOCK_MONOTONIC, which is never set.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Iterator, Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from bota_clients.errors import RecordingError
+from bota_clients.numbers import moment, seconds
+from bota_clients.recording.columns import Ints
+from bota_ethercat.errors import BadMessageError
+from bota_ethercat.text.json_text import parse_json_object
+
+_SECOND: Final = 1_000_000_000
+_LATEST_NS: Final = 4_102_444_800 * _SECOND  # the year 2100
+_NAMES: Final = ("stamp_ns", "timestamp_ns", "timestamp", "stamp", "time")  # of a column, if none is given
+_SCALES: Final = ((10**9, 1e11), (10**6, 1e14), (10**3, 1e17))  # ns in a unit, its numbers are smaller than
+_NONE: Final = np.zeros(0, np.int64)
+
+
+class Clock(NamedTuple):
+    """Another clock than the server's, as `ethercat-export align` finds it."""
+
+    stamp_ns: int  # of that clock, ...
+    monotonic_ns: int  # ... at this instant of the server's CLOCK_MONOTONIC
+    drift_ppm: float  # by which the server's is faster
+
+    def monotonic(self, stamps_ns: Ints) -> Ints:
+        """The server's CLOCK_MONOTONIC at these stamps, ns."""
+        passed = stamps_ns - self.stamp_ns
+        drifted: Ints = passed + np.rint(passed * (self.drift_ppm * 1e-6)).astype(np.int64)
+        return drifted + self.monotonic_ns
+
+    @classmethod
+    def read(cls, path: Path) -> Clock:
+        """From what `ethercat-export align --json` printed; RecordingError."""
+        try:
+            found = parse_json_object(path.read_bytes())
+            return cls(int(found["stamp_ns"]), int(found["monotonic_ns"]), float(found["drift_ppm"]))
+        except OSError as error:
+            raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
+        except (BadMessageError, KeyError, TypeError, ValueError, OverflowError):
+            raise RecordingError(f"{path} is not what 'ethercat-export align --json' prints") from None
+
+
+class FrameTimes:
+    """The frames' instants on the server's clock.
+
+    Attributes:
+        count: number of frames given; 0 for a rate.
+        instants_ns: (f,) by CLOCK_MONOTONIC, ascending, of the frames that the recording has reached.
+        stamps_ns: (count,) as given; of a rate, by CLOCK_REALTIME, as many as instants.
+    """
+
+    def __init__(
+        self,
+        stamps_ns: Ints | None = None,
+        *,
+        fps: float = 0.0,
+        latency_s: float = 0.0,
+        clock: Clock | None = None,
+        source: str = "the frames",
+    ) -> None:
+        """Stamps of frames, or their rate from the first sample on; RecordingError if they cannot be used.
+
+        `latency_s`: from the exposure to the stamp. `clock`: of the stamps, if it is not the server's
+        CLOCK_REALTIME. `source` is named in errors.
+        """
+        self.stamps_ns, self.instants_ns = _NONE if stamps_ns is None else stamps_ns, _NONE
+        self.count = len(self.stamps_ns)
+        self._period_ns, self._latency_ns = fps and _SECOND / fps, round(latency_s * _SECOND)
+        self._source = source
+        self._begin = self._newest = (-1, -1)  # both stamps of the first and of the newest DATA frame
+        # Where a stamp is before that of the frame before: the clock was set back, or they are not sorted.
+        self._descents = np.append(np.flatnonzero(np.diff(self.stamps_ns) < 0) + 1, self.count)
+        self._awaits_descent = False
+        if clock is not None:
+            if self._descents[0] < self.count:
+                raise self.refusal(int(self._descents[0]))
+            self._take(clock.monotonic(self.stamps_ns))
+
+    def follow(self, stamp_ns: Ints, monotonic_ns: Ints) -> None:
+        """Take both stamps of the next DATA frames."""
+        if not len(stamp_ns):
+            return
+        if self._begin[0] < 0:
+            self._begin = self._newest = int(stamp_ns[0]), int(monotonic_ns[0])
+        stamps = np.append(self._newest[0], stamp_ns)
+        instants = np.append(self._newest[1], monotonic_ns)
+        self._newest = int(stamps[-1]), int(instants[-1])
+        if self._period_ns:
+            last = int((instants[-1] - self._begin[1]) / self._period_ns)
+            numbers = np.arange(len(self.instants_ns), last + 1)
+            made = self._begin[1] + np.rint(numbers * self._period_ns).astype(np.int64)
+            self._take(made)
+            self.stamps_ns = np.append(self.stamps_ns, _interpolated(made, instants, stamps))
+            return
+        cuts = [0, *(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), len(stamps)]
+        for begin, end in itertools.pairwise(cuts):
+            # The clock was set between two samples, and frames of this time may be by either.
+            before_ns = int(instants[begin] - instants[begin - 1]) if begin else 0
+            after_ns = int(instants[end] - instants[end - 1]) if end < len(instants) else 0
+            if begin:
+                self._awaits_descent = False
+            self._map(stamps[begin:end], instants[begin:end], before_ns, after_ns)
+
+    def _map(self, stamps: Ints, instants: Ints, before_ns: int, after_ns: int) -> None:
+        """Take the frames from `before_ns` before these DATA frames, between which no clock was set, on."""
+        done = len(self.instants_ns)
+        if self._awaits_descent or done == self.count:
+            return
+        stop = int(self._descents[np.searchsorted(self._descents, done, "right")])
+        frames = self.stamps_ns[done:stop]
+        if frames[0] < stamps[0] - before_ns:
+            return
+        frames = frames[: np.searchsorted(frames, stamps[-1] + after_ns, "right")]
+        self._take(_interpolated(frames, stamps, instants))
+        self._awaits_descent = done + len(frames) == stop
+
+    def _take(self, instants_ns: Ints) -> None:
+        self.instants_ns = np.append(self.instants_ns, instants_ns - self._latency_ns)
+
+    def refusal(self, row: int) -> RecordingError:
+        """Why this frame has no window, where all before it have one."""
+        if not self.count:
+            return RecordingError("the recording is too short for a frame")
+        stamp_ns = int(self.stamps_ns[row])
+        which = f"row {row} of {self._source} (counted from 0; {moment(stamp_ns)})"
+        if row and stamp_ns < self.stamps_ns[row - 1]:
+            return RecordingError(
+                f"{which} is before the row above it, and the server's clock was not set then: sort the rows"
+            )
+        is_mapped = row < len(self.instants_ns)
+        at_ns = int(self.instants_ns[row]) if is_mapped else stamp_ns
+        begin_ns, end_ns = self._begin[is_mapped], self._newest[is_mapped]
+        is_early = at_ns < (begin_ns + end_ns) // 2
+        off_ns = begin_ns - at_ns if is_early else at_ns - end_ns
+        where = f"{seconds(max(off_ns, 0) * 1e-9)} {'before' if is_early else 'after'} the samples"
+        return RecordingError(
+            f"{which} is {where} of the recording ({moment(self._begin[0])} to {moment(self._newest[0])}): "
+            "leave it out, or find the offset of its clock with 'ethercat-export align'"
+        )
+
+
+def _interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
+    """One clock by another, beyond the ends at the same pace; all in ns, without loss of digits."""
+    inside = np.interp(at - here[0], here - here[0], there - there[0])
+    found: Ints = np.rint(inside).astype(np.int64) + there[0] + at - np.clip(at, here[0], here[-1])
+    return found
+
+
+def read_stamps(path: Path, column: str | None = None, topic: str | None = None) -> Ints:
+    """The frames' stamps, ns since 1970: of a column, or the `header.stamp` of a topic; RecordingError.
+
+    A column has ISO 8601, timestamps, or numbers: s, ms, µs or ns since 1970, as their magnitude tells.
+    """
+    try:
+        if topic is not None:
+            stamps = np.array([stamp_ns(message, topic) for message in messages(path, topic)], np.int64)
+        elif path.suffix == ".parquet":
+            stamps = _parquet_column(path, column)
+        elif path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
+            raise RecordingError(f"{path} is a bag: name the topic of the frames with --topic")
+        else:
+            with path.open(newline="", encoding="utf-8-sig") as file:
+                rows = csv.reader(file)
+                at = _column(path, next(rows, []), column)
+                stamps = _in_ns([row[at] if at < len(row) else "" for row in rows if row], str(path))
+    except (OSError, UnicodeError, csv.Error) as error:
+        raise RecordingError(f"{path} cannot be read: {error}") from None
+    if not len(stamps):
+        raise RecordingError(f"{path} has no frames")
+    if (wrong := np.flatnonzero((stamps < 0) | (stamps > _LATEST_NS))).size:
+        raise RecordingError(f"row {wrong[0]} of {path} (counted from 0) is no time since 1970")
+    return stamps
+
+
+def _column(path: Path, names: Sequence[str], wanted: str | None) -> int:
+    """The position of the column."""
+    choice = [name for name in ((wanted,) if wanted else _NAMES) if name in names]
+    if not choice and (wanted or len(names) != 1):
+        raise RecordingError(
+            f"{path} has the columns {', '.join(names)}: name that of the times with --column"
+        )
+    return names.index(choice[0]) if choice else 0
+
+
+def _parquet_column(path: Path, column: str | None) -> Ints:
+    from pyarrow import ArrowInvalid, compute, parquet, types  # noqa: PLC0415 - of the extra `dataset`
+
+    try:
+        names = parquet.read_schema(path).names
+        name = names[_column(path, names, column)]
+        found = parquet.read_table(path, columns=[name]).column(0)
+    except ArrowInvalid as error:
+        raise RecordingError(f"{path} cannot be read: {error}") from None
+    if types.is_timestamp(found.type):
+        return np.asarray(compute.cast(found, "timestamp[ns]").to_numpy().astype(np.int64))
+    return _in_ns(found.to_pylist(), str(path))
+
+
+def _in_ns(cells: Sequence[object], source: str) -> Ints:
+    found, scale = [], 0
+    for row, cell in enumerate(cells):
+        try:
+            number = Decimal(str(cell).strip())
+            scale = scale or next((scale for scale, most in _SCALES if abs(number) < most), 1)
+            found.append(int(number * scale))
+        except (InvalidOperation, ValueError, OverflowError):
+            text = str(cell).strip().removesuffix("Z").removesuffix("+00:00")
+            try:
+                found.append(int(np.datetime64(text, "ns").astype(np.int64)))
+            except ValueError:
+                raise RecordingError(
+                    f"row {row} of {source} (counted from 0) is {cell!r:.40}, no time"
+                ) from None
+    return np.array(found, np.int64)
+
+
+def messages(path: Path, topic: str) -> Iterator[Any]:
+    """The messages of a topic of a ROS bag (the folder, .mcap, .db3, .bag); RecordingError."""
+    from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 - of the extra `dataset`
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+            chosen = [each for each in bag.connections if each.topic == topic]
+            if not chosen:
+                there = ", ".join(sorted({each.topic for each in bag.connections}))
+                raise RecordingError(f"{path} has no topic {topic}, but {there}")
+            for connection, _, data in bag.messages(chosen):
+                yield bag.deserialize(data, connection.msgtype)
+    except (AnyReaderError, FileNotFoundError) as error:
+        raise RecordingError(f"{path} cannot be read as a bag: {error}") from None
+
+
+def stamp_ns(message: Any, topic: str) -> int:
+    """Its `header.stamp`, ns since 1970; RecordingError if it has none."""
+    if not hasattr(message, "header"):
+        raise RecordingError(f"messages of {topic} have no header, so it is not known when they were stamped")
+    return int(message.header.stamp.sec) * _SECOND + int(message.header.stamp.nanosec)

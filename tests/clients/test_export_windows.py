@@ -1,0 +1,276 @@
+"""`ethercat-export --at`: each frame has what was measured before it, and nothing that was not measured."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bota_clients.export.cli import main
+from bota_clients.export.dataset import windows_of
+from bota_clients.export.frame_times import FrameTimes, read_stamps
+from bota_clients.export.windows import Arrays, Tool, Windows
+from bota_clients.recording.reader import open_recording
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.pdo import SampleDecoder
+from bota_ethercat.sensor.frames import IMU_HEIGHTS
+from ft_compensation.alignment import align
+from ft_compensation.compensator import Compensator
+from ft_compensation.quantities import Accelerometer, Payload, Wrench
+from ft_compensation.specific_force import ImuSpecificForce
+from tests.clients.bags import imu, write_bag
+from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
+from tests.clients.simulated import Script, described, simulate
+from tests.ended import run_here
+
+SETTINGS: dict[str, Any] = {"fir": False, "acceleration_filter": 1, "angular_rate_filter": 3}
+DELAY_NS = {"force_torque": 1_880_000, "acceleration": 1_940_000, "angular_rate": 2_900_000}
+RATE_HZ = 800.0
+SIZES = {"force": 9, "torque": 1, "acceleration": 1, "angular_rate": 90}
+TOOL = Tool(
+    Payload(0.8, (0.004, -0.006, 0.055), (1e-3, 2e-3, 3e-3, 1e-4, 0.0, 0.0)),
+    Wrench((3.0, -1.5, 7.25), (0.2, -0.05, 0.125)),
+    Accelerometer((0.1, -0.2, 0.3), (1.01, 0.99, 1.0)),
+)
+
+
+def windows(
+    path: Path, frames: Iterable[DataMessage], times: FrameTimes, length: int = 4, **options: Any
+) -> Arrays:
+    """Of a recording of these frames."""
+    record(path, frames, **SETTINGS)
+    with open_recording(path) as recording:
+        return joined(windows_of(recording, times, Windows(length, **options)))
+
+
+def joined(blocks: Iterable[Arrays]) -> Arrays:
+    made = [*blocks]
+    return {name: np.concatenate([block[name] for block in made]) for name in made[0]}
+
+
+def stamps(*samples: float) -> FrameTimes:
+    """Frames at these instants, in periods of the sensor."""
+    return FrameTimes(np.array([START_NS + round(sample * PERIOD_NS) for sample in samples]))
+
+
+def newest(made: Arrays) -> list[list[float]]:
+    """The numbers of the samples, which are their force x; -1: empty."""
+    return np.nan_to_num(made["force_torque"][:, :, 0], nan=-1.0).tolist()
+
+
+def test_a_window_ends_with_the_newest_sample_that_was_measured_before_the_frame(tmp_path: Path) -> None:
+    at = (50.0, 50.49, 50.5)
+    frames = (frame(n, **{"angular_rate.z": n, "acceleration.x": n}) for n in range(100))
+    made = windows(tmp_path / "run.mcap", frames, stamps(*at))
+    # Measured before the stamp: force 1.88 ms, acceleration 1.94 ms, rate 2.9 ms; a period is 1.25 ms.
+    assert newest(made) == [[48, 49, 50, 51], [48, 49, 50, 51], [49, 50, 51, 52]]
+    assert made["imu"][:, -1, 0] / 9.80665 == pytest.approx([51, 52, 52])
+    assert np.degrees(made["imu"][:, -1, 5]) == pytest.approx([52, 52, 52])
+    for name, delay_ms in (("force_torque", 1.88), ("acceleration", 1.94), ("angular_rate", 2.9)):
+        last = [math.floor(instant + delay_ms / 1.25) for instant in at]
+        ages = [
+            [(instant - end + k) * 1.25e-3 + delay_ms * 1e-3 for k in (3, 2, 1, 0)]
+            for instant, end in zip(at, last, strict=True)
+        ]
+        assert made[f"{name}_age"] == pytest.approx(np.array(ages), abs=1e-7)
+        assert made[f"{name}_valid"].all()
+
+
+def test_a_lost_sample_stays_in_its_place_and_is_masked(tmp_path: Path) -> None:
+    """5 and 6 are lost, 8 is INVALID, 10 saturated, 12 not finite; then nothing for long."""
+    frames = [frame(number) for number in (0, 1, 2, 3, 4, 7, 8, 9, 10, 11, 12, 13, 2000)]
+    frames[5] = frames[5]._replace(flags=int(DataFlag.GAP))
+    frames[6] = frames[6]._replace(flags=int(DataFlag.INVALID))
+    frames[8], frames[10] = frame(10, warnings=1), frame(12, **{"torque.y": float("nan")})
+    frames[12] = frames[12]._replace(flags=int(DataFlag.GAP))
+    at = stamps(6.6, 12.4, 100, 1000, 1997)
+    made = windows(tmp_path / "run.mcap", frames, at, 8)
+    lost = [-1.0] * 8
+    assert newest(made) == [[1, 2, 3, 4, -1, -1, 7, -1], [-1, 7, -1, 9, -1, 11, -1, 13], lost, lost, lost]
+    assert (made["force_torque_valid"] == np.isfinite(made["force_torque"]).all(axis=2)).all()
+    assert (made["force_torque_valid"] == np.isfinite(made["force_torque_age"])).all()
+    assert made["acceleration_valid"][1].tolist() == [False, True, False, True, True, True, True, True]
+    held = windows(tmp_path / "held.mcap", frames, stamps(6.6, 12.4), 8, hold=True)
+    assert newest(held) == [[1, 2, 3, 4, 4, 4, 7, 7], [-1, 7, 7, 9, 9, 11, 11, 13]]
+    assert held["force_torque_valid"].tolist() == made["force_torque_valid"][:2].tolist()
+    assert held["force_torque_age"][0, 4:6] == pytest.approx(held["force_torque_age"][0, 3])
+
+
+@pytest.mark.parametrize("step_s", [-0.3, 0.3, -3600.0])
+def test_a_step_of_the_wall_clock_in_the_middle_bends_nothing(tmp_path: Path, step_s: float) -> None:
+    def stamp(instant: float) -> int:
+        return START_NS + round(instant) + (round(step_s * 1e9) if instant >= 1000.4 * PERIOD_NS else 0)
+
+    frames = [frame(number)._replace(stamp_ns=stamp(number * PERIOD_NS)) for number in range(2000)]
+    instants = np.arange(0.1e9, 2.4e9, 1e9 / 30)
+    times = FrameTimes(np.array([stamp(instant) for instant in instants]))
+    made = windows(tmp_path / "run.mcap", frames, times)
+    assert made["monotonic_ns"] == pytest.approx(instants, abs=PERIOD_NS if step_s > 0 else 1)
+    assert made["stamp_ns"].tolist() == times.stamps_ns.tolist()
+
+
+def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> None:
+    """The stream is without REPEATED frames, comes in other batches, and is asked as it comes."""
+    frames = simulate(3.0, script=Script(((1.0, "stick"), (1.2, "unstick")), lost_frames=0.02))
+    path, row, chance = tmp_path / "run.mcap", described(), random.Random(1)
+    record(path, frames, sensors=(0,), **row["settings"])
+    with open_recording(path) as recording:
+        recorded = joined(
+            windows_of(recording, FrameTimes(fps=30.0, latency_s=-0.05), Windows(32, tool=TOOL))
+        )
+    live = Windows(32, tool=TOOL)
+    live.configure(recording.sensors[0].settings, RATE_HZ, row["name"])
+    sent, asked, blocks = [each for each in frames if not each.flags & DataFlag.REPEATED], 0, []
+    while sent:
+        size = chance.randrange(1, 40)
+        live.take(sent[:size])
+        sent = sent[size:]
+        instants = recorded["monotonic_ns"][asked:]
+        ready = instants[: np.searchsorted(instants, live.until_ns, "right")]
+        if len(ready):
+            blocks.append(live.at(ready))
+            live.forget(int(ready[-1]))
+            asked += len(ready)
+    assert asked == len(recorded["monotonic_ns"]) > 80
+    assert not recorded["force_torque_valid"].all()
+    for name, array in joined(blocks).items():
+        assert array.tobytes() == recorded[name].tobytes(), name
+
+
+@pytest.mark.parametrize("fir", [False, True])
+def test_the_compensated_wrench_is_the_nodes(fir: bool) -> None:
+    """While it turns, and after samples were lost: few, or so many that it starts anew."""
+    lost = {*range(300, 303), *range(500, 505), 700, 701, *range(1000, 1200)}
+    frames = []
+    for number in set(range(1500)) - lost:
+        t = number * PERIOD_NS * 1e-9
+        values = {
+            f"{name}.{axis}": size * math.sin((2 + which) * t + number_of + which)
+            for number_of, (name, size) in enumerate(SIZES.items())
+            for which, axis in enumerate("xyz")
+        }
+        frames.append(frame(number, flags=int(DataFlag.GAP) if number - 1 in lost else 0, **values))
+    settings = {**described()["settings"], **SETTINGS, "fir": fir}
+    windows = Windows(1, tool=TOOL)
+    windows.configure(settings, RATE_HZ, "BFT-SENS-ECAT-M8")
+    cx, cy, cz = TOOL.payload.center
+    imu = ImuSpecificForce((cx, cy, cz - IMU_HEIGHTS["SENS"]), TOOL.accelerometer, align(settings, RATE_HZ))
+    compensator, decoder = Compensator(TOOL.payload, TOOL.bias), SampleDecoder(61)
+    delay_ns = round((12 if fir else 1.5) * PERIOD_NS, -4)
+    compared = 0
+    for begin in range(0, len(frames), 64):
+        windows.take(frames[begin : begin + 64])
+        for each in frames[begin : begin + 64]:
+            sample = decoder.decode(each.process_data)
+            felt = imu.follow(sample.acceleration, sample.angular_rate, each.monotonic_ns * 1e-9)
+            if each.monotonic_ns - delay_ns > windows.until_ns:
+                continue
+            made = windows.at(np.array([each.monotonic_ns - delay_ns]))
+            assert made["force_torque_compensated_valid"][0, 0] == (felt is not None)
+            if felt is not None:
+                nodes = compensator.compensate(sample.force, sample.torque, felt, imu.turning).final.values
+                assert made["force_torque_compensated"][0, 0] == pytest.approx(nodes, abs=1e-5)
+                compared += 1
+    assert compared > 900
+
+
+FORMATS = ("npz", "parquet", "zarr")
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> dict[str, Arrays]:
+    """The same windows in every format."""
+    zarr, parquet = pytest.importorskip("zarr"), pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "run.mcap"
+    record(path, (frame(number) for number in range(3000)), **SETTINGS)
+    for suffix in FORMATS:
+        run_here(main, path, tmp_path / f"run.{suffix}", "--fps", 30, "--window", 8)
+    table = parquet.read_table(tmp_path / "run.parquet")
+    group = zarr.open_group(tmp_path / "run.zarr", mode="r")
+    npz = np.load(tmp_path / "run.npz")
+    attributes = json.loads(table.schema.metadata[b"bota_ethercat"])
+    assert attributes == group.attrs["bota_ethercat"] == json.loads(str(npz["attributes"]))
+    assert attributes["sensor"]["serial"] == 100
+    assert attributes["settings"][0]["delay_ms"]["acceleration"] == 1.94
+    return {
+        "npz": {name: npz[name] for name in npz if name != "attributes"},
+        "zarr": {name: group[name][:] for name in group},
+        "parquet": {name: np.stack(table[name].to_numpy()) for name in table.column_names},
+    }
+
+
+def test_every_format_has_the_same(written: dict[str, Arrays]) -> None:
+    npz, parquet, zarr = (written[suffix] for suffix in FORMATS)
+    assert npz.keys() == zarr.keys() == parquet.keys()
+    assert len(npz["stamp_ns"]) == 113
+    for name, array in npz.items():
+        assert (zarr[name].tobytes(), parquet[name].tobytes()) == (array.tobytes(), array.tobytes()), name
+        assert zarr[name].shape == array.shape
+        assert zarr[name].dtype == parquet[name].dtype == array.dtype
+
+
+STAMPS = [START_NS + 123_456_789, START_NS + 223_456_000]
+
+
+def test_stamps_are_read_from_tables_and_bags(tmp_path: Path) -> None:
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "frames.csv"
+    for texts in (
+        [str(stamp) for stamp in STAMPS],
+        [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in STAMPS],
+        ["2023-11-14T22:13:20.123456789Z", "2023-11-14 22:13:20.223456+00:00"],
+    ):
+        path.write_text("\n".join(["frame,timestamp", *(f"{n},{text}" for n, text in enumerate(texts))]))
+        assert read_stamps(path).tolist() == STAMPS
+        assert read_stamps(path, "timestamp").tolist() == STAMPS
+    path, exact = tmp_path / "frames.parquet", pa.array(STAMPS, pa.timestamp("ns"))
+    for column in (pa.array(STAMPS), exact, exact.cast(pa.timestamp("us"), safe=False)):
+        parquet.write_table(pa.table({"timestamp": column}), path)
+        assert abs(read_stamps(path) - STAMPS).max() < 1000
+    bag = write_bag(tmp_path / "bag", "/camera", [imu(stamp) for stamp in STAMPS])
+    assert read_stamps(bag, topic="/camera").tolist() == STAMPS
+
+
+@pytest.mark.parametrize(
+    ("rows", "arguments", "said"),
+    [
+        ([1.0, 0.9], (), "row 1 of {} (counted from 0; 2023-11-14 22:13:20 UTC) is before the row above"),
+        ([-0.5, 1.0], (), "row 0 of {} (counted from 0; 2023-11-14 22:13:19 UTC) is 500 ms before the"),
+        ([1.0, 2.0, 2.6, 2.7], (), "row 2 of {} (counted from 0; 2023-11-14 22:13:22 UTC) is 101 ms after"),
+        ([0.01], ("--latency", 1), "row 0 of {} (counted from 0; 2023-11-14 22:13:20 UTC) is 990 ms before"),
+        ([-1.6e9], (), "is 26666667 min before the samples of the recording"),
+        (["0.1", "soon"], (), "row 1 of {} (counted from 0) is 'soon', no time"),
+        ([-3e9], (), "row 0 of {} (counted from 0) is no time since 1970"),
+        ([], (), "{} has no frames"),
+        ([1.0], ("--column", "t"), "{} has the columns timestamp, exposure: name that of the times with"),
+        ([1.0], ("--topic", "/c"), "{} cannot be read as a bag: "),
+        ([1.0], ("--tool", "{}"), "{} does not have a tool's parameters"),
+        ([1.0], ("--clock", "{}"), "{} is not what 'ethercat-export align --json' prints"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_done_is_said_and_leaves_nothing(
+    tmp_path: Path, rows: Sequence[Any], arguments: tuple[Any, ...], said: str
+) -> None:
+    run, path = tmp_path / "run.mcap", tmp_path / "frames.csv"
+    record(run, (frame(number) for number in range(2000)), **SETTINGS)
+    texts = [row if isinstance(row, str) else f"{START_NS * 1e-9 + row:.3f}" for row in rows]
+    path.write_text("\n".join(["timestamp,exposure", *(f"{text},1" for text in texts)]))
+    given = [str(argument).format(path) for argument in arguments]
+    ended = run_here(main, run, tmp_path / "out.npz", "--at", path, *given)
+    assert ended.code == 1
+    assert ended.err.count("\n") == 1
+    assert said.format(path) in ended.err
+    assert sorted(tmp_path.iterdir()) == [path, run]
+
+
+@pytest.mark.parametrize(
+    "arguments", ["out.csv --fps 30", "out.npz", "out.npz --fps 30 --at x", "out.npz --fps 30 --window 0"]
+)
+def test_wrong_usage(arguments: str) -> None:
+    assert run_here(main, "run.mcap", *arguments.split()).code == 2
