@@ -117,43 +117,6 @@ class ImuSpecificForce:
         return motion_error(self._ring[end - count : end].copy(), self.alignment, self.lever, mass)
 
 
-def specific_forces(
-    samples: Array, times: Array, alignment: Alignment, lever: Vector3
-) -> tuple[Array, Array, Array]:
-    """`ImuSpecificForce` for many samples: (n, 3) m/s², and `turning`, rad/s and rad/s²; NaN where unknown.
-
-    `samples` are (n, 6) acceleration (m/s², corrected) and angular rate (rad/s), one row for each period of
-    the sensor, NaN where it was lost; `times` (n,) s.
-    """
-    found = np.full((3, 3, len(samples)), math.nan)  # acceleration, angular rate, angular acceleration
-    known = np.flatnonzero(np.isfinite(samples).all(axis=1))
-    before = alignment.taps.shape[1] - 1
-    for run in np.split(known, np.flatnonzero(np.diff(times[known]) > alignment.gap_s) + 1):
-        if not len(run):
-            continue
-        first, second, end = run[0], run[min(1, len(run) - 1)], run[-1] + 1
-        # Before the first sample the angular rate changed as it does after it.
-        slope = (samples[second] - samples[first]) / max(second - first, 1) * (0, 0, 0, 1, 1, 1)
-        series = np.empty((6, before + end - first))
-        series[:, :before] = (samples[first] - slope * np.arange(before, 0, -1)[:, np.newaxis]).T
-        for row, column in zip(series, samples.T, strict=True):
-            row[before:] = np.interp(np.arange(first, end), run, column[run])
-        for which, weights in enumerate(alignment.taps):
-            rows = series[3 if which else 0 :][:3]
-            total = np.zeros((3, end - first))
-            for tap in np.flatnonzero(weights):
-                total += weights[tap] * rows[:, tap : tap + end - first]
-            found[which, :, first:end] = total
-            # The first sample alone tells of no slope.
-            found[which, :, first] = weights.sum() * rows[:, before]
-        if any(lever):
-            turns = np.linalg.norm(samples[first : min(first + alignment.lead, end), 3:], axis=1) > _TURNING
-            found[0, :, first : first + len(turns)][:, turns] = math.nan
-    acceleration, rate, rising = (part.T for part in found)
-    at_center = acceleration + np.cross(rising, lever) + np.cross(rate, np.cross(rate, lever))
-    return at_center, rate, rising
-
-
 class QuaternionGravity:
     """Gravity from orientations of the sensor in a base frame."""
 

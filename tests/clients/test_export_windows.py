@@ -18,21 +18,15 @@ from bota_clients.export.frame_times import FrameTimes, read_stamps
 from bota_clients.export.windows import Arrays, Tool, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.pdo import SampleDecoder
-from bota_ethercat.sensor.frames import IMU_HEIGHTS
-from ft_compensation.alignment import align
-from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import Accelerometer, Payload, Wrench
-from ft_compensation.specific_force import ImuSpecificForce
 from tests.clients.bags import imu, write_bag
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
 from tests.clients.simulated import Script, described, simulate
 from tests.ended import run_here
 
 SETTINGS: dict[str, Any] = {"fir": False, "acceleration_filter": 1, "angular_rate_filter": 3}
-DELAY_NS = {"force_torque": 1_880_000, "acceleration": 1_940_000, "angular_rate": 2_900_000}
 RATE_HZ = 800.0
-SIZES = {"force": 9, "torque": 1, "acceleration": 1, "angular_rate": 90}
+NOT_FINITE: Any = {"torque.y": math.nan}
 TOOL = Tool(
     Payload(0.8, (0.004, -0.006, 0.055), (1e-3, 2e-3, 3e-3, 1e-4, 0.0, 0.0)),
     Wrench((3.0, -1.5, 7.25), (0.2, -0.05, 0.125)),
@@ -61,12 +55,14 @@ def stamps(*samples: float) -> FrameTimes:
 
 def newest(made: Arrays) -> list[list[float]]:
     """The numbers of the samples, which are their force x; -1: empty."""
-    return np.nan_to_num(made["force_torque"][:, :, 0], nan=-1.0).tolist()
+    found: list[list[float]] = np.nan_to_num(made["force_torque"][:, :, 0], nan=-1.0).tolist()
+    return found
 
 
 def test_a_window_ends_with_the_newest_sample_that_was_measured_before_the_frame(tmp_path: Path) -> None:
     at = (50.0, 50.49, 50.5)
-    frames = (frame(n, **{"angular_rate.z": n, "acceleration.x": n}) for n in range(100))
+    numbered: Any = ({"angular_rate.z": number, "acceleration.x": number} for number in range(100))
+    frames = (frame(number, **values) for number, values in enumerate(numbered))
     made = windows(tmp_path / "run.mcap", frames, stamps(*at))
     # Measured before the stamp: force 1.88 ms, acceleration 1.94 ms, rate 2.9 ms; a period is 1.25 ms.
     assert newest(made) == [[48, 49, 50, 51], [48, 49, 50, 51], [49, 50, 51, 52]]
@@ -87,7 +83,7 @@ def test_a_lost_sample_stays_in_its_place_and_is_masked(tmp_path: Path) -> None:
     frames = [frame(number) for number in (0, 1, 2, 3, 4, 7, 8, 9, 10, 11, 12, 13, 2000)]
     frames[5] = frames[5]._replace(flags=int(DataFlag.GAP))
     frames[6] = frames[6]._replace(flags=int(DataFlag.INVALID))
-    frames[8], frames[10] = frame(10, warnings=1), frame(12, **{"torque.y": float("nan")})
+    frames[8], frames[10] = frame(10, warnings=1), frame(12, **NOT_FINITE)
     frames[12] = frames[12]._replace(flags=int(DataFlag.GAP))
     at = stamps(6.6, 12.4, 100, 1000, 1997)
     made = windows(tmp_path / "run.mcap", frames, at, 8)
@@ -143,41 +139,27 @@ def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> N
         assert array.tobytes() == recorded[name].tobytes(), name
 
 
-@pytest.mark.parametrize("fir", [False, True])
-def test_the_compensated_wrench_is_the_nodes(fir: bool) -> None:
-    """While it turns, and after samples were lost: few, or so many that it starts anew."""
-    lost = {*range(300, 303), *range(500, 505), 700, 701, *range(1000, 1200)}
-    frames = []
-    for number in set(range(1500)) - lost:
-        t = number * PERIOD_NS * 1e-9
-        values = {
-            f"{name}.{axis}": size * math.sin((2 + which) * t + number_of + which)
-            for number_of, (name, size) in enumerate(SIZES.items())
-            for which, axis in enumerate("xyz")
-        }
-        frames.append(frame(number, flags=int(DataFlag.GAP) if number - 1 in lost else 0, **values))
-    settings = {**described()["settings"], **SETTINGS, "fir": fir}
-    windows = Windows(1, tool=TOOL)
-    windows.configure(settings, RATE_HZ, "BFT-SENS-ECAT-M8")
-    cx, cy, cz = TOOL.payload.center
-    imu = ImuSpecificForce((cx, cy, cz - IMU_HEIGHTS["SENS"]), TOOL.accelerometer, align(settings, RATE_HZ))
-    compensator, decoder = Compensator(TOOL.payload, TOOL.bias), SampleDecoder(61)
-    delay_ns = round((12 if fir else 1.5) * PERIOD_NS, -4)
-    compared = 0
-    for begin in range(0, len(frames), 64):
-        windows.take(frames[begin : begin + 64])
-        for each in frames[begin : begin + 64]:
-            sample = decoder.decode(each.process_data)
-            felt = imu.follow(sample.acceleration, sample.angular_rate, each.monotonic_ns * 1e-9)
-            if each.monotonic_ns - delay_ns > windows.until_ns:
-                continue
-            made = windows.at(np.array([each.monotonic_ns - delay_ns]))
-            assert made["force_torque_compensated_valid"][0, 0] == (felt is not None)
-            if felt is not None:
-                nodes = compensator.compensate(sample.force, sample.torque, felt, imu.turning).final.values
-                assert made["force_torque_compensated"][0, 0] == pytest.approx(nodes, abs=1e-5)
-                compared += 1
-    assert compared > 900
+def test_the_compensated_wrench_is_the_nodes() -> None:
+    """The worked example of docs/compensation.md; unknown where it turns and what was before is not known."""
+    held: dict[str, Any] = {
+        "force.x": 8.0,
+        "acceleration.y": 1.0,
+        "force.y": -9.345,
+        "force.z": 7.25,
+        "torque.x": 0.631,
+        "torque.y": 0.55,
+        "torque.z": 0.094,
+    }
+    frames = [frame(8, **held), *(frame(number) for number in range(9, 100))]
+    turning: dict[str, Any] = {"acceleration.y": 1.0, "angular_rate.z": 90.0}
+    frames[50:] = [frame(number, flags=4, **turning) for number in range(130, 136)]
+    bias = Wrench((3.0, -1.5, 7.25), (0.2, -0.05, 0.125))
+    windows = Windows(1, tool=Tool(Payload(0.8, (0.004, -0.006, 0.055)), bias))
+    windows.configure({**described()["settings"], **SETTINGS}, RATE_HZ, "BFT-SENS-ECAT-M8")
+    windows.take(frames)
+    made = windows.at(np.array([8, 130, 131]) * PERIOD_NS - 1_880_000)
+    assert made["force_torque_compensated"][0, 0] == pytest.approx([5, 0, 0, 0, 0.6, 0], abs=1e-3)
+    assert made["force_torque_compensated_valid"].ravel().tolist() == [True, False, True]
 
 
 FORMATS = ("npz", "parquet", "zarr")
@@ -194,10 +176,12 @@ def written(tmp_path: Path) -> dict[str, Arrays]:
     table = parquet.read_table(tmp_path / "run.parquet")
     group = zarr.open_group(tmp_path / "run.zarr", mode="r")
     npz = np.load(tmp_path / "run.npz")
-    attributes = json.loads(table.schema.metadata[b"bota_ethercat"])
-    assert attributes == group.attrs["bota_ethercat"] == json.loads(str(npz["attributes"]))
-    assert attributes["sensor"]["serial"] == 100
-    assert attributes["settings"][0]["delay_ms"]["acceleration"] == 1.94
+    for found in (
+        json.loads(table.schema.metadata[b"bota_ethercat"]), group.attrs["bota_ethercat"],
+        json.loads(str(npz["attributes"])),
+    ):  # fmt: skip
+        assert (found["sensor"]["serial"], found["options"]["window"]) == (100, 8)
+        assert found["settings"][0]["delay_ms"]["acceleration"] == 1.94
     return {
         "npz": {name: npz[name] for name in npz if name != "attributes"},
         "zarr": {name: group[name][:] for name in group},
@@ -223,14 +207,14 @@ def test_stamps_are_read_from_tables_and_bags(tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
     for texts in (
         [str(stamp) for stamp in STAMPS],
-        [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in STAMPS],
-        ["2023-11-14T22:13:20.123456789Z", "2023-11-14 22:13:20.223456+00:00"],
+        ["2023-11-14T22:13:20.123456789Z", "2023-11-14T22:13:20.223456000Z"],
     ):
         path.write_text("\n".join(["frame,timestamp", *(f"{n},{text}" for n, text in enumerate(texts))]))
         assert read_stamps(path).tolist() == STAMPS
         assert read_stamps(path, "timestamp").tolist() == STAMPS
     path, exact = tmp_path / "frames.parquet", pa.array(STAMPS, pa.timestamp("ns"))
-    for column in (pa.array(STAMPS), exact, exact.cast(pa.timestamp("us"), safe=False)):
+    seconds = pa.array([stamp * 1e-9 for stamp in STAMPS])
+    for column in (pa.array(STAMPS), exact, exact.cast(pa.timestamp("us"), safe=False), seconds):
         parquet.write_table(pa.table({"timestamp": column}), path)
         assert abs(read_stamps(path) - STAMPS).max() < 1000
     bag = write_bag(tmp_path / "bag", "/camera", [imu(stamp) for stamp in STAMPS])
@@ -240,14 +224,14 @@ def test_stamps_are_read_from_tables_and_bags(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "arguments", "said"),
     [
-        ([1.0, 0.9], (), "row 1 of {} (counted from 0; 2023-11-14 22:13:20 UTC) is before the row above"),
-        ([-0.5, 1.0], (), "row 0 of {} (counted from 0; 2023-11-14 22:13:19 UTC) is 500 ms before the"),
-        ([1.0, 2.0, 2.6, 2.7], (), "row 2 of {} (counted from 0; 2023-11-14 22:13:22 UTC) is 101 ms after"),
-        ([0.01], ("--latency", 1), "row 0 of {} (counted from 0; 2023-11-14 22:13:20 UTC) is 990 ms before"),
-        ([-1.6e9], (), "is 26666667 min before the samples of the recording"),
-        (["0.1", "soon"], (), "row 1 of {} (counted from 0) is 'soon', no time"),
+        ([1.0, 0.9], (), "row 1 of {} (counted from 0) is before the row above it"),
+        ([-0.5, 1.0], (), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:19.500"),
+        ([1.0, 2.0, 2.6, 2.7], (), "row 2 of {} (counted from 0) is of 2023-11-14T22:13:22.600"),
+        ([0.5], ("--latency", 1), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:20.500"),
+        ([-1.7e9], (), "is of 1970-01-01T00:00:00.000000000Z, and the recording has samples from 2023-11-"),
+        (["0.1", "soon"], (), "{} has no times in timestamp: Failed to parse string: 'soon'"),
         ([-3e9], (), "row 0 of {} (counted from 0) is no time since 1970"),
-        ([], (), "{} has no frames"),
+        ([], (), "{} cannot be read: "),
         ([1.0], ("--column", "t"), "{} has the columns timestamp, exposure: name that of the times with"),
         ([1.0], ("--topic", "/c"), "{} cannot be read as a bag: "),
         ([1.0], ("--tool", "{}"), "{} does not have a tool's parameters"),

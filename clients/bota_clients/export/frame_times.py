@@ -7,17 +7,14 @@ CLOCK_MONOTONIC, which is never set.
 
 from __future__ import annotations
 
-import csv
 import itertools
-from collections.abc import Iterator, Sequence
-from decimal import Decimal, InvalidOperation
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from bota_clients.errors import RecordingError
-from bota_clients.numbers import moment, seconds
 from bota_clients.recording.columns import Ints
 from bota_ethercat.errors import BadMessageError
 from bota_ethercat.text.json_text import parse_json_object
@@ -25,8 +22,6 @@ from bota_ethercat.text.json_text import parse_json_object
 _SECOND: Final = 1_000_000_000
 _LATEST_NS: Final = 4_102_444_800 * _SECOND  # the year 2100
 _NAMES: Final = ("stamp_ns", "timestamp_ns", "timestamp", "stamp", "time")  # of a column, if none is given
-_SCALES: Final = ((10**9, 1e11), (10**6, 1e14), (10**3, 1e17))  # ns in a unit, its numbers are smaller than
-_NONE: Final = np.zeros(0, np.int64)
 
 
 class Clock(NamedTuple):
@@ -39,8 +34,9 @@ class Clock(NamedTuple):
     def monotonic(self, stamps_ns: Ints) -> Ints:
         """The server's CLOCK_MONOTONIC at these stamps, ns."""
         passed = stamps_ns - self.stamp_ns
-        drifted: Ints = passed + np.rint(passed * (self.drift_ppm * 1e-6)).astype(np.int64)
-        return drifted + self.monotonic_ns
+        return np.asarray(
+            self.monotonic_ns + passed + np.rint(passed * (self.drift_ppm * 1e-6)).astype(np.int64)
+        )
 
     @classmethod
     def read(cls, path: Path) -> Clock:
@@ -48,9 +44,7 @@ class Clock(NamedTuple):
         try:
             found = parse_json_object(path.read_bytes())
             return cls(int(found["stamp_ns"]), int(found["monotonic_ns"]), float(found["drift_ppm"]))
-        except OSError as error:
-            raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
-        except (BadMessageError, KeyError, TypeError, ValueError, OverflowError):
+        except (OSError, BadMessageError, LookupError, TypeError, ValueError):
             raise RecordingError(f"{path} is not what 'ethercat-export align --json' prints") from None
 
 
@@ -77,8 +71,8 @@ class FrameTimes:
         `latency_s`: from the exposure to the stamp. `clock`: of the stamps, if it is not the server's
         CLOCK_REALTIME. `source` is named in errors.
         """
-        self.stamps_ns, self.instants_ns = _NONE if stamps_ns is None else stamps_ns, _NONE
-        self.count = len(self.stamps_ns)
+        self.stamps_ns = np.zeros(0, np.int64) if stamps_ns is None else stamps_ns
+        self.count, self.instants_ns = len(self.stamps_ns), np.zeros(0, np.int64)
         self._period_ns, self._latency_ns = fps and _SECOND / fps, round(latency_s * _SECOND)
         self._source = source
         self._begin = self._newest = (-1, -1)  # both stamps of the first and of the newest DATA frame
@@ -92,12 +86,9 @@ class FrameTimes:
 
     def follow(self, stamp_ns: Ints, monotonic_ns: Ints) -> None:
         """Take both stamps of the next DATA frames."""
-        if not len(stamp_ns):
-            return
         if self._begin[0] < 0:
             self._begin = self._newest = int(stamp_ns[0]), int(monotonic_ns[0])
-        stamps = np.append(self._newest[0], stamp_ns)
-        instants = np.append(self._newest[1], monotonic_ns)
+        stamps, instants = np.append(self._newest[0], stamp_ns), np.append(self._newest[1], monotonic_ns)
         self._newest = int(stamps[-1]), int(instants[-1])
         if self._period_ns:
             last = int((instants[-1] - self._begin[1]) / self._period_ns)
@@ -111,8 +102,7 @@ class FrameTimes:
             # The clock was set between two samples, and frames of this time may be by either.
             before_ns = int(instants[begin] - instants[begin - 1]) if begin else 0
             after_ns = int(instants[end] - instants[end - 1]) if end < len(instants) else 0
-            if begin:
-                self._awaits_descent = False
+            self._awaits_descent = self._awaits_descent and not begin
             self._map(stamps[begin:end], instants[begin:end], before_ns, after_ns)
 
     def _map(self, stamps: Ints, instants: Ints, before_ns: int, after_ns: int) -> None:
@@ -122,11 +112,10 @@ class FrameTimes:
             return
         stop = int(self._descents[np.searchsorted(self._descents, done, "right")])
         frames = self.stamps_ns[done:stop]
-        if frames[0] < stamps[0] - before_ns:
-            return
-        frames = frames[: np.searchsorted(frames, stamps[-1] + after_ns, "right")]
-        self._take(_interpolated(frames, stamps, instants))
-        self._awaits_descent = done + len(frames) == stop
+        if frames[0] >= stamps[0] - before_ns:
+            frames = frames[: np.searchsorted(frames, stamps[-1] + after_ns, "right")]
+            self._take(_interpolated(frames, stamps, instants))
+            self._awaits_descent = done + len(frames) == stop
 
     def _take(self, instants_ns: Ints) -> None:
         self.instants_ns = np.append(self.instants_ns, instants_ns - self._latency_ns)
@@ -135,50 +124,35 @@ class FrameTimes:
         """Why this frame has no window, where all before it have one."""
         if not self.count:
             return RecordingError("the recording is too short for a frame")
-        stamp_ns = int(self.stamps_ns[row])
-        which = f"row {row} of {self._source} (counted from 0; {moment(stamp_ns)})"
-        if row and stamp_ns < self.stamps_ns[row - 1]:
+        stamp, source = int(self.stamps_ns[row]), f"row {row} of {self._source} (counted from 0)"
+        if row and stamp < self.stamps_ns[row - 1]:
             return RecordingError(
-                f"{which} is before the row above it, and the server's clock was not set then: sort the rows"
+                f"{source} is before the row above it, and the server's clock was not set then: sort the rows"
             )
-        is_mapped = row < len(self.instants_ns)
-        at_ns = int(self.instants_ns[row]) if is_mapped else stamp_ns
-        begin_ns, end_ns = self._begin[is_mapped], self._newest[is_mapped]
-        is_early = at_ns < (begin_ns + end_ns) // 2
-        off_ns = begin_ns - at_ns if is_early else at_ns - end_ns
-        where = f"{seconds(max(off_ns, 0) * 1e-9)} {'before' if is_early else 'after'} the samples"
+        taken, begin, end = (np.datetime64(ns, "ns") for ns in (stamp, self._begin[0], self._newest[0]))
         return RecordingError(
-            f"{which} is {where} of the recording ({moment(self._begin[0])} to {moment(self._newest[0])}): "
-            "leave it out, or find the offset of its clock with 'ethercat-export align'"
+            f"{source} is of {taken}Z, and the recording has samples from {begin}Z to {end}Z: leave the row "
+            "out, or find the offset of its clock with 'ethercat-export align'"
         )
 
 
 def _interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
     """One clock by another, beyond the ends at the same pace; all in ns, without loss of digits."""
     inside = np.interp(at - here[0], here - here[0], there - there[0])
-    found: Ints = np.rint(inside).astype(np.int64) + there[0] + at - np.clip(at, here[0], here[-1])
-    return found
+    return np.asarray(np.rint(inside).astype(np.int64) + there[0] + at - np.clip(at, here[0], here[-1]))
 
 
 def read_stamps(path: Path, column: str | None = None, topic: str | None = None) -> Ints:
     """The frames' stamps, ns since 1970: of a column, or the `header.stamp` of a topic; RecordingError.
 
-    A column has ISO 8601, timestamps, or numbers: s, ms, µs or ns since 1970, as their magnitude tells.
+    A column has times (ISO 8601), integers, ns since 1970, or other numbers, s since 1970.
     """
-    try:
-        if topic is not None:
-            stamps = np.array([stamp_ns(message, topic) for message in messages(path, topic)], np.int64)
-        elif path.suffix == ".parquet":
-            stamps = _parquet_column(path, column)
-        elif path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
-            raise RecordingError(f"{path} is a bag: name the topic of the frames with --topic")
-        else:
-            with path.open(newline="", encoding="utf-8-sig") as file:
-                rows = csv.reader(file)
-                at = _column(path, next(rows, []), column)
-                stamps = _in_ns([row[at] if at < len(row) else "" for row in rows if row], str(path))
-    except (OSError, UnicodeError, csv.Error) as error:
-        raise RecordingError(f"{path} cannot be read: {error}") from None
+    if topic is not None:
+        stamps = np.array([stamp_ns(message, topic) for message in messages(path, topic)], np.int64)
+    elif path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
+        raise RecordingError(f"{path} is a bag: name the topic of the frames with --topic")
+    else:
+        stamps = _read_column(path, column)
     if not len(stamps):
         raise RecordingError(f"{path} has no frames")
     if (wrong := np.flatnonzero((stamps < 0) | (stamps > _LATEST_NS))).size:
@@ -186,46 +160,28 @@ def read_stamps(path: Path, column: str | None = None, topic: str | None = None)
     return stamps
 
 
-def _column(path: Path, names: Sequence[str], wanted: str | None) -> int:
-    """The position of the column."""
-    choice = [name for name in ((wanted,) if wanted else _NAMES) if name in names]
-    if not choice and (wanted or len(names) != 1):
-        raise RecordingError(
-            f"{path} has the columns {', '.join(names)}: name that of the times with --column"
-        )
-    return names.index(choice[0]) if choice else 0
-
-
-def _parquet_column(path: Path, column: str | None) -> Ints:
-    from pyarrow import ArrowInvalid, compute, parquet, types  # noqa: PLC0415 - of the extra `dataset`
+def _read_column(path: Path, column: str | None) -> Ints:
+    import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
+    from pyarrow import csv, parquet  # noqa: PLC0415
 
     try:
-        names = parquet.read_schema(path).names
-        name = names[_column(path, names, column)]
-        found = parquet.read_table(path, columns=[name]).column(0)
-    except ArrowInvalid as error:
+        table = parquet.read_table(path) if path.suffix == ".parquet" else csv.read_csv(path)
+    except (OSError, pa.ArrowInvalid) as error:
         raise RecordingError(f"{path} cannot be read: {error}") from None
-    if types.is_timestamp(found.type):
-        return np.asarray(compute.cast(found, "timestamp[ns]").to_numpy().astype(np.int64))
-    return _in_ns(found.to_pylist(), str(path))
-
-
-def _in_ns(cells: Sequence[object], source: str) -> Ints:
-    found, scale = [], 0
-    for row, cell in enumerate(cells):
-        try:
-            number = Decimal(str(cell).strip())
-            scale = scale or next((scale for scale, most in _SCALES if abs(number) < most), 1)
-            found.append(int(number * scale))
-        except (InvalidOperation, ValueError, OverflowError):
-            text = str(cell).strip().removesuffix("Z").removesuffix("+00:00")
-            try:
-                found.append(int(np.datetime64(text, "ns").astype(np.int64)))
-            except ValueError:
-                raise RecordingError(
-                    f"row {row} of {source} (counted from 0) is {cell!r:.40}, no time"
-                ) from None
-    return np.array(found, np.int64)
+    names = table.column_names
+    chosen = [name for name in ((column,) if column else _NAMES) if name in names] or names[: len(names) == 1]
+    if not chosen or column not in {None, *chosen}:
+        there = ", ".join(names)
+        raise RecordingError(f"{path} has the columns {there}: name that of the times with --column")
+    found = table[chosen[0]]
+    if pa.types.is_timestamp(found.type):
+        return np.asarray(found.cast(pa.timestamp("ns", found.type.tz)).cast("int64").to_numpy())
+    if pa.types.is_integer(found.type):
+        return np.asarray(found.to_numpy().astype(np.int64))
+    try:
+        return np.asarray(np.rint(found.cast("float64").to_numpy() * _SECOND).astype(np.int64))
+    except pa.ArrowInvalid as error:
+        raise RecordingError(f"{path} has no times in {chosen[0]}: {error}") from None
 
 
 def messages(path: Path, topic: str) -> Iterator[Any]:

@@ -7,14 +7,11 @@ from datetime import UTC, datetime
 from functools import cache, partial
 from typing import Final
 
-from rich.console import Console
-from rich.progress import track
-
 from bota_clients.errors import RecordingError
-from bota_clients.export.cli import PROGRAM, ExportOptions
+from bota_clients.export.cli import Options
+from bota_clients.export.progress import Advance, export
 from bota_clients.numbers import count
-from bota_clients.program import interrupt_on_signals, say
-from bota_clients.recording.reader import open_recording
+from bota_clients.recording.reader import Recording
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
@@ -34,8 +31,6 @@ COLUMNS: Final = (
     *(str(flag.name).lower() for flag in _FLAGS),
     *_REGISTERS,
 )  # fmt: skip
-
-_say = partial(say, PROGRAM)
 
 
 class Table:
@@ -91,29 +86,21 @@ def _seconds(ns: int) -> str:
     return f"{'-' if ns < 0 else ''}{whole}.{rest:09d}"
 
 
-def run(options: ExportOptions) -> int:
-    """Export; returns the exit code. Ctrl-C ends it at any time and leaves no file."""
-    interrupt_on_signals()
-    table, console = Table(options.imu_units, everything=options.all), Console(stderr=True)
-    try:
-        with open_recording(options.recording) as recording:
-            there = {sensor.sensor: sensor.frames for sensor in recording.sensors if sensor.frames}
-            if not there or options.sensor not in {None, *there}:
-                which = "" if options.sensor is None else f" of sensor {options.sensor}"
-                raise RecordingError(f"{options.recording} has no samples{which}")
-            if recording.cut_off is not None:
-                _say(f"{options.recording} was cut off ({recording.cut_off}): the intact part is exported")
-            total = sum(there.values()) if options.sensor is None else there[options.sensor]
-            with NewFile(options.output, force=options.force) as file:
-                lines = table.lines(recording.frames(options.sensor))
-                for line in track(
-                    lines, total=total, console=console, transient=True, disable=not console.is_terminal
-                ):
-                    file.write(line)
-                file.finish()
-    except KeyboardInterrupt:
-        _say("stopped: nothing was written")
-        return 1
+def run(options: Options) -> int:
+    """Export; returns the exit code."""
+    return export(options, partial(_write, options))
+
+
+def _write(options: Options, recording: Recording, advance: Advance) -> str:
+    there = {sensor.sensor for sensor in recording.sensors if sensor.frames}
+    if not there or options.sensor not in {None, *there}:
+        which = "" if options.sensor is None else f" of sensor {options.sensor}"
+        raise RecordingError(f"{recording.path} has no samples{which}")
+    table = Table(options.imu_units, everything=options.all)
+    with NewFile(options.output, force=options.force) as file:
+        for line in table.lines(recording.frames(options.sensor)):
+            file.write(line)
+            advance(1)
+        file.finish()
     left = f"; {count(table.left_out, 'frame')} without a new sample left out" if table.left_out else ""
-    _say(f"{options.output}: {count(table.written, 'sample')}{left}")
-    return 0
+    return f"{count(table.written, 'sample')}{left}"

@@ -81,7 +81,7 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
         return float(((force - rows @ np.linalg.lstsq(rows, force, rcond=None)[0]) ** 2).sum())
 
     coarse = np.arange(_EARLIEST_S, _LATEST_S, max(period, 0.005))
-    best = _lowest(left, float(coarse[np.argmin([left(lag) for lag in coarse])]), max(period, 0.005))
+    best = lowest(left, float(coarse[np.argmin([left(lag) for lag in coarse])]), max(period, 0.005))
     rows = moved(best)
     tool = np.linalg.lstsq(rows, force, rcond=None)[0]
     total = float((force**2).sum())
@@ -127,7 +127,7 @@ def at_times(looks: Array, times: Array, columns: Array) -> Array:
     return np.stack([np.interp(looks, times, column) for column in columns.T], axis=1)
 
 
-def _lowest(left: Callable[[float], float], start: float, step: float) -> float:
+def lowest(left: Callable[[float], float], start: float, step: float) -> float:
     """The minimum of a function near `start`, by parabolas."""
     for _ in range(6):
         before, at, after = left(start - step), left(start), left(start + step)

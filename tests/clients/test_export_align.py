@@ -1,0 +1,124 @@
+"""`ethercat-export align`: the offset between two clocks, from how sensor and robot turned."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bota_clients.errors import RecordingError
+from bota_clients.export.align import find_offset
+from bota_clients.export.cli import main
+from bota_clients.export.frame_times import Clock
+from tests.clients.bags import imu, joint_states, write_bag
+from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
+from tests.ended import run_here
+from tests.json_schema import problems
+
+Array = NDArray[np.float64]
+Motion = Callable[[Array], Array]
+OFFSET_S, DRIFT = -17.25, 60e-6
+GYROSCOPE_S = 2.9e-3
+URDF = """<robot name="arm">
+ <link name="base"/> <link name="upper"/> <link name="lower"/> <link name="slide"/> <link name="tool"/>
+ <joint name="first" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/></joint>
+ <joint name="second" type="continuous"><parent link="upper"/><child link="lower"/>
+  <origin xyz="0 0 0.4" rpy="0.3 0 1.2"/><axis xyz="0 2 0"/></joint>
+ <joint name="rail" type="prismatic"><parent link="lower"/><child link="slide"/></joint>
+ <joint name="mount" type="fixed"><parent link="slide"/><child link="tool"/><origin rpy="0 1.57 0"/></joint>
+</robot>"""
+
+
+def about(axis: int, angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    rotation = np.eye(3)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    rotation[[first, first, second, second], [first, second, first, second]] = c, -s, s, c
+    return rotation
+
+
+def joints(t: Array) -> Array:
+    """(n, 2) rad, of a motion without a rhythm."""
+    first = 0.5 * np.sin(2.3 * t) + 0.3 * np.sin(5.1 * t + 1) + 0.4 * np.sin(0.7 * t * (1 + t / 70))
+    return np.stack(
+        [first, 0.4 * np.sin(3.1 * t + 2) + 0.3 * np.sin(1.3 * t) + 0.2 * np.sin(6.7 * t)], axis=1
+    )
+
+
+def rates(t: Array) -> Array:
+    """(n, 3) rad/s of the link before the mount: its own joint's, and the first one's, by hand."""
+    speeds = (joints(t + 1e-4) - joints(t - 1e-4)) / 2e-4
+    up = about(2, 1.2) @ about(0, 0.3)
+    return np.array([
+        (about(1, second).T @ up.T)[:, 2] * first_speed + np.array([0, second_speed, 0])
+        for second, (first_speed, second_speed) in zip(joints(t)[:, 1], speeds, strict=True)
+    ])  # fmt: skip
+
+
+@functools.cache
+def sensor_times() -> Array:
+    return np.arange(0, 40, PERIOD_NS * 1e-9)
+
+
+@pytest.mark.parametrize("topic", ["/imu", "/joint_states"])
+def test_the_offset_and_drift_of_a_robots_clock(tmp_path: Path, topic: str) -> None:
+    noise = np.random.default_rng(1)
+    felt = rates(sensor_times() - GYROSCOPE_S) @ about(0, 0.7) @ about(1, 2.0) + 0.02
+    felt = np.degrees(felt + noise.normal(0, 0.005, felt.shape))
+    frames = (
+        frame(number, **dict(zip(("angular_rate.x", "angular_rate.y", "angular_rate.z"), row, strict=True)))
+        for number, row in enumerate(felt.tolist())
+    )
+    record(tmp_path / "run.mcap", frames, fir=False, angular_rate_filter=3)
+    instants = np.arange(2, 36, 0.008)
+    # What the robot's clock shows at these instants, s; some messages are late.
+    stamps = (instants - OFFSET_S) / (1 + DRIFT)
+    stamps_ns = START_NS + np.rint(1e9 * stamps + noise.normal(0, 2e5, len(stamps))).astype(np.int64)
+    if topic == "/imu":
+        turned = rates(instants) + noise.normal(0, 0.01, (len(instants), 3))
+        messages = [imu(at, row) for at, row in zip(stamps_ns.tolist(), turned.tolist(), strict=True)]
+    else:
+        at_s = zip(stamps_ns.tolist(), joints(instants).tolist(), strict=True)
+        messages = [joint_states(at, gripper=0.1, second=row[1], first=row[0]) for at, row in at_s]
+        messages.insert(100, joint_states(int(stamps_ns[100]), another=1.0))
+    bag = write_bag(tmp_path / "bag", topic, messages)
+    (tmp_path / "arm.urdf").write_text(URDF)
+    given = ["--topic", topic, "--urdf", tmp_path / "arm.urdf", "--link", "tool"]
+    ended = run_here(main, "align", tmp_path / "run.mcap", bag, *given, "--json")
+    assert ended.code == 0, ended.err
+    assert not problems("export-align", ended.json)
+    found = Clock(ended.json["stamp_ns"], ended.json["monotonic_ns"], ended.json["drift_ppm"])
+    error_ms = (found.monotonic(START_NS + np.rint(1e9 * stamps).astype(np.int64)) * 1e-9 - instants) * 1e3
+    assert abs(error_ms).max() < 0.5
+    assert abs(error_ms[len(error_ms) // 2]) < 2 * ended.json["interval_ms"] < 0.5
+    assert ended.json["offset_ms"] == pytest.approx(OFFSET_S * 1e3, abs=5)
+    text = run_here(main, "align", tmp_path / "run.mcap", bag, *given).out
+    assert text.startswith(f"to stamps of {topic} add -1724")
+
+
+def periodic(t: Array) -> Array:
+    return np.stack([np.sin(6.0 * t), np.sin(6.0 * t + 1), np.cos(6.0 * t)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "robot", "said"),
+    [
+        (lambda t: 0 * rates(t), rates, "the sensor hardly turned"),
+        (rates, lambda t: 0 * rates(t), "the robot hardly turned"),
+        (rates, lambda t: np.roll(rates(t[::-1]) ** 2, 1, axis=1), "the robot's motion explains only"),
+        (periodic, periodic, "the motion repeats itself"),
+        (lambda t: rates(t)[: len(t) // 5], rates, "the sensor was recorded for less than 10 s"),
+    ],
+)  # fmt: skip
+def test_a_motion_that_says_nothing_is_refused(sensor: Motion, robot: Motion, said: str) -> None:
+    noise = np.random.default_rng(1)
+    times = np.arange(0, 40, 0.005)
+    felt = sensor(times)
+    felt = felt + noise.normal(0, 0.01, felt.shape)
+    with pytest.raises(RecordingError, match=said):
+        find_offset(times[: len(felt)], felt, times, robot(times) + noise.normal(0, 0.01, (len(times), 3)))
