@@ -220,7 +220,7 @@ _PERIOD_US: Final = 1250.0  # the sample period at the factory setting, 800 Hz
 _WAKE_NOTE_US: Final = 100
 _WAKE_WARNING_US: Final = 250
 _EXCHANGE_NOTE_US: Final = 250
-_STEADIER: Final = "see 'A steadier cycle' in docs/operations.md"
+_STEADIER: Final = "see docs/tuning.md"
 
 
 def points(summary: Mapping[str, Any]) -> str:

@@ -186,7 +186,6 @@ TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
         "p99.9": _shown("age_us", "p999", "age_p999"),
         "stamp error p99, µs": _shown("stamp_error_us", "p99_absolute"),
         "CPU, %": _shown("cpu_percent", "server", "cpu"),
-        "memory, MB": _shown("rss_mb", "server"),
     },
     "load": {
         "beside loops": lambda row: f"{row['rate_hz']} Hz, {row['loops']} loops: {row['chain']}",

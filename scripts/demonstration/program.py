@@ -126,7 +126,7 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
     if summary.lost + summary.lost_before:
         console.print(
             "Samples are missing: other programs or a hypervisor had the processors for some time. "
-            "'A steadier cycle' in docs/operations.md helps."
+            "docs/tuning.md helps."
         )
 
 

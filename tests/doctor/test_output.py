@@ -152,11 +152,8 @@ def test_json_has_it_all() -> None:
     assert found["findings"] == [expected]
 
 
-def test_the_docs_have_every_check_in_its_order() -> None:
+def test_the_docs_have_every_check() -> None:
     docs = (Path(__file__).parent.parent.parent / "docs" / "doctor.md").read_text()
-    table, subject = [], ""
-    for line in docs.partition("| Subject | Check |")[2].partition("\n\n")[0].splitlines()[2:]:
-        cells = [cell.strip().strip("`") for cell in line.split("|")[1:-1]]
-        subject = cells[0] or subject
-        table.append((subject, cells[1]))
-    assert table[: len(CHECKS)] == [(check.subject, check.name) for check in CHECKS]
+    assert not [
+        check for check in CHECKS if f"| `{check.subject}` |" not in docs or f"`{check.name}`" not in docs
+    ]

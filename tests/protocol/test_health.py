@@ -133,7 +133,7 @@ def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable(seen: Obser
 
 
 def test_the_documented_verdicts_are_these() -> None:
-    rows = (Path(__file__).parents[2] / "docs" / "operations.md").read_text().splitlines()
+    rows = (Path(__file__).parents[2] / "docs" / "programs.md").read_text().splitlines()
     for row in (
         f"| no new sample | | for {LIMITS.stale_after:g} s |",
         f"| lost samples, invalid frames | any | above {100 * LIMITS.lost_error:g} %, and at least "

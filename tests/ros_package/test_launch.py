@@ -138,14 +138,6 @@ def test_a_parameter_file_is_found_or_refused(tmp_path: Path, monkeypatch: pytes
     assert (node.named["name"], len(node.named["parameters"])) == ("bota_ft_sensor", 2)
 
 
-def test_the_page_names_every_file_and_argument() -> None:
-    page = (ROOT / "docs/ros2-workspace.md").read_text()
-    assert {file.name for file in LAUNCH.glob("*.launch.py")} == {f"{name}.launch.py" for name in ARGUMENTS}
-    for name, arguments in ARGUMENTS.items():
-        assert f"`{name}.launch.py`" in page
-        assert [argument for argument in arguments if f"`{argument}`" not in page] == []
-
-
 # Run by `ros2 launch`.
 
 

@@ -1,4 +1,4 @@
-"""SampleClock against simulated machines, network cards and sensors; docs/sample-clock.md has the table."""
+"""SampleClock against simulated machines, network cards and sensors; docs/sample-clock.md has the model."""
 
 from __future__ import annotations
 

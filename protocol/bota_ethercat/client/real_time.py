@@ -2,7 +2,7 @@
 """Real-time scheduling of a client: SCHED_FIFO and a CPU for one thread, memory that is never paged out.
 
 Beside programs that use every CPU, an ordinary client has its samples some milliseconds late. Each right is
-used if the system allows it; what is not allowed is said, with what would allow it (docs/operations.md).
+used if the system allows it; what is not allowed is said, with what would allow it (docs/tuning.md).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The thresholds of every verdict on a stream: one table. docs/operations.md has it for people."""
+"""The thresholds of every verdict on a stream: one table. docs/programs.md has it for people."""
 
 from __future__ import annotations
 
