@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import random
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -165,9 +167,7 @@ def test_the_compensated_wrench_is_the_nodes() -> None:
 FORMATS = ("npz", "parquet", "zarr")
 
 
-@pytest.fixture
-def written(tmp_path: Path) -> dict[str, Arrays]:
-    """The same windows in every format."""
+def test_every_format_has_the_same(tmp_path: Path) -> None:
     zarr, parquet = pytest.importorskip("zarr"), pytest.importorskip("pyarrow.parquet")
     path = tmp_path / "run.mcap"
     record(path, (frame(number) for number in range(3000)), **SETTINGS)
@@ -182,21 +182,54 @@ def written(tmp_path: Path) -> dict[str, Arrays]:
     ):  # fmt: skip
         assert (found["sensor"]["serial"], found["options"]["window"]) == (100, 8)
         assert found["settings"][0]["delay_ms"]["acceleration"] == 1.94
-    return {
-        "npz": {name: npz[name] for name in npz if name != "attributes"},
-        "zarr": {name: group[name][:] for name in group},
-        "parquet": {name: np.stack(table[name].to_numpy()) for name in table.column_names},
-    }
-
-
-def test_every_format_has_the_same(written: dict[str, Arrays]) -> None:
-    npz, parquet, zarr = (written[suffix] for suffix in FORMATS)
-    assert npz.keys() == zarr.keys() == parquet.keys()
+    assert {*table.column_names, "attributes"} == {*group, "attributes"} == {*npz}
     assert len(npz["stamp_ns"]) == 113
-    for name, array in npz.items():
-        assert (zarr[name].tobytes(), parquet[name].tobytes()) == (array.tobytes(), array.tobytes()), name
-        assert zarr[name].shape == array.shape
-        assert zarr[name].dtype == parquet[name].dtype == array.dtype
+    for name in group:
+        array, flat = npz[name], np.stack(table[name].to_numpy())
+        assert group[name][:].tobytes() == flat.tobytes() == array.tobytes(), name
+        assert (group[name].shape, group[name].dtype, flat.dtype) == (array.shape, array.dtype, array.dtype)
+        if array.ndim > 1:  # as in a data set of LeRobot v3
+            assert table.schema.field(name).type.list_size == array[0].size
+    # Files are replaced with --force only.
+    for suffix in FORMATS:
+        given = path, tmp_path / f"run.{suffix}", "--fps", 30
+        assert "exists" in run_here(main, *given).err
+        assert run_here(main, *given, "--force").code == 0
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "datasets.md"
+
+
+@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL))
+def test_the_code_of_the_page_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in re.findall(r"^(?:import|from) (\w+)", code, re.MULTILINE):
+        pytest.importorskip(package)
+    monkeypatch.chdir(tmp_path)
+    record(Path("run.mcap"), (frame(number) for number in range(1000)), **SETTINGS)
+    for suffix in ("npz", "parquet"):
+        run_here(main, "run.mcap", f"run.{suffix}", "--fps", 30)
+    if "lerobot" in code:
+        made = importlib.import_module("lerobot.datasets.lerobot_dataset").LeRobotDataset.create(
+            "me/run",
+            30,
+            {"state": {"dtype": "float32", "shape": (2,), "names": None}},
+            "run",
+            use_videos=False,
+        )
+        for number in range(38):
+            made.add_frame({"state": np.array([number, 0], np.float32), "task": "none"})
+        made.save_episode()
+        made.finalize()
+    found: dict[str, Any] = {}
+    exec(code, found)
+    if "force_torque" in found:
+        assert found["force_torque"].shape == (38, 32, 6)
+        assert found["valid"][-1].all()
+    if "newest_force" in found:
+        assert found["newest_force"][-1].tolist() == [found["newest_force"][-1][0], 0, 0]
+    if "lerobot" in code:
+        merged = found["LeRobotDataset"]("me/with_force", root="with_force")[20]
+        assert merged["observation.force_torque"].reshape(32, 6)[-1, 0] == 20 * 800 // 30 + 1
 
 
 STAMPS = [START_NS + 123_456_789, START_NS + 223_456_000]

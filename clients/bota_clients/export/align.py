@@ -42,7 +42,7 @@ _EXPLAINED: Final = 0.5
 _CANDIDATES: Final = 4
 _APART_S: Final = 0.5  # one from the other
 _OTHER: Final = 0.9  # of what the best candidate explains: another that does as much may be right, too
-_WIDEST_S: Final = 0.005
+_WIDEST_MS: Final = 5.0
 
 
 class ClockOffset(NamedTuple):
@@ -50,9 +50,9 @@ class ClockOffset(NamedTuple):
 
     at_s: float  # y
     offset_s: float
-    offset_interval_s: float  # half of the 95 % interval
-    drift: float
-    drift_interval: float
+    interval_ms: float  # half of the 95 % interval, as drift_interval_ppm
+    drift_ppm: float
+    drift_interval_ppm: float
 
 
 def find_offset(times: Array, rates: Array, other_times: Array, other_rates: Array) -> ClockOffset:
@@ -95,13 +95,14 @@ def find_offset(times: Array, rates: Array, other_times: Array, other_rates: Arr
     weight, lever = float(weights.sum()), float((weights * off**2).sum())
     drift = float((weights * off * offsets).sum()) / lever
     scatter = float((weights * (offsets - offset - drift * off) ** 2).sum()) / (_PARTS - 2)
-    interval, drift_interval = (_T_95 * float(np.sqrt(scatter / total)) for total in (weight, lever))
-    if not interval < _WIDEST_S:
+    interval_ms, drift_interval_ppm = (
+        _T_95 * float(np.sqrt(scatter / total)) * scale for total, scale in ((weight, 1e3), (lever, 1e6))
+    )
+    if not interval_ms < _WIDEST_MS:
         raise RecordingError(
-            f"the motion is too slow to tell (± {interval * 1e3:.0f} ms): turn the sensor faster, and about "
-            "several axes"
+            f"the motion is too slow to tell (± {interval_ms:.0f} ms): turn faster, and about several axes"
         )
-    return ClockOffset(middle, offset, interval, drift, drift_interval)
+    return ClockOffset(middle, offset, interval_ms, drift * 1e6, drift_interval_ppm)
 
 
 def _smooth(which: str, times: Array, rates: Array) -> tuple[Array, Array]:
@@ -216,9 +217,9 @@ def run(options: Options) -> int:
         for settings, frames in recording.batches(choose(recording, options.sensor).sensor):
             table = decode(frames, options.imu_units)
             table = table.where(table.fresh & np.isfinite(table.angular_rate).all(axis=1))
-            later_ns = round((angular_rate_response(known_settings(settings.values)).delay_s or 0.0) * 1e9)
-            rows.append((table.stamp_ns - later_ns, table.monotonic_ns - later_ns, table.angular_rate))
-    stamps, instants, rates = map(np.concatenate, zip(*rows, strict=True))
+            delay_s = angular_rate_response(known_settings(settings.values)).delay_s or 0.0
+            rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
+    instants, rates = map(np.concatenate, zip(*rows, strict=True))
     robot_stamps, robot_rates = _robot_rates(options)
     try:
         if (np.diff(instants) <= 0).any():
@@ -232,22 +233,14 @@ def run(options: Options) -> int:
         return 1
     robot_ns = int(robot_stamps[0]) + round(found.at_s * 1e9)
     monotonic_ns = int(instants[0]) + round((found.at_s + found.offset_s) * 1e9)
-    # The server's clocks are as far apart as in the nearest sample.
-    nearest = min(int(np.searchsorted(instants, monotonic_ns)), len(instants) - 1)
-    values = {
-        "ok": True,
-        "stamp_ns": robot_ns,
-        "monotonic_ns": monotonic_ns,
-        "offset_ms": (monotonic_ns + int(stamps[nearest] - instants[nearest]) - robot_ns) * 1e-6,
-        "interval_ms": found.offset_interval_s * 1e3,
-        "drift_ppm": found.drift * 1e6,
-        "drift_interval_ppm": found.drift_interval * 1e6,
-    }
+    # The server's clocks are as far apart as at the end of the recording.
+    offset_ms = (monotonic_ns + frames[-1].stamp_ns - frames[-1].monotonic_ns - robot_ns) * 1e-6
+    values = {"ok": True, "stamp_ns": robot_ns, "monotonic_ns": monotonic_ns, "offset_ms": offset_ms}
+    values |= dict(zip(found._fields[2:], found[2:], strict=True))
     text = (
         "to stamps of {topic} add {offset_ms:+.2f} ms (± {interval_ms:.2f} ms, 95 %) at {when}, and "
         "{drift_ppm:+.1f} ppm (± {drift_interval_ppm:.1f}) of the time since then: that is the server's "
-        "CLOCK_REALTIME"
-    )
-    said = text.format(topic=options.topic, when=moment(robot_ns), **values)
-    sys.stdout.write((json.dumps(values, indent=1) if options.json else said) + "\n")
+        "CLOCK_REALTIME\n"
+    ).format(topic=options.topic, when=moment(robot_ns), **values)
+    sys.stdout.write(json.dumps(values, indent=1) + "\n" if options.json else text)
     return 0

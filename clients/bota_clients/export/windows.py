@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -31,13 +31,24 @@ from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import SettingValue, known_settings
 from ft_compensation.alignment import align
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import EXACT, NO_PAYLOAD, NO_WRENCH, ZERO, Accelerometer, Payload, Wrench
+from ft_compensation.quantities import (
+    EXACT,
+    NO_PAYLOAD,
+    NO_WRENCH,
+    STILL,
+    ZERO,
+    Accelerometer,
+    Payload,
+    Turning,
+    Wrench,
+)
 from ft_compensation.specific_force import ImuSpecificForce
 from ft_compensation.stationary import BAD_WRENCH
 
 Array = npt.NDArray[Any]
 Arrays = dict[str, Array]
 _CHANNELS: Final = dict(zip(Delays._fields, (slice(0, 6), slice(6, 9), slice(9, 12)), strict=True))
+_UNKNOWN: Final = (math.nan,) * 3
 _SLOT: Final = np.dtype([
     ("stamp_ns", "i8"),  # of an empty slot by its place between two samples
     ("measured_ns", "i8", 3),  # by channel
@@ -178,21 +189,22 @@ class Windows:
             slots["compensated"][end] = self._compensated(samples, self._tool)
         self._slots = np.concatenate([self._slots, slots])
 
-    def _compensated(self, samples: Columns, tool: Tool) -> list[Sequence[float]]:
-        """Of each sample N, Nm, as the ROS 2 node has it."""
-        found = list[Sequence[float]]()
-        compensate = Compensator(tool.payload, tool.bias).compensate
-        parts = samples.force, samples.torque, samples.acceleration, samples.angular_rate
-        times = (samples.monotonic_ns * 1e-9).tolist()
-        for force, torque, acceleration, rate, time_s in zip(
-            *(part.tolist() for part in parts), times, strict=True
-        ):
-            felt: Vector3 | None = ZERO
-            if tool.payload.mass:
-                felt = self._imu.follow(acceleration, rate, time_s) if any(acceleration) else None
-            known = felt and compensate(force, torque, felt, self._imu.turning).final.values
-            found.append(known or (math.nan,) * 6)
-        return found
+    def _compensated(self, samples: Columns, tool: Tool) -> Array:
+        """(n, 6) N, Nm, as the ROS 2 node has it."""
+        felt, turning = np.zeros((len(samples), 3)), cast(Any, STILL)
+        if tool.payload.mass:
+            follow, rows, turned = self._imu.follow, list[Vector3](), list[Turning]()
+            times = (samples.monotonic_ns * 1e-9).tolist()
+            for acceleration, rate, time_s in zip(
+                samples.acceleration.tolist(), samples.angular_rate.tolist(), times, strict=True
+            ):
+                rows.append((any(acceleration) and follow(acceleration, rate, time_s)) or _UNKNOWN)
+                turned.append(self._imu.turning)
+            felt = np.array(rows)
+            if any(tool.payload.inertia):
+                turning = np.moveaxis(np.array(turned), 0, 2)
+        compensate = cast(Any, Compensator(tool.payload, tool.bias).compensate)  # of arrays as of numbers
+        return np.vstack(compensate(samples.force.T, samples.torque.T, felt.T, turning).final).T
 
     def at(self, instants_ns: Ints) -> Arrays:
         """Windows of these f instants; the last sample of each is the newest.
