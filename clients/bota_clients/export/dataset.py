@@ -55,11 +55,12 @@ def windows_of(
     done = 0
     for settings, frames in recording.batches(sensor):
         windows.configure(settings.values, settings.rate_hz, settings.identity.name)
-        table = windows.take(frames)
-        times.follow(table.stamp_ns, table.monotonic_ns)
+        samples = windows.take(frames)
+        if len(samples):
+            times.follow(samples.stamp_ns, samples.monotonic_ns)
         instants = times.instants_ns[done:]
         if len(instants) and instants[0] < windows.begin_ns:
-            raise times.refusal(done)
+            raise times.refusal(done, windows.until_ns)
         ready = instants[: np.searchsorted(instants, windows.until_ns, "right")]
         if len(ready):
             stamps = times.stamps_ns[done : done + len(ready)]
@@ -68,7 +69,7 @@ def windows_of(
         windows.forget(min([windows.until_ns, *instants[len(ready) :][:1].tolist()]))
         advance(len(frames))
     if done < times.count or not done:
-        raise times.refusal(done)
+        raise times.refusal(done, windows.until_ns)
 
 
 def run(options: Options) -> int:

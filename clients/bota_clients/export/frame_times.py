@@ -21,7 +21,7 @@ from bota_ethercat.text.json_text import parse_json_object
 
 _SECOND: Final = 1_000_000_000
 _LATEST_NS: Final = 4_102_444_800 * _SECOND  # the year 2100
-_NAMES: Final = ("stamp_ns", "timestamp_ns", "timestamp", "stamp", "time")  # of a column, if none is given
+_NAMES: Final = ("stamp_ns", "timestamp", "time")  # of a column, if none is given
 
 
 class Clock(NamedTuple):
@@ -31,16 +31,9 @@ class Clock(NamedTuple):
     monotonic_ns: int  # ... at this instant of the server's CLOCK_MONOTONIC
     drift_ppm: float  # by which the server's is faster
 
-    def monotonic(self, stamps_ns: Ints) -> Ints:
-        """The server's CLOCK_MONOTONIC at these stamps, ns."""
-        passed = stamps_ns - self.stamp_ns
-        return np.asarray(
-            self.monotonic_ns + passed + np.rint(passed * (self.drift_ppm * 1e-6)).astype(np.int64)
-        )
-
     @classmethod
     def read(cls, path: Path) -> Clock:
-        """From what `ethercat-export align --json` printed; RecordingError."""
+        """What `ethercat-export align --json` printed; RecordingError."""
         try:
             found = parse_json_object(path.read_bytes())
             return cls(int(found["stamp_ns"]), int(found["monotonic_ns"]), float(found["drift_ppm"]))
@@ -73,19 +66,22 @@ class FrameTimes:
         """
         self.stamps_ns = np.zeros(0, np.int64) if stamps_ns is None else stamps_ns
         self.count, self.instants_ns = len(self.stamps_ns), np.zeros(0, np.int64)
-        self._period_ns, self._latency_ns = fps and _SECOND / fps, round(latency_s * _SECOND)
+        self._period_ns, self._latency_ns = fps and _SECOND / fps, 0 if fps else round(latency_s * _SECOND)
         self._source = source
-        self._begin = self._newest = (-1, -1)  # both stamps of the first and of the newest DATA frame
+        self._begin = self._newest = (-1, -1)  # both stamps of the first and of the newest sample
         # Where a stamp is before that of the frame before: the clock was set back, or they are not sorted.
         self._descents = np.append(np.flatnonzero(np.diff(self.stamps_ns) < 0) + 1, self.count)
         self._awaits_descent = False
         if clock is not None:
             if self._descents[0] < self.count:
-                raise self.refusal(int(self._descents[0]))
-            self._take(clock.monotonic(self.stamps_ns))
+                raise self.refusal(int(self._descents[0]), 0)
+            passed = self.stamps_ns - clock.stamp_ns
+            self._take(
+                clock.monotonic_ns + passed + np.rint(passed * (clock.drift_ppm * 1e-6)).astype(np.int64)
+            )
 
     def follow(self, stamp_ns: Ints, monotonic_ns: Ints) -> None:
-        """Take both stamps of the next DATA frames."""
+        """Take both stamps of the next samples."""
         if self._begin[0] < 0:
             self._begin = self._newest = int(stamp_ns[0]), int(monotonic_ns[0])
         stamps, instants = np.append(self._newest[0], stamp_ns), np.append(self._newest[1], monotonic_ns)
@@ -106,7 +102,7 @@ class FrameTimes:
             self._map(stamps[begin:end], instants[begin:end], before_ns, after_ns)
 
     def _map(self, stamps: Ints, instants: Ints, before_ns: int, after_ns: int) -> None:
-        """Take the frames from `before_ns` before these DATA frames, between which no clock was set, on."""
+        """Take the frames from `before_ns` before these samples, between which no clock was set, on."""
         done = len(self.instants_ns)
         if self._awaits_descent or done == self.count:
             return
@@ -120,8 +116,8 @@ class FrameTimes:
     def _take(self, instants_ns: Ints) -> None:
         self.instants_ns = np.append(self.instants_ns, instants_ns - self._latency_ns)
 
-    def refusal(self, row: int) -> RecordingError:
-        """Why this frame has no window, where all before it have one."""
+    def refusal(self, row: int, until_ns: int) -> RecordingError:
+        """Why this frame has no window, where all before it have one; windows end at `until_ns`."""
         if not self.count:
             return RecordingError("the recording is too short for a frame")
         stamp, source = int(self.stamps_ns[row]), f"row {row} of {self._source} (counted from 0)"
@@ -129,10 +125,11 @@ class FrameTimes:
             return RecordingError(
                 f"{source} is before the row above it, and the server's clock was not set then: sort the rows"
             )
-        taken, begin, end = (np.datetime64(ns, "ns") for ns in (stamp, self._begin[0], self._newest[0]))
+        end_ns = self._newest[0] + until_ns - self._newest[1]
+        taken, begin, end = (np.datetime64(ns, "ns") for ns in (stamp, self._begin[0], end_ns))
         return RecordingError(
-            f"{source} is of {taken}Z, and the recording has samples from {begin}Z to {end}Z: leave the row "
-            "out, or find the offset of its clock with 'ethercat-export align'"
+            f"{source} is of {taken}Z, and samples were measured from {begin}Z to {end}Z: leave the row out, "
+            "or find the offset of its clock with 'ethercat-export align'"
         )
 
 

@@ -141,15 +141,15 @@ class Windows:
         return int(self._slots["measured_ns"].max(axis=0, initial=-1).min())
 
     def take(self, frames: Sequence[DataMessage]) -> Columns:
-        """Take the next frames of the sensor, also REPEATED and INVALID ones; decoded. RecordingError."""
+        """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
         table = decode(frames, self._units)
         # GAP of a frame that brings no sample is that of the next sample.
         gaps = np.cumsum(np.append(self._gap, table.flags & int(DataFlag.GAP) != 0))
         at = np.flatnonzero(table.fresh)
         self._gap = bool(gaps[-1] > (gaps[at[-1] + 1] if len(at) else 0))
-        if not len(at):
-            return table
         samples = table.where(table.fresh)
+        if not len(at):
+            return samples
         stamps, sequence = samples.monotonic_ns, samples.sequence
         is_first = self.begin_ns < 0
         if is_first:
@@ -161,7 +161,7 @@ class Windows:
         room = np.rint(passed * (self._rate_hz * 1e-9)).astype(np.int64) - 1
         self._newest = int(stamps[-1]), int(sequence[-1])
         self._append(samples, passed, np.where(broken, np.maximum(room, 0), 0))
-        return table
+        return samples
 
     def _append(self, samples: Columns, passed: Ints, lost: Ints) -> None:
         """Samples, each `passed` ns after the one before, with so many `lost` in between."""
