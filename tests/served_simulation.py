@@ -47,9 +47,11 @@ class _Transport(SocketTransport):
     def wait(
         self, readers: Collection[int], writers: Collection[int], seconds: float
     ) -> tuple[Sequence[int], Sequence[int]]:
-        until_ns = self._clock.now_ns + round(seconds * 1e9)
-        ready = super().wait(readers, writers, max(0, until_ns - time.monotonic_ns()) * 1e-9)
-        self._clock.advance(min(until_ns, time.monotonic_ns()) if any(ready) else until_ns)
+        began_ns, until_ns = time.monotonic_ns(), self._clock.now_ns + round(seconds * 1e9)
+        ready = super().wait(readers, writers, max(0, until_ns - began_ns) * 1e-9)
+        if any(ready):  # it does not catch up now: it would always be too late to begin a request
+            until_ns = min(until_ns, self._clock.now_ns + time.monotonic_ns() - began_ns)
+        self._clock.advance(until_ns)
         return ready
 
 

@@ -71,7 +71,7 @@ def test_files_hold_what_the_pages_say(page: Path) -> None:
 def test_the_troubleshooting_page_quotes_what_is_said() -> None:
     text = (ROOT / "docs" / "troubleshooting.md").read_text()
     said = "".join(path.read_text() for path in sorted((ROOT / "ethercat_server").rglob("*.py")))
-    symptoms = re.findall(r"^\| ((?:`[^`]+`(?:, )?)+) \|", text, re.MULTILINE)
+    symptoms = re.findall(r"^- ((?:`[^`]+`(?:, )?)+): ", text, re.MULTILINE)
     assert len(symptoms) > 5
     for quoted in re.findall(r"`([^`]+)`", " ".join(symptoms)):
         assert quoted in said, quoted

@@ -14,9 +14,11 @@ from typing import Final
 
 import pytest
 
+from bota_clients.identify.cli import main as identify
 from ethercat_server import programs
 from ethercat_server.virtual_sensor.cli import main as virtual_sensor
 from tests.ended import run_here
+from tests.simulation import more_if_long
 
 ROOT: Final = Path(__file__).parent.parent
 SCRIPTS: Final[dict[str, str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -48,7 +50,7 @@ def interrupted(name: str, number: int, at: str, arguments: str) -> tuple[int, s
     return done.returncode, done.stderr, done.stdout
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", more_if_long([signal.SIGINT], [signal.SIGINT, signal.SIGTERM]))
 @pytest.mark.parametrize(
     ("name", "module", "arguments"),
     [
@@ -88,9 +90,7 @@ def test_every_program_starts_so(name: str, monkeypatch: pytest.MonkeyPatch) -> 
         signal.signal(signal.SIGINT, before)
 
 
-def test_the_server_says_what_it_needs(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_missing_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def start(_: str) -> int:
         raise ModuleNotFoundError("No module named 'pysoem'", name="pysoem")
 
@@ -99,6 +99,10 @@ def test_the_server_says_what_it_needs(
     assert programs.server() == 1
     sentence = "ethercat-server: pysoem is missing: this needs Linux and 'pip install .' there\n"
     assert capsys.readouterr().err == sentence
+    monkeypatch.setitem(sys.modules, "bota_clients.identify.program", None)
+    assert identify(["x.mcap"]) == 1
+    sentence = "ethercat-identify: bota_clients is not installed: in this project's folder run "
+    assert capsys.readouterr().err.startswith(sentence)
 
 
 @pytest.mark.parametrize("name", ["ethercat-sensor", "ethercat-doctor", "ethercat-record", "ethercat-replay"])

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bias and tool subtracted from one sample, in plain floats: what runs for every sample.
 
-Same signs and units as `equations`, which the tests hold it to. NumPy would cost more here than
-the arithmetic.
+Signs and units are those of docs/compensation.md. NumPy would cost more here than the arithmetic.
 """
 
 from __future__ import annotations

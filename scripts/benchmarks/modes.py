@@ -31,7 +31,7 @@ _OTHER: Final = (
     "env", "-u", "LD_LIBRARY_PATH", "-u", "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
     f"PYTHONPATH={VENDOR.with_name('protocol')}",
 )  # fmt: skip
-THIS, C_CLIENT, BARE_C, BY_C = "this", "this, C client", "bare C", "this / C, C client"
+THIS, C_CLIENT, BARE_C = "this", "this, C client", "bare C"
 DRIVER, ROS = "Bota's driver", "this, ROS"
 RATIOS: Final = {
     "age_p50": ("age_us", "p50"),
@@ -96,12 +96,9 @@ def compare(setup: Setup, with_driver: bool) -> list[Figures]:
             missing[DRIVER] = "bota-driver could not be installed by scripts/benchmark"
     if setup.ros:
         taken[ROS] = turn(setup, ROS)
-    rows: list[Figures] = []
-    for name, (figures, _) in taken.items():
-        rows.append({"program": name, **figures})
-        if name == BARE_C:
-            turns = ([each[by] for each in rounds] for by in (C_CLIENT, BARE_C))
-            rows.append({"program": BY_C, "ratio": ratios(*turns)})
+    if BARE_C in taken:
+        taken[C_CLIENT][0]["ratio"] = ratios(*([each[by] for each in rounds] for by in (C_CLIENT, BARE_C)))
+    rows: list[Figures] = [{"program": name, **figures} for name, (figures, _) in taken.items()]
     rows += [{"program": name, "missing": why} for name, why in missing.items()]
     return [{"rate_hz": setup.rate_hz, "sensors": setup.sensors, **row} for row in rows]
 
@@ -162,10 +159,9 @@ def load(setup: Setup, loops: int) -> list[Figures]:
 
 def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
     def show(row: Figures) -> str:
-        if "ratio" in row:
-            return f"{row['ratio'][ratio]:.2f}" if ratio else ""
         value = (row.get(table) or {}).get(key)
-        return _NONE if value is None else f"{value:.{1 if value < 100 else 0}f}"
+        text = _NONE if value is None else f"{value:.{1 if value < 100 else 0}f}"
+        return f"{text} ({row['ratio'][ratio]:.2f})" if ratio and "ratio" in row else text
 
     return show
 
@@ -178,8 +174,7 @@ def _points(row: Figures, name: str) -> str:
 # Of the table of each, by heading: how a row is shown.
 TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
     "comparison": {
-        "sensors": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}",
-        "": lambda row: row["program"],
+        "sensors: program": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}: {row['program']}",
         "lost": lambda row: f"{row['lost']} of {row['made']}" if "made" in row else row.get("missing", ""),
         "age p50, µs": _shown("age_us", "p50", "age_p50"),
         "p99": _shown("age_us", "p99", "age_p99"),

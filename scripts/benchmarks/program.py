@@ -106,7 +106,7 @@ def table(name: str, rows: Sequence[Figures]) -> Table:
     """For a terminal."""
     made = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     for at, heading in enumerate(TABLES[name]):
-        made.add_column(heading, justify="right" if at > 1 else "left")
+        made.add_column(heading, justify="right" if at else "left")
     for line in cells(name, rows):
         made.add_row(*line)
     return made

@@ -92,15 +92,6 @@ def test_the_supervisor_is_heard_during_each_service(
     assert "Traceback" not in node.log
 
 
-def test_the_versions_that_the_internals_are_right_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of Jazzy and Kilted. Before another one is added, tests/bridge have to pass with it."""
-    assert RIGHT_FOR == ("7.1.", "9.1.")
-    assert rclpy_internals.is_known()
-    monkeypatch.setattr(rclpy_internals, "RIGHT_FOR", ("7.0.",))
-    with Node(Server(), zzz=1) as node:
-        assert "unknown parameter" not in node.log
-
-
 def supervised(server: Server, exit_code: int = 0) -> Node:
     """A node that has been told to stop, and what it has said."""
     with Node(server) as node:

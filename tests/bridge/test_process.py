@@ -156,14 +156,6 @@ def executor(node: Any) -> Iterator[SingleThreadedExecutor]:
     made.shutdown()
 
 
-def test_told_before_and_once_more_after_the_end(executor: SingleThreadedExecutor) -> None:
-    spinner = Spinner(executor)
-    spinner.stop()
-    spinner.run()
-    executor.shutdown()
-    spinner.stop()
-
-
 def test_a_callback_that_raises_ends_it_and_is_told(executor: SingleThreadedExecutor, node: Any) -> None:
     def fail() -> Any:
         raise LookupError("of the callback")

@@ -91,19 +91,6 @@ def node(server: WholeServer) -> Iterator[Node]:
         yield started
 
 
-def test_gravity_and_orientation(node: Node, server: WholeServer) -> None:
-    messages, oriented = node.hear("imu/data_raw"), node.hear("imu/data")
-    node.run(0.3)
-    a = messages[-1].linear_acceleration
-    assert math.hypot(a.x, a.y, a.z) == pytest.approx(9.8, abs=0.5)
-    assert not oriented  # mapped, but not estimated
-    node.set("settings.orientation_estimation", True)
-    node.run(0.3)
-    assert messages[-1].orientation_covariance[0] == -1.0
-    assert oriented[-1].orientation_covariance[0] == 0.0
-    assert server.time_ns() - stamp_ns(messages[-1]) < 20e6
-
-
 def test_settings(node: Node, server: WholeServer) -> None:
     assert node.parameters("settings.sinc_length", "settings.chop") == [512, False]
     node.set("settings.sinc_length", 256)
@@ -151,33 +138,6 @@ def test_a_server_that_stood_still(node: Node, server: WholeServer) -> None:
     assert int(values(array["stream"])["lost"]) > 100
     assert stamp_ns(wrenches[0]) > went_on_ns - 20e6, "nothing old"
     node.until(**HEALTHY)
-
-
-def test_a_sensor_without_power(node: Node, server: WholeServer) -> None:
-    wrenches = node.hear("wrench")
-    server.simulation.command("power off")
-    node.until("is lost", sensor="error", stream="error", clock="stale")
-    assert not node.fresh(wrenches, 1.0)
-    server.simulation.command("power on")
-    power_on_ns = server.time_ns()
-    node.until(**HEALTHY)
-    assert stamp_ns(wrenches[0]) > power_on_ns
-
-
-def test_a_server_that_starts_again(node: Node, server: WholeServer) -> None:
-    node.set("settings.sinc_length", 256)
-    wrenches = node.hear("wrench")
-    server.close()
-    node.until(link="error", stream="stale")
-    assert node.parameters("settings.sinc_length") == [None]
-    wrenches.clear()
-    server.start_again()
-    started_ns = server.time_ns()
-    array = node.until("was interrupted", link="warn")
-    assert values(array["link"])["reconnects"] == "1"
-    node.until(**HEALTHY)
-    assert node.parameters("settings.sinc_length") == [512]  # not what the node had asked for
-    assert stamp_ns(wrenches[0]) > started_ns
 
 
 @pytest.mark.long

@@ -360,24 +360,6 @@ def test_next_says_at_once_that_the_connection_is_lost(server: PlayedServer) -> 
 # -- bounds
 
 
-def test_messages_cut_anywhere_and_more_than_fits_the_buffer(server: PlayedServer) -> None:
-    with stream(server, receive_buffer=4_000_000) as running:
-        long = encode_json({"event": "something new", "text": "x" * 60_000})
-        wire = b"".join(long + frame(n) if n % 50 == 0 else frame(n) for n in range(1, 1001))
-        assert server.connection is not None
-        server.connection.setblocking(False)
-        sent, last = 0, 0
-        while last < 1000:
-            with contextlib.suppress(BlockingIOError):
-                sent += server.connection.send(wire[sent : sent + 7919])
-            reading = running.latest()
-            assert reading["sequence"] >= last
-            assert not reading["gap"]
-            last = reading["sequence"]
-        told = running.info()
-        assert (told["samples"], told["bad_messages"], told["gaps"]) == (1000, 0, 0)
-
-
 @pytest.mark.parametrize(
     ("wire", "said"),
     [
@@ -442,17 +424,6 @@ def test_it_starts_without_the_server(step: str) -> None:
             accept_while(late, running, step=step)
             late.send(frame(1))
             running.until(lambda r: r["fresh"], "the first sample")
-
-
-def test_a_connection_that_was_lost_is_made_anew(server: PlayedServer) -> None:
-    with stream(server, max_age_ms=0, reconnect_every_ms=1) as running:
-        server.send(frame(70))
-        running.latest()
-        server.hang_up()
-        running.until(lambda r: r["condition"] == "disconnected", "the end")
-        accept_while(server, running)
-        server.send(frame(3))
-        assert picked(running.latest(), "is_new", "gap", "connection", "sequence") == (True, True, 2, 3)
 
 
 def is_down(running: Driver) -> Callable[[], bool]:

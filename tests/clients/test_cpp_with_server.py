@@ -144,14 +144,6 @@ def test_describe_tare_and_refusals(shared: ServedSimulation) -> None:
         assert "no JSON object" in refused["error"]
 
 
-def test_a_sensor_that_there_is_not(shared: ServedSimulation) -> None:
-    with driver(shared.port, sensor=9, reconnect="when_told") as running:
-        told = running.do("connect", 5000)
-        assert not told["ok"]
-        assert "9" in told["error"]
-        assert "refused" in told["error"]
-
-
 def test_requests_without_a_server() -> None:
     with driver(free_port()) as running:
         for what in ("describe", "tare 10"):

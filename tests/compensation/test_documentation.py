@@ -5,42 +5,44 @@ from __future__ import annotations
 import doctest
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ft_compensation.quantities import DEFAULT_GRAVITY
-from tests.compensation import equations, figure
-from tests.compensation.making import BIAS, TOOL
+from ft_compensation.compensator import Compensator
+from ft_compensation.quantities import NO_WRENCH, Payload
+from tests.compensation import figure
+from tests.compensation.figure import Array
+from tests.compensation.making import BIAS, TOOL, gravity_for, load
 
 ROOT = Path(__file__).parent.parent.parent
 PAGE = (ROOT / "docs" / "compensation.md").read_text()
 
-# Orientations of the sensor, x, y, z, w: upright, rolled by 90° and by 180°.
-POSES = ((0.0, 0.0, 0.0, 1.0), (0.5**0.5, 0.0, 0.0, 0.5**0.5), (1.0, 0.0, 0.0, 0.0))
-BASE_R_SENSOR = equations.matrix_from_quaternion(POSES)
-GRAVITY = equations.gravity_in_sensor_from_quaternion(POSES, DEFAULT_GRAVITY)
-WEIGHT = equations.gravity_force(TOOL.mass, GRAVITY)
-WEIGHT_TORQUE = equations.torque_of(TOOL.center, WEIGHT)
+# What points up: the sensor upright, rolled by 90° about its x axis, and by 180°.
+UPS = ((0, 0, 1), (0, 1, 0), (0, 0, -1))
+GRAVITY = np.array([gravity_for(up) for up in UPS])
 # The bias of a tare with the tool on, upright.
-TARED = np.array(BIAS.values) + np.hstack([WEIGHT[0], WEIGHT_TORQUE[0]])
+TARED = load(UPS[0])
 
-MISTAKES: dict[str, dict[str, object]] = {
+MISTAKES: dict[str, dict[str, Any]] = {
     "none": {},
-    "bias not subtracted": {"bias": np.zeros(6)},
+    "bias not subtracted": {"bias": NO_WRENCH},
     "tare with the tool on, no gravity compensation": {"bias": TARED, "mass": 0.0},
     "tare with the tool on, and gravity compensation": {"bias": TARED},
     "mass 25 % too small": {"mass": 0.75 * TOOL.mass},
-    "rotation the wrong way round": {"gravity": equations.gravity_in_sensor(BASE_R_SENSOR, DEFAULT_GRAVITY)},
+    "rotation the wrong way round": {"gravity": GRAVITY * (1, -1, 1)},
     "frame turned by 90° about z": {"gravity": GRAVITY[:, [1, 0, 2]] * (1, -1, 1)},
     "center of gravity wrong": {"center": (0.0, 0.0, 0.1)},
 }
 
 
-def left_over(mistake: str) -> equations.ArrayStages:
-    known = {"bias": BIAS.values, "mass": TOOL.mass, "center": TOOL.center, "gravity": GRAVITY}
-    measured = WEIGHT + np.array(BIAS.force), WEIGHT_TORQUE + np.array(BIAS.torque)
-    return equations.compensate(*measured, **(known | MISTAKES[mistake]))  # type: ignore[arg-type]
+def left_over(mistake: str) -> Array:
+    """What compensation leaves in each pose, (n, 6)."""
+    known = {"bias": BIAS, "mass": TOOL.mass, "center": TOOL.center, "gravity": GRAVITY, **MISTAKES[mistake]}
+    compensator = Compensator(Payload(known["mass"], known["center"]), known["bias"])
+    poses = zip(UPS, (-known["gravity"]).tolist(), strict=True)
+    return np.array([compensator.compensate(*load(up), (*felt,)).final.values for up, felt in poses])
 
 
 def table_of_mistakes() -> dict[str, list[float]]:
@@ -54,13 +56,13 @@ def test_the_example_runs_and_every_mistake_is_tried() -> None:
     assert not failed
     assert table_of_mistakes().keys() == MISTAKES.keys()
     left = left_over("center of gravity wrong")
-    assert np.abs(left.final_force).max() < 1e-9
-    assert np.abs(left.final_torque).max() > 0.1
+    assert np.abs(left[:, :3]).max() < 1e-9
+    assert np.abs(left[:, 3:]).max() > 0.1
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_the_mistakes_look_as_the_page_says(mistake: str) -> None:
-    force = np.linalg.norm(left_over(mistake).final_force, axis=1)
+    force = np.linalg.norm(left_over(mistake)[:, :3], axis=1)
     assert table_of_mistakes()[mistake] == pytest.approx(force, abs=0.051)
 
 

@@ -503,41 +503,6 @@ def test_the_intervals_cover_93_to_97_percent(poses: int, ratio: float, offset: 
         assert offset or shares.mean() < (0.97 if len(shares) > 1 else 0.98), name
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("poses", [6, 8, 12, 24])
-@pytest.mark.parametrize("ratio", [1, 3, 10])
-@pytest.mark.parametrize("offset", [None, 0.0, 0.3])
-def test_the_intervals_cover_the_truth_axis_by_axis(poses: int, ratio: float, offset: float | None) -> None:
-    runs = 3000 if offset is None else 800
-    for name, shares in covered(simulate(runs, poses, ratio, offset)[0]).items():
-        assert shares.min() >= (0.93 if offset is None else 0.92), f"{name}: {shares}"
-        assert offset is not None or shares.max() <= 0.97, f"{name}: {shares}"
-
-
-@pytest.mark.parametrize("poses", more_if_long([6], [6, 12]))
-def test_under_drift_and_crossed_axes_the_intervals_stay_honest(poses: int) -> None:
-    """Of the mass and the center of gravity, with 0.5 N in all and 0.5 % of each other axis; any tool."""
-    draw, inside, runs = np.random.default_rng([poses, SEED]), [], 25
-    for run in range(runs):
-        tool = Payload(draw.uniform(0.5, 2.1), tuple(draw.uniform(-0.02, 0.08, 3).tolist()))
-        reading, noise = Reading(run, crossed=0.005), random.Random(run)
-        minutes = 0.2 * (poses - 1)
-        drift = Wrench(tuple((draw.choice((-1, 1), 3) * 0.3 / minutes).tolist()), (0.0, 0.01, 0.0))
-        ups = [*AXES, *map(tuple, draw.normal(size=(poses - 6, 3)).tolist())]
-        draw.shuffle(ups)
-        measured = timed([pose(up, tool, noise=noise) for up in ups], drift)
-        found = identify(
-            [
-                reading.pose(up)._replace(wrench=each.wrench, time_s=each.time_s)
-                for up, each in zip(ups, measured, strict=True)
-            ]
-        )
-        inside.append(abs(found.payload.mass - tool.mass) <= found.mass_interval)
-        centers = zip(found.payload.center, tool.center, found.centre_interval, strict=True)
-        inside += [abs(value - truth) <= half for value, truth, half in centers]
-    assert np.mean(inside) > 0.9
-
-
 def test_the_interval_of_an_offset_holds_it_and_shrinks_with_more_poses() -> None:
     halves = []
     for poses in (6, 24):

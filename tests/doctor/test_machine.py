@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import socket
 import struct
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.machine import FACTS, Machine, processor_list
@@ -263,15 +260,6 @@ GARBAGE = ("", "\0\0", "-", "99999999999999999999", "x" * 5000, "1 2 3\n" * 50, 
 @pytest.mark.parametrize("number", range(len(GARBAGE)))
 def test_garbage_in_every_file(tmp_path: Path, number: int) -> None:
     assert not faults(list(examine_machine(machine(tmp_path, dict.fromkeys(GOOD, GARBAGE[number])))))
-
-
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    st.dictionaries(st.sampled_from(sorted(GOOD)), st.one_of(st.text(max_size=40), st.binary(max_size=40)))
-)
-def test_any_text_in_any_file(tmp_path: Path, files: dict[str, str | bytes]) -> None:
-    with tempfile.TemporaryDirectory(dir=tmp_path) as folder:
-        assert not faults(list(examine_machine(machine(Path(folder), files))))
 
 
 def test_no_files_at_all(tmp_path: Path) -> None:

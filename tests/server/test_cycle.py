@@ -162,7 +162,7 @@ def test_samples_that_pass_while_the_sensor_itself_is_held_up_are_counted(dc: st
 
 
 @pytest.mark.parametrize("dc", ["", "none"])
-@pytest.mark.parametrize("jitter_us", more_if_long([300, 700], [300, 400, 700]))
+@pytest.mark.parametrize("jitter_us", more_if_long([700], [300, 400, 700]))
 @pytest.mark.parametrize("seed", more_if_long([0], range(6)))
 def test_what_is_lost_is_counted_though_frames_take_unevenly_long(seed: int, jitter_us: int, dc: str) -> None:
     """A starved slave looks at its data anywhere within an exchange: of the first it is not sure."""
@@ -359,7 +359,7 @@ def test_many_sensors_with_clocks_of_their_own(count: int) -> None:
     assert running.status()["cycles"] - before < 800 * count * 1.15
 
 
-@pytest.mark.parametrize("sinc_length", more_if_long([256], [64, 256]))
+@pytest.mark.parametrize("sinc_length", more_if_long([512], [64, 512]))
 def test_process_data_in_two_frames_is_as_complete(sinc_length: int) -> None:
     sensors = [
         SensorOptions(serial=n + 1, signal="clock", pdo_size=77, ppm=10.0 * n, sinc_length=sinc_length)
@@ -396,13 +396,6 @@ def test_percentiles_are_exact_to_a_few_percent() -> None:
     for extreme in (10**15, -5):
         recent.record(extreme)
     assert recent.summaries_us()[0]["max"] == pytest.approx(10**12)
-
-
-def test_negative_durations_count_as_zero() -> None:
-    recent = RecentDistribution()
-    for duration in (-5, -5e9, 7):
-        recent.record(duration)
-    assert recent.summaries_us()[0] == {"p50": 0, "p99": 0.007, "p999": 0.007, "max": 0.007}
 
 
 def test_recent_forgets_after_ten_rolls_and_reading_takes_no_longer_with_time() -> None:

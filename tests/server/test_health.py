@@ -93,15 +93,6 @@ def test_samples_that_are_not_finite_are_counted(field: str, value: float) -> No
     assert simulation.status()["sensors"][0]["not_finite"] == pytest.approx(counted, abs=2)
 
 
-def test_what_is_discarded_after_a_start_is_not_counted() -> None:
-    simulation = Simulation()
-    measure(simulation, **{"force.x": math.nan})
-    simulation.run_until(lambda: simulation.streams[0].process_data, "a sample")
-    simulation.run_until(lambda: simulation.streams[0].fresh, "a frame")
-    row = simulation.status()["sensors"][0]
-    assert row["not_finite"] == row["fresh"] > 0
-
-
 def test_not_finite_is_logged_when_it_begins_and_when_it_is_over(log: pytest.LogCaptureFixture) -> None:
     simulation = Simulation(settings=SLOW)
     simulation.run(2.0)

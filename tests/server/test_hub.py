@@ -161,14 +161,6 @@ def test_framed_requests_are_answered_in_order_with_their_ids(served: Served) ->
     assert ids(served.read(client)) == list(range(20))
 
 
-def test_a_request_may_arrive_byte_by_byte(served: Served) -> None:
-    client = served.connect()
-    for byte in DESCRIBE:
-        assert served.read(client) == []
-        client.send(bytes((byte,)))
-    assert served.read(client) == [ANSWER]
-
-
 @pytest.mark.parametrize("ending", [b"", b"\n", b" \r\n"])
 def test_bare_json_needs_no_newline(served: Served, ending: bytes) -> None:
     client = served.connect(sent=b'{"action":"describe","id":7}' + ending)
@@ -591,20 +583,6 @@ def test_a_thread_that_was_not_running_does_not_silence_the_clients(served: Serv
     served.serve(0.03)
     served.serve(0.03)
     assert len(busy.handled) == 2
-
-
-def test_samples_are_sent_while_requests_wait(served: Served) -> None:
-    listener = served.subscribe(buffer_size=500)
-    flood(served, 8)
-    Busy(served, 1_000_000)
-    received = 0
-    for _ in range(100):
-        served.publish()
-        served.hub.serve(served.clock.now_ns + TURN_NS)
-        served.hub.serve(served.clock.now_ns + TURN_NS)
-        while listener.readable:
-            received += len(listener.recv_all())
-    assert received >= 90 * len(one_frame(0)[0])
 
 
 # -- the whole server

@@ -35,13 +35,6 @@ def streaming(
     return simulation, client
 
 
-def latches(simulation: Simulation) -> tuple[bytearray, int]:
-    """Where the sensor's controller is told to latch event times."""
-    return life_of(
-        simulation.backend
-    ).esc.memory, reg.SYNC_MANAGER + 3 * reg.SYNC_MANAGER_SIZE + reg.SM_ACTIVATE
-
-
 def state(client: Client, sensor: int = 0) -> str:
     found: str = client.described(sensor)["state"]
     return found
@@ -92,17 +85,6 @@ def test_settings_are_written_again_after_a_power_cut() -> None:
     client.wait_event("sensor_back")
     assert simulation.written() == at_start * 2
     assert simulation.stats()["calibration_writes"] == 0
-
-
-@pytest.mark.parametrize("fault", ["deaf 0.1", "safeop 0x1B"])
-def test_event_times_are_latched_again_if_another_master_ended_that(fault: str) -> None:
-    simulation, client = streaming()
-    memory, at = latches(simulation)
-    assert memory[at] & reg.SM_LATCH_PDI
-    memory[at] &= ~reg.SM_LATCH_PDI
-    simulation.command(fault)
-    client.wait_event("sensor_back")
-    assert memory[at] & reg.SM_LATCH_PDI
 
 
 def test_a_stuck_sensor_stays_visible_as_repeated() -> None:
@@ -162,18 +144,6 @@ def test_power_cut_again_while_being_set_up(milliseconds: int) -> None:
     assert state(client) == "OP"
     assert simulation.stats()["al_state"] == "OP"
     check_frames(simulation.frames)
-
-
-def test_the_socket_side_goes_on_while_a_sensor_is_lost() -> None:
-    simulation, client = streaming()
-    simulation.command("power off")
-    client.wait_event("sensor_lost")
-    for _ in range(50):
-        assert client.ask("status")["ok"]
-    assert simulation.connect().ask("subscribe")["sensors"][0]["state"] == "LOST"
-    simulation.command("power on")
-    client.wait_event("sensor_back")
-    assert len(client.fresh(20)) == 20
 
 
 def test_an_interface_that_is_down_is_the_reason_and_is_asked_once(
@@ -277,20 +247,6 @@ def test_a_lost_datagram_is_no_lost_sensor(monkeypatch: pytest.MonkeyPatch, anot
     simulation.run(1.2)
     assert next(count) > 10
     assert lost(client) == []
-
-
-def test_a_server_that_was_stopped_carries_on() -> None:
-    simulation, client = streaming()
-    simulation.at(0.1, lambda: simulation.clock.stall(0.5e9))
-    # The sensor has no process data watchdog, and stays in OP.
-    simulation.run(1.0)
-    assert client.events == []
-    simulation.at(0.1, lambda: simulation.clock.stall(0.5e9))
-    simulation.at(0.3, "safeop 0x1B")  # it acknowledges, and takes the sensor back to OP
-    client.wait_event("sensor_back")
-    client.fresh(100)
-    check_frames(simulation.frames)
-    assert state(client) == "OP"
 
 
 def test_a_sensor_that_is_slow_to_change_its_state_comes_back_too(

@@ -13,11 +13,10 @@ import pytest
 
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import DATAGRAM_HEADER, FRAME_HEADER, Command
-from ethercat_server.sensor.objects.dictionary import KNOWN_OBJECTS, NOTE_NAMES
+from ethercat_server.sensor.objects.dictionary import KNOWN_OBJECTS
 from ethercat_server.simulation.backend import MemoryBackend
-from tests.server.test_objects import IN_THE_NOTE
 from tests.simulation import SimulatedBus, SimulatedServer, registers, simulated_bus, simulated_server
-from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign, no_mailbox
+from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign
 from tests.tool.running import complaints, one_sentence, refused, told, tool_here
 
 
@@ -103,15 +102,6 @@ def test_a_foreign_slave_is_no_sensor_to_anybody(monkeypatch: pytest.MonkeyPatch
         assert bus.written() == []
 
 
-def test_a_sensor_without_a_mailbox_has_no_objects(monkeypatch: pytest.MonkeyPatch) -> None:
-    no_mailbox(monkeypatch)
-    with simulated_bus() as bus:
-        assert told("eeprom", bus.near)["slaves"][0]["protocols"] == []
-        for command in (["objects"], ["plan", "--set", "fir=on"]):
-            refused = tool_here(command[0], bus.near, *command[1:], code=1)
-            assert "has no CoE mailbox" in one_sentence(refused)
-
-
 def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
     bench.command("sii error")
     said = refused("eeprom", bench.near)
@@ -119,20 +109,6 @@ def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
     assert "cannot be read" in refused("objects", bench.near)
     bench.command("sii ok")
     assert told("eeprom", bench.near)["slaves"][0]["check_byte_right"]
-
-
-def test_every_row_of_table_iii_1_is_read_by_name(bench: SimulatedBus) -> None:
-    rows = (*NOTE_NAMES, *IN_THE_NOTE)
-    names = [name for _, _, name in rows]
-    ended = tool_here("read", bench.near, *names, "--json", code=1)
-    found = ended.json["sensors"][0]["objects"]
-    read = {(int(row["index"], 16), row["subindex"]) for row in found}
-    assert {(index, subindex) for index, subindex, _ in rows} <= read
-    unreadable = {row["index"] for row in found if "error" in row}
-    assert unreadable == {"0x8003", "0x6000"}, "no range, and no quaternion in 61 bytes"
-    assert re.search(
-        r"sensor 0 gave no value of .*: .*does not have it .*; and \d+ more$", one_sentence(ended)
-    )
 
 
 def test_a_sensor_that_sends_nothing_is_watched_in_vain() -> None:

@@ -78,13 +78,6 @@ def test_apply_and_save_keep_it_over_a_power_cut(bench: SimulatedBus) -> None:
     assert "nothing to change" in tool_here("plan", near, *asked).out
 
 
-def test_a_power_cut_in_the_save_says_what_holds(bench: SimulatedBus) -> None:
-    near = bench.near
-    bench.command("cut-save 5")
-    said = refused("apply", near, "--set", "fir=true", "--save")
-    assert said.endswith("; whether it saved all, some or none of its settings is not known: save again")
-
-
 def test_a_chain_wants_a_choice(chain: SimulatedBus) -> None:
     near = chain.near
     said = refused("apply", near, "--set", "fir=on", code=2)
@@ -305,14 +298,6 @@ def test_without_a_known_tare_there_is_nothing_to_undo(
         file.write_text(content)
     assert "no tare of sensor 0: BFT-SENS-ECAT-M8, serial 4711" in refused("tare", bench.near, "--undo")
     assert bench.written() == []
-
-
-def test_a_clearing_that_does_not_take_leaves_the_old_offset(bench: SimulatedBus) -> None:
-    tool_here("tare", bench.near, "--samples", 50)
-    before = offset(bench.near)
-    bench.command("on-write 0x8000 2 abort 0x8000 3 0x08000022")
-    assert "the old offset is in force" in refused("tare", bench.near, "--clear")
-    assert offset(bench.near) == before
 
 
 UNMATCHED = ": by the sampling rate, which this length does not match"

@@ -149,7 +149,7 @@ def alert(one: Alert) -> dict[str, str]:
 
 
 def json_line(state: State, unix_s: float) -> str:
-    """The state as one JSON object, for programs: docs/monitor.md has the keys. What is not known is null."""
+    """The state as one JSON object, for programs: docs/schemas/monitor.json. What is not known is null."""
     server = state.server
     found = {
         "time": unix_s,
