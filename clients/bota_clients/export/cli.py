@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from bota_clients.arguments import add_force, add_imu_units, number, parser, position, typed
-from bota_clients.program import start
+from bota_clients.program import interrupt_on_signals, say, start
+from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import ImuUnits
+
+if TYPE_CHECKING:
+    from bota_clients.recording.reader import Recording
 
 PROGRAM: Final = "ethercat-export"
 DATASETS: Final = (".parquet", ".zarr", ".npz")
 _MOST_SAMPLES: Final = 100_000  # in a window
+Advance = Callable[[int], object]  # is told how many DATA frames were read since the last call
 
 
 class Options(argparse.Namespace):
@@ -117,6 +122,38 @@ def _window(text: str) -> int:
     if 1 <= (samples := int(text)) <= _MOST_SAMPLES:
         return samples
     raise ValueError
+
+
+def export(options: Options, write: Callable[[Recording, Advance], str]) -> int:
+    """Have the output written, and say what `write` says of it; returns the exit code.
+
+    Ctrl-C ends it at any time and leaves no file.
+    """
+    from rich.console import Console  # noqa: PLC0415 - needs the extra, and so do these
+    from rich.progress import Progress  # noqa: PLC0415
+
+    from bota_clients.recording.reader import open_recording  # noqa: PLC0415
+
+    interrupt_on_signals()
+    console = Console(stderr=True)
+    progress = Progress(console=console, transient=True, disable=not console.is_terminal)
+    try:
+        with open_recording(options.recording) as recording, progress:
+            if recording.cut_off is not None:
+                say(
+                    PROGRAM,
+                    f"{recording.path} was cut off ({recording.cut_off}): the intact part is exported",
+                )
+            chosen = [each.frames for each in recording.sensors if options.sensor in {None, each.sensor}]
+            task = progress.add_task("", total=sum(chosen))
+            written = write(recording, lambda frames: progress.advance(task, frames))
+    except KeyboardInterrupt:
+        say(PROGRAM, "stopped: nothing was written")
+        return 1
+    except OSError as error:
+        raise FileError(f"{options.output} cannot be written: {error.strerror or error}") from None
+    say(PROGRAM, f"{options.output}: {written}")
+    return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -22,9 +22,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from bota_clients.export.cli import DATASETS, PROGRAM, Options
+from bota_clients.export.cli import DATASETS, PROGRAM, Advance, Options, export
 from bota_clients.export.frame_times import Clock, FrameTimes, read_stamps
-from bota_clients.export.progress import Advance, export
 from bota_clients.export.windows import Arrays, Tool, Windows
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count

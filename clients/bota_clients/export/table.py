@@ -8,8 +8,7 @@ from functools import cache, partial
 from typing import Final
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.cli import Options
-from bota_clients.export.progress import Advance, export
+from bota_clients.export.cli import Advance, Options, export
 from bota_clients.numbers import count
 from bota_clients.recording.reader import Recording
 from bota_ethercat.accounting import NOT_NEW

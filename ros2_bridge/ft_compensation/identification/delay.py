@@ -119,6 +119,7 @@ def hann_window(seconds: float, period: float) -> Array:
 
 
 def smoothed(columns: Array, window: Array) -> Array:
+    """Columns convolved with a window."""
     return np.stack([np.convolve(column, window, "same") for column in columns.T], axis=1)
 
 
