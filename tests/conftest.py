@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import random
 import re
+import shutil
+import tempfile
 from collections import defaultdict
 from pathlib import Path
 
@@ -29,6 +32,9 @@ def _choose_domain() -> None:
 _choose_domain()
 # The servers started here stay the user that the tests are, whose files they read.
 os.environ.pop("SUDO_UID", None)
+# And what they keep of virtual sensors is nobody's.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="ethercat-state-")
+atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 # Nor do they use the server that this user has chosen.
 os.environ["BOTA_SERVER"] = "localhost:12001"
 # A tenth of the time goes into looking for cycles among what was imported and collected, which all stays.

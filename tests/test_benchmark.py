@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
@@ -15,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from scripts.benchmarks import modes, statistics
 from scripts.benchmarks import program as benchmark
@@ -155,38 +153,6 @@ def test_recording_begins_after_the_warm_up(tmp_path: Path) -> None:
 
 
 # -- runs
-
-
-@pytest.mark.parametrize("installed", [True, False])
-def test_what_is_measured_is_shown_and_written(
-    installed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    figures, ages = statistics.summary([arrivals(range(5, 105))])
-    measured = {**figures, "rss_mb": {"server": 40.0}, "cpu_percent": {"server": 5.0}}, ages
-    monkeypatch.setattr(modes, "turn", lambda *_: measured)
-    monkeypatch.setattr(modes, "build", lambda _: tmp_path)
-    monkeypatch.setattr(modes, "VENDOR", tmp_path)
-    if installed:
-        (tmp_path / "has-bota-driver==1").touch()
-    monkeypatch.setenv("DEMO_DIRECTORY", str(tmp_path))
-    monkeypatch.setattr(benchmark, "loopback_up", lambda: None)
-    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)
-    shown = io.StringIO()
-    monkeypatch.setattr(benchmark, "find_spec", lambda _: None)
-    monkeypatch.setattr(benchmark, "may_be_real_time", lambda: False)
-    options = benchmark.parse(["--json", str(tmp_path / "b.json"), "--vendor", "--quick", "--seconds", "6"])
-    benchmark.run(options, Console(file=shown, width=100), idle_states=True)
-    content = json.loads((tmp_path / "b.json").read_text())
-    assert all(map(math.isfinite, numbers(content)))
-    assert [row["program"] for row in content["comparison"]] == [
-        "this", "this, C client", "bare C", *["Bota's driver"] * installed,
-        *["Bota's driver"] * (not installed),
-    ]  # fmt: skip
-    assert {(row["rate_hz"], row["sensors"]) for row in content["comparison"]} == {(800, 1)}
-    assert content["comparison"][0]["made"] == 300
-    assert ("could not be installed" in content["comparison"][-1].get("missing", "")) == (not installed)
-    assert content["idle_states"]
-    assert "0 of 300" in shown.getvalue()
 
 
 def numbers(content: Any) -> Iterator[float]:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from bota_clients.identify.cli import main as identify
 from bota_clients.monitor.model import State
 from bota_clients.monitor.words import json_line
 from bota_clients.report.cli import main as report
@@ -16,7 +15,6 @@ from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.tool.cli import COMMANDS
 from tests.clients.monitor_states import gone, healthy, troubled
 from tests.clients.recordings import frame, record
-from tests.clients.test_identify import posed
 from tests.ended import run_here
 from tests.json_schema import SCHEMAS, problems
 from tests.simulation import more_if_long, simulated_bus
@@ -33,17 +31,6 @@ def test_the_doctors_findings() -> None:
     assert not problems("doctor", found)
     assert found["findings"]
     assert not problems("doctor", run_here(doctor, "x/y", "--json").json)
-
-
-def test_the_result_of_an_identification(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    record(path, posed())
-    found = run_here(identify, path, "--json")
-    assert (found.code, found.json["ok"]) == (0, True)
-    assert not problems("identify", found.json)
-    refused = run_here(identify, path, "--json", "--least-seconds", 3600)
-    assert (refused.code, refused.json["ok"]) == (1, False)
-    assert not problems("identify", refused.json)
 
 
 def test_the_checks_of_a_report(tmp_path: Path) -> None:

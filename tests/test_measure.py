@@ -90,13 +90,6 @@ def test_the_rate_is_judged_and_what_came_before_is_lost_too() -> None:
     assert gap.summary().lost_before == 4
 
 
-def test_a_gap_without_numbers_is_as_long_as_the_rate_has_it() -> None:
-    measurement = measured()
-    data = frame(850).process_data
-    measurement.take_frame(DataMessage(801, 0, 850 * PERIOD_NS, 0, DataFlag.GAP, 3, data))
-    assert measurement.lost_before == 49
-
-
 def test_the_live_figure_of_what_is_lost_is_the_summarys(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

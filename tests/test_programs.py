@@ -5,16 +5,19 @@ from __future__ import annotations
 import importlib
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
 
 from bota_clients.identify.cli import main as identify
+from bota_ethercat.program.arguments import Parser
 from ethercat_server import programs
 from ethercat_server.virtual_sensor.cli import main as virtual_sensor
 from tests.ended import run_here
@@ -116,6 +119,34 @@ def test_every_option_is_documented(name: str, monkeypatch: pytest.MonkeyPatch) 
     )
     text = "".join(page.read_text() for page in (ROOT / "docs").glob("*.md"))
     assert not {option for option in options - {"--help", "--version"} if option not in text}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_help_begins_with_three_examples_that_are_understood(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package, _, entry = PROGRAMS[name].partition(":")
+    started: list[str] = []
+    monkeypatch.setattr(f"{package}.run", started.append)
+    getattr(importlib.import_module(package), entry)()
+    main = importlib.import_module(started[0]).main
+    head, *rows, end, usage = run_here(main, "--help").out.splitlines()[:6]
+    assert (head, end, usage.split()[:2]) == ("examples:", "", ["usage:", name])
+
+    def only_once(parse: Callable[..., Any]) -> Callable[..., Any]:
+        def parsed(self: Parser, *given: Any) -> Any:
+            found = parse(self, *given)
+            if name != "ethercat-sensor" or self.prog != name:  # it parses the subcommand's name first
+                raise SystemExit(42)
+            return found
+
+        return parsed
+
+    for method in ("parse_args", "parse_intermixed_args"):
+        monkeypatch.setattr(Parser, method, only_once(getattr(Parser, method)))
+    for row in rows:
+        _, *arguments = shlex.split(row.removeprefix("sudo "), comments=True)
+        assert run_here(main, *arguments).code == 42, row
 
 
 def test_help_needs_nothing_of_the_extra() -> None:

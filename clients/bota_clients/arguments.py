@@ -9,17 +9,9 @@ from typing import TypeVar
 from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program import server_choice
-from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor_choice import MOST_PLACES
 
 _Value = TypeVar("_Value")
-
-
-def parser(prog: str, description: str, epilog: str, usage: str | None = None) -> argparse.ArgumentParser:
-    """The parser of a program, with --version."""
-    made = argparse.ArgumentParser(prog=prog, usage=usage, description=description, epilog=epilog)
-    made.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
-    return made
 
 
 def add_server(parser: argparse.ArgumentParser, what: str = "the server") -> None:

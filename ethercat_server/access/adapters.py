@@ -1,14 +1,16 @@
 """The network interfaces of this machine, as the kernel describes them by pyroute2; and which process uses
 one as an EtherCAT master, with the TCP port it listens on.
 
-See `packet_sockets`; listening TCP sockets are in /proc/net too. Of another user's process neither is
-visible: then the server that programs use by default is asked which interface it uses.
+See `packet_sockets`; listening TCP sockets are in /proc/net too. Of another user's process, and in another
+network namespace, neither is visible: then the server that programs use by default is asked for
+its interface.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ipaddress
+import socket
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,8 +18,10 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
-from bota_ethercat.errors import ProtocolError
+from bota_ethercat.errors import ProtocolError, UnreachableError
+from bota_ethercat.health.sentences import no_server
 from bota_ethercat.program.server_choice import default_server
+from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.nic import Routes, find_routes, master_sockets, table, users_of
 from ethercat_server.process.signals import signals_held_back
 
@@ -134,21 +138,35 @@ def _stands_on(row: Any, index: int) -> bool:
 
 def find_holder(ifname: str) -> Holder | None:
     """The process with the EtherCAT socket on `ifname`; None if there is none, or no such interface."""
-    if not (inodes := master_sockets(ifname)):
-        return None
-    for pid, name, sockets in users_of(inodes):
+    inodes = master_sockets(ifname)
+    for pid, name, sockets in users_of(inodes) if inodes else ():
         return Holder(pid, name, _listening(Path(f"/proc/{pid}"), sockets))
-    return Holder(None, "ethercat-server", _default_server(ifname))
+    address = None
+    if inodes or is_elsewhere(ifname):
+        with contextlib.suppress(ServerError):
+            address, its = server_here()
+            address = address if its == ifname else None
+    return Holder(None, "ethercat-server", address) if inodes or address else None
 
 
-def _default_server(ifname: str) -> Address | None:
-    """The server that is used where none is given, if it uses this interface."""
-    with contextlib.suppress(ValueError, ProtocolError):
+def is_elsewhere(ifname: str) -> bool:
+    """Whether this network namespace has no such interface; that of a server's virtual bus may."""
+    return ifname not in dict(socket.if_nameindex()).values()
+
+
+def server_here() -> tuple[Address, str]:
+    """The server that is used where none is given, and its interface; ServerError if that is none of here."""
+    try:
         address = default_server()
         with Client(address.port, address.host, stream=False).connect() as client:
-            if client.description.get("interface") == ifname:
-                return address
-    return None
+            ifname = client.description.get("interface")
+            if not (client.session.same_machine and isinstance(ifname, str)):
+                raise ServerError(f"the server at {address} has no interface on this computer")
+            return address, ifname
+    except UnreachableError as error:
+        raise ServerError(no_server(address, error)) from None
+    except (ValueError, ProtocolError) as error:
+        raise ServerError(str(error)) from None
 
 
 def _listening(process: Path, sockets: set[int]) -> Address | None:

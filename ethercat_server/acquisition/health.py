@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import logging
 import math
-from itertools import chain
+from collections.abc import Callable, Sequence
 from typing import Final
 
+from bota_ethercat.health.sentences import STOOD_STILL
 from bota_ethercat.pdo import is_finite, layout_for
 from ethercat_server.acquisition.clock import PLAUSIBLE_PULL, SampleClock
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming
@@ -91,8 +92,7 @@ class Causes:
         if now_ns - self._frame_ns < _RECENT_NS:
             otherwise = f"check for another EtherCAT master, whose frames arrive on {self._ifname}"
         elif now_ns - self._stall_ns < _RECENT_NS and self._stalled_ns > _STALL_NS:
-            stalled_ms = self._stalled_ns / 1e6
-            otherwise = f"this computer stood still for {stalled_ms:.0f} ms, check it with ethercat-doctor"
+            otherwise = f"this {STOOD_STILL.format(f' for {self._stalled_ns / 1e6:.0f} ms')}"
         return f"{reason}: {otherwise}" if otherwise else reason
 
     def check(self) -> None:
@@ -124,6 +124,8 @@ class SampleHealth:
         self._number = number
         self.not_finite = 0  # new samples with a number that is NaN or infinite
         self.newest: list[bytes] = []  # process data that was handed out since `count`
+        # Gets those that are finite, by field.
+        self.take: Callable[[Sequence[Sequence[float]]], object] = lambda _: None
         self._checked = (0, 0, 0)  # the counts of the last check: fresh, repeated, not finite
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
@@ -132,12 +134,15 @@ class SampleHealth:
         self._deviating_s = 0
 
     def count(self) -> None:
-        """Find those of the newest samples that are not finite; to be called now and then."""
+        """Look at the newest samples, and for those that are not finite; to be called now and then."""
+        if not self.newest:
+            return
         newest, self.newest = self.newest, []
+        columns = list(zip(*layout_for(len(newest[0])).struct.iter_unpack(b"".join(newest)), strict=True))
         # An infinity or a NaN survives the sum, so that one look is enough for all of them.
-        if newest and not math.isfinite(
-            sum(chain.from_iterable(layout_for(len(newest[0])).reals.iter_unpack(b"".join(newest))))
-        ):
+        if math.isfinite(sum(map(sum, columns))):
+            self.take(columns)
+        else:
             self.not_finite += sum(not is_finite(each) for each in newest)
 
     def check(self, fresh: int, repeated: int, clock: SampleClock) -> None:

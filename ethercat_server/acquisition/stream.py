@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from bota_ethercat.framing import DataFlag, encode_data
 from ethercat_server.acquisition.clock import SILENT_PERIODS, SampleClock
+from ethercat_server.acquisition.drift import Drift
 from ethercat_server.acquisition.exchange_timing import ExchangeTiming, RecentDistribution
 from ethercat_server.acquisition.health import SampleHealth
 from ethercat_server.acquisition.slave_clock import EventTimes
@@ -63,6 +64,7 @@ class SensorStream:
         # From the estimated instant of a sample to its hand-out, while locked.
         self.age = RecentDistribution()
         self.health = SampleHealth(number)
+        self.drift: Drift | None = None
         self._discard = DISCARDED_AT_START
         self._gap = 0  # number of new samples to come that have GAP
         self._silent = False  # whether REPEATED or INVALID frames were sent since the newest sample
@@ -175,6 +177,8 @@ class SensorStream:
     def check(self) -> None:
         """To be called once a second: log what the samples show of the sensor."""
         self.health.check(self.fresh, self.repeated, self.clock)
+        if self.drift is not None:
+            self.drift.second()
         events = self.clock.events
         if events is not None and events.trust.is_final:
             self.clock.events = None
@@ -188,6 +192,8 @@ class SensorStream:
             before, self.clock = self.clock.events, self._new_clock(period_ns, latching)
             if before is not None and self.clock.events is not None:
                 self.clock.events.trust.was_trusted = before.trust.was_trusted
+            if self.drift is not None:
+                self.drift.begin("return")
             self._discard = DISCARDED_AT_START
             self._gap = 1
             self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
@@ -211,6 +217,7 @@ class SensorStream:
                 "offset_ppm": round((1 / (1 + clock.estimate.pull) - 1) * 1e6, 1),
                 "uncertainty_us": round(clock.uncertainty_ns / 1000, 1) if clock.locked else None,
             },
+            **(self.drift.as_json() if self.drift is not None else {}),
         }
 
 
@@ -218,9 +225,12 @@ def make_streams(bus: Bus, sensors: Sequence[Sensor], timing: ExchangeTiming) ->
     """Those of the sensors on a bus in OP."""
     offset = RealtimeOffset(bus.clock)
     passing_ns = {at.number: at.start * BYTE_NS for inputs in bus.process_data.inputs for at in inputs}
-    return [
-        SensorStream(
+    streams = []
+    for number, each in enumerate(sensors):
+        stream = SensorStream(
             number, each.period_ns, timing, bus.clock, bus.read_clock(number), offset, passing_ns[number]
         )
-        for number, each in enumerate(sensors)
-    ]
+        stream.drift = Drift(each, bus.clock)
+        stream.health.take = stream.drift.add
+        streams.append(stream)
+    return streams

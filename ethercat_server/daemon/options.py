@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.errors import SettingError
+from bota_ethercat.program.arguments import Parser
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import (
     SETTINGS,
@@ -24,7 +25,6 @@ from bota_ethercat.settings import (
     start_up_defaults,
 )
 from bota_ethercat.text.did_you_mean import did_you_mean
-from ethercat_server import __version__
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import realtime
@@ -272,11 +272,11 @@ class ServerOptions:
 @functools.cache
 def build_parser() -> argparse.ArgumentParser:
     """The command line of `ethercat-server`."""
-    parser = argparse.ArgumentParser(
-        prog="ethercat-server",
+    parser = Parser(
+        "ethercat-server",
+        "EtherCAT master for Bota force/torque sensors: streams their samples over TCP.",
+        "settings: " + "; ".join(f"{row.name} ({row.meaning})" for row in SETTINGS.values()),
         usage="%(prog)s [options] IFACE [SENSOR_NAME] PORT",
-        description="EtherCAT master for Bota force/torque sensors: streams their samples over TCP.",
-        epilog="settings: " + "; ".join(f"{row.name} ({row.meaning})" for row in SETTINGS.values()),
     )
     interface = f"network interface ('{VIRTUAL_INTERFACE}' for a simulated sensor)"
     parser.add_argument("ifname", metavar="IFACE", help=interface)
@@ -307,7 +307,6 @@ def build_parser() -> argparse.ArgumentParser:
             setting.flag, dest=setting.name, metavar=setting.metavar, help=text,
             type=setting.parse_argument, action="append" if setting.many else "store",
         )  # fmt: skip
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
 

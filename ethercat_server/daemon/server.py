@@ -8,6 +8,7 @@ import logging
 import os
 from collections.abc import Sequence
 
+from ethercat_server.daemon.histories import kept
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
 from ethercat_server.daemon.service import Notifier
 from ethercat_server.ethercat.soem import open_bus
@@ -44,9 +45,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         hub.permissions.control_uids = control_uids | {os.geteuid()}
         hub.permissions.names = names
         hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
-        server = Server(
-            bus, hub, options, signals.check, watchdog=notifier, extra={"interface": options.ifname}
-        )
+        server = Server(bus, hub, options, signals.check, watchdog=notifier, extra={"interface": ifname})
         server.cycle.every_second = lambda: notifier.update(server)
         signals.call(server.stop)
         for sensor in server.sensors:
@@ -62,7 +61,8 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         notifier.send("READY=1")
         notifier.update(server)
         try:
-            server.run()
+            with kept([stream.drift for stream in server.streams if stream.drift is not None]):
+                server.run()
         finally:
             notifier.send("STOPPING=1")
         log.info("shutting down: the sensors go to INIT")

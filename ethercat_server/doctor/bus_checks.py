@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.address import Address
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health import history
 from bota_ethercat.health.judge import Observation, emergency, judge
 from bota_ethercat.health.observer import StreamObserver
 from bota_ethercat.health.verdict import LIMITS, Level
@@ -342,6 +343,7 @@ class ServerView:
                 is_lost=[fate for fate in fates if fate in _FATES][-1:] == [Event.SENSOR_LOST],
                 state=str(described["state"]),
                 emergency=emergency(after.get("emergency")),
+                drift=history.drift(after, LIMITS),
                 settings=settings if isinstance(settings, dict) else {},
             )
         )
@@ -370,6 +372,9 @@ class ServerView:
                 yield note(f"{text}, {lost} since its start", f"none meanwhile; {_LOG}", **values)
             else:
                 yield ok(f"{text}: {verdict.sentence[0].lower()}{verdict.sentence[1:]}", **values)
+            past, overloaded = history.overload(after)
+            if overloaded:
+                yield note(f"sensor {position} {past}", "have it checked")
 
     def wake_ups(self) -> Finding:
         """Its lateness."""

@@ -12,12 +12,15 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from bota_ethercat.health.verdict import Level
+from bota_ethercat.program import server_choice
+from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import visible
-from ethercat_server import __version__
+from ethercat_server.access.adapters import find_holder, is_elsewhere, server_here
 from ethercat_server.daemon.options import SERVER_SETTINGS, VIRTUAL_INTERFACE
 from ethercat_server.doctor.bus_checks import examine_bus
 from ethercat_server.doctor.machine import Machine
-from ethercat_server.doctor.machine_checks import check_rights, examine_machine
+from ethercat_server.doctor.machine_checks import examine_machine
 from ethercat_server.doctor.report import CannotLookError, Finding, Report, as_json, worst
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP, MAX_NAME_LENGTH
@@ -31,15 +34,16 @@ _LONGEST_S: Final = 3600.0
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog=_PROGRAM,
-        description="Diagnoses latency and lost samples: kernel, processors, network card, other software, "
+    parser = Parser(
+        _PROGRAM,
+        "Diagnoses latency and lost samples: kernel, processors, network card, other software, "
         "bus; then measures. Read-only. Run as root for a complete report.",
-        epilog=_EXIT_CODES,
+        _EXIT_CODES,
     )
     parser.add_argument(
-        "iface", metavar="IFACE",
-        help="interface the sensors are connected to ('virtual' for a virtual sensor)",
+        "iface", metavar="IFACE", nargs="?",
+        help="interface the sensors are connected to ('virtual' for a virtual sensor); by default that of "
+        f"the server {server_choice.HELP}",
     )  # fmt: skip
     parser.add_argument(
         "--seconds", type=_seconds, default=10.0, metavar="N",
@@ -53,7 +57,6 @@ def build_parser() -> argparse.ArgumentParser:
         )  # fmt: skip
     parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     parser.add_argument("--json", action="store_true", help="machine-readable output")
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
 
@@ -77,6 +80,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
+    if args.iface is None:
+        try:
+            _, args.iface = server_here()
+        except ServerError as error:
+            raise UsageError(f"name an interface, or a server: {error}") from None
     if not 0 < len(os.fsencode(args.iface)) <= MAX_NAME_LENGTH or "/" in args.iface:
         raise UsageError(
             f"{args.iface!r} is not an interface name: it must have 1 to {MAX_NAME_LENGTH} characters; "
@@ -85,7 +93,7 @@ def _run(args: argparse.Namespace) -> int:
     last = (os.cpu_count() or 1) - 1
     if args.cpu is not None and args.cpu > last:
         raise UsageError(f"--cpu {args.cpu}: this machine has the processors 0 to {last}")
-    header = {"interface": args.iface, "version": __version__, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
+    header = {"interface": args.iface, "version": VERSION, "time": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
     header |= {"kernel": os.uname().release, "root": os.geteuid() == 0, "seconds": args.seconds}
     if args.json:
         findings = list(_examined(args, lambda _: None))
@@ -93,9 +101,7 @@ def _run(args: argparse.Namespace) -> int:
     else:
         report, findings = Report(), []
         who = "as root" if header["root"] else "not as root"
-        report.say(
-            visible(f"{_PROGRAM} {__version__} on {args.iface}: Linux {header['kernel']}, {who}") + "\n"
-        )
+        report.say(visible(f"{_PROGRAM} {VERSION} on {args.iface}: Linux {header['kernel']}, {who}") + "\n")
         for finding in _examined(args, report.wait):
             findings.append(finding)
             report.write(finding)
@@ -109,11 +115,12 @@ def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iter
         args.iface, args.iface, rt_priority=args.rt_priority, cpu=args.cpu, allow_ip=args.allow_ip
     )
     with contextlib.ExitStack() as cleanup:
+        if is_elsewhere(args.iface) and find_holder(args.iface) is not None:
+            machine.facts["link"] = CannotLookError("it is in a network namespace of its server's own")
         if args.iface == VIRTUAL_INTERFACE:
             try:
-                check_rights(machine)
                 machine.ifname = cleanup.enter_context(VirtualBus("", args.rt_priority)).ifname
-            except (CannotLookError, ServerError) as error:
+            except ServerError as error:
                 machine.facts["link"] = CannotLookError(f"there is no virtual bus: {error}")
         yield from examine_machine(machine)
         yield from examine_bus(machine, args.seconds, announce)

@@ -108,13 +108,6 @@ def _capabilities(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def check_rights(machine: Machine) -> None:
-    """CannotLookError unless this process may open a bus."""
-    missing = [name for bit, name in reversed(_NEEDED.items()) if not machine.has_capability(bit)]
-    if missing:
-        raise CannotLookError(f"{' and '.join(missing)} missing; run with sudo")
-
-
 _CPUS: Final = "/sys/devices/system/cpu"
 _LATENCY_FILE: Final = "/dev/cpu_dma_latency"
 _NO_CONSTRAINT_US: Final = 1_000_000

@@ -413,7 +413,7 @@ def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
             ) from None
         if problem := network_trouble(ifname, routes):
             raise InterfaceError(problem)
-    if missing := _missing_capabilities():
+    if missing := missing_capabilities():
         raise InterfaceError(
             f"not allowed to open {ifname}: {' and '.join(missing)} missing; run with sudo, or "
             "give the service CAP_NET_RAW and CAP_NET_ADMIN"
@@ -430,7 +430,8 @@ def _wait_usable(ifname: str) -> None:
         raise InterfaceError(problem)
 
 
-def _missing_capabilities() -> list[str]:
+def missing_capabilities() -> list[str]:
+    """Those of this process that a master needs and that it has not."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("CapEff:"):
             effective = int(line.split()[1], 16)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import pwd
@@ -66,6 +67,8 @@ def become(user: User) -> None:
             os.setgroups([])
         os.setresgid(user.gid, user.gid, user.gid)
         os.setresuid(user.uid, user.uid, user.uid)
+        with contextlib.suppress(KeyError):  # where its files are
+            os.environ["HOME"] = pwd.getpwuid(user.uid).pw_dir
     except (OSError, OverflowError) as error:
         why = error.strerror if isinstance(error, OSError) else "there is no such user"
         raise ServerError(f"cannot become user {user}: {why}; '--user root' stays root") from None

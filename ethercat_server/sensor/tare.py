@@ -8,14 +8,16 @@ errors of the difference of the two means. The standard error of a mean is the l
 single samples, and from the means of eight parts of its window, which covers noise that the sensor's filters
 have correlated.
 
-Rest is judged here, not as in `ft_compensation`: in raw units, and by sums, which delay no exchange.
+Rest is judged here (`why_moving`), not as in `ft_compensation`: in raw units, and by sums, which delay no
+exchange.
 """
 
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Callable, Sequence
+from itertools import repeat
+from operator import add, mul
 from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.control import ErrorCode
@@ -29,8 +31,8 @@ from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 
 LATER: Final = "; it gets its old offset when it is back"
 # Fields of the process data with force and torque, and with the angular rate.
-_LOAD: Final = slice(2, 8)
-_RATE: Final = slice(13, 16)
+LOAD: Final = slice(2, 8)
+RATE: Final = slice(13, 16)
 LEAST_SAMPLES: Final = 20  # fewer would not show whether the sensor is stationary
 
 
@@ -43,7 +45,7 @@ class _Channel(NamedTuple):
     steady: float  # what a mean may move within a window, and be off target after a tare, beyond noise
 
 
-_CHANNELS: Final = (
+CHANNELS: Final = (
     *(_Channel(name, "N", 1.0, 0.3) for name in ("Fx", "Fy", "Fz")),
     *(_Channel(name, "Nm", 0.05, 0.01) for name in ("Mx", "My", "Mz")),
     *(_Channel(name, "deg/s", 3.0, math.inf) for name in ("Rx", "Ry", "Rz")),
@@ -51,7 +53,7 @@ _CHANNELS: Final = (
 # Limit of the mean angular rate: above it the robot is moving. The residual shows slower motion.
 _REST_TURN_DPS: Final = math.degrees(0.5)
 _BY_CHANCE: Final = 5.0  # standard errors by which two means must differ to differ significantly
-_PARTS: Final = 8  # parts of a window whose means give the standard error of the whole window's
+PARTS: Final = 8  # parts of a window whose means give the standard error of the whole window's
 _ROUNDING: Final = 1e-6  # share of a reading by which REAL32 arithmetic in the sensor may be off
 _PATIENCE: Final = 4.0  # timeout for samples, in multiples of their nominal duration
 
@@ -86,7 +88,11 @@ def tare(
     while sensor.settling:
         yield
     before = yield from _average(sdo.clock, sensor, stream, samples)
-    _check_rest(sensor, before)
+    if why := why_moving(before):
+        raise RequestError(
+            ErrorCode.NOT_READY,
+            f"sensor {sensor.number} is not at rest: {why}: hold it still and tare again",
+        )
     old = yield from read_offset(sdo)
     new = tuple(t - found.mean + o for t, found, o in zip(target, before[:6], old, strict=True))
     _check_fits(new, "the offset that the key 'target' asks for")
@@ -134,8 +140,8 @@ def _take_back(
     return extended(error, addition)
 
 
-class _Found(NamedTuple):
-    """One channel over some samples."""
+class Found(NamedTuple):
+    """One channel over a window of samples."""
 
     mean: float
     deviation: float
@@ -144,45 +150,47 @@ class _Found(NamedTuple):
     error: float  # standard error of the mean
 
 
-class _Part:
+class Part:
     """Sums over part of a window."""
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = len(CHANNELS)) -> None:
         self.taken = 0
-        self.sums = [0.0] * len(_CHANNELS)
-        self.squares = [0.0] * len(_CHANNELS)
+        self.sums = [0.0] * channels
+        self.squares = [0.0] * channels
 
-    def add(self, row: Sequence[float]) -> None:
-        self.taken += 1
-        for channel, value in enumerate(row):
-            self.sums[channel] += value
-            self.squares[channel] += value * value
+    def add(self, columns: Sequence[Sequence[float]]) -> None:
+        """Add samples, by channel."""
+        self.taken += len(columns[0])
+        self.sums = list(map(add, self.sums, map(sum, columns)))
+        squares = map(map, repeat(mul), columns, columns)
+        self.squares = list(map(add, self.squares, map(sum, squares)))
 
 
-def _moments(parts: Sequence[_Part], channel: int) -> tuple[float, float]:
+def _moments(parts: Sequence[Part], channel: int) -> tuple[float, float]:
     """Mean and variance."""
     taken = sum(part.taken for part in parts)
     mean = sum(part.sums[channel] for part in parts) / taken
     return mean, max(0.0, sum(part.squares[channel] for part in parts) / taken - mean * mean)
 
 
-def _found(parts: Sequence[_Part], channel: int, start: float) -> _Found:
-    """One channel of a window, in whose sums values are relative to `start`."""
-    samples, first = sum(part.taken for part in parts), parts[: _PARTS // 2]
+def found_in(parts: Sequence[Part], channel: int, start: float = 0.0) -> Found:
+    """One channel of a window of `PARTS` parts, in whose sums values are relative to `start`."""
+    samples, first = sum(part.taken for part in parts), parts[: PARTS // 2]
     mean, variance = _moments(parts, channel)
-    (one, noise), (other, more_noise) = _moments(first, channel), _moments(parts[_PARTS // 2 :], channel)
+    (one, noise), (other, more_noise) = _moments(first, channel), _moments(parts[PARTS // 2 :], channel)
     by_chance = _BY_CHANCE * math.sqrt((noise + more_noise) / sum(part.taken for part in first))
-    of_parts = statistics.stdev(_moments([part], channel)[0] for part in parts)
-    error = max(math.sqrt(variance / samples), of_parts / math.sqrt(_PARTS))
-    return _Found(start + mean, math.sqrt(variance), abs(other - one), by_chance, error)
+    means = [part.sums[channel] / part.taken for part in parts]
+    of_parts = math.dist(means, [sum(means) / PARTS] * PARTS) / math.sqrt(PARTS * (PARTS - 1))
+    error = max(math.sqrt(variance / samples), of_parts)
+    return Found(start + mean, math.sqrt(variance), abs(other - one), by_chance, error)
 
 
-def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[list[_Found]]:
+def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[list[Found]]:
     """Over the next samples."""
     unpack = layout_for(sensor.pdo_size).struct.unpack
     deadline = _patience(clock, sensor, samples)
     seen, taken = stream.fresh, 0
-    parts = [_Part() for _ in range(_PARTS)]
+    parts = [Part() for _ in range(PARTS)]
     first: list[float] = []
     while taken < samples:
         yield
@@ -194,17 +202,16 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
             continue
         seen = stream.fresh
         values = unpack(stream.process_data)
-        row = [*values[_LOAD], *values[_RATE]]
+        row = [*values[LOAD], *values[RATE]]
         if not all(map(math.isfinite, row)):
             raise RequestError(
                 ErrorCode.NOT_READY, f"sensor {sensor.number} is overloaded: it gives no finite numbers"
             )
         first = first or row
         # From the first on, so that a large load does not drown its small changes.
-        row = [value - start for value, start in zip(row, first, strict=True)]
-        parts[_PARTS * taken // samples].add(row)
+        parts[PARTS * taken // samples].add([(v - start,) for v, start in zip(row, first, strict=True)])
         taken += 1
-    return [_found(parts, channel, start) for channel, start in enumerate(first)]
+    return [found_in(parts, channel, start) for channel, start in enumerate(first)]
 
 
 def _wait(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[None]:
@@ -220,25 +227,25 @@ def _patience(clock: Clock, sensor: Sensor, samples: int) -> Deadline:
     return Deadline(clock, 1.0 + _PATIENCE * samples * sensor.period_ns * 1e-9)
 
 
-def _check_rest(sensor: Sensor, window: Sequence[_Found]) -> None:
+def why_moving(window: Sequence[Found]) -> str:
+    """Why a sensor was not at rest in a window of force, torque and angular rate; empty if it was."""
     turn = math.hypot(*(found.mean for found in window[6:]))
     if turn > _REST_TURN_DPS:
-        raise _not_at_rest(sensor, f"it turns by {turn:.3g} deg/s (mean; at most {_REST_TURN_DPS:.3g})")
-    for (name, unit, most, steady), found in zip(_CHANNELS, window, strict=True):
+        return f"it turns by {turn:.3g} deg/s (mean; at most {_REST_TURN_DPS:.3g})"
+    for (name, unit, most, steady), found in zip(CHANNELS, window, strict=True):
         if found.deviation > most:
-            text = f"{name} varies by {found.deviation:.3g} {unit} (standard deviation; at most {most:g})"
-            raise _not_at_rest(sensor, text)
+            return f"{name} varies by {found.deviation:.3g} {unit} (standard deviation; at most {most:g})"
         if found.change > (most_change := steady + found.by_chance):
-            text = f"{name} changes by {found.change:.3g} {unit} (mean; at most {most_change:.3g})"
-            raise _not_at_rest(sensor, text)
+            return f"{name} changes by {found.change:.3g} {unit} (mean; at most {most_change:.3g})"
+    return ""
 
 
 def _check_better(
-    sensor: Sensor, before: Sequence[_Found], after: Sequence[_Found], samples: int, target: Sequence[float]
+    sensor: Sensor, before: Sequence[Found], after: Sequence[Found], samples: int, target: Sequence[float]
 ) -> None:
     """RequestError if an axis is off target or further from it than before, and noise does not explain it."""
     worst, text = 0.0, ""
-    for (name, unit, _, steady), old, new, wanted in zip(_CHANNELS, before, after, target, strict=False):
+    for (name, unit, _, steady), old, new, wanted in zip(CHANNELS, before, after, target, strict=False):
         was, now = old.mean - wanted, new.mean - wanted
         allowed = _BY_CHANCE * math.hypot(old.error, new.error)
         allowed += _ROUNDING * max(1.0, abs(wanted), abs(old.mean))
@@ -255,9 +262,3 @@ def _check_better(
             text = f"{what}: {name} is {now:.3g} {unit} off target after it and was {was:.3g} before"
     if text:
         raise RequestError(ErrorCode.NOT_READY, f"{text}: keep its load still and tare again")
-
-
-def _not_at_rest(sensor: Sensor, why: str) -> RequestError:
-    return RequestError(
-        ErrorCode.NOT_READY, f"sensor {sensor.number} is not at rest: {why}: hold it still and tare again"
-    )

@@ -13,8 +13,8 @@ from typing import Any, Final, Protocol
 from bota_ethercat.address import boot_id
 from bota_ethercat.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from bota_ethercat.errors import RequestError
+from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server import __version__
 from ethercat_server.serving.connection import Connection, Subscription
 from ethercat_server.serving.hub import Hub
 
@@ -101,7 +101,7 @@ class Actions:
         rows = [sensor.describe() for sensor in self._sensors]
         if len(rows) > _MOST_EXPLAINED:
             rows = [{key: value for key, value in row.items() if key != "meaning"} for row in rows]
-        return reply(request, protocol=PROTOCOL_VERSION, version=__version__, sensors=rows, **self._extra)
+        return reply(request, protocol=PROTOCOL_VERSION, version=VERSION, sensors=rows, **self._extra)
 
     def _subscribe(self, connection: Connection, request: Request) -> JsonObject:
         numbers = request.values["sensors"]

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NoReturn
 
+from bota_ethercat.program.arguments import Parser
 from bota_ethercat.text.did_you_mean import did_you_mean
-from ethercat_server import __version__
 from ethercat_server.process import command_line
 from ethercat_server.tool import bus, filters, objects, settings, watch
 from ethercat_server.tool.command import Command, say_json
@@ -29,13 +29,13 @@ COMMANDS: Final[Mapping[str, Command]] = {
 _NEGATIVE: Final = re.compile(r"-(\.?\d|inf|nan)")
 
 
-class _Parser(argparse.ArgumentParser):
+class _Parser(Parser):
     """Recognizes all negative numbers, and reports errors as JSON with --json."""
 
     as_json = False
 
-    def __init__(self, **values: Any) -> None:
-        super().__init__(**values)
+    def __init__(self, *values: Any, **options: Any) -> None:
+        super().__init__(*values, **options)
         self._negative_number_matcher = _NEGATIVE  # argparse takes -1e-3 for an option
 
     def error(self, message: str) -> NoReturn:
@@ -49,14 +49,13 @@ def build_parser() -> argparse.ArgumentParser:
     width = max(map(len, COMMANDS))
     summaries = "\n".join(f"  {name:{width}}  {command.summary}" for name, command in COMMANDS.items())
     parser = _Parser(
-        prog=_PROGRAM,
+        _PROGRAM,
+        "Inspects and configures Bota EtherCAT sensors, on the interface or through a server.",
+        f"commands (see COMMAND --help):\n{summaries}\n\n{_EXIT_CODES}",
         usage="%(prog)s COMMAND [ARGUMENT ...]",
-        description="Inspects and configures Bota EtherCAT sensors, on the interface or through a server.",
-        epilog=f"commands (see COMMAND --help):\n{summaries}\n\n{_EXIT_CODES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("command", choices=list(COMMANDS), metavar="COMMAND", help="see below")
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
 
@@ -73,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"no command {arguments[0]!r}: there are {', '.join(COMMANDS)}{guess}")
     command = COMMANDS[parser.parse_args(arguments[:1] if named else arguments).command]
     description = f"{command.summary[0].upper()}{command.summary[1:]}."
-    parser = _Parser(prog=f"{_PROGRAM} {command.name}", description=description, epilog=_EXIT_CODES)
+    parser = _Parser(f"{_PROGRAM} {command.name}", description, _EXIT_CODES)
     command.add_arguments(parser)
     args = parser.parse_intermixed_args(arguments[1:])
     return command_line.run(_PROGRAM, lambda: command.run(args), as_json=args.json)

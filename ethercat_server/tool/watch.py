@@ -12,6 +12,7 @@ from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.judge import Observation, judge
 from bota_ethercat.health.observer import COMMON, StreamObserver
+from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.text.json_text import JsonObject
@@ -35,13 +36,6 @@ from ethercat_server.tool.command import (
 _FOREVER_S: Final = 1e9
 _FORCE: Final = COMMON.index("force.x")  # torque follows
 _COUNTS: Final = ("lost", "repeated", "invalid")
-# What is told of a watched sensor, unless the event has a message of its own.
-_TOLD: Final[Mapping[str, str]] = {
-    Event.SENSOR_LOST: "sensor {sensor} is lost",
-    Event.SENSOR_BACK: "sensor {sensor} is back after {lost_s} s",
-    Event.EMERGENCY: "sensor {sensor} reports an emergency",
-    Event.RECONFIGURED: "the settings of sensor {sensor} have changed",
-}
 
 
 class _Watched:
@@ -80,9 +74,9 @@ def _tell(opened: Sensors, event: JsonObject, watched: Mapping[int, _Watched]) -
     kind, of = event["event"], whole(event.get("sensor"))
     if kind == Event.SHUTTING_DOWN:
         raise ServerError(f"{opened.used} is shutting down")
-    if kind not in _TOLD or of is None or of not in watched:
+    if of is None or of not in watched:
         return False
-    note(str(event.get("message") or _TOLD[kind].format_map({"lost_s": None, **event})))
+    note(event_sentence(event))
     watched[of].rate_hz = event.get("rate_hz", watched[of].rate_hz)
     return kind in (Event.SENSOR_BACK, Event.RECONFIGURED)
 

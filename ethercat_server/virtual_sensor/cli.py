@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
@@ -10,10 +11,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
+from bota_ethercat.program.arguments import Parser
 from bota_ethercat.settings import SETTINGS
-from ethercat_server import __version__
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import look_up
+from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from ethercat_server.process.signals import signals_call
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
@@ -30,6 +32,7 @@ from ethercat_server.virtual_sensor.options import (
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
 
+_PROGRAM: Final = "ethercat-virtual-sensor"
 _SERIAL_NUMBERS: Final = 100  # for each bus: more than it has slaves
 
 
@@ -68,24 +71,26 @@ def build_parser() -> argparse.ArgumentParser:
     """The command line."""
     commands = "\n".join(f"  {c.usage:34} {c.meaning}" for c in COMMANDS)
     words = "\n".join(f"  {w.usage:34} {w.meaning}" for w in CLOCK_WORDS)
-    parser = argparse.ArgumentParser(
-        prog="ethercat-virtual-sensor",
-        description="Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
+    parser = Parser(
+        _PROGRAM,
+        "Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
         "and other slaves beside them.",
-        epilog=f"commands, one per line on stdin or on the --control socket:\n{commands}\n\n"
+        f"commands, one per line on stdin or on the --control socket, or with --send:\n{commands}\n\n"
         f"of a distributed clock, in --dc or as a command:\n{words}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("iface", metavar="IFACE", help="interface, for instance one end of a veth pair")
+    parser.add_argument("iface", metavar="IFACE", nargs="?", help="interface, one end of a veth pair")
     for name, metavar, default, _, meaning in _OPTIONS:
         action = "append" if name in _ALONG_THE_CHAIN else "store"
         parser.add_argument(f"--{name}", metavar=metavar, default=default, action=action, help=meaning)
     parser.add_argument("--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data")
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
     parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of the scene")
-    parser.add_argument("--control", metavar="PATH", help="Unix socket for commands")
+    parser.add_argument(
+        "--control", metavar="PATH", help=f"Unix socket for commands (default {link.own_socket()})"
+    )
+    parser.add_argument("--send", metavar="COMMAND", help="have the one that listens there obey, and end")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser
 
 
@@ -143,18 +148,27 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
 
 
 def main(
-    argv: Sequence[str] | None = None, on_open: Callable[[], None] = lambda: None, number: int = 0
+    argv: Sequence[str] | None = None,
+    on_open: Callable[[], None] = lambda: None,
+    number: int = 0,
+    priority: int = DEFAULT_PRIORITY + 1,
 ) -> int:
     """Run the virtual sensor: 0 when ended, 1 on failure, 2 for wrong arguments.
 
     `on_open` is called once its interface is open, before it reads anything. The default serial numbers go by
-    `number`, or by the interface's MAC address.
+    `number`, or by the interface's MAC address. `priority` is that of SCHED_FIFO, above a master's: real
+    sensors do not wait for a CPU; 0 for ordinary scheduling.
     """
-    args = build_parser().parse_args(argv)
+    parser = build_parser()
+    args = parser.parse_args(argv)
+    if args.send is not None:
+        return _send(args.control or link.own_socket(), args.send)
+    if args.iface is None:
+        parser.error("name an interface, or a command with --send")
     try:
         slaves = options_from(args, _SERIAL_NUMBERS * (number or _number_of(args.iface)) or 1)
     except UsageError as error:
-        print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
+        _say(error)
         return 2
     stopped = threading.Event()
     models = [slave.model for slave in slaves if isinstance(slave, SensorOptions)]
@@ -164,6 +178,15 @@ def main(
         f"{args.pdo} bytes of process data, signal {args.signal}"
         + (f", beside {', '.join(foreign)}" if foreign else "")
     )
+
+    def opened() -> None:
+        try:
+            if priority:
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        except PermissionError:
+            _say(f"not granted: real-time priority {priority} (CAP_SYS_NICE); samples may come late")
+        on_open()
+
     try:
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)  # reading from the terminal must not suspend it
         with signals_call(stopped.set):
@@ -174,10 +197,25 @@ def main(
                 control_path=args.control,
                 commands=sys.stdin,
                 exit_on_eof=args.exit_on_eof,
-                on_open=on_open,
+                on_open=opened,
                 on_ready=lambda: print(ready, flush=True),
             )
     except link.LinkError as error:
-        print(f"ethercat-virtual-sensor: {error}", file=sys.stderr)
+        _say(error)
         return 1
     return 0
+
+
+def _say(sentence: object) -> None:
+    print(f"{_PROGRAM}: {sentence}", file=sys.stderr)
+
+
+def _send(path: str, command: str) -> int:
+    """Exit code 0 if the virtual sensor that listens there has obeyed."""
+    try:
+        answer = link.send(path, command)
+    except OSError as error:
+        _say(f"no virtual sensor of yours listens at {path} ({error.strerror}): start one, or give --control")
+        return 1
+    print(answer)
+    return int(not answer.startswith("ok"))

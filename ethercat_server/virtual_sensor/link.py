@@ -13,6 +13,7 @@ import select
 import socket
 import stat
 import struct
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -41,6 +42,7 @@ _STEP: Final = 0.001
 _QUICK: Final = 1 / 16
 _MOST_CONNECTIONS: Final = 16
 _CHUNK: Final = 4096
+_ANSWER_S: Final = 5.0
 
 
 class LinkError(Exception):
@@ -88,7 +90,7 @@ def run(
 
     Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the
     end of `commands` if `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is
-    only down is waited for), or `control_path` cannot be used.
+    only down is waited for), or `control_path` cannot be used; without one `own_socket` is, if it is free.
     """
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
@@ -130,13 +132,13 @@ class CommandChannel:
         """LinkError if `control_path` cannot be used."""
         self._bus = bus
         self._poller = poller
-        self._path = control_path
         self._listener: socket.socket | None = None
         self._connections: dict[int, socket.socket] = {}
         self._pending: dict[int, bytes] = {}  # the beginning of a line, by descriptor
         self.ended = False  # the text stream has
-        if control_path is not None:
-            self._listener = _listen(control_path)
+        with contextlib.suppress(LinkError) if control_path is None else contextlib.nullcontext():
+            self._path = control_path or own_socket()
+            self._listener = _listen(self._path)
             poller.register(self._listener, select.POLLIN)
         if commands is not None:
             with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
@@ -150,7 +152,7 @@ class CommandChannel:
         for connection in self._connections.values():
             connection.close()
         self._connections.clear()
-        if self._listener is not None and self._path is not None:
+        if self._listener is not None:
             self._listener.close()
             with contextlib.suppress(OSError):
                 Path(self._path).unlink()
@@ -215,6 +217,24 @@ class CommandChannel:
             rest = b""
         self._pending[descriptor] = rest
         return [line[:LONGEST_LINE].decode(errors="replace") for line in lines if line.strip()]
+
+
+def own_socket() -> str:
+    """Where this user's virtual sensor takes commands if no other place is given."""
+    folder, uid = "/run/user", os.geteuid()
+    folder = f"{folder}/{uid}" if Path(f"{folder}/{uid}").is_dir() else tempfile.gettempdir()
+    return f"{folder}/ethercat-virtual-sensor-{uid}"
+
+
+def send(path: str, command: str) -> str:
+    """The answer to a command of a virtual sensor that listens there, this user's or root's; OSError."""
+    if Path(path).stat().st_uid not in (0, os.geteuid()):
+        raise PermissionError(errno.EPERM, "it is another user's")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        sock.settimeout(_ANSWER_S)
+        sock.connect(path)
+        sock.sendall(command.encode() + b"\n")
+        return sock.makefile(encoding="utf-8").readline().strip()
 
 
 def _listen(path: str) -> socket.socket:

@@ -2,7 +2,8 @@
 
 The sensor's process creates the pair in its own network namespace and moves the near end into the server's.
 However the processes end, the kernel removes the namespace and the pair. Without CAP_SYS_ADMIN both ends
-are created in the server's namespace and deleted at the end.
+are created in the server's namespace and deleted at the end; without CAP_NET_ADMIN in a user and a network
+namespace of the sensor's, which the server enters: its TCP sockets, opened before, stay where they are.
 """
 
 from __future__ import annotations
@@ -17,17 +18,20 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Final
 
 from ethercat_server.errors import ServerError
+from ethercat_server.ethercat.nic import missing_capabilities
 from ethercat_server.process.privileges import become, user_to_become
 
 VIRTUAL_INTERFACE: Final = "virtual"  # the interface name that requests a virtual bus
-_CLONE_NEWNET: Final = 0x40000000
+_CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
 _START_TIMEOUT_S: Final = 20.0
 _GONE_TIMEOUT_S: Final = 3.0
 _USAGE_EXIT_CODE: Final = 2
 _FAR_END: Final = "sensor"
+_LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 
 class VirtualBus:
@@ -77,9 +81,21 @@ class VirtualBus:
                 "the virtual sensor did not start"
                 + (f" (exit code {code})" if code is not None else "")
                 + ": see its message above"
-                + ("" if code == _USAGE_EXIT_CODE else "; it needs root, or CAP_NET_ADMIN and CAP_NET_RAW")
+                + ("" if code == _USAGE_EXIT_CODE else "; it needs root, or a kernel with user namespaces")
             )
+        self._enter_namespaces()
         return self
+
+    def _enter_namespaces(self) -> None:
+        """Those of the sensor, if it has a user namespace of its own."""
+        own, theirs = Path("/proc/self/ns"), Path(f"/proc/{self.pid}/ns")
+        if (own / "user").readlink() == (theirs / "user").readlink():
+            return
+        with (theirs / "user").open() as user, (theirs / "net").open() as network:
+            if any(_LIBC.setns(file.fileno(), 0) for file in (user, network)):
+                why = os.strerror(ctypes.get_errno())
+                self.__exit__()
+                raise ServerError(f"cannot enter the namespaces of the virtual sensor ({why}): use root")
 
     def __exit__(self, *_: object) -> None:
         """End the sensor's process, and with it the bus."""
@@ -98,13 +114,26 @@ class VirtualBus:
             time.sleep(0.01)
 
 
+def _enter_own_namespaces() -> None:
+    """Have every capability in a user and a network namespace, as the same user; OSError."""
+    ids = {"uid": os.geteuid(), "gid": os.getegid()}
+    if _LIBC.unshare(_CLONE_NEWUSER | _CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    Path("/proc/self/setgroups").write_text("deny", encoding="ascii")
+    for kind, number in ids.items():
+        Path(f"/proc/self/{kind}_map").write_text(f"{number} {number} 1", encoding="ascii")
+
+
 @contextlib.contextmanager
-def veth_pair(near: str) -> Iterator[str]:
-    """Create the pair and bring it up; yields the name of the far end, in this process's namespace."""
+def veth_pair(near: str, *, apart: bool = True) -> Iterator[str]:
+    """Create the pair and bring it up; yields the name of the far end, in this process's namespace.
+
+    `apart`: if possible that is another one than the near end's.
+    """
     from pyroute2 import IPRoute  # noqa: PLC0415 - only this process needs it
 
     with open("/proc/self/ns/net", "rb") as namespace, IPRoute() as outer:  # noqa: PTH123
-        own_namespace = ctypes.CDLL(None, use_errno=True).unshare(_CLONE_NEWNET) == 0
+        own_namespace = apart and _LIBC.unshare(_CLONE_NEWNET) == 0
         far = _FAR_END if own_namespace else f"{near[:14]}s"
         with IPRoute() as inner:
             peer = {"ifname": near, "net_ns_fd": namespace.fileno()} if own_namespace else {"ifname": near}
@@ -121,6 +150,9 @@ def veth_pair(near: str) -> Iterator[str]:
 
 def main(argv: Sequence[str]) -> int:
     """The sensor's process: near end's name, priority, user or "", number, the sensor's options."""
+    if unprivileged := bool(missing_capabilities()):
+        with contextlib.suppress(OSError):  # said when the pair cannot be created
+            _enter_own_namespaces()
     from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415 - only this process needs it
 
     from ethercat_server.virtual_sensor import cli  # noqa: PLC0415 - likewise
@@ -128,14 +160,11 @@ def main(argv: Sequence[str]) -> int:
     near, priority, user, number, *arguments = argv
     with contextlib.ExitStack() as made:
         try:
-            far = made.enter_context(veth_pair(near))
+            far = made.enter_context(veth_pair(near, apart=not unprivileged))
         except (OSError, NetlinkError) as error:
             why = os.strerror(error.code) if isinstance(error, NetlinkError) else error.strerror or error
             sys.stderr.write(f"ethercat-virtual-sensor: cannot create a veth pair: {why}\n")
             return 1
-        if int(priority):
-            with contextlib.suppress(PermissionError):
-                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(priority)))
 
         def give_up_root() -> None:
             # Deleting an interface in the server's namespace takes rights.
@@ -143,7 +172,7 @@ def main(argv: Sequence[str]) -> int:
                 become(found)
 
         try:
-            return cli.main([far, "--exit-on-eof", *arguments], give_up_root, int(number))
+            return cli.main([far, "--exit-on-eof", *arguments], give_up_root, int(number), int(priority))
         except ServerError as error:
             sys.stderr.write(f"ethercat-virtual-sensor: {error}\n")
             return 1

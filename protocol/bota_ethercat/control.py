@@ -117,6 +117,14 @@ def six_numbers(value: object) -> tuple[float, ...]:
     raise ValueError("a list of six finite numbers")
 
 
+def known_six(value: object) -> tuple[float, ...] | None:
+    """Six finite numbers from a message or a file; None if they are none."""
+    try:
+        return six_numbers(value)
+    except ValueError:
+        return None
+
+
 def _settings(value: object) -> Mapping[str, Any]:
     if not isinstance(value, dict) or not value:
         raise ValueError('an object with settings by name, such as {"sinc_length": 64}')

@@ -50,11 +50,7 @@ class ConnectionFailedError(ProtocolError):
 
 
 class UnreachableError(ConnectionFailedError):
-    """Nothing answers at that address."""
-
-    def at(self, address: object) -> str:
-        """The one sentence about it."""
-        return f"no server at {address} ({self}): start ethercat-server"
+    """Nothing answers at that address; `health.sentences.no_server` is the sentence about it."""
 
 
 class NoReplyError(ConnectionFailedError):

@@ -14,6 +14,11 @@ from collections.abc import Sequence
 from bridge.process import block_stop_signals
 
 USAGE = """\
+examples:
+  ros2 run bridge client                                         # of the server on this computer
+  ros2 run bridge client --ros-args -p server_host:=robot        # of another computer's
+  ros2 run bridge client --ros-args --params-file client.yaml    # with the parameters in a file
+
 usage: ros2 run bridge client [--ros-args -p NAME:=VALUE ... --params-file FILE ...]
        bridge-client          [--ros-args ...]
 

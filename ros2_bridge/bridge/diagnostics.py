@@ -19,6 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from bota_ethercat.errors import ConnectionFailedError
+from bota_ethercat.health.history import drift
 from bota_ethercat.health.judge import SATURATIONS, Observation, emergency, judge
 from bota_ethercat.health.observer import p99
 from bota_ethercat.health.verdict import About, Level, Limits
@@ -71,6 +72,8 @@ class Monitor:
         self.limits = limits  # may be replaced at any time
         self._reader, self._link, self._clock = reader, reader.link, reader.link.clock
         self._compensation, self._outputs, self._stamps = compensation, outputs, stamps
+        # Called once a second with the sensor's row of the server's `status` and its temperature.
+        self.on_status: Callable[[Mapping[str, Any], float], object] = lambda *_: None
         self._log = node.get_logger()
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
@@ -122,6 +125,8 @@ class Monitor:
             stamp.sec, stamp.nanosec = divmod(self._clock.time_ns(), 1_000_000_000)
             self._publisher.publish(message)
         if regular:
+            if (sample := self._reader.watch.sample) is not None:
+                self.on_status(self._row, sample.temperature)
             self._begin_interval(now_s)
 
     def _measure(self, now_s: float) -> None:
@@ -223,6 +228,7 @@ class Monitor:
             state=link.info.state,
             server_silent=answer_s > _SLOW_ANSWER_S / 2,
             emergency=emergency(self._row.get("emergency")),
+            drift=drift(self._row, self.limits),
             settings=link.info.settings,
         )
         findings = judge(seen, self.limits).findings
@@ -258,11 +264,7 @@ class Monitor:
     def _judge_link(self, problems: Problems, now_s: float, answer_s: float) -> DiagnosticStatus:
         link = self._link
         if not link.is_connected:
-            text = f"not connected to {link.address}: {link.problem}"
-            if not link.is_reachable:
-                text = f"no server at {link.address}: {link.problem}; start ethercat-server there, or set "
-                text += "server_host and server_port to where it is"
-            problems = [(Level.TROUBLE, f"{text} (the node keeps trying)")]
+            problems = [(Level.TROUBLE, f"{link.absence} (the node keeps trying)")]
         elif answer_s > _SLOW_ANSWER_S:
             text = f"the server at {link.address} has not answered for {answer_s:.0f} s"
             problems = [(Level.LOOK, f"{text}: it is stopped or overloaded")]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -25,9 +24,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from bota_ethercat.control import MAX_TARE_SAMPLES
+from bota_ethercat.control import MAX_TARE_SAMPLES, known_six
 from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import Vector3
+from bota_ethercat.program import state
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.declare import SettingsParameters
 from bridge.parameters.table import AUTO, ParameterError
@@ -39,7 +39,6 @@ from bridge.stream.link import (
     Link,
     RequestFailedError,
     find_sensor,
-    known_offset,
     offset_text,
 )
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
@@ -131,7 +130,7 @@ class SensorServices:
         titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
         parts = [f"{title} {offset_text(reply.get(key))}" for key, title in titles]
         offset, spread, residual = (
-            known_offset(reply.get(key)) or _UNKNOWN for key in ("new_offset", "deviation", "residual")
+            known_six(reply.get(key)) or _UNKNOWN for key in ("new_offset", "deviation", "residual")
         )
         fields = {"bias": tuple(-value for value in offset), "spread": spread, "residual": residual}
         return Done(f"sensor {sensor} tared: " + "; ".join(parts), fields)
@@ -302,12 +301,9 @@ class IdentifyServices:
     def _path(self) -> Path:
         path = self._control.parameters.identify_file
         if path == AUTO:
-            state = os.environ.get("XDG_STATE_HOME", "")
-            # The XDG specification says that a relative path is to be ignored.
-            directory = state if Path(state).is_absolute() else "~/.local/state"
             serial = self._control.link.info.serial
             name = f"sensor-{serial if serial.isalnum() else 'unknown'}-payload.yaml"
-            path = f"{directory}/bota-ethercat-bridge/{name}"
+            path = f"{state.folder()}/{name}"
         try:
             return Path(path).expanduser()
         except RuntimeError:
@@ -343,7 +339,7 @@ def take_window(control: CompensationControl, *, needs_tool: bool, samples: int 
         raise CompensationError(conflict)
     link, clock = control.link, control.link.clock
     if not link.is_connected:
-        raise CompensationError(f"{link.absence}, so there are no samples")
+        raise CompensationError(f"there are no samples: {link.absence}")
     _wait_settled(link)
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
     window = RestWindow(seconds, limits, control.choice.source)

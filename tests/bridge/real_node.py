@@ -8,10 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import signal
-import subprocess
-import sys
-import tempfile
 import threading
 import time
 import uuid
@@ -28,7 +24,7 @@ from std_srvs.srv import Trigger
 
 from bridge.node import BridgeNode, spin
 from bridge.spinning import Spinner
-from tests.server.running import wait_until
+from tests.server.running import Program, wait_until
 
 PATIENCE_S = 45.0
 ASK_AGAIN_S = 5.0
@@ -210,30 +206,19 @@ class NodeThread(Started):
         self.ends()
 
 
-class NodeProcess(Started):
+class NodeProcess(Program, Started):
     """`bridge-client` in a process of its own."""
 
     def __init__(self, *arguments: str) -> None:
-        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "bridge.client", *arguments], stdout=self._log, stderr=subprocess.STDOUT
-        )
+        super().__init__("bridge.client", arguments)
 
     @property
     def log(self) -> str:  # type: ignore[override]
-        self._log.seek(0)
-        return self._log.read()
+        return self.said()
 
     def ends(self) -> int:
         """Wait until it has ended; its exit code."""
         return self.process.wait(PATIENCE_S)
-
-    def close(self) -> None:
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGCONT)
-            self.process.kill()
-            self.process.wait()
-        self._log.close()
 
 
 Start = Callable[..., NodeThread]

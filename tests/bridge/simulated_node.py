@@ -432,8 +432,8 @@ def sensed(
     length = math.sqrt(sum(part * part for part in up))
     values = dict(zip(names, [*load(up, payload, bias).values, *(part / length for part in up)], strict=True))
     for name, change in changes.items():
-        position, axis = name.rsplit("_", 1)
-        values[f"{position}.{axis}"] = values.get(f"{position}.{axis}", 0.0) + change
+        field = ".".join(name.rsplit("_", 1))
+        values[field] = values.get(field, 0.0) + change
     return encode(size, values)
 
 

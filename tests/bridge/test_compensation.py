@@ -165,18 +165,6 @@ def test_a_tool_that_is_set_during_a_tare(stages: Stages, server: Server, node: 
         stages.at(up, bias=BIAS)
 
 
-def test_a_tare_that_is_restored_is_for_the_tool_of_now(stages: Stages, server: Server, node: Node) -> None:
-    node.set("tool_mass", 0.0)
-    for up in (UP, SIDE):
-        server.hold(up, bias=BIAS)
-        node.run(1.0)
-        node.do("tare")
-    node.set("tool_mass", TOOL.mass)
-    for done in (True, False):
-        assert node.trigger("undo_tare")[0] is done
-        stages.at(OVER, bias=BIAS)
-
-
 def put(node: Node, **named: Any) -> Any:
     """Set parameters at once; the result."""
     messages = [Parameter(name, value=value).to_parameter_msg() for name, value in named.items()]

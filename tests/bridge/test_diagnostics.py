@@ -185,6 +185,8 @@ def test_a_server_that_does_not_answer(node: Node, server: Server) -> None:
     server.answers["status"] = answer
     server.send_json({"reply": "status", "id": owed[0]["id"], **status()})
     node.until(**HEALTHY)
+    server.answers["status"], server.paused = owed.append, True  # as if it were stopped
+    node.until("No new sample for", "the server does not answer", stream="error", clock="stale")
 
 
 def test_a_server_that_is_gone_and_comes_back(node: Node, server: Server) -> None:
@@ -196,7 +198,7 @@ def test_a_server_that_is_gone_and_comes_back(node: Node, server: Server) -> Non
     assert values(array["link"])["connected"] == "false"
     server.listens, sensors = True, server.description["sensors"]
     server.description["sensors"] = []
-    node.until("not connected to localhost:12001: the server has no sensor 0", link="error")
+    node.until("not connected to the server at localhost:12001 (the server has no sensor 0", link="error")
     server.description["sensors"] = sensors
     server.answers["status"] = lambda _: status(lost_samples=500)
     array = node.until("was interrupted", link="warn")

@@ -62,7 +62,10 @@ def test_attempts_to_connect_back_off_and_one_line_says_so(quiet: Server) -> Non
         node.run(5.0)
         pauses = [after - before for before, after in itertools.pairwise(quiet.attempted_s)]
         assert pauses[:8] == pytest.approx([0.1, 0.15, 0.225, 0.3375, 0.50625, 0.759, 1.0, 1.0], abs=0.011)
-        assert node.log == "no server at localhost:12001: Connection refused; trying until there is one"
+        assert node.log == (
+            "no server at localhost:12001 (Connection refused): start ethercat-server, or give its address "
+            "(the node keeps trying)"
+        )
         quiet.listens = True
         node.run(2.0)  # after a connection that lasted the next attempt comes soon
         quiet.drop()
@@ -118,21 +121,21 @@ def test_events_reach_the_log_and_the_link(node: Node, quiet: Server) -> None:
 @pytest.mark.parametrize(
     ("message", "said"),
     [
-        ({"event": "sensor_lost", "reason": "wkc"}, "the server has lost the sensor"),
+        ({"event": "sensor_lost", "reason": "wkc"}, "the sensor is lost"),
         ({"event": "sensor_back", "lost_s": 1.25}, "the sensor is back after 1.25 s"),
         ({"event": "sensor_back", "lost_s": "long"}, "the sensor is back"),
         (
             {"event": "reconfigured", "settings": {"fir": True, "sinc_length": 128, "chop": False}},
-            "the sensor was reconfigured: fir true, sinc_length 128",
+            "the settings of the sensor have changed: fir true, sinc_length 128",
         ),
         (
-            {"event": "offset_changed", "offset": [1, 2, 3, 0.1, 0.2, 0.3]},
-            "the sensor's own offset is Fx 1.0000 Fy 2.0000 Fz 3.0000 Mx 0.1000 My 0.2000 Mz 0.3000 (N, Nm) "
-            "now",
+            {"event": "offset_changed", "sensor": 1, "offset": [1, 2, 3, 0.1, 0.2, 0.3]},
+            "the offset of sensor 1 has changed: it is Fx 1.0000 Fy 2.0000 Fz 3.0000 Mx 0.1000 My 0.2000 "
+            "Mz 0.3000 (N, Nm)",
         ),
-        ({"event": "offset_changed", "offset": [1]}, "the sensor's own offset is no longer known"),
+        ({"event": "offset_changed"}, "the offset of the sensor has changed: it is unknown"),
         ({"event": "emergency", "code": 4096}, "the sensor reports an emergency"),
-        ({"event": "emergency", "message": "too hot"}, "the sensor reports an emergency: too hot"),
+        ({"event": "emergency", "message": "too hot"}, "too hot"),
         ({"event": "shutting_down"}, "the server is shutting down"),
     ],
 )

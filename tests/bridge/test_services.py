@@ -44,6 +44,8 @@ def test_settings_given_at_start_or_set_since_are_applied_on_request(node: Node,
     node.set("settings.fir", True)
     node.do("apply_settings")
     assert asked == [{"sinc_length": 64}, {"fir": True}, {"sinc_length": 64, "fir": True}]
+    node.do("save_settings")
+    assert scripted.requests[-1]["save"] is True
     scripted.answers["configure"] = lambda _: refuse("not for uid 7", ErrorCode.DENIED)
     assert node.trigger("apply_settings") == (False, "not for uid 7 (denied)")
     scripted.reconfigure()
@@ -146,7 +148,7 @@ def test_without_a_server(node: Node, scripted: Server) -> None:
     node.refuse("sensor_tare", "the server at localhost:12001 is gone: the connection ended before the reply")
     node.run(0.1)
     assert node.parameters(*NAMES) == [None] * 4
-    refused = "there is no server at localhost:12001"
+    refused = "no server at localhost:12001"
     for done, text in (
         node.trigger("sensor_tare"),
         node.trigger("tare"),

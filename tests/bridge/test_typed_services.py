@@ -145,9 +145,3 @@ def test_without_the_package_there_are_the_triggers_only(monkeypatch: pytest.Mon
         offered = {one.service_name.removeprefix(f"{node.name}/") for one in node.node.services}
     assert {"tare", "sensor_tare", "get_settings", "identify/solve"} <= offered
     assert not [name for name in offered if name.startswith("typed/")]
-
-
-def test_every_file_is_generated() -> None:
-    listed = re.findall(r'"srv/(\w+).srv"', (PACKAGE / "CMakeLists.txt").read_text())
-    files = sorted(path.stem for path in (PACKAGE / "srv").iterdir())
-    assert listed == files == sorted(set(SERVICES.values()))

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from catkin_pkg.package import parse_package
 
 from bota_ethercat.client.reading import Condition
 from tests.clients.cpp_programs import (
@@ -221,11 +220,3 @@ def test_cmake_installs_the_headers_and_a_program_finds_them(tmp_path: Path) -> 
 def test_the_version_is_the_projects() -> None:
     text = (CLIENT / "CMakeLists.txt").read_text()
     assert f"project(bota_ethercat VERSION {PROJECT['version']} " in text
-
-
-def test_the_package_needs_nothing_but_cmake() -> None:
-    """rosdep and colcon read package.xml."""
-    package = parse_package(CLIENT)
-    assert package.get_build_type() == "cmake"
-    assert [need.name for need in package.buildtool_depends] == ["cmake"]
-    assert not [*package.build_depends, *package.exec_depends, *package.test_depends]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -12,10 +11,8 @@ from bota_ethercat.address import Address
 from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.cpp_programs import (
-    SOURCES,
     Reading,
     assert_no_faults,
-    build,
     driver,
     needs_gxx,
     patient,
@@ -150,17 +147,6 @@ def test_requests_without_a_server() -> None:
             told = running.do(what)
             assert not told["ok"]
             assert "nobody listens there" in told["error"]
-
-
-@pytest.mark.long
-def test_threads_with_a_client_each_have_no_race() -> None:
-    """Real threads, under ThreadSanitizer."""
-    program = build(SOURCES / "threads.cpp", ("-g", "-O1", "-fsanitize=thread"))
-    with served(sinc_length=256) as running:
-        # Without randomized addresses, which ThreadSanitizer cannot have everywhere.
-        command = ["setarch", "-R", str(program), str(running.port)]
-        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100)
-    assert (done.returncode, done.stderr) == (0, ""), done.stdout
 
 
 def test_a_server_is_named_as_in_the_other_programs() -> None:

@@ -106,6 +106,7 @@ def test_it_finds_the_poses_by_itself(recording: Path) -> None:
 def test_it_finds_the_tool_and_the_bias(recording: Path) -> None:
     code, answer, said = asked(recording)
     assert (code, answer["ok"], said) == (0, True, "")
+    assert not problems("identify", answer)
     assert answer["tool_mass"] == pytest.approx(signals.TOOL_MASS, rel=0.01)
     assert math.dist(answer["tool_center_of_gravity"], signals.TOOL_CENTRE) < 0.002
     assert answer["bias"] == pytest.approx(OFFSET, abs=0.05)

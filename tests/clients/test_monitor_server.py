@@ -147,7 +147,7 @@ def test_once_without_a_server_is_exit_1_and_one_sentence(run: Run) -> None:
     assert (code, out) == (1, "")
     assert err == (
         f"ethercat-monitor: no server at localhost:{port} (Connection refused): start ethercat-server, "
-        "or give its HOST:PORT\n"
+        "or give its address\n"
     )
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import xacro
-import yaml
 from catkin_pkg.package import parse_package
 
 from tests.clients.cpp_programs import ROOT
@@ -67,14 +66,3 @@ def test_the_macro_lists_what_is_asked_for(tmp_path: Path) -> None:
         assert len(set(listed)) == len(listed)
         assert set(listed) == set(SIGNALS if flag == "true" else [*SIGNALS[:6], "age", "condition"])
         assert [(p.get("name"), p.text) for p in robot.iter("param")] == [("port", "12002")]
-
-
-def test_the_controllers_are_those_of_the_arm() -> None:
-    controllers = yaml.safe_load((PACKAGE / "config" / "mock_arm_controllers.yaml").read_text())
-    arm = (PACKAGE / "urdf" / "mock_arm.urdf.xacro").read_text()
-    named = set(controllers["controller_manager"]["ros__parameters"]) - {"update_rate"}
-    assert named == controllers.keys() - {"controller_manager"}
-    joints = controllers["admittance_controller"]["ros__parameters"]["joints"]
-    assert [f'<xacro:mock_joint number="{joint.removeprefix("joint")}"' in arm for joint in joints] == [
-        True
-    ] * 6

@@ -34,7 +34,6 @@ from tests.clients.played_sensor import PlayedSensor, described, frame, played
 from tests.clients.recordings import record
 from tests.clients.test_identify import posed
 from tests.ended import run_here
-from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port, wait_until
 
 pytestmark = [needs_gxx, patient]
@@ -116,10 +115,6 @@ def server(running: Loop) -> Iterator[PlayedSensor]:
     with played() as sensor:
         yield sensor
         running.do("stop")
-
-
-def threads(loop: Loop) -> int:
-    return len(list(Path(f"/proc/{loop.process.pid}/task").iterdir()))
 
 
 def wrench(seen: Seen) -> Any:
@@ -377,18 +372,6 @@ def test_it_becomes_usable_with_the_first_sample(running: Loop, server: PlayedSe
     assert wrench(loop.read()) > 1
 
 
-def test_nan_and_saturation_in_the_stream(running: Loop, server: PlayedSensor) -> None:
-    loop = running.opened(server.port, on_saturated="hold")
-    server.send(frame(1))
-    loop.until(FRESH)
-    server.send(frame(2, torque__z=math.nan))
-    assert wrench(loop.until(NOT_FINITE)) is None
-    server.send(frame(3))
-    loop.until(FRESH)
-    server.send(frame(4, warnings=1))
-    assert wrench(loop.until(SATURATED)) == 3
-
-
 def test_stale_samples_and_a_lost_sensor(running: Loop, server: PlayedSensor) -> None:
     loop = running.opened(server.port, max_age=0.05, on_stale="hold", error_after=0.2)
     server.send(frame(1))
@@ -469,18 +452,6 @@ def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> Non
         loop.do("stop")
 
 
-def test_the_first_sample_while_the_sensor_turns(running: Loop, server: PlayedSensor) -> None:
-    """How fast it spins up, and so the inertia of the tool, is not known yet."""
-    loop = running.opened(server.port, "compensated", tool_mass=1, on_invalid="hold")
-    begin_ns = time.monotonic_ns()
-    for number, condition in ((1, NOT_FINITE), (2, FRESH)):
-        data = encode(61, {"acceleration.z": 1.0, "angular_rate.x": 100.0, "force.x": number})
-        server.send(encode_data(number, 5, begin_ns + number * 1_250_000, 0, 0, 3, data))
-        seen = loop.until(condition)
-    assert wrench(seen) == 2
-    assert seen["compensated.force.x"] == pytest.approx(2)
-
-
 def test_without_a_payload_the_log_says_what_zero_is(running: Loop, server: PlayedSensor) -> None:
     loop = running.opened(server.port)
     assert loop.do("tare")["ok"]
@@ -516,33 +487,6 @@ def test_another_sensor_in_its_place_is_refused(running: Loop) -> None:
 
 
 # -- a real server
-
-
-@pytest.mark.long
-def test_a_server_killed_and_started_again(running: Loop) -> None:
-    with contextlib.ExitStack() as ends:
-        first = ends.enter_context(served(sinc_length=512))
-        loop = running.opened(first.port, max_age=0.3)
-        assert loop.do("wait", PATIENCE_S * 1000)["ok"]
-        first.kill()
-        gone = loop.until(DISCONNECTED)
-        assert wrench(gone) is None
-        loop.logged("warning: disconnected; on such samples: nan")
-        second = ends.enter_context(served(port=first.port, sinc_length=512))
-        back = loop.until(FRESH, lambda seen: wrench(seen) is None)
-        assert back["age"] <= 0.3
-        loop.logged("samples are usable again")
-        second.command("power off")
-        loop.until(LOST)
-        second.command("power on")
-        loop.until(FRESH)
-        with second.client() as client:
-            assert client.ask("configure", settings={"calibration_matrix": False})["ok"]
-            loop.logged("sends ADC counts instead of N and Nm")
-            assert wrench(loop.read()) is None
-        assert threads(loop) == 2
-        loop.do("stop")
-        assert threads(loop) == 1
 
 
 def test_a_cycle_makes_no_system_call(running: Loop, server: PlayedSensor) -> None:

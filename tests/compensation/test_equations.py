@@ -16,7 +16,7 @@ def test_what_the_environment_does_is_left_of_any_load_in_any_pose() -> None:
     draw = np.random.default_rng(4)
     for _ in range(500):
         up, contact, bias = (
-            draw.normal(size=3),
+            draw.normal(size=3).tolist(),
             Wrench.of(draw.normal(size=6)),
             Wrench.of(draw.normal(size=6)),
         )

@@ -22,7 +22,7 @@ from ft_compensation.identification.poses import Pose, coverage, pose_of
 from ft_compensation.identification.weighted import Array, two_sided
 from ft_compensation.quantities import NO_WRENCH, SCALE_PRIOR, CompensationError, Payload, Wrench
 from ft_compensation.stationary import StationaryMeans, triple
-from tests.compensation.making import AXES, BIAS, SEED, TOOL, gravity_for, load, pose, written_parameters
+from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, pose, written_parameters
 from tests.simulation import more_if_long
 
 Up = tuple[float, float, float]
@@ -255,31 +255,6 @@ def test_poses_about_one_axis_are_taken_with_a_note(tilt: float) -> None:
     assert found.payload.center == pytest.approx(TOOL.center)
     assert found.bias.values == pytest.approx(BIAS.values)
     assert re.search("hardly changed along the sensor's x axis.*[+-]x axis points up", found.notes[-1])
-
-
-def cone(draw: np.random.Generator) -> list[Up]:
-    """Twelve poses within 30 to 45° of upright."""
-    tilts, turns = np.radians(draw.uniform(30, 45, 12)), draw.uniform(0, math.tau, 12)
-    rows = np.stack([np.sin(tilts) * np.cos(turns), np.sin(tilts) * np.sin(turns), np.cos(tilts)], axis=1)
-    return [(x, y, z) for x, y, z in rows.tolist()]
-
-
-def anywhere(draw: np.random.Generator) -> list[Up]:
-    """Six poses."""
-    return [(x, y, z) for x, y, z in draw.normal(size=(6, 3)).tolist()]
-
-
-@pytest.mark.parametrize("ups", [cone, anywhere])
-@pytest.mark.parametrize("seed", more_if_long(range(4), range(100)))
-def test_poses_are_judged_by_the_intervals_that_result(
-    ups: Callable[[np.random.Generator], list[Up]], seed: int
-) -> None:
-    draw, noise = np.random.default_rng([seed, SEED]), random.Random(seed)
-    reading = Reading(seed)
-    poses = [reading.pose(up)._replace(wrench=pose(up, noise=noise).wrench) for up in ups(draw)]
-    found = identify(poses)
-    assert abs(found.payload.mass - TOOL.mass) < min(0.02, 2 * found.mass_interval)
-    assert math.dist(found.payload.center, TOOL.center) < 0.002
 
 
 def test_poses_that_leave_wide_intervals_are_refused_with_them() -> None:

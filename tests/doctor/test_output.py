@@ -13,7 +13,6 @@ import pytest
 
 from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.cli import main
-from ethercat_server.doctor.machine import Machine
 from ethercat_server.doctor.machine_checks import CHECKS
 from ethercat_server.doctor.report import (
     Finding,
@@ -27,6 +26,8 @@ from ethercat_server.doctor.report import (
     warning,
     worst,
 )
+from ethercat_server.errors import ServerError
+from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 from tests.doctor.running import MODULE, doctor_here
 from tests.ended import run_here
 from tests.server.running import PATIENCE_S
@@ -35,7 +36,7 @@ from tests.server.running import PATIENCE_S
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ([], "usage: ethercat-doctor"),
+        ([], "name an interface, or a server: no server at localhost:12001 (Connection refused)"),
         (["ens5", "--colour"], "usage: ethercat-doctor"),
         (["ens5", "--seconds", "soon"], "invalid number value"),
         (["ens5", "--seconds", "-1"], "from 0 to 3600"),
@@ -94,12 +95,14 @@ def test_reader_that_has_enough() -> None:
         assert piped.stderr.read() == ""
 
 
-def test_virtual_without_rights_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Machine, "has_capability", lambda *_: False)
+def test_virtual_where_there_is_no_virtual_bus_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> None:
+        raise ServerError("no namespaces")
+
+    monkeypatch.setattr(VirtualBus, "__enter__", refuse)
     ended = doctor_here("virtual", "--json", "--seconds", 0)
     assert ended.code == 0
-    assert "there is no virtual bus: CAP_NET_RAW" in ended.findings("bus")["slaves"]["found"]
-    assert ended.err == ""
+    assert "there is no virtual bus: no namespaces" in ended.findings("bus")["slaves"]["found"]
 
 
 class Terminal(io.StringIO):

@@ -6,16 +6,13 @@ What it makes of the answers is tested on made-up machines and simulated buses.
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from ethercat_server.doctor.machine import Machine
 from tests import rights
 from tests.doctor.running import ATTEMPTS, MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
 from tests.rights import NOBODY
@@ -65,42 +62,6 @@ def test_the_whole_doctor(bench: Bench) -> None:
         now = sensor.stats(position)
         assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
     assert not promiscuous(veth), "SOEM leaves it so"
-
-
-@pytest.mark.parametrize(
-    ("commands", "up", "carrier", "master", "addresses"),
-    [
-        ([], True, True, False, ()),
-        (["link set {near} down"], False, False, False, ()),
-        (["link set {far} down"], True, False, False, ()),
-        (["address add 192.0.2.77/32 dev {near}"], True, True, False, ("192.0.2.77/32",)),
-        (["link add {bridge} type bridge", "link set {near} master {bridge}"], True, True, True, ()),
-    ],
-    ids=["up", "down", "no carrier", "with an address", "in a bridge"],
-)
-def test_the_kernel_says_what_an_interface_is_used_for(
-    commands: list[str], up: bool, carrier: bool, master: bool, addresses: tuple[str, ...]
-) -> None:
-    """No frame is sent where there is an address or a bridge: the kernel says so in messages of its own."""
-    with contextlib.ExitStack() as cleanup:
-        veth = cleanup.enter_context(Veth())
-        names = {"near": veth.near, "far": veth.far, "bridge": f"eb{os.getpid()}"}
-        bridge = ["ip", "link", "del", names["bridge"]]
-        cleanup.callback(subprocess.run, bridge, check=False, capture_output=True)
-        for command in commands:
-            veth.ip(*command.format(**names).split())
-        found = Machine(veth.near)
-        link, routes = found.link, found.fact("routes")
-        assert (link.kind, link.up, link.carrier, bool(link.master)) == ("veth", up, carrier, master)
-        assert (routes.addresses, routes.default) == (addresses, False)
-
-
-def is_running(pid: str) -> bool:
-    """Whether this process is there and no zombie, whose parent need not be quick."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
 
 
 @contextlib.contextmanager

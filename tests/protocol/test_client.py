@@ -316,23 +316,15 @@ def test_another_thread_may_ask_while_one_receives(scripted: ScriptedServer) -> 
             reader.join()
 
 
-@pytest.fixture
-def descriptors_to_1024() -> Iterator[None]:
-    """Everything that is opened from now on has a descriptor that `select` does not take."""
+def test_it_receives_beyond_1024_descriptors(scripted: ScriptedServer) -> None:
+    """Which `select` does not take."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, limits[1]), limits[1]))
-    taken = [os.open(os.devnull, os.O_RDONLY)]
-    while taken[-1] < 1024:
-        taken.append(os.dup(taken[0]))
-    yield
-    for descriptor in taken:
-        os.close(descriptor)
-    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
-
-
-def test_it_receives_beyond_1024_descriptors(scripted: ScriptedServer, descriptors_to_1024: None) -> None:
-    with connect(scripted.port, timeout_s=PATIENCE_S) as sensor:
-        assert sensor.fileno() > 1024
+    with contextlib.ExitStack() as taken:
+        taken.callback(resource.setrlimit, resource.RLIMIT_NOFILE, limits)
+        while taken.enter_context(open(os.devnull)).fileno() < 1024:  # noqa: PTH123
+            pass
+        sensor = taken.enter_context(connect(scripted.port, timeout_s=PATIENCE_S))
         assert scripted.subscribed.wait(PATIENCE_S)
         scripted.send_sample(1.0)
         assert [frame.sequence for frame in sensor.receive()] == [1]

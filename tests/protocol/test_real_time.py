@@ -73,8 +73,3 @@ def test_memory_is_not_locked_up_to_a_limit() -> None:
     assert found["own"][:2] == [os.SCHED_FIFO, 40]
     assert not found["locked"]
     assert "not granted: locked memory ('memlock unlimited' in a file in" in found["text"]
-
-
-def test_nothing_is_asked_for_by_default() -> None:
-    found = probe(0, -1, limit=limited())
-    assert found["text"] == "ordinary scheduling"

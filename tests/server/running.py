@@ -115,7 +115,7 @@ class Program:
     ) -> None:
         """`under` is a command that becomes the program given behind it, such as `setpriv ...`."""
         descriptor, path = tempfile.mkstemp(prefix="ethercat-test-")
-        self.log = Path(path)
+        self._log = Path(path)
         with open(descriptor, "w") as log:  # noqa: PTH123
             self.process = subprocess.Popen(
                 [*under, python, "-m", module, *arguments],
@@ -127,7 +127,7 @@ class Program:
             )
 
     def said(self) -> str:
-        return self.log.read_text()
+        return self._log.read_text()
 
     def wait_for(self, text: str) -> None:
         def arrived() -> bool:
@@ -155,7 +155,7 @@ class Program:
         if self.process.stdin:
             with contextlib.suppress(BrokenPipeError):
                 self.process.stdin.close()
-        self.log.unlink(missing_ok=True)
+        self._log.unlink(missing_ok=True)
 
 
 class Commanded:

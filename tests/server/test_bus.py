@@ -12,7 +12,6 @@ from bota_ethercat.framing import DataFlag
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.datagrams import LateAnswers
 from ethercat_server.ethercat.exchange import DUPLICATE, FIRST_INDEX
 from ethercat_server.ethercat.exchange import Exchange as Taken
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build, parse
@@ -203,17 +202,6 @@ def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() 
     assert process_data.take(late, 1) is None
     assert awaited(process_data.take(current, 1)).frame == current
     assert process_data.duplicates == 0, "it was given up, not taken"
-
-
-def test_a_late_answer_makes_datagrams_wait_longer_but_never_long() -> None:
-    late, pending = LateAnswers(clock := SimulatedClock(Machine())), 0x80 + 3
-    for stall_s in (0.01, 10.0):
-        late.pending_ns[3] = clock.now_ns
-        clock.sleep(stall_s)
-        late.in_time(3)
-        assert 0.02 <= late.timeout_s <= 0.25
-        late.note(done(build((Command.NOP, 0, 0, b""), first_index=pending)))
-        assert 0.02 <= late.timeout_s <= 0.25
 
 
 # -- whatever comes from the wire the loop goes on

@@ -82,16 +82,16 @@ class Hostile:
             return data
         return None
 
-    def hear(self, turns: int = 16, until: bytes = b"") -> Generator[None, None, bytes]:
-        """What the server says in so many turns, or before it ends the connection or has said `until`."""
+    def hear(self, turns: int = 16) -> Generator[None, None, bytes]:
+        """What the server says in so many turns, or before it ends the connection."""
         found = b""
         for _ in range(turns):
             data = self.hear_some()
             found += data or b""
-            if data == b"" or (until and until in found):
+            if data == b"":
                 return found
             yield
-        assert turns < PATIENCE_TURNS, f"neither {until!r} nor an end; it said {found!r}"
+        assert turns < PATIENCE_TURNS, f"it does not end; it said {found!r}"
         return found
 
 
@@ -140,23 +140,12 @@ def any_form(client: Hostile, message: dict[str, object]) -> bytes:
 
 
 @kind
-def connect_and_close(client: Hostile) -> Steps:
-    yield from ()
-
-
-@kind
 def half_close(client: Hostile) -> Steps:
     yield from client.send(any_form(client, request("status")))
     client.stream.end_sending()
     if not (yield from client.hear(PATIENCE_TURNS)):
         raise ConnectionAbortedError("one too many: not let in")
     client.answers["heard after a half close"] += 1
-
-
-@kind
-def half_close_at_once(client: Hostile) -> Steps:
-    client.stream.end_sending()
-    assert (yield from client.hear(PATIENCE_TURNS)) == b""
 
 
 @kind
@@ -172,12 +161,6 @@ def half_a_message_then_silence(client: Hostile) -> Steps:
     whole = client.chance.choice((*FRAMED[:3], *BARE[:3]))
     yield from client.send(whole[: client.chance.randrange(1, len(whole))])
     client.hold()
-
-
-@kind
-def silence(client: Hostile) -> Steps:
-    client.hold()
-    yield from ()
 
 
 @kind
@@ -202,16 +185,6 @@ def subscribe_and_vanish(client: Hostile) -> Steps:
     if client.chance.random() < 0.5:
         yield from client.hear()
     client.chance.choice((client.stream.reset, client.hold, client.stream.close))()
-
-
-@kind
-def byte_by_byte(client: Hostile) -> Steps:
-    for byte in client.chance.choice((FRAMED[0], BARE[0])):
-        yield from client.send(bytes((byte,)))
-        if client.chance.random() < 0.1:
-            yield
-    if b'"ok":true' not in (yield from client.hear(PATIENCE_TURNS, until=b'"ok":true')):
-        raise ConnectionAbortedError("one too many: not let in")
 
 
 @kind

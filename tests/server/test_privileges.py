@@ -113,72 +113,25 @@ def test_what_needs_root_is_done_before_a_frame_is_read(monkeypatch: pytest.Monk
     assert done == ["opened ens5", "prepared, becomes user: True", "became nobody", "brought up"]
 
 
-# -- how
-
-BECOME = """
-import ctypes, json, mmap, os, pwd, threading
-from pathlib import Path
-from ethercat_server.process import realtime
-from ethercat_server.process.privileges import user_to_become, become
-waiting, ready, end = [], threading.Event(), threading.Event()
-def other():
-    ready.set()
-    end.wait()
-threading.Thread(target=other, daemon=True).start()
-ready.wait()
-realtime.prepare(40, None, becomes_user=True)
-become(user_to_become("nobody"))
-memory = [bytearray(1 << 20) for _ in range(64)]
-mapped = mmap.mmap(-1, 64 << 20)
-threads = [threading.Thread(target=end.wait, daemon=True) for _ in range(20)]
-for thread in threads:
-    thread.start()
-refused = []
-for attempt in (lambda: os.setresuid(0, 0, 0), lambda: os.setgroups([0]), lambda: os.kill(1, 0)):
-    try:
-        attempt()
-    except PermissionError:
-        refused.append(True)
-rows = [Path(f"/proc/self/task/{task}/status").read_text() for task in os.listdir("/proc/self/task")]
-kinds = ("Uid", "Gid", "Groups", "Cap")
-found = [dict(l.split(":", 1) for l in text.splitlines() if l.startswith(kinds)) for text in rows]
-print(json.dumps([found, refused, os.sched_getscheduler(0), Path("/proc/self/status").read_text()]))
-"""
-
-
-@needs_another_user
-def test_it_cannot_go_back_and_keeps_what_it_has() -> None:
-    """Priority and locked memory stay; memory and threads can be had as before."""
-    done = subprocess.run([sys.executable, "-c", BECOME], capture_output=True, text=True, check=True)
-    threads, refused, scheduler, status = json.loads(done.stdout)
-    assert refused == [True] * 3
-    assert len(threads) == 22
-    groups = os.getgrouplist("nobody", NOBODY.pw_gid)
-    for thread in threads:
-        assert thread["Uid"].split() == [str(NOBODY.pw_uid)] * 4
-        assert thread["Gid"].split() == [str(NOBODY.pw_gid)] * 4
-        assert sorted(map(int, thread["Groups"].split())) == sorted(groups)
-        assert not int(thread["CapEff"], 16) | int(thread["CapPrm"], 16) | int(thread["CapAmb"], 16)
-    assert "NoNewPrivs:\t1" in status
-    if "real-time priority" not in done.stderr:
-        assert scheduler == os.SCHED_FIFO
-    if "locked memory" not in done.stderr:
-        assert "VmLck:\t       0 kB" not in status
-
-
 # -- the server
 
 
-def rows_of(process: int) -> dict[str, str]:
-    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+def rows_of(process: int, task: str = "") -> dict[str, str]:
+    folder = Path(f"/proc/{process}/task/{task or process}")
+    lines = (folder / "status").read_text().splitlines()
     return {key: value.strip() for key, _, value in (line.partition(":") for line in lines)}
 
 
 def check_unprivileged(process: int) -> None:
-    rows = rows_of(process)
-    assert rows["Uid"].split() == [str(NOBODY.pw_uid)] * 4
-    assert int(rows["CapEff"], 16) == int(rows["CapPrm"], 16) == 0
-    assert rows["NoNewPrivs"] == "1"
+    """Each of its threads: none has what it could go back with."""
+    groups = os.getgrouplist("nobody", NOBODY.pw_gid)
+    for path in Path(f"/proc/{process}/task").iterdir():
+        rows = rows_of(process, path.name)
+        assert rows["Uid"].split() == [str(NOBODY.pw_uid)] * 4
+        assert rows["Gid"].split() == [str(NOBODY.pw_gid)] * 4
+        assert sorted(map(int, rows["Groups"].split())) == sorted(groups)
+        assert not int(rows["CapEff"], 16) | int(rows["CapPrm"], 16) | int(rows["CapAmb"], 16)
+    assert rows_of(process)["NoNewPrivs"] == "1"
 
 
 @pytest.fixture(scope="module")
@@ -237,6 +190,7 @@ def test_only_the_loop_has_real_time_priority(running: tuple[Server, Path]) -> N
     tasks = [int(path.name) for path in Path(f"/proc/{found.process.pid}/task").iterdir()]
     policies = {task: os.sched_getscheduler(task) & ~os.SCHED_RESET_ON_FORK for task in tasks}
     assert policies.pop(found.process.pid) == os.SCHED_FIFO
+    assert "locked memory" in found.said() or int(rows_of(found.process.pid)["VmLck"].split()[0]) > 0
     assert policies
     assert set(policies.values()) == {os.SCHED_OTHER}, "the log's"
 
@@ -304,6 +258,24 @@ def confined(capabilities: Iterable[str]) -> dict[str, Any]:
 
     rights.need(*become(CAPABILITIES))
     return {"under": [*rights.readable(), *become(capabilities)], "python": rights.PYTHON}
+
+
+@pytest.mark.long
+@on_a_bus
+def test_an_ordinary_user_has_a_virtual_bus_in_namespaces_of_its_own() -> None:
+    limits = confined(())
+    user = ("setpriv", f"--reuid={NOBODY.pw_uid}", f"--regid={NOBODY.pw_gid}", "--clear-groups")
+    rights.need(*user, "unshare", "--user", "--net")
+    with server("virtual", **limits) as found:
+        assert rows_of(found.process.pid)["Uid"].split() == [str(NOBODY.pw_uid)] * 4
+        assert found.ifname not in dict(socket.if_nameindex()).values()
+        for uid in (None, NOBODY.pw_uid):
+            with found.connect(uid) as client:
+                assert client.ask("subscribe")["interface"] == found.ifname
+                client.fresh(50)
+                assert client.ask("configure", settings={"fir": uid is None})["ok"]
+        found.signal(signal.SIGTERM)
+        assert found.wait() == 0
 
 
 @on_a_bus

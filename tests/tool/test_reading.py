@@ -111,17 +111,6 @@ def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
     assert told("eeprom", bench.near)["slaves"][0]["check_byte_right"]
 
 
-def test_a_sensor_that_sends_nothing_is_watched_in_vain() -> None:
-    with simulated_bus("--sinc", "512") as bus:
-        bus.at(0.6, "deaf 9")
-        ended = tool_here("watch", bus.near, "--seconds", 3, "--interval", 9, code=1)
-    assert "0 samples" in ended.out
-    said = complaints(ended.err)[-1]
-    assert said.endswith(
-        "No new sample for 3.0 s, the sensor does not answer the bus: check its cable and power"
-    )
-
-
 def test_objects_of_a_chain_by_place_serial_and_name(chain: SimulatedBus) -> None:
     sensors = told("objects", chain.near)["sensors"]
     assert len(sensors) == 2

@@ -43,15 +43,6 @@ def test_the_eeprom_is_read_while_the_server_streams(bench: Bench) -> None:
 
 
 @pytest.mark.usefixtures("bench")
-def test_objects_are_read_by_name() -> None:
-    found = told("read", *SERVER, "Sampling Rate", "Force/Torque Offset")["sensors"]
-    assert [row["serial"] for row in found] == [10, 20]
-    rows = [(row["index"], row["subindex"]) for row in found[0]["objects"]]
-    assert rows == [("0x8011", 0), *(("0x8000", sub) for sub in range(7))]
-    assert "did you mean Sampling rate" in refused("read", *SERVER, "sampling rte", code=2)
-
-
-@pytest.mark.usefixtures("bench")
 def test_the_first_name_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BOTA_SERVER", SimulatedServer.address)
     found = told("read", "Sampling rate", "fir")["sensors"][0]["objects"]

@@ -131,21 +131,6 @@ def let_chop_divide(bus: SimulatedBus) -> None:
     life.dictionary.let_chop_divide(2)
 
 
-def test_chop_that_divides_the_rate_is_taken_and_told(single: SimulatedBus) -> None:
-    near = single.near
-    let_chop_divide(single)
-    applied = told("apply", near, "--set", "chop=on")
-    meaning = applied["meaning"]
-    assert (applied["rate_hz"], meaning["rate_hz"], meaning["cutoff_hz"]) == (400, 400, None)
-    assert applied["settings"]["chop"], "the length reads back as another one"
-    planned = told("plan", near, "--set", "chop=on")
-    assert (planned["changes"], planned["then"]["rate_hz"]) == ([], 400)
-    assert told("plan", near, "--set", "imu_active=3", code=3)["then"]["rate_hz"] == 400
-    assert len(told("tare", near, "--samples", 20)["new_offset"]) == 6
-    watched = told("watch", near, "--samples", 100, "--interval", 9)
-    assert (round(watched["rate_hz"]), watched["lost"]) == (400, 0)
-
-
 def test_tare_makes_the_mean_the_target(bench: SimulatedBus) -> None:
     near = bench.near
     target = ("1", "-2", "3", "0.1", "0.2", "-0.3")
@@ -243,23 +228,6 @@ def test_a_snapshot_is_restored_as_far_as_it_differs(bench: SimulatedBus, tmp_pa
     assert "nothing to restore" in tool_here("restore", near, path).out
 
 
-@pytest.mark.long
-def test_a_snapshot_replaces_a_file_only_if_forced_and_once_it_is_complete(
-    chain: SimulatedBus, tmp_path: Path
-) -> None:
-    near, path = chain.near, tmp_path / "a.json"
-    tool_here("snapshot", near, path, "--sensor", 0)
-    tool_here("snapshot", near, path, "--sensor", 7, "--force", code=2)
-    exists = refused("snapshot", near, path, "--sensor", 1)
-    assert "a.json exists: choose another name, or use --force" in exists
-    assert json.loads(path.read_text())["serial"] == 10
-    tool_here("snapshot", near, path, "--sensor", 1, "--force")
-    assert json.loads(path.read_text())["serial"] == 20
-    full = refused("snapshot", near, "/dev/full", "--sensor", 0)
-    assert "/dev/full cannot be written: No space left" in full
-    assert list(tmp_path.iterdir()) == [path], "nothing else is left"
-
-
 def test_another_sensors_snapshot_is_refused(chain: SimulatedBus, tmp_path: Path) -> None:
     near, path = chain.near, tmp_path / "a.json"
     tool_here("apply", near, "--sensor", 0, "--set", "sinc_length=128")
@@ -300,6 +268,14 @@ def test_without_a_known_tare_there_is_nothing_to_undo(
     assert bench.written() == []
 
 
+def test_a_clearing_that_does_not_take_leaves_the_old_offset(bench: SimulatedBus) -> None:
+    tool_here("tare", bench.near, "--samples", 50)
+    before = offset(bench.near)
+    bench.command("on-write 0x8000 2 abort 0x8000 3 0x08000022")
+    assert "the old offset is in force" in refused("tare", bench.near, "--clear")
+    assert offset(bench.near) == before
+
+
 UNMATCHED = ": by the sampling rate, which this length does not match"
 MEANINGS = {
     64: (384, "800 Hz; cut-off 209.5 Hz with FIR off, 31.5 Hz with FIR on" + UNMATCHED),
@@ -329,6 +305,7 @@ def test_what_is_said_of_it_follows_the_rate(bus: SimulatedBus, length: int) -> 
 def test_a_length_that_chop_hides_is_not_overwritten(bus: SimulatedBus) -> None:
     let_chop_divide(bus)
     assert told("apply", bus.near, "--set", "chop=on")["rate_hz"] == 400
+    assert told("plan", bus.near, "--set", "imu_active=3", code=3)["then"]["rate_hz"] == 400
     written = bus.written()
     assert told("apply", bus.near, "--set", "imu_active=3")["rate_hz"] == 400
     assert {row[0] for row in bus.written()[len(written) :]} == {"0x8010"}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import pytest
 
@@ -26,8 +26,8 @@ def start() -> Iterator[Start]:
     """Starts virtual sensors, and waits until they are ready unless they cannot be."""
     with contextlib.ExitStack() as running:
 
-        def launch(*arguments: str, ready: bool = True) -> VirtualSensor:
-            program = VirtualSensor("ethercat_server.virtual_sensor", arguments)
+        def launch(*arguments: str, ready: bool = True, under: Sequence[str] = ()) -> VirtualSensor:
+            program = VirtualSensor("ethercat_server.virtual_sensor", arguments, under)
             running.callback(program.close)
             if ready:
                 program.wait_for("ready")

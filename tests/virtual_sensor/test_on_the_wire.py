@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import socket
 import struct
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -180,27 +179,6 @@ def test_soem_sets_distributed_clocks_up(bench: Bench) -> None:
     reach_op(master)
 
 
-def test_pysoem_reports_an_emergency_and_no_eeprom_write(bench: Bench) -> None:
-    sensor, master = bench()
-    assert master.config_init() == 1
-    [slave] = master.slaves
-    with pytest.raises(pysoem.EepromError):
-        slave.eeprom_write(0x08, b"\xde\xad")
-    told: list[Any] = []
-    slave.add_emergency_callback(told.append)
-    master.state_check(pysoem.PREOP_STATE, 2_000_000)
-    sensor.command("emergency 0x8130 0x11 0102030405")
-    assert read(slave, 0x1008, 0).rstrip(b"\0") == b"BFT-SENS-ECAT-M8"
-    assert [(e.error_code, e.error_reg) for e in told] == [(0x8130, 0x11)]
-    sensor.command("emergency 0x8131")
-    with pytest.raises(
-        pysoem.ConfigMapError
-    ):  # whatever comes besides the answers is an error of the mapping
-        master.config_map()
-    master.config_map()
-    assert master.state_check(pysoem.SAFEOP_STATE, 2_000_000) == pysoem.SAFEOP_STATE
-
-
 @pytest.mark.parametrize("tag", ["8100e000", "81006005", "88a80005"])
 def test_an_answer_has_the_vlan_tag_of_its_frame(tag: str, veth: tuple[str, str], start: Start) -> None:
     start(veth[0])
@@ -217,11 +195,3 @@ def test_an_answer_has_the_vlan_tag_of_its_frame(tag: str, veth: tuple[str, str]
     assert data[end : end + 2] == b"\1\0", "the working counter"
     *_, control, kind = struct.unpack("=IIIHHHH", auxiliary)
     assert f"{kind:04x}{control:04x}" == tag
-
-
-def test_an_interface_down_for_a_while(veth: tuple[str, str], bench: Bench) -> None:
-    _, master = bench()
-    for state in ("down", "up"):
-        subprocess.run(["ip", "link", "set", veth[0], state], check=True)
-    bring_up(master)
-    assert exchange(master) == 3

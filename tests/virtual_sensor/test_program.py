@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from ethercat_server.virtual_sensor.cli import build_parser, main, options_from
 from ethercat_server.virtual_sensor.options import SensorOptions, UsageError
+from tests import rights
 from tests.virtual_sensor.conftest import Start
 
 
@@ -95,7 +98,9 @@ def test_each_interface_has_serial_numbers_of_its_own(veth: tuple[str, str], sta
 
 
 @pytest.mark.bus
-def test_the_control_socket(veth: tuple[str, str], start: Start, tmp_path: Path) -> None:
+def test_the_control_socket(
+    veth: tuple[str, str], start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "control"
     sensor = start(veth[0], "--control", str(path))
     sensor.command("lose 1")
@@ -106,6 +111,10 @@ def test_the_control_socket(veth: tuple[str, str], start: Start, tmp_path: Path)
             peer.connect(str(path))
         other.sendall(b"sta")
         one.sendall(b"nonsense\nhear\n")
+        assert main(["--control", str(path), "--send", "lose 2"]) == 0
+        assert main(["--control", str(path), "--send", "lose"]) == 1
+        said = capsys.readouterr().out
+        assert said == "ok\nerror: wrong number of arguments: lose N\n"
         with one.makefile() as answers, other.makefile() as other_answers:
             assert answers.readline().startswith("error: ")
             assert answers.readline() == "ok\n"
@@ -115,6 +124,30 @@ def test_the_control_socket(veth: tuple[str, str], start: Start, tmp_path: Path)
             assert answers.readline() == "ok\n"
     assert sensor.wait() == 0
     assert not path.exists(), "nothing is left behind"
+    assert main(["--control", str(path), "--send", "help"]) == 1
+    assert f"no virtual sensor of yours listens at {path} (No such file" in capsys.readouterr().err
+
+
+@pytest.mark.long
+@pytest.mark.bus
+def test_without_a_place_it_listens_where_commands_are_sent_to(
+    veth: tuple[str, str], start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    sensor = start(veth[0])
+    start(veth[1])  # the place is taken
+    assert main(["--send", "quit"]) == 0
+    assert sensor.wait() == 0
+
+
+@rights.needs_root
+@pytest.mark.long
+@pytest.mark.bus
+def test_it_is_scheduled_above_a_server_or_says_that_it_is_not(veth: tuple[str, str], start: Start) -> None:
+    assert os.sched_getscheduler(start(veth[0]).process.pid) == os.SCHED_FIFO
+    lacking = start(veth[1], under=("prlimit", "--rtprio=0", "setpriv", "--bounding-set=-sys_nice"))
+    assert "not granted: real-time priority 81" in lacking.said()
 
 
 @pytest.mark.bus

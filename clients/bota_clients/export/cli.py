@@ -8,10 +8,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bota_clients.arguments import add_force, add_imu_units, number, parser, position, typed
+from bota_clients.arguments import add_force, add_imu_units, number, position, typed
 from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.program.arguments import Parser
 
 if TYPE_CHECKING:
     from bota_clients.recording.reader import Recording
@@ -48,7 +49,7 @@ class Options(argparse.Namespace):
 
 def parse_options(argv: Sequence[str] | None) -> Options:
     """Read the command line; argparse exits with 2 if it is wrong."""
-    made = parser(
+    made = Parser(
         PROGRAM,
         "Writes the samples of a recording as CSV, one a line, or for each camera frame the last samples "
         "that were measured before it, as .parquet, .zarr or .npz.",
@@ -90,7 +91,7 @@ def parse_options(argv: Sequence[str] | None) -> Options:
 
 def parse_align(argv: Sequence[str]) -> Options:
     """Read the command line after `align`."""
-    made = parser(
+    made = Parser(
         f"{PROGRAM} align",
         "Finds the offset between the server's clock and a robot's, and its drift: from the angular rate of "
         "the sensor's IMU and that of an IMU of the robot, or of its joints.",

@@ -10,9 +10,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import add_force, add_imu_units, number, parser, position
+from bota_clients.arguments import add_force, add_imu_units, number, position
 from bota_clients.program import start
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
+from bota_ethercat.program.arguments import Parser
 from ft_compensation.quantities import StationaryLimits
 
 _LIMITS: Final = tuple(field.name for field in fields(StationaryLimits))
@@ -35,7 +36,7 @@ class IdentifyOptions(argparse.Namespace):
 
 def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
     """Read the command line; argparse exits with 2 if it is wrong."""
-    made = parser(
+    made = Parser(
         "ethercat-identify",
         "Identifies mass and center of gravity of the tool and the bias of the sensor from a recording in "
         "which the sensor was held stationary in several poses.",
@@ -63,7 +64,7 @@ def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
 
 def parse_delay(argv: Sequence[str]) -> IdentifyOptions:
     """Read the command line after `delay`."""
-    made = parser(
+    made = Parser(
         "ethercat-identify delay",
         "Tells from a recording how much later force and torque are than the accelerometer.",
         "Record with ethercat-record for 10 s: shake the sensor with its tool by hand, two to five times a "

@@ -125,6 +125,13 @@ class Monitor(App[None]):
         for view, rows in zip(self._views, screen, strict=True):
             view.show(rows)
 
+    def action_suspend_process(self) -> None:
+        """Ctrl-Z stops the whole process, a recording too: not before that is stopped."""
+        if self.recorder.running:
+            self._model.say("A recording is running: stop it before suspending (r)", True)
+        else:
+            super().action_suspend_process()
+
     def action_help_quit(self) -> None:
         """Ctrl-C quits, instead of Textual's hint at another key."""
         self.exit()
@@ -139,8 +146,8 @@ class Monitor(App[None]):
             self.refresh(layout=True)
         elif look.question:
             self._answer(key)
-        elif look.help:
-            self._look = replace(look, help=False)
+        elif look.page:
+            self._look = replace(look, page="")
         elif key == "t":
             self._ask_tare()
         elif key == "r":
@@ -153,7 +160,9 @@ class Monitor(App[None]):
         elif key == "n":
             self._next()
         elif key in {"?", "h"}:
-            self._look = replace(look, help=True)
+            self._look = replace(look, page="help")
+        elif key == "w":
+            self._look = replace(look, page="warnings")
         elif key == "q":
             self.exit()
         self.draw()

@@ -15,15 +15,17 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from bota_clients.arguments import add_imu_units, add_server, address, parser, seconds, server_of
+from bota_clients.arguments import add_imu_units, add_server, address, seconds, server_of
 from bota_clients.monitor.model import Model
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.web.hub import is_loopback
 from bota_clients.monitor.words import json_line, verdict
 from bota_clients.program import discard_output, interrupt_on_signals, not_installed
 from bota_ethercat.address import DEFAULT_HOST, Address
+from bota_ethercat.health.sentences import no_server
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.program.arguments import Parser
 
 DEFAULT_WEB: Final = Address(DEFAULT_HOST, 12080)
 _PERIOD_S: Final = 1.0
@@ -60,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def parse(argv: Sequence[str] | None) -> Options:
     """Read the command line; argparse exits with 2 if it is wrong."""
-    made = parser(
+    made = Parser(
         "ethercat-monitor",
         "Shows the stream of ethercat-server live in the terminal. Press ? for the keys.",
         "With --once: exit code 0 if all is good or worth a look, 1 if there is trouble, or no server.",
@@ -133,8 +135,8 @@ def _once(options: Options, model: Model, *, answered: bool) -> int:
     if options.json:
         _say(json_line(state, time.time()))
     if not answered:
-        reason = state.server.reason or f"the server at {options.address} does not answer"
-        sys.stderr.write(f"ethercat-monitor: {reason}, or give its HOST:PORT\n")
+        reason = state.server.reason or no_server(options.address, "it does not answer")
+        sys.stderr.write(f"ethercat-monitor: {reason}\n")
         return 1
     if not options.json:
         _say(*table(state))

@@ -18,8 +18,10 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health import history
 from bota_ethercat.health.judge import Observation, emergency, judge, saturated_axes
 from bota_ethercat.health.observer import COMMON, StreamObserver
+from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.sensor.response import delays_ms
@@ -27,7 +29,6 @@ from bota_ethercat.settings import SETTINGS, SettingValue
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import number, rows, text, whole
 
-AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 SILENT_S: Final = LIMITS.stale_after  # a server normally sends a frame per sample period
 _WRENCH: Final = tuple(COMMON.index(f.name) for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
 _WINDOW_NS: Final = 5 * 10**9  # of rate, jitter and age
@@ -117,6 +118,7 @@ class SensorState:
     lost_on_bus: int | None = None
     recoveries: int | None = None
     hand_out_us: Spread | None = None  # age when the server hands them out
+    zero: str = ""  # how far it has drifted, and how it goes by temperature, in words
 
     @property
     def units(self) -> tuple[str, str]:
@@ -263,6 +265,7 @@ class _Sensor:
             is_lost=self.lost is not None,
             state=text(self._row.get("state")),
             emergency=said if now_s - at_s < LIMITS.emergency_s else "",
+            drift=history.drift(self._status, LIMITS),
             settings=_mapping(self._row.get("settings")),
         )
 
@@ -301,6 +304,7 @@ class _Sensor:
             lost_on_bus=whole(status.get("lost_samples")),
             recoveries=whole(status.get("recoveries")),
             hand_out_us=_spread(self._hand_out),
+            zero="; ".join(filter(None, (history.drift(status), history.temperature_line(status)))),
             **self._stream(_ns(now_s)),
         )
 
@@ -401,17 +405,15 @@ class Model:
         """An event of the server."""
         with self._lock:
             self._heard_s = now_s
-            position = whole(event.get("sensor"))
-            name, said = text(event.get("event")), text(event.get("message"))
+            name, said = text(event.get("event")), event_sentence(event)
             if (sensor := self._sensor(event)) is not None:
                 if name == Event.SENSOR_LOST:
-                    sensor.lost = said or "The server has lost this sensor"
+                    sensor.lost = said
                 elif name == Event.SENSOR_BACK:
                     sensor.lost = None
                 elif name == Event.OFFSET_CHANGED:  # the zero has moved
                     sensor.peaks = None
-            where = "" if position is None else f" {position}"
-            self._events.append(f"{clock_text()} {name}{where}{': ' + said if said else ''}")
+            self._events.append(f"{clock_text()} {said}")
 
     def reset(self) -> None:
         """Reset peaks and past warnings."""

@@ -16,8 +16,9 @@ from bota_clients.monitor.model import Model
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client, ClientEvent, Connected, Disconnected
 from bota_ethercat.control import Event
-from bota_ethercat.errors import ConnectionFailedError, RefusedError, UnreachableError
+from bota_ethercat.errors import ConnectionFailedError, RefusedError
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health.sentences import no_server
 
 BATCH_S: Final = 0.05
 _STATUS_EVERY_S: Final = 1.0
@@ -87,7 +88,7 @@ class Reader(threading.Thread):
         if not self._closing.is_set():
             reason = f"the connection ended: {end.reason}"
             if not end.reachable:
-                reason = UnreachableError(end.reason).at(self._client.address)
+                reason = no_server(self._client.address, end.reason)
             self._model.gone(reason, now_s)
             self.tried.set()
 

@@ -18,13 +18,15 @@ from rich.text import Text
 
 from bota_clients import numbers
 from bota_clients.monitor import words
-from bota_clients.monitor.model import AXES, Alert, Range, SensorState, State
+from bota_clients.monitor.model import Alert, Range, SensorState, State
+from bota_ethercat.health.history import AXES
 
 KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
     ("r", "record", "start or stop a recording in this folder, as of ethercat-record"),
     ("p", "pause", "freeze the display; samples and peaks still count"),
     ("0", "reset", "reset peaks and past warnings"),
+    ("w", "warnings", "of all sensors, present and past"),
     ("n", "next", "the next sensor of the chain"),
     ("?", "help", "this page"),
     ("q", "quit", "also Ctrl-C; Ctrl-L redraws the screen"),
@@ -65,7 +67,7 @@ class Look:
     paused: str = ""  # time of day of the pause; empty if not paused
     recording: str = ""  # the running recording, in words
     question: str = ""  # the pending question
-    help: bool = False
+    page: str = ""  # "help" or "warnings" in place of the overview
 
 
 class Screen(NamedTuple):
@@ -78,7 +80,10 @@ class Screen(NamedTuple):
 
 def render(state: State, look: Look, width: int) -> Screen:
     """The screen."""
-    body = _help() if look.help else _overview(state, look, width)
+    if look.page:
+        body = _help() if look.page == "help" else _warnings(state, width)
+    else:
+        body = _overview(state, look, width)
     screen = Screen([_title(state, look, width)], body, [*_message(state, look, width), _keys(look, width)])
     for row in (row for part in screen for row in part):
         row.no_wrap = True
@@ -103,8 +108,18 @@ def table(state: State) -> list[str]:
 
 
 def _help() -> list[Text]:
-    rows = [Text.assemble((f"  {key}  ", VALUE), (name.ljust(8), LABEL), what) for key, name, what in KEYS]
+    rows = [Text.assemble((f"  {key}  ", VALUE), (name.ljust(10), LABEL), what) for key, name, what in KEYS]
     return [*rows, *map(Text, _HELP.splitlines())]
+
+
+def _warnings(state: State, width: int) -> list[Text]:
+    """Of all sensors."""
+    rows = [
+        row
+        for sensor in state.sensors
+        for row in (Text(words.identity(sensor), VALUE), *_alerts(sensor, width), Text())
+    ]
+    return [*rows, Text("Press any key to return.")]
 
 
 def _overview(state: State, look: Look, width: int) -> list[Text]:
@@ -182,16 +197,15 @@ def _panel(sensor: SensorState, width: int, *, bars: bool = True) -> list[Text]:
     identity = Text(words.identity(sensor), VALUE if sensor.al_state in {"OP", ""} else BAD)
     if sensor.old_s is not None:
         identity = Text.assemble((f"values {numbers.duration(sensor.old_s)} old ", ALARM), " ", identity)
-    alerts = [row for alert in sensor.alerts for row in _alert(alert, width)]
-    none = _field("Warnings", "none" if sensor.sample is not None else "no sample yet")
     return [
         identity,
         *_axes(sensor, 0, width, bars=bars),
         *_axes(sensor, 1, width, bars=bars),
-        *(alerts or [none]),
+        *_alerts(sensor, width),
         *_imu(sensor),
         _field("Stream", stream),
         _field("Delay", words.delays(sensor)),
+        *([_field("Zero", sensor.zero)] if sensor.zero else []),
         lost,
         clock,
     ]
@@ -199,6 +213,11 @@ def _panel(sensor: SensorState, width: int, *, bars: bool = True) -> list[Text]:
 
 def _field(name: str, text: str, style: str = "") -> Text:
     return Text.assemble((name.ljust(9), LABEL), (text, style))
+
+
+def _alerts(sensor: SensorState, width: int) -> list[Text]:
+    none = _field("Warnings", "none" if sensor.sample is not None else "no sample yet")
+    return [row for alert in sensor.alerts for row in _alert(alert, width)] or [none]
 
 
 def _alert(alert: Alert, width: int) -> list[Text]:

@@ -20,6 +20,7 @@ from bota_clients.record.cli import RecordOptions
 from bota_clients.record.recorder import BATCH_S, NAME, Batch, Recorder, Source, check_path, notes
 from bota_clients.recording.reader import Event
 from bota_ethercat.errors import RefusedError, UnreachableError
+from bota_ethercat.health.sentences import event_sentence, no_server
 from bota_ethercat.text.untrusted import printable
 
 _say = partial(say, "ethercat-record")
@@ -32,7 +33,7 @@ def run(options: RecordOptions, signals: Signals) -> int:
             check_path(options.path, overwrite=options.force)
             source.connect()
         except UnreachableError as error:
-            raise RecordingError(error.at(options.address)) from None
+            raise RecordingError(no_server(options.address, error)) from None
         except RefusedError as error:
             raise RecordingError(f"the server refused: {error}") from None
         return _record(source, options, signals)
@@ -74,8 +75,8 @@ def _record(source: Source, options: RecordOptions, signals: Signals) -> int:
 def _report(batch: Batch, show: Callable[[str], None]) -> None:
     for item in batch:
         if isinstance(item, Event):
-            row = item.event
-            words = row.get("message") or row.get("reason") or ""
-            position = f" {row['sensor']}" if "sensor" in row else ""
-            if item.name != "connected" or words:
-                show(printable(f"{item.name}{position}{': ' if words else ''}{words}", 300))
+            words = item.event.get("message") or item.event.get("reason") or ""
+            if not item.by_recorder:
+                show(event_sentence(item.event))
+            elif item.name != "connected" or words:
+                show(printable(f"{item.name}{': ' if words else ''}{words}", 300))

@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import address, number, parser, typed
+from bota_clients.arguments import address, number, typed
 from bota_clients.program import Signals, start
 from bota_ethercat.address import DEFAULT_HOST, Address
+from bota_ethercat.program.arguments import Parser
 from bota_ethercat.program.server_choice import own_server
 
 _HOSTS: Final = ["127.0.0.1", "::1"]
@@ -29,7 +30,7 @@ class ReplayOptions(argparse.Namespace):
 
 def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
     """Read the command line; argparse exits with 2 if it is wrong."""
-    made = parser(
+    made = Parser(
         "ethercat-replay",
         "Serves a recording over the same protocol as ethercat-server.",
         "It starts with the first subscriber and ends as the server does. Ctrl-C ends it.",

@@ -9,13 +9,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bota_clients.arguments import add_force, add_imu_units, add_server, number, parser, server_of, typed
+from bota_clients.arguments import add_force, add_imu_units, add_server, number, server_of, typed
 from bota_clients.errors import ReportError
 from bota_clients.program import discard_output, interrupt_on_signals, say, start
 from bota_ethercat.address import Address
 from bota_ethercat.errors import UnreachableError
+from bota_ethercat.health.sentences import no_server
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.program.arguments import Parser
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.server_choice import is_address
 from bota_ethercat.program.version import VERSION
@@ -45,7 +47,7 @@ class ReportOptions(argparse.Namespace):
 
 def parse_options(argv: Sequence[str] | None) -> ReportOptions:
     """Read the command line; argparse exits with 2 if it is wrong."""
-    made = parser(
+    made = Parser(
         _PROGRAM,
         "Writes a one-page sensor health report (HTML) from a recording or a live stream.",
         "exit code: 0 good, worth a look or not conclusive, 1 trouble, or no report was made, 2 wrong usage",
@@ -94,7 +96,7 @@ def run(options: ReportOptions) -> int:
         say(_PROGRAM, "stopped: no report was written")
         return 1
     except UnreachableError as error:
-        raise ReportError(f"{error.at(options.server)}, or give its HOST:PORT") from None
+        raise ReportError(no_server(options.server, error)) from None
     try:
         print(words, flush=True)
     except BrokenPipeError:

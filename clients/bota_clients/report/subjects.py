@@ -6,11 +6,11 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -28,10 +28,13 @@ from bota_clients.recording.reader import (
 )
 from bota_clients.report.series import Subject, subject
 from bota_ethercat.address import Address
+from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health import history
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.sensor_choice import SensorChoice
-from bota_ethercat.text.untrusted import printable
+from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import printable, rows
 
 _MOST_EVENTS_NAMED: Final = 10
 _MOST_SENSORS_NAMED: Final = 4
@@ -181,4 +184,17 @@ def of_server(
             show(completed=passed)
             recorder.put(source.batch(min(_BATCH_S, seconds - passed)))
         recorder.stop("")
-        return of_recording(path, choice, imu_units, str(address))
+        past: dict[object, JsonObject] = {}
+        with contextlib.suppress(ProtocolError):  # the stream is enough
+            past = {row.get("sensor"): row for row in rows(source.ask("status").get("sensors"))}
+        subjects = of_recording(path, choice, imu_units, str(address))
+        return [each.with_remarks(_past(past.get(each.position, {}))) for each in subjects]
+
+
+def _past(row: Mapping[str, Any]) -> list[str]:
+    """What the server knows of a sensor's past."""
+    overload, overloaded = history.overload(row)
+    texts = [history.drift(row), history.temperature_line(row), overload]
+    return [f"{text[0].upper()}{text[1:]}." for text in texts if text] + (
+        ["Have it checked for damage by overload."] if overloaded else []
+    )

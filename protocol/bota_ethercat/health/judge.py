@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
+from bota_ethercat.health.history import AXES
+from bota_ethercat.health.sentences import STOOD_STILL
 from bota_ethercat.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
 from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain
 from bota_ethercat.text.untrusted import number, printable, whole
@@ -41,6 +43,7 @@ class Observation(NamedTuple):
     state: str = "OP"  # the sensor's AL state
     server_silent: bool = False  # the server itself owes an answer
     emergency: str = ""  # what the sensor's newest emergency says, if it is new and not over
+    drift: str = ""  # how far its zero has drifted, if that is worth a look
     settings: Mapping[str, object] = {}
 
 
@@ -52,9 +55,8 @@ class Saturation(NamedTuple):
     flag: WarningFlag
 
 
-_WRENCH: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 SATURATIONS: Final = (
-    Saturation("force_torque_saturated", _WRENCH, WarningFlag.FORCE_TORQUE_SATURATED),
+    Saturation("force_torque_saturated", AXES, WarningFlag.FORCE_TORQUE_SATURATED),
     Saturation("acceleration_saturated", ("ax", "ay", "az"), WarningFlag.ACCELERATION_SATURATED),
     Saturation("angular_rate_saturated", ("ωx", "ωy", "ωz"), WarningFlag.ANGULAR_RATE_SATURATED),
 )
@@ -63,7 +65,7 @@ _ERROR_CLASS: Final = 0xFF00
 # AL states that are, or may be, those of a sensor that streams.
 _STREAMING: Final = frozenset({"OP", "?", ""})
 _CABLE: Final = "Check its cable and power"
-_STOOD_STILL: Final = "The server's computer stood still meanwhile, check it with ethercat-doctor"
+_STOOD_STILL: Final = f"The server's {STOOD_STILL.format(' meanwhile')}"
 # Missed deadlines that amount to this time explain why a sensor did not answer, or left OP.
 _STANDSTILL_S: Final = 0.02
 
@@ -220,6 +222,8 @@ def _rate(seen: Observation, limits: Limits) -> Iterator[Finding]:
 def _circumstances(seen: Observation) -> Iterator[Finding]:
     if seen.emergency:
         yield _look("emergency", seen.emergency, "If it comes again, contact support", About.SENSOR)
+    if seen.drift:
+        yield _look("drift", seen.drift, "Re-tare advised", About.SENSOR)
     if seen.settings.get("coordinate_system") is True:
         found = "settings.coordinate_system is on, force and torque are in a frame configured in the sensor"
         yield _look("coordinate_system", found, "Switch it off, or correct the URDF", About.SENSOR)

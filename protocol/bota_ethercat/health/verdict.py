@@ -23,6 +23,8 @@ class Limits(NamedTuple):
     temperature_warn: float = 60.0  # °C
     temperature_error: float = 80.0
     coldest: float = -40.0  # °C that the electronics cannot have
+    drift_force: float = 1.0  # N of drift since the tare that are worth a look
+    drift_torque: float = 0.05  # Nm
     emergency_s: float = 60.0  # how long an emergency of the sensor is worth a look
     # Share of a period that 5 % of the intervals may deviate by: beyond it the clock is not followed.
     irregular: float = 0.2

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Mapping
 from typing import Any, Final
 
 from rclpy.node import Node
 
+from bota_ethercat.health.history import line_slope
 from bridge.compensating.sources import IMU_IS_OFF, SourceChoice
 from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import LiveParameters
@@ -31,6 +33,7 @@ _FROM_PARAMETER: Final = "parameter"
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
 _NOTHING_CURRENT: Final = "no current orientation"
 _MOTION_S: Final = 1.0  # how often it is looked up what motion leaves
+_LEAST_K: Final = 0.2  # change of temperature that shifts the bias; less is noise
 _LEAST_TOLD_N: Final = 0.2  # about the noise of a force
 _ANOTHER_SENSOR: Final = "the bias may be another sensor's"
 
@@ -47,7 +50,7 @@ class OwnOffset:
         self._of_bias: Wrench | None = None
         self._appeared = False  # whether the offset became known only after the bias was taken
         # Whether there is a bias. Zero may be one: what a tare finds where the sensor reads nothing.
-        self._has_bias = False
+        self.has_bias = False
 
     @property
     def now(self) -> Wrench | None:
@@ -57,7 +60,7 @@ class OwnOffset:
 
     def begin(self, bias: Wrench, *, is_measured: bool = False) -> None:
         """`bias` goes with the current offset. Zero is no bias, unless it was measured."""
-        self._has_bias = is_measured or bias != NO_WRENCH
+        self.has_bias = is_measured or bias != NO_WRENCH
         self._of_bias, self._appeared = self.now, False
 
     def follow(self) -> Wrench | None:
@@ -66,14 +69,14 @@ class OwnOffset:
         if now is None or now == before:
             return None
         self._of_bias = now
-        if not self._has_bias:
+        if not self.has_bias:
             return None
         self._appeared = self._appeared or before is None
         return None if before is None else now.plus(before, -1.0)
 
     def doubt(self) -> str:
         """Why the bias may no longer fit the sensor, a sentence; empty if it does."""
-        if not self._has_bias or not self._link.is_connected:
+        if not self.has_bias or not self._link.is_connected:
             return ""
         if self._appeared:
             return "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare"
@@ -104,6 +107,7 @@ class CompensationControl:
         self.own_offset = OwnOffset(self.link)
         # Origin of the bias that is being put in force, and what it was taken with if by a tare.
         self._next: tuple[str, Taken | None] = (_FROM_PARAMETER, None)
+        self._celsius: float | None = None  # up to which temperature the bias follows the line
         self.choice.check(parameters)
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
         self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
@@ -364,6 +368,18 @@ class CompensationControl:
             self._log.info(
                 f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
             )
+            self._guard.trigger()
+
+    def follow_temperature(self, row: Mapping[str, Any], celsius: float) -> None:
+        """Shift a bias along the line in this row of `status`, if that is wanted; any thread."""
+        slope = line_slope(row) if self.parameters.temperature_line and self.own_offset.has_bias else None
+        if slope is None or self._celsius is None:
+            self._celsius = None if slope is None else celsius
+        elif abs(celsius - self._celsius) >= _LEAST_K:
+            change = Wrench.of([value * (celsius - self._celsius) for value in slope])
+            self._celsius = celsius
+            with self._shifting:
+                self._ramp.shift(change)
             self._guard.trigger()
 
 

@@ -15,8 +15,9 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.client.client import Client
 from bota_ethercat.client.session import Disconnected
-from bota_ethercat.control import Event, six_numbers
+from bota_ethercat.control import Event, known_six
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError
+from bota_ethercat.health.sentences import event_sentence, no_server
 from bota_ethercat.settings import SettingValue, known_settings
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import number, printable, rows
@@ -105,9 +106,10 @@ class Link:
 
     @property
     def absence(self) -> str:
-        """That there is no connection, and why: the beginning of a sentence."""
-        what = "the node is not connected to the server" if self.is_reachable else "there is no server"
-        return f"{what} at {self.address} ({self.problem})"
+        """That there is no connection, and why: a sentence."""
+        if self.is_reachable:
+            return f"the node is not connected to the server at {self.address} ({self.problem})"
+        return no_server(self.address, self.problem)
 
     def disconnected(self, event: Disconnected) -> None:
         """There is no connection (any more)."""
@@ -126,7 +128,7 @@ class Link:
             return False
         event = message.get("event")
         if event == Event.SENSOR_LOST:
-            self.lost = printable(message.get("message", "the server has lost the sensor"))
+            self.lost = event_sentence(message)
             self.epoch += 1
         elif event in (Event.SENSOR_BACK, Event.RECONFIGURED):
             self.lost = None
@@ -135,7 +137,7 @@ class Link:
         elif event != Event.OFFSET_CHANGED:
             return True
         if "offset" in message:
-            self._change(offset=known_offset(message["offset"]))
+            self._change(offset=known_six(message["offset"]))
         self.on_change()
         return True
 
@@ -166,7 +168,7 @@ class Link:
     def ask(self, action: str, timeout_s: float, **values: object) -> JsonObject:
         """The reply that grants the request; RequestFailedError otherwise. Blocks for `timeout_s` at most."""
         if not self.is_connected:
-            raise RequestFailedError(f"{self.absence}: ask again when the node is connected")
+            raise RequestFailedError(f"{self.absence}; ask again when the node is connected")
         try:
             return self.client.ask(action, timeout_s, **values)
         except RefusedError as error:
@@ -218,18 +220,10 @@ def known_delays(delay_ms: object) -> Mapping[str, float]:
     return {channel: ms for channel, ms in found.items() if ms is not None and 0 <= ms <= LONGEST_DELAY_MS}
 
 
-def known_offset(offset: object) -> tuple[float, ...] | None:
-    """The sensor's own offset from a message; None if missing or invalid."""
-    try:
-        return six_numbers(offset)
-    except ValueError:
-        return None
-
-
-def offset_text(offset: object, unknown: str = "unknown") -> str:
+def offset_text(offset: object) -> str:
     """An offset from a message for people."""
-    known = known_offset(offset)
-    return unknown if known is None else wrench_text(Wrench.of(known))
+    known = known_six(offset)
+    return "unknown" if known is None else wrench_text(Wrench.of(known))
 
 
 def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
@@ -245,7 +239,7 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
                 settings=known_settings(row.get("settings")),
                 delay_ms=known_delays(row.get("delay_ms")),
                 settling=row.get("settling") is True,
-                offset=known_offset(row.get("offset")),
+                offset=known_six(row.get("offset")),
             )
     there = ", ".join(printable(row.get("sensor"), 10) for row in found[:16]) or "none"
     raise RequestFailedError(
@@ -254,23 +248,12 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
 
 
 def sentence(message: JsonObject, before: Mapping[str, SettingValue]) -> str:
-    """What an event says; `before` are the settings that were in force."""
-    event = message["event"]
-    told = message.get("message")
-    if event == Event.SENSOR_LOST:
-        return printable(told) if isinstance(told, str) and told else "the server has lost the sensor"
-    if event == Event.SENSOR_BACK:
-        lost_s = number(message.get("lost_s"))
-        return "the sensor is back" + ("" if lost_s is None else f" after {lost_s:g} s")
+    """What an event says, and what it changed; `before` are the settings that were in force."""
+    event, text = message["event"], event_sentence(message)
     if event == Event.RECONFIGURED:
         settings = known_settings(message.get("settings")).items()
         changed = [f"{name} {str(value).lower()}" for name, value in settings if before.get(name) != value]
-        return "the sensor was reconfigured" + (f": {', '.join(changed)}" if changed else "")
+        return f"{text}: {', '.join(changed)}" if changed else text
     if event == Event.OFFSET_CHANGED:
-        now = offset_text(message.get("offset"), unknown="")
-        return "the sensor's own offset is " + (f"{now} now" if now else "no longer known")
-    if event == Event.EMERGENCY:
-        return "the sensor reports an emergency" + (f": {printable(told)}" if isinstance(told, str) else "")
-    if event == Event.SHUTTING_DOWN:
-        return "the server is shutting down"
-    return f"the server sent the event {printable(event, 40)}, which this version does not know"
+        return f"{text}: it is {offset_text(message.get('offset'))}"
+    return text

@@ -20,6 +20,7 @@ from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
 from bota_ethercat.control import Event
 from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health.sentences import no_server
 from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
 from bridge.parameters.table import Parameters
 from bridge.process import Worker
@@ -271,7 +272,7 @@ class Reader:
             known = self._problem == text
         else:
             # After a connection that ended, this only says what is known already.
-            text = f"no server at {self.link.address}: {event.reason}; trying until there is one"
+            text = f"{no_server(self.link.address, event.reason)} (the node keeps trying)"
             known = self._problem is not None
         if not known:
             self._problem = text

@@ -22,12 +22,13 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
 from bota_clients.monitor import words
-from bota_clients.monitor.model import AXES, Model, SensorState, State
+from bota_clients.monitor.model import Model, SensorState, State
 from bota_clients.monitor.tare import WAYS, Say
 from bota_clients.numbers import duration
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health.history import AXES
 from bota_ethercat.health.observer import COMMON
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits, PdoType

@@ -333,7 +333,7 @@ private:
     /// As `lose`. Not strerror: that may allocate.
     void fail(int error_number) noexcept {
         switch (complain(""); error_number) {
-            case ECONNREFUSED: error.add("nobody listens there: start ethercat-server, or name its port"); break;
+            case ECONNREFUSED: error.add("nobody listens there: start ethercat-server, or give its address"); break;
             case ECONNRESET: case EPIPE: error.add("the server reset the connection"); break;
             case ETIMEDOUT: error.add("no answer"); break;
             case EHOSTUNREACH: case ENETUNREACH: error.add("no route to that host"); break;

@@ -1,0 +1,156 @@
+"""How far the zero of a sensor at rest has moved since its tare, and how that goes by temperature.
+
+A change is believed only if nothing but drift explains it:
+
+- In windows of 8 s the sensor is at rest (`tare.why_moving`), and its acceleration has the direction of the
+  first one after the tare, within a degree: then a tool weighs on it as it did, to 2 % of its weight.
+- From one window to the next it is as slow as drift is, 0.9 N or 0.03 Nm a minute; after motion, or another
+  pose, it is what it was, within what a tare calls steady. Else it was a contact or another load, and all is
+  void until the wrench is back where it was, or tared.
+
+A contact that comes more slowly cannot be told from drift.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from operator import add
+from typing import Any, Final
+
+from bota_ethercat.pdo import LAYOUTS
+from ethercat_server.ethercat.clock import Clock
+from ethercat_server.sensor.history import History
+from ethercat_server.sensor.sensor import Sensor
+from ethercat_server.sensor.tare import (
+    CHANNELS,
+    LOAD,
+    PARTS,
+    RATE,
+    Found,
+    Part,
+    found_in,
+    why_moving,
+)
+
+_FIELDS: Final = LAYOUTS[min(LAYOUTS)]
+_SATURATED: Final = _FIELDS.index("force_torque_saturated")
+_ACCELERATION: Final = slice(_FIELDS.index("acceleration.x"), _FIELDS.index("acceleration.z") + 1)
+_TEMPERATURE: Final = _FIELDS.index("temperature")
+_UP: Final = slice(len(CHANNELS), len(CHANNELS) + 3)  # acceleration among the sums; temperature is the last
+_SUMS: Final = len(CHANNELS) + 4
+_CONE: Final = math.cos(math.radians(1.0))
+_LEAST_UP: Final = 0.5  # g, or m/s² of firmware that sends those: without an IMU it is 0
+_SLOW_S: Final = 20.0  # in this time drift stays steady
+_LEAST_SPREAD_K: Final = 1.0  # standard deviation of temperature in a run: a warm-up by 3.5 K
+_LEAST_WINDOWS: Final = 20
+_LONGEST_RUN_S: Final = 86400.0
+# With these on, force and torque are not the sensor's own.
+_NOT_PLAIN: Final = ("temperature_compensation", "coordinate_system", "inertia_compensation")
+
+
+class Drift:
+    """Of one sensor."""
+
+    def __init__(self, sensor: Sensor, clock: Clock) -> None:
+        self.history = History()
+        self.sensor, self._clock = sensor, clock
+        self._begin_run()
+        self.begin("start")
+
+    def begin(self, cause: str) -> None:
+        """All that was before is void: a `tare`, a `change` of settings, a `return`, the `start`."""
+        self.end_run()
+        self._cause, self._since_s = cause, self._now_s()
+        self._part, self._parts = Part(_SUMS), list[Part]()
+        self._full, self._found = list[Part](), list[Found]()  # a window, and what of it is known
+        self._first: list[Found] | None = None
+        self._joined = False  # whether the last window was believed
+        self._unusable = True  # until the next second, so that nothing is from before
+
+    def end_run(self) -> None:
+        """Keep what was learned until now: slopes of lines through the offsets, least squares."""
+        count, x, xx, *of_axes = self._run
+        below = count * xx - x * x
+        if count >= _LEAST_WINDOWS and below > (count * _LEAST_SPREAD_K) ** 2:
+            axes = zip(of_axes[:6], of_axes[6:], strict=True)
+            self.history.add_run([(count * xy - x * y) / below for y, xy in axes])
+        self._begin_run()
+
+    def _begin_run(self) -> None:
+        # How many windows, sums of K and K², of N and Nm, of their products with K.
+        self._run, self._run_began_s = [0.0] * 15, self._now_s()
+
+    def _now_s(self) -> float:
+        return self._clock.monotonic_ns() * 1e-9
+
+    def add(self, columns: Sequence[Sequence[float]]) -> None:
+        """Some samples, by field of the process data."""
+        if self._unusable:
+            return
+        load = columns[LOAD]
+        self._part.add([*load, *columns[RATE], *columns[_ACCELERATION], columns[_TEMPERATURE]])
+        self.history.see(load, saturated=any(columns[_SATURATED]))
+        if self._full:
+            self._examine()
+
+    def second(self) -> None:
+        """A second has passed."""
+        self.history.second()
+        sensor = self.sensor
+        self._unusable = sensor.settling or sensor.settings.get("calibration_matrix") is False
+        part, self._part = self._part, Part(_SUMS)
+        self._parts = [*self._parts, part] if part.taken else []
+        if len(self._parts) == PARTS:
+            self._full, self._parts, self._found = self._parts, [], []
+
+    def _examine(self) -> None:
+        """One channel of a full window: all at once would delay an exchange."""
+        self._found.append(found_in(self._full, len(self._found)))
+        if len(self._found) == _SUMS:
+            self._full = []
+            self._joined = self._believes(self._found)
+            if self._joined:
+                self._take(self._found)
+
+    def _believes(self, window: Sequence[Found]) -> bool:
+        up = [found.mean for found in window[_UP]]
+        if why_moving(window[: len(CHANNELS)]) or math.hypot(*up) < _LEAST_UP:
+            return False
+        if self._first is None:
+            return True
+        was = [found.mean for found in self._first[_UP]]
+        if sum(a * b for a, b in zip(up, was, strict=True)) < _CONE * math.hypot(*up) * math.hypot(*was):
+            return False
+        share = (self._now_s() - self._last_s) / _SLOW_S if self._joined else 1.0
+        return all(
+            abs(new.mean - old.mean) <= share * channel.steady + math.hypot(new.by_chance, old.by_chance) / 2
+            for channel, new, old in zip(CHANNELS[:6], window, self._last, strict=False)
+        )
+
+    def _take(self, window: list[Found]) -> None:
+        self._first = self._first or window
+        self._last, self._last_s = window, self._now_s()
+        if self._last_s - self._run_began_s > _LONGEST_RUN_S:
+            self.end_run()
+        if not any(self.sensor.settings.get(name) for name in _NOT_PLAIN):
+            kelvin, wrench = self._moved()
+            row = (1.0, kelvin, kelvin * kelvin, *wrench, *(kelvin * value for value in wrench))
+            self._run = list(map(add, self._run, row))
+
+    def _moved(self) -> tuple[float, list[float]]:
+        """K, and N and Nm, since the first window."""
+        assert self._first is not None
+        *wrench, kelvin = (
+            self._last[channel].mean - self._first[channel].mean for channel in (*range(6), _SUMS - 1)
+        )
+        return kelvin, wrench
+
+    def as_json(self) -> dict[str, Any]:
+        """The sensor's part of `status`."""
+        drift = None
+        if self._first is not None:
+            kelvin, wrench = self._moved()
+            ago_s = round(self._now_s() - self._since_s)
+            drift = {"since": self._cause, "ago_s": ago_s, "kelvin": kelvin, "wrench": wrench}
+        return {"drift": drift, "temperature_line": self.history.line, "history": self.history.as_json()}

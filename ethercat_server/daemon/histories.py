@@ -1,0 +1,52 @@
+"""The histories of the sensors in files, one by serial number, which a thread writes now and then."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from bota_ethercat.program import state
+from ethercat_server.acquisition.drift import Drift
+from ethercat_server.process import realtime
+from ethercat_server.sensor.history import History
+
+_EVERY_S: Final = 600.0
+
+log = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def kept(drifts: Sequence[Drift]) -> Iterator[None]:
+    """Within it the histories are those of the files, and are written there; at the end, too."""
+    by_path = {state.folder() / f"sensor-{drift.sensor.identity.serial}.json": drift for drift in drifts}
+    for path, drift in by_path.items():
+        drift.history = History(state.read(path))
+    ended = threading.Event()
+
+    def write() -> None:
+        for path, drift in by_path.items():
+            if drift.history.changed:
+                drift.history.changed = False
+                try:
+                    state.write(path, drift.history.kept())
+                except OSError as error:
+                    log.warning("the history of sensor %d is not kept: %s", drift.sensor.number, error)
+
+    def write_now_and_then() -> None:
+        realtime.leave()
+        while not ended.wait(_EVERY_S):
+            write()
+
+    thread = threading.Thread(target=write_now_and_then, name="histories", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        for drift in drifts:
+            drift.end_run()
+        write()

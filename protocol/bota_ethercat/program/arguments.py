@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line of every program: its help begins with three examples, `--version` is the package's."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any, Final
+
+from bota_ethercat.program.version import VERSION
+
+EXAMPLES: Final = """\
+ethercat-server virtual 12001                              # a simulated sensor
+sudo ethercat-server ens5 12001                            # the sensors on an interface
+sudo ethercat-server ens5 12001 --set sinc_length=128      # with another filter
+sudo ethercat-sensor find                                  # on which interface is a sensor?
+ethercat-sensor watch                                      # force and torque, of the server on this computer
+sudo ethercat-sensor apply ens5 --set sinc_length=128      # change a setting
+ethercat-doctor                                            # of the server on this computer, its interface
+sudo ethercat-doctor ens5                                  # everything, on an interface
+sudo ethercat-doctor ens5 --seconds 3600                   # for stalls that are rare
+sudo ethercat-virtual-sensor veth0                         # a sensor on one end of a veth pair
+sudo ethercat-virtual-sensor veth0 --sensors 2 --pdo 77    # a chain, with orientation
+ethercat-virtual-sensor --send 'power cycle 2'             # a fault of the one that runs
+ethercat-monitor                                           # of the server on this computer
+ethercat-monitor --once                                    # a table and a verdict, for scripts
+ethercat-monitor --web                                     # in a browser
+ethercat-record run.mcap                                   # until Ctrl-C
+ethercat-record run.mcap --for 5min                        # for some time
+ethercat-record run.mcap --server robot:12001              # of another computer's server
+ethercat-replay run.mcap                                   # as recorded, in place of the server
+ethercat-replay run.mcap --loop                            # again and again
+ethercat-replay run.mcap --speed max --server 12002        # as fast as clients read, on another port
+ethercat-export run.mcap                                   # writes run.csv
+ethercat-export run.mcap /dev/stdout                       # into a pipe
+ethercat-export run.mcap --at frames.csv                   # what was measured before each camera frame
+ethercat-report                                            # listen to the server, write report.html
+ethercat-report run.mcap                                   # of a recording, write run.html
+ethercat-report --sensor serial:1234 --note 'cell 3'       # of one sensor, with a remark
+ethercat-identify poses.mcap                               # mass, center of gravity, bias, with intervals
+ethercat-identify poses.mcap --yaml tool.yaml              # also as parameters of the node
+ethercat-identify delay shaken.mcap                        # how late force is, by a shaken sensor
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """The parser of a program, or of a subcommand."""
+
+    def __init__(self, prog: str, description: str, epilog: str, **options: Any) -> None:
+        super().__init__(prog=prog, description=description, epilog=epilog, **options)
+        self.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
+
+    def format_help(self) -> str:
+        """The examples, then what argparse has."""
+        rows = [row for row in EXAMPLES.splitlines() if self.prog in row.removeprefix("sudo ").split()[:1]]
+        return "\n".join([*(["examples:", *rows, ""] if rows else []), super().format_help()])

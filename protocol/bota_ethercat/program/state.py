@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What programs keep between their runs: JSON objects in files of this user's, or of the service's."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from pathlib import Path
+from typing import Any, Final
+
+_LONGEST: Final = 1 << 20  # bytes that a file may have
+
+
+def folder() -> Path:
+    """$STATE_DIRECTORY, which systemd gives a service, else in $XDG_STATE_HOME or ~/.local/state."""
+    if given := os.environ.get("STATE_DIRECTORY"):
+        return Path(given)
+    base = os.environ.get("XDG_STATE_HOME", "")
+    if not base.startswith("/"):
+        with contextlib.suppress(RuntimeError):  # a user without a home: nothing is kept
+            base = f"{Path.home()}/.local/state"
+    return Path(base or "/nonexistent") / "bota-ethercat-bridge"
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The object, which may be another program's; empty if there is none."""
+    try:
+        if not path.is_file() or path.stat().st_size > _LONGEST:
+            return {}
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def write(path: Path, kept: dict[str, Any]) -> None:
+    """Replace the file as a whole; OSError if it cannot be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(f".{os.getpid()}")
+    unfinished.write_text(json.dumps(kept), encoding="utf-8")
+    unfinished.replace(path)
