@@ -260,13 +260,13 @@ def test_stamps_are_read_from_tables_and_bags(tmp_path: Path) -> None:
         ([1.0, 2.0, 2.6, 2.7], (), "row 2 of {} (counted from 0) is of 2023-11-14T22:13:22.600"),
         ([0.5], ("--latency", 1), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:20.500"),
         ([-1.7e9], (), "is of 1970-01-01T00:00:00.000000000Z, and samples were measured from 2023-11-"),
-        (["0.1", "soon"], (), "{} has no times in timestamp: Failed to parse string: 'soon'"),
+        (["0.1", "soon"], (), "{} has no times in a column timestamp (choose one with --column; of a bag, --topic): Failed to parse string: 'soon'"),
         ([-3e9], (), "row 0 of {} (counted from 0) is no time since 1970"),
-        ([], (), "{} cannot be read: "),
-        ([1.0], ("--column", "t"), "{} has the columns timestamp, exposure: name that of the times with"),
+        ([], (), "{} has no times in a column timestamp "),
+        ([1.0], ("--column", "t"), "{} has no times in a column t (choose one with --column; of a bag, --topic): "),
         ([1.0], ("--topic", "/c"), "{} cannot be read as a bag: "),
         ([1.0], ("--tool", "{}"), "{} does not have a tool's parameters"),
-        ([1.0], ("--clock", "{}"), "{} is not what 'ethercat-export align --json' prints"),
+        ([1.0], ("--clock", "{}"), "{} is not what 'ethercat-export align' prints"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_done_is_said_and_leaves_nothing(

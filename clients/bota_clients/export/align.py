@@ -3,11 +3,13 @@
 The angular rates of two bodies that are mounted on each other are the same but for a rotation. The offset is
 first looked for by the magnitude of the rates, which needs no rotation, then in each of eight parts by least
 squares together with the rotation and the gyroscope's offset. A line through the eight has the drift, and how
-far they are off it tells the interval, which so covers what the model leaves out.
+far they are off it tells the interval, which so covers residuals that are correlated; it is found twice, the
+second time with the drift of the first taken out of each part.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -18,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.cli import PROGRAM, Options
-from bota_clients.export.frame_times import messages, stamp_ns
+from bota_clients.export.cli import PROGRAM
+from bota_clients.export.frame_times import Clock, messages, stamp_ns
 from bota_clients.identify.program import choose
 from bota_clients.numbers import moment
 from bota_clients.program import interrupt_on_signals, say
@@ -30,10 +32,9 @@ from bota_ethercat.settings import known_settings
 from ft_compensation.identification.delay import at_times, hann_window, lowest, smoothed
 
 Array = npt.NDArray[np.float64]
-_GRID_S: Final = 0.01
 _SMOOTH_S: Final = 0.1
-_STEP_S: Final = 0.02  # of the search in a part, and so far ...
-_AROUND_S: Final = 0.4  # ... which a drift of 200 ppm in an hour takes
+_STEP_S: Final = 0.02
+_AROUND_S: Final = 0.4  # of a part: what a drift of 200 ppm in an hour takes
 _PARTS: Final = 8
 _T_95: Final = 2.447  # Student's t for as many parts, less two
 _SHORTEST_S: Final = 10.0
@@ -62,47 +63,52 @@ def find_offset(times: Array, rates: Array, other_times: Array, other_rates: Arr
     """
     sensor, robot = _smooth("sensor", times, rates), _smooth("robot", other_times, other_rates)
 
-    def looks_at(offset: float, step_s: float, margin_s: float = 0.0) -> Array:
+    def looks_at(offset: float) -> Array:
         begin, end = max(robot[0][0], sensor[0][0] - offset), min(robot[0][-1], sensor[0][-1] - offset)
-        return np.arange(begin + margin_s, end - margin_s, step_s)
+        return np.arange(begin + _AROUND_S, end - _AROUND_S, _STEP_S / 2)
+
+    def left(looks: Array, offset: float | Array) -> float:
+        """The part of the sensor's rates that no rotation of the robot's explains."""
+        basis = np.linalg.qr(np.column_stack([at_times(looks, *robot), np.ones(len(looks))]))[0]
+        felt = at_times(looks + offset, *sensor)
+        return float(((felt - basis @ (basis.T @ felt)) ** 2).sum() / (felt.var(axis=0).sum() * len(looks)))
 
     tried = [
-        (1.0 - float(np.divide(*_rest(sensor, robot, looks, offset))), offset)
+        (left(looks, offset), offset)
         for offset in _candidates(sensor, robot)
-        if len(looks := looks_at(offset, _STEP_S)) * _STEP_S > _SHORTEST_S
+        if len(looks := looks_at(offset)) * _STEP_S / 2 > _SHORTEST_S - 4 * _AROUND_S
     ]
-    (explained, coarse), (other, _) = [*sorted(tried, reverse=True), (0.0, 0.0), (0.0, 0.0)][:2]
-    if not explained > _EXPLAINED:
+    (rest, coarse), (other, _) = [*sorted(tried), (1.0, 0.0), (1.0, 0.0)][:2]
+    if rest > 1 - _EXPLAINED:
         raise RecordingError(
-            f"the robot's motion explains only {100 * max(explained, 0):.0f} % of the sensor's: record both "
+            f"the robot's motion explains only {100 * (1 - rest):.0f} % of the sensor's: record both "
             "at the same time, of one body that turns about several axes"
         )
-    if other > _OTHER * explained:
+    if 1 - other > _OTHER * (1 - rest):
         raise RecordingError("the motion repeats itself, so several offsets fit: move without a rhythm")
-    rows = []
-    for looks in np.array_split(looks_at(coarse, _GRID_S, _AROUND_S), _PARTS):
+    looks = looks_at(coarse)
+    middle, line = float(looks.mean()), np.array([0.0, coarse])
+    for around in (np.arange(-_AROUND_S, _AROUND_S, _STEP_S), np.zeros(1)):
+        rows = []
+        for part in np.array_split(looks, _PARTS):
+            at, expected = part - middle, np.polyval(line, part - middle)
 
-        def left(offset: float, looks: Array = looks) -> float:
-            return float(_rest(sensor, robot, looks, offset)[0])
+            def missed(offset: float, part: Array = part, expected: Array = expected) -> float:
+                return left(part, expected + offset)
 
-        around = coarse + np.arange(-_AROUND_S, _AROUND_S, _STEP_S)
-        best = lowest(left, float(around[np.argmin([left(offset) for offset in around])]), _STEP_S)
-        curve = left(best - _STEP_S) - 2 * left(best) + left(best + _STEP_S)
-        rows.append((looks.mean(), best, max(curve, 1e-12)))
-    at, offsets, weights = np.array(rows).T
-    middle = float(np.average(at, weights=weights))
-    off, offset = at - middle, float(np.average(offsets, weights=weights))
-    weight, lever = float(weights.sum()), float((weights * off**2).sum())
-    drift = float((weights * off * offsets).sum()) / lever
-    scatter = float((weights * (offsets - offset - drift * off) ** 2).sum()) / (_PARTS - 2)
-    interval_ms, drift_interval_ppm = (
-        _T_95 * float(np.sqrt(scatter / total)) * scale for total, scale in ((weight, 1e3), (lever, 1e6))
-    )
-    if not interval_ms < _WIDEST_MS:
+            best = lowest(missed, min(around.tolist(), key=missed), _STEP_S)
+            curve = missed(best - _STEP_S) - 2 * missed(best) + missed(best + _STEP_S)
+            rows.append((at.mean(), best, max(curve, 1e-12) ** 0.5))
+        at, offsets, weights = np.array(rows).T
+        change, covariance = np.polyfit(at, offsets, 1, w=weights, cov=True)
+        line = line + change
+    drift_interval, interval = _T_95 * np.sqrt(np.diag(covariance))
+    if not interval * 1e3 < _WIDEST_MS:
         raise RecordingError(
-            f"the motion is too slow to tell (± {interval_ms:.0f} ms): turn faster, and about several axes"
+            f"the motion is too slow to tell (± {interval * 1e3:.0f} ms): turn faster, and about several axes"
         )
-    return ClockOffset(middle, offset, interval_ms, drift * 1e6, drift_interval_ppm)
+    drift, offset = line.tolist()
+    return ClockOffset(middle, offset, float(interval) * 1e3, drift * 1e6, float(drift_interval) * 1e6)
 
 
 def _smooth(which: str, times: Array, rates: Array) -> tuple[Array, Array]:
@@ -114,13 +120,6 @@ def _smooth(which: str, times: Array, rates: Array) -> tuple[Array, Array]:
     period = float(np.median(np.diff(times)))
     even = np.arange(times[0], times[-1], period)
     return even, smoothed(at_times(even, times, rates), hann_window(_SMOOTH_S, period))
-
-
-def _rest(sensor: tuple[Array, Array], robot: tuple[Array, Array], looks: Array, offset: float) -> Array:
-    """What no rotation of the robot's rates explains of the sensor's, and all of theirs, (rad/s)²."""
-    basis = np.linalg.qr(np.column_stack([at_times(looks, *robot), np.ones(len(looks))]))[0]
-    felt = at_times(looks + offset, *sensor)
-    return np.array([((felt - basis @ (basis.T @ felt)) ** 2).sum(), felt.var(axis=0).sum() * len(looks)])
 
 
 def _candidates(sensor: tuple[Array, Array], robot: tuple[Array, Array]) -> list[float]:
@@ -141,10 +140,9 @@ def _candidates(sensor: tuple[Array, Array], robot: tuple[Array, Array]) -> list
     return offsets
 
 
-def _robot_rates(options: Options) -> tuple[Ints, Array]:
+def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[Ints, Array]:
     """Stamps (n,), ns, and angular rates (n, 3), rad/s: as an IMU has them, or of a link in its own frame."""
-    path, topic = options.bag, options.topic or ""
-    joints = [] if options.urdf is None else _chain(options.urdf, options.link)
+    joints = [] if urdf is None else _chain(urdf, link)
     turning = [name for name, _, axis in joints if axis.any()]
     stamps, rows = list[int](), list[list[float]]()
     for message in messages(path, topic):
@@ -166,51 +164,47 @@ def _robot_rates(options: Options) -> tuple[Ints, Array]:
     times, values = np.array(stamps, np.int64), np.array(rows)
     if not joints:
         return times, values
-    pose: Any = np.eye(3)[np.newaxis]  # (n, 3, 3) of the link
+    angles = dict(zip(turning, values.T, strict=True))
+    pose = np.eye(3)
     for name, origin, axis in joints:
-        pose = pose @ origin
-        if axis.any():
-            pose = pose @ _turned(axis, values[:, turning.index(name)])
+        pose = pose @ origin @ _turned(np.outer(angles.get(name, 0.0), axis))
     step, passed = pose[:-1].swapaxes(1, 2) @ pose[1:], np.diff(times)
     twice = step - step.swapaxes(1, 2)  # the sine of a small angle
-    rates = twice[:, (2, 0, 1), (1, 2, 0)] / (2e-9 * passed[:, np.newaxis])
-    return times[:-1] + passed // 2, np.asarray(rates)
+    return times[:-1] + passed // 2, twice[:, (2, 0, 1), (1, 2, 0)] / (2e-9 * passed[:, np.newaxis])
 
 
-def _chain(urdf: Path, link: str | None) -> list[tuple[str, Array, Array]]:
-    """Name, rotation and axis of each joint from the root to `link`; no axis (zeros): it does not turn."""
+def _chain(urdf: Path, link: str) -> list[tuple[str, Array, Array]]:
+    """Name, rotation (3, 3) and axis of each joint from the root to `link`; axis zeros: it does not turn."""
+    chain = list[tuple[str, Array, Array]]()
     try:
-        joints = [*ElementTree.parse(urdf).getroot().iterfind("joint")]  # noqa: S314 - a file of the user's
-    except (OSError, ElementTree.ParseError) as error:
+        joints: Any = ElementTree.parse(urdf).iterfind("joint")  # noqa: S314 - a file of the user's
+        above, at = {joint.find("child").get("link"): joint for joint in joints}, link
+        while (joint := above.pop(at, None)) is not None:
+            at = joint.find("parent").get("link")
+            tags = {each.tag: each for each in joint}
+            rpy, axis = (
+                np.array(tags[tag].get(key, given).split() if tag in tags else given.split(), float)
+                for tag, key, given in (("origin", "rpy", "0 0 0"), ("axis", "xyz", "1 0 0"))
+            )
+            roll, pitch, yaw = _turned(np.diag(rpy))
+            turns = joint.get("type") in ("revolute", "continuous")
+            chain.insert(0, (joint.get("name"), yaw @ pitch @ roll, turns * axis / np.linalg.norm(axis)))
+    except (OSError, ElementTree.ParseError, AttributeError, ValueError) as error:
         raise RecordingError(f"{urdf} cannot be read as URDF: {error}") from None
-
-    def given(joint: ElementTree.Element, tag: str, key: str, default: str = "") -> str:
-        found = joint.find(tag)
-        return default if found is None else found.get(key, default)
-
-    above, chain, at = {given(joint, "child", "link"): joint for joint in joints}, [], link or ""
-    while (joint := above.pop(at, None)) is not None:
-        at = given(joint, "parent", "link")
-        angles = np.array(given(joint, "origin", "rpy", "0 0 0").split(), float)
-        roll, pitch, yaw = (_turned(axis, angles[[n]])[0] for n, axis in enumerate(np.eye(3)))
-        axis = np.array(given(joint, "axis", "xyz", "1 0 0").split(), float)
-        axis *= joint.get("type") in ("revolute", "continuous")
-        chain.append((joint.get("name", ""), yaw @ pitch @ roll, axis))
     if not any(axis.any() for _, _, axis in chain):
         raise RecordingError(f"{urdf} has no joint that turns link {link}")
-    return chain[::-1]
+    return chain
 
 
-def _turned(axis: Array, angles: Array) -> Array:
-    """(n, 3, 3) rotations about an axis, rad."""
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross))
+def _turned(vectors: Array) -> Array:
+    """(n, 3, 3) rotations by rotation vectors (n, 3), rad."""
+    angle = np.linalg.norm(vectors, axis=1)[:, np.newaxis, np.newaxis] / np.pi
+    cross = np.cross(vectors[:, np.newaxis], np.eye(3)).swapaxes(1, 2)
+    return np.asarray(np.eye(3) + np.sinc(angle) * cross + np.sinc(angle / 2) ** 2 / 2 * (cross @ cross))
 
 
-def run(options: Options) -> int:
-    """Find it; returns the exit code."""
+def run(options: argparse.Namespace) -> int:
+    """Find it; returns the exit code. RecordingError."""
     interrupt_on_signals()
     with open_recording(options.recording) as recording:
         rows = []
@@ -220,27 +214,21 @@ def run(options: Options) -> int:
             delay_s = angular_rate_response(known_settings(settings.values)).delay_s or 0.0
             rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
     instants, rates = map(np.concatenate, zip(*rows, strict=True))
-    robot_stamps, robot_rates = _robot_rates(options)
-    try:
-        if (np.diff(instants) <= 0).any():
-            raise RecordingError("the server's machine was restarted during the recording: record again")
-        since, robot_since = instants - instants[0], robot_stamps - robot_stamps[0]
-        found = find_offset(since * 1e-9, rates, robot_since * 1e-9, robot_rates)
-    except RecordingError as refusal:
-        if options.json:
-            sys.stdout.write(json.dumps({"ok": False, "error": str(refusal)}, indent=1) + "\n")
-        say(PROGRAM, f"{options.recording}, {options.topic}: {refusal}")
-        return 1
-    robot_ns = int(robot_stamps[0]) + round(found.at_s * 1e9)
-    monotonic_ns = int(instants[0]) + round((found.at_s + found.offset_s) * 1e9)
+    if (np.diff(instants) <= 0).any():
+        raise RecordingError("the server's machine was restarted during the recording: record again")
+    stamps, robot_rates = _robot_rates(options.bag, options.topic, options.urdf, options.link)
+    found = find_offset((instants - instants[0]) * 1e-9, rates, (stamps - stamps[0]) * 1e-9, robot_rates)
+    at_ns, offset_ns = round(found.at_s * 1e9), round(found.offset_s * 1e9)
+    clock = Clock(int(stamps[0]) + at_ns, int(instants[0]) + at_ns + offset_ns, found.drift_ppm)
     # The server's clocks are as far apart as at the end of the recording.
-    offset_ms = (monotonic_ns + frames[-1].stamp_ns - frames[-1].monotonic_ns - robot_ns) * 1e-6
-    values = {"ok": True, "stamp_ns": robot_ns, "monotonic_ns": monotonic_ns, "offset_ms": offset_ms}
-    values |= dict(zip(found._fields[2:], found[2:], strict=True))
+    apart_ns = frames[-1].stamp_ns - frames[-1].monotonic_ns
+    values = clock._asdict() | {"offset_ms": (clock.monotonic_ns + apart_ns - clock.stamp_ns) * 1e-6}
+    values |= {"interval_ms": found.interval_ms, "drift_interval_ppm": found.drift_interval_ppm}
     text = (
         "to stamps of {topic} add {offset_ms:+.2f} ms (± {interval_ms:.2f} ms, 95 %) at {when}, and "
         "{drift_ppm:+.1f} ppm (± {drift_interval_ppm:.1f}) of the time since then: that is the server's "
-        "CLOCK_REALTIME\n"
-    ).format(topic=options.topic, when=moment(robot_ns), **values)
-    sys.stdout.write(json.dumps(values, indent=1) + "\n" if options.json else text)
+        "CLOCK_REALTIME"
+    )
+    say(PROGRAM, text.format(topic=options.topic, when=moment(clock.stamp_ns), **values))
+    sys.stdout.write(json.dumps(values, indent=1) + "\n")
     return 0

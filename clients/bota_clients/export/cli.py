@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final
 from bota_clients.arguments import add_force, add_imu_units, number, position, typed
 from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.errors import FileError
-from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.arguments import Parser
 
 if TYPE_CHECKING:
@@ -23,31 +22,7 @@ _MOST_SAMPLES: Final = 100_000  # in a window
 Advance = Callable[[int], object]  # is told how many DATA frames were read since the last call
 
 
-class Options(argparse.Namespace):
-    """What to export, and where to, or what to align."""
-
-    recording: Path
-    sensor: int | None
-    imu_units: ImuUnits
-    output: Path
-    all: bool
-    force: bool
-    at: Path | None
-    fps: float | None
-    column: str | None
-    topic: str | None
-    window: int
-    latency: float  # s
-    clock: Path | None
-    tool: Path | None
-    hold: bool
-    bag: Path
-    urdf: Path | None
-    link: str | None
-    json: bool
-
-
-def parse_options(argv: Sequence[str] | None) -> Options:
+def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; argparse exits with 2 if it is wrong."""
     made = Parser(
         PROGRAM,
@@ -61,40 +36,39 @@ def parse_options(argv: Sequence[str] | None) -> Options:
     add("output", type=Path, nargs="?", metavar="OUT",
         help="file to write (default: RECORDING.csv, with --at or --fps RECORDING.parquet)")  # fmt: skip
     add("--all", action="store_true", help="CSV: also frames that are no new sample: repeated, invalid")
-    add = made.add_argument_group("for each camera frame").add_argument
+    add_force(made)
+    group = made.add_argument_group("for each camera frame")
+    add = group.add_mutually_exclusive_group().add_argument
     add("--at", type=Path, metavar="FRAMES", help="times of the frames: CSV, Parquet, or a bag")
-    add("--column", metavar="NAME", help="the column of FRAMES")
+    add("--fps", type=number(1e-3, 1e5), metavar="HZ", help="frames at this rate")
+    add = group.add_argument
+    add("--column", metavar="NAME", default="timestamp", help="the column of FRAMES (default timestamp)")
     add("--topic", metavar="TOPIC", help="the topic of the bag; its header.stamp is taken")
-    add("--fps", type=number(1e-3, 1e5), metavar="HZ", help="instead of --at: frames at this rate")
     add("--window", type=typed(_window, f"from 1 to {_MOST_SAMPLES}"), default=32, metavar="K",
         help="samples for each frame (default 32)")  # fmt: skip
     add("--latency", type=number(-60, 60), default=0.0, metavar="S",
         help="seconds from a frame's exposure to its stamp (default 0)")  # fmt: skip
     add("--clock", type=Path, metavar="JSON",
-        help="clock of the stamps, by 'ethercat-export align --json' (default: the server's)")  # fmt: skip
+        help="clock of the stamps, by 'ethercat-export align' (default: the server's)")  # fmt: skip
     add("--tool", type=Path, metavar="YAML",
         help="also the compensated wrench, with these parameters of the ROS 2 node")  # fmt: skip
     add("--hold", action="store_true", help="repeat the last sample where one was lost, instead of NaN")
-    add_force(made)
-    options = made.parse_args(argv, Options())
+    options = made.parse_args(argv)
     has_frames = options.at is not None or options.fps is not None
-    suffix = DATASETS[0] if has_frames else ".csv"
-    options.output = options.output or options.recording.with_suffix(suffix)
+    options.output = options.output or options.recording.with_suffix(DATASETS[0] if has_frames else ".csv")
     if options.output.absolute() == options.recording.absolute():
         made.error("the output would overwrite the recording: give another name")
-    if options.at is not None and options.fps is not None:
-        made.error("give --at or --fps, not both")
     if (options.output.suffix in DATASETS) != has_frames:
         made.error(f"windows of samples, with --at or --fps, are written as {', '.join(DATASETS)} only")
     return options
 
 
-def parse_align(argv: Sequence[str]) -> Options:
+def parse_align(argv: Sequence[str]) -> argparse.Namespace:
     """Read the command line after `align`."""
     made = Parser(
         f"{PROGRAM} align",
         "Finds the offset between the server's clock and a robot's, and its drift: from the angular rate of "
-        "the sensor's IMU and that of an IMU of the robot, or of its joints.",
+        "the sensor's IMU and that of an IMU of the robot, or of its joints. Prints JSON, for --clock.",
         "Both on one link, with any axes. Record both while the robot turns the sensor about several axes, "
         "not periodically, for half a minute or more.",
     )
@@ -103,19 +77,14 @@ def parse_align(argv: Sequence[str]) -> Options:
     add("bag", type=Path, metavar="BAG", help="a bag of ROS: the folder, .mcap, .db3 or .bag")
     add("--topic", required=True, metavar="TOPIC", help="sensor_msgs/Imu or sensor_msgs/JointState")
     add("--urdf", type=Path, metavar="FILE", help="of joint states: the robot")
-    add("--link", metavar="NAME", help="of joint states: the link that carries the sensor")
-    add("--json", action="store_true", help="print JSON, for --clock")
-    options = made.parse_args(argv, Options())
-    if (options.urdf is None) != (options.link is None):
-        made.error("joint states need both --urdf and --link")
-    return options
+    add("--link", metavar="NAME", default="", help="of joint states: the link that carries the sensor")
+    return made.parse_args(argv)
 
 
 def _add_recording(made: argparse.ArgumentParser) -> None:
-    made.add_argument("recording", type=Path, metavar="RECORDING", help="a recording of ethercat-record")
-    made.add_argument(
-        "--sensor", type=position, metavar="N", help="only the sensor at this position on the bus"
-    )
+    add = made.add_argument
+    add("recording", type=Path, metavar="RECORDING", help="a recording of ethercat-record")
+    add("--sensor", type=position, metavar="N", help="only the sensor at this position on the bus")
     add_imu_units(made)
 
 
@@ -125,7 +94,7 @@ def _window(text: str) -> int:
     raise ValueError
 
 
-def export(options: Options, write: Callable[[Recording, Advance], str]) -> int:
+def export(options: argparse.Namespace, write: Callable[[Recording, Advance], str]) -> int:
     """Have the output written, and say what `write` says of it; returns the exit code.
 
     Ctrl-C ends it at any time and leaves no file.
@@ -141,10 +110,8 @@ def export(options: Options, write: Callable[[Recording, Advance], str]) -> int:
     try:
         with open_recording(options.recording) as recording, progress:
             if recording.cut_off is not None:
-                say(
-                    PROGRAM,
-                    f"{recording.path} was cut off ({recording.cut_off}): the intact part is exported",
-                )
+                how = f"was cut off ({recording.cut_off}): the intact part is exported"
+                say(PROGRAM, f"{recording.path} {how}")
             chosen = [each.frames for each in recording.sensors if options.sensor in {None, each.sensor}]
             task = progress.add_task("", total=sum(chosen))
             written = write(recording, lambda frames: progress.advance(task, frames))

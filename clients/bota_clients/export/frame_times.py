@@ -7,7 +7,6 @@ CLOCK_MONOTONIC, which is never set.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -21,7 +20,6 @@ from bota_ethercat.text.json_text import parse_json_object
 
 _SECOND: Final = 1_000_000_000
 _LATEST_NS: Final = 4_102_444_800 * _SECOND  # the year 2100
-_NAMES: Final = ("stamp_ns", "timestamp", "time")  # of a column, if none is given
 
 
 class Clock(NamedTuple):
@@ -33,12 +31,12 @@ class Clock(NamedTuple):
 
     @classmethod
     def read(cls, path: Path) -> Clock:
-        """What `ethercat-export align --json` printed; RecordingError."""
+        """What `ethercat-export align` printed; RecordingError."""
         try:
             found = parse_json_object(path.read_bytes())
             return cls(int(found["stamp_ns"]), int(found["monotonic_ns"]), float(found["drift_ppm"]))
         except (OSError, BadMessageError, LookupError, TypeError, ValueError):
-            raise RecordingError(f"{path} is not what 'ethercat-export align --json' prints") from None
+            raise RecordingError(f"{path} is not what 'ethercat-export align' prints") from None
 
 
 class FrameTimes:
@@ -64,21 +62,19 @@ class FrameTimes:
         `latency_s`: from the exposure to the stamp. `clock`: of the stamps, if it is not the server's
         CLOCK_REALTIME. `source` is named in errors.
         """
-        self.stamps_ns = np.zeros(0, np.int64) if stamps_ns is None else stamps_ns
-        self.count, self.instants_ns = len(self.stamps_ns), np.zeros(0, np.int64)
+        none = np.zeros(0, np.int64)
+        self.stamps_ns, self.instants_ns = none if stamps_ns is None else stamps_ns, none
+        self.count = len(self.stamps_ns)
         self._period_ns, self._latency_ns = fps and _SECOND / fps, 0 if fps else round(latency_s * _SECOND)
         self._source = source
         self._begin = self._newest = (-1, -1)  # both stamps of the first and of the newest sample
-        # Where a stamp is before that of the frame before: the clock was set back, or they are not sorted.
-        self._descents = np.append(np.flatnonzero(np.diff(self.stamps_ns) < 0) + 1, self.count)
-        self._awaits_descent = False
+        self._is_set_back = False  # so is the clock of the next frame, and that of the samples not yet
         if clock is not None:
-            if self._descents[0] < self.count:
-                raise self.refusal(int(self._descents[0]), 0)
+            if (descents := np.flatnonzero(np.diff(self.stamps_ns) < 0)).size:
+                raise self.refusal(int(descents[0]) + 1, 0)
             passed = self.stamps_ns - clock.stamp_ns
-            self._take(
-                clock.monotonic_ns + passed + np.rint(passed * (clock.drift_ppm * 1e-6)).astype(np.int64)
-            )
+            drifted = np.rint(passed * (clock.drift_ppm * 1e-6)).astype(np.int64)
+            self._take(clock.monotonic_ns + passed + drifted)
 
     def follow(self, stamp_ns: Ints, monotonic_ns: Ints) -> None:
         """Take both stamps of the next samples."""
@@ -93,25 +89,28 @@ class FrameTimes:
             self._take(made)
             self.stamps_ns = np.append(self.stamps_ns, _interpolated(made, instants, stamps))
             return
-        cuts = [0, *(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), len(stamps)]
-        for begin, end in itertools.pairwise(cuts):
+        begin = 0
+        for end in [*(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), len(stamps)]:
+            here, there = stamps[begin:end], instants[begin:end]
             # The clock was set between two samples, and frames of this time may be by either.
-            before_ns = int(instants[begin] - instants[begin - 1]) if begin else 0
-            after_ns = int(instants[end] - instants[end - 1]) if end < len(instants) else 0
-            self._awaits_descent = self._awaits_descent and not begin
-            self._map(stamps[begin:end], instants[begin:end], before_ns, after_ns)
+            if begin:
+                there = np.append(instants[begin - 1], there)
+                here = np.append(here[0] - there[1] + there[0], here)
+                self._is_set_back = False
+            if end < len(stamps):
+                there = np.append(there, instants[end])
+                here = np.append(here, here[-1] + there[-1] - there[-2])
+            self._map(here, there)
+            begin = end
 
-    def _map(self, stamps: Ints, instants: Ints, before_ns: int, after_ns: int) -> None:
-        """Take the frames from `before_ns` before these samples, between which no clock was set, on."""
-        done = len(self.instants_ns)
-        if self._awaits_descent or done == self.count:
-            return
-        stop = int(self._descents[np.searchsorted(self._descents, done, "right")])
-        frames = self.stamps_ns[done:stop]
-        if frames[0] >= stamps[0] - before_ns:
-            frames = frames[: np.searchsorted(frames, stamps[-1] + after_ns, "right")]
-            self._take(_interpolated(frames, stamps, instants))
-            self._awaits_descent = done + len(frames) == stop
+    def _map(self, stamps: Ints, instants: Ints) -> None:
+        """Take the frames between these samples, between which no clock was set back."""
+        frames = self.stamps_ns[len(self.instants_ns) :]
+        frames = frames[: int(np.append(np.flatnonzero(np.diff(frames) < 0), len(frames))[0]) + 1]
+        if len(frames) and frames[0] >= stamps[0] and not self._is_set_back:
+            ready = frames[: np.searchsorted(frames, stamps[-1], "right")]
+            self._take(_interpolated(ready, stamps, instants))
+            self._is_set_back = len(ready) == len(frames)
 
     def _take(self, instants_ns: Ints) -> None:
         self.instants_ns = np.append(self.instants_ns, instants_ns - self._latency_ns)
@@ -134,22 +133,19 @@ class FrameTimes:
 
 
 def _interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
-    """One clock by another, beyond the ends at the same pace; all in ns, without loss of digits."""
-    inside = np.interp(at - here[0], here - here[0], there - there[0])
-    return np.asarray(np.rint(inside).astype(np.int64) + there[0] + at - np.clip(at, here[0], here[-1]))
+    """One clock by another, in ns, without loss of digits."""
+    return there[0] + np.rint(np.interp(at - here[0], here - here[0], there - there[0])).astype(np.int64)
 
 
-def read_stamps(path: Path, column: str | None = None, topic: str | None = None) -> Ints:
+def read_stamps(path: Path, column: str = "timestamp", topic: str | None = None) -> Ints:
     """The frames' stamps, ns since 1970: of a column, or the `header.stamp` of a topic; RecordingError.
 
     A column has times (ISO 8601), integers, ns since 1970, or other numbers, s since 1970.
     """
-    if topic is not None:
-        stamps = np.array([stamp_ns(message, topic) for message in messages(path, topic)], np.int64)
-    elif path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
-        raise RecordingError(f"{path} is a bag: name the topic of the frames with --topic")
-    else:
+    if topic is None:
         stamps = _read_column(path, column)
+    else:
+        stamps = np.array([stamp_ns(message, topic) for message in messages(path, topic)], np.int64)
     if not len(stamps):
         raise RecordingError(f"{path} has no frames")
     if (wrong := np.flatnonzero((stamps < 0) | (stamps > _LATEST_NS))).size:
@@ -157,28 +153,22 @@ def read_stamps(path: Path, column: str | None = None, topic: str | None = None)
     return stamps
 
 
-def _read_column(path: Path, column: str | None) -> Ints:
+def _read_column(path: Path, column: str) -> Ints:
     import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
     from pyarrow import csv, parquet  # noqa: PLC0415
 
     try:
         table = parquet.read_table(path) if path.suffix == ".parquet" else csv.read_csv(path)
-    except (OSError, pa.ArrowInvalid) as error:
-        raise RecordingError(f"{path} cannot be read: {error}") from None
-    names = table.column_names
-    chosen = [name for name in ((column,) if column else _NAMES) if name in names] or names[: len(names) == 1]
-    if not chosen or column not in {None, *chosen}:
-        there = ", ".join(names)
-        raise RecordingError(f"{path} has the columns {there}: name that of the times with --column")
-    found = table[chosen[0]]
-    if pa.types.is_timestamp(found.type):
-        return np.asarray(found.cast(pa.timestamp("ns", found.type.tz)).cast("int64").to_numpy())
-    if pa.types.is_integer(found.type):
+        found = table[column]
+        if pa.types.is_timestamp(found.type):
+            found = found.cast(pa.timestamp("ns", found.type.tz)).cast("int64")
+        elif not pa.types.is_integer(found.type):
+            found = pa.array(np.rint(found.cast("float64").to_numpy() * _SECOND).astype(np.int64))
         return np.asarray(found.to_numpy().astype(np.int64))
-    try:
-        return np.asarray(np.rint(found.cast("float64").to_numpy() * _SECOND).astype(np.int64))
-    except pa.ArrowInvalid as error:
-        raise RecordingError(f"{path} has no times in {chosen[0]}: {error}") from None
+    except (OSError, KeyError, pa.ArrowInvalid) as error:
+        raise RecordingError(
+            f"{path} has no times in a column {column} (choose one with --column; of a bag, --topic): {error}"
+        ) from None
 
 
 def messages(path: Path, topic: str) -> Iterator[Any]:

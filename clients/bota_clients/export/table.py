@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from functools import cache, partial
 from typing import Final
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.cli import Advance, Options, export
+from bota_clients.export.cli import Advance, export
 from bota_clients.numbers import count
 from bota_clients.recording.reader import Recording
 from bota_ethercat.accounting import NOT_NEW
@@ -85,12 +86,12 @@ def _seconds(ns: int) -> str:
     return f"{'-' if ns < 0 else ''}{whole}.{rest:09d}"
 
 
-def run(options: Options) -> int:
+def run(options: argparse.Namespace) -> int:
     """Export; returns the exit code."""
     return export(options, partial(_write, options))
 
 
-def _write(options: Options, recording: Recording, advance: Advance) -> str:
+def _write(options: argparse.Namespace, recording: Recording, advance: Advance) -> str:
     there = {sensor.sensor for sensor in recording.sensors if sensor.frames}
     if not there or options.sensor not in {None, *there}:
         which = "" if options.sensor is None else f" of sensor {options.sensor}"

@@ -50,11 +50,10 @@ Arrays = dict[str, Array]
 _CHANNELS: Final = dict(zip(Delays._fields, (slice(0, 6), slice(6, 9), slice(9, 12)), strict=True))
 _UNKNOWN: Final = (math.nan,) * 3
 _SLOT: Final = np.dtype([
-    ("stamp_ns", "i8"),  # of an empty slot by its place between two samples
-    ("measured_ns", "i8", 3),  # by channel
-    ("values", "f8", 12),  # force, torque, acceleration, angular rate: N, Nm, m/s², rad/s; NaN: empty
+    ("measured_ns", "i8", 3),  # by channel; of an empty slot by its place between two samples
+    ("values", "f4", 12),  # force, torque, acceleration, angular rate: N, Nm, m/s², rad/s; NaN: empty
     ("valid", "?", 3),  # by channel
-    ("compensated", "f8", 6),  # N, Nm; NaN: not known
+    ("compensated", "f4", 6),  # N, Nm; NaN: not known
 ])  # fmt: skip
 
 
@@ -73,15 +72,18 @@ class Tool:
         import yaml  # noqa: PLC0415 - of the extra `dataset`
 
         try:
-            found: Any = yaml.safe_load(path.read_bytes())["/**"]["ros__parameters"]
-            rows = {name.removeprefix("accelerometer."): row for name, row in found.items()}
-            calibration = EXACT._replace(
-                **{name: tuple(rows[name]) for name in EXACT._fields if name in rows}
+            rows: Any = yaml.safe_load(path.read_bytes())["/**"]["ros__parameters"]
+            corrected = {
+                name: tuple(rows.get(f"accelerometer.{name}", EXACT[at]))
+                for at, name in enumerate(EXACT._fields)
+            }
+            inertia = tuple(rows.get("tool_inertia", NO_PAYLOAD.inertia))
+            return cls(
+                Payload(rows["tool_mass"], tuple(rows["tool_center_of_gravity"]), inertia),
+                Wrench.of(rows.get("bias", NO_WRENCH.values)),
+                Accelerometer(**corrected),
+                tuple(rows.get("imu_position", ZERO)),
             )
-            inertia = tuple(found.get("tool_inertia", NO_PAYLOAD.inertia))
-            payload = Payload(found["tool_mass"], tuple(found["tool_center_of_gravity"]), inertia)
-            position = tuple(found.get("imu_position", ZERO))
-            return cls(payload, Wrench.of(found.get("bias", NO_WRENCH.values)), calibration, position)
         except (OSError, yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError) as error:
             why = " ".join(str(error).split())
             raise RecordingError(
@@ -111,7 +113,7 @@ class Windows:
         self.begin_ns = -1
         self._length, self._hold, self._tool, self._units = length, hold, tool, imu_units
         self._slots = np.zeros(0, _SLOT)
-        self._newest, self._gap = (0, 0), False  # stamp and sequence of the newest sample; GAP since
+        self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._in_force: tuple[Mapping[str, object], float] | None = None
 
     def configure(self, settings: Mapping[str, object], rate_hz: float, name: str = "") -> None:
@@ -143,37 +145,27 @@ class Windows:
     def take(self, frames: Sequence[DataMessage]) -> Columns:
         """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
         table = decode(frames, self._units)
-        # GAP of a frame that brings no sample is that of the next sample.
-        gaps = np.cumsum(np.append(self._gap, table.flags & int(DataFlag.GAP) != 0))
-        at = np.flatnonzero(table.fresh)
-        self._gap = bool(gaps[-1] > (gaps[at[-1] + 1] if len(at) else 0))
         samples = table.where(table.fresh)
-        if not len(at):
+        if not len(samples):
             return samples
         stamps, sequence = samples.monotonic_ns, samples.sequence
-        is_first = self.begin_ns < 0
-        if is_first:
-            self.begin_ns, self._newest = int(stamps[0]), (int(stamps[0]), int(sequence[0]) - 1)
+        if self.begin_ns < 0:
+            self.begin_ns, self._newest = int(stamps[0]), (int(stamps[0]) - 1, int(sequence[0]) - 1)
         passed = np.diff(stamps, prepend=self._newest[0])
-        if (passed[int(is_first) :] <= 0).any():
+        if (passed <= 0).any():
             raise RecordingError("the server's machine was restarted meanwhile: record again")
-        broken = (np.diff(gaps[at + 1], prepend=0) > 0) | (np.diff(sequence, prepend=self._newest[1]) != 1)
-        room = np.rint(passed * (self._rate_hz * 1e-9)).astype(np.int64) - 1
+        is_gap = (samples.flags & int(DataFlag.GAP) != 0) | (np.diff(sequence, prepend=self._newest[1]) != 1)
         self._newest = int(stamps[-1]), int(sequence[-1])
-        self._append(samples, passed, np.where(broken, np.maximum(room, 0), 0))
-        return samples
-
-    def _append(self, samples: Columns, passed: Ints, lost: Ints) -> None:
-        """Samples, each `passed` ns after the one before, with so many `lost` in between."""
-        kept = np.minimum(lost, 2 * self._length)
+        lost = np.maximum(np.rint(passed * (self._rate_hz * 1e-9)).astype(np.int64) - 1, 0) * is_gap
+        # Of the slots of lost samples the first ones do: a window is not longer.
+        kept = np.minimum(lost, self._length)
         end = np.cumsum(kept + 1) - 1  # where each sample is
         of = np.repeat(np.arange(len(end)), kept + 1)
-        number = np.arange(len(of)) - (end - kept)[of] + 1  # in its gap, from 1
-        number += np.where(number > self._length, (lost - kept)[of], 0)
+        before = (lost - kept)[of] + end[of] - np.arange(len(of))  # periods until the next sample
+        before[end] = 0
         slots = np.zeros(len(of), _SLOT)
-        since_ns = np.rint(passed[of] * (number / (lost[of] + 1))).astype(np.int64)
-        slots["stamp_ns"] = (samples.monotonic_ns - passed)[of] + since_ns
-        slots["measured_ns"] = slots["stamp_ns"][:, np.newaxis] - self._delay_ns
+        until_ns = np.rint(passed[of] * (before / (lost[of] + 1))).astype(np.int64)
+        slots["measured_ns"] = (stamps[of] - until_ns)[:, np.newaxis] - self._delay_ns
         values = np.hstack([samples.force, samples.torque, samples.acceleration, samples.angular_rate])
         slots["values"] = math.nan
         slots["values"][end] = np.where(np.isfinite(values), values, math.nan)
@@ -188,6 +180,7 @@ class Windows:
         if self._tool is not None:
             slots["compensated"][end] = self._compensated(samples, self._tool)
         self._slots = np.concatenate([self._slots, slots])
+        return samples
 
     def _compensated(self, samples: Columns, tool: Tool) -> Array:
         """(n, 6) N, Nm, as the ROS 2 node has it."""
@@ -217,7 +210,7 @@ class Windows:
             raise ValueError(
                 f"{instants_ns[-1]} ns is after {self.until_ns} ns: its samples are not all here"
             )
-        slots, found, imu = self._slots, Arrays(), []
+        slots, found = self._slots, Arrays()
         for channel, (name, part) in enumerate(_CHANNELS.items()):
             index = self._ends(instants_ns, channel)[:, np.newaxis] + np.arange(-self._length, 0)
             is_there, index = index >= 0, np.maximum(index, 0)
@@ -229,15 +222,12 @@ class Windows:
             age_s = (instants_ns[:, np.newaxis] - slots["measured_ns"][index, channel]) * 1e-9
             values, wrench = slots["values"][index, part], slots["compensated"][index]
             age_s[empty] = values[empty] = wrench[empty] = math.nan
-            found[f"{name}_age"], found[f"{name}_valid"] = age_s.astype(np.float32), valid
-            if channel:
-                imu.append(values)
-                continue
-            found[name] = values.astype(np.float32)
-            if self._tool is not None:
-                found[f"{name}_compensated"] = wrench.astype(np.float32)
+            found |= {name: values, f"{name}_age": age_s.astype(np.float32), f"{name}_valid": valid}
+            if self._tool is not None and not channel:
+                found[f"{name}_compensated"] = wrench
                 found[f"{name}_compensated_valid"] = valid & np.isfinite(wrench).all(axis=2)
-        return found | {"imu": np.concatenate(imu, axis=2).astype(np.float32)}
+        found["imu"] = np.concatenate([found.pop("acceleration"), found.pop("angular_rate")], axis=2)
+        return found
 
     def forget(self, before_ns: int) -> None:
         """What windows of this instant and later ones do not need; without this everything is kept."""

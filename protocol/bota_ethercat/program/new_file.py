@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file that is written whole or not at all, and that replaces nothing without --force."""
+"""A text file that is written whole or not at all, and that replaces nothing without --force."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Final, Self, cast
+from typing import Final, Self
 
 from bota_ethercat.errors import FileError
 
@@ -32,6 +32,8 @@ class NewFile:
     def __init__(self, path: Path, *, force: bool) -> None:
         self._path, self._force = path, force
         with self._errors():
+            with contextlib.suppress(FileNotFoundError):
+                path.stat()  # of other errors `exists` says nothing since Python 3.14
             refuse_existing(path, force=force)
             if path.exists() and not path.is_file():
                 self._target = self._beside = path
@@ -40,11 +42,6 @@ class NewFile:
                 self._beside = self._target.with_name(f".unfinished-{secrets.token_hex(4)}")
             self._in_place = self._beside == self._target
             self._file = self._beside.open("w" if self._in_place else "x", encoding="utf-8", newline="\n")
-
-    @property
-    def binary(self) -> BinaryIO:
-        """To write bytes into the file, instead of `write`; with the errors of the system."""
-        return cast(BinaryIO, self._file.buffer)
 
     def write(self, text: str) -> None:
         """Add text."""
