@@ -111,7 +111,7 @@ def periodic(t: Array) -> Array:
 def test_a_motion_that_says_nothing_is_refused(sensor: Motion, robot: Motion, said: str) -> None:
     noise = np.random.default_rng(1)
     times = np.arange(0, 40, 0.005)
-    felt = sensor(times)
-    felt = felt + noise.normal(0, 0.01, felt.shape)
+    felt, turned = (turn(times) + noise.normal(0, 0.01, turn(times).shape) for turn in (sensor, robot))
+    stamps = np.rint(times * 1e9).astype(np.int64)
     with pytest.raises(RecordingError, match=said):
-        find_offset(times[: len(felt)], felt, times, robot(times) + noise.normal(0, 0.01, (len(times), 3)))
+        find_offset(stamps[: len(felt)], felt, stamps, turned)

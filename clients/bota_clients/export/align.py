@@ -1,10 +1,10 @@
 """What `ethercat-export align` does: the offset between the server's clock and a robot's, by how both turned.
 
 The angular rates of two bodies that are mounted on each other are the same but for a rotation. The offset is
-first looked for by the magnitude of the rates, which needs no rotation, then in each of eight parts by least
-squares together with the rotation and the gyroscope's offset. A line through the eight has the drift, and how
-far they are off it tells the interval, which so covers residuals that are correlated; it is found twice, the
-second time with the drift of the first taken out of each part.
+first looked for by their cross-correlation, then in each of eight parts by least squares together with the
+rotation and the gyroscope's offset. A line through the eight has the drift, and how far they are off it tells
+the interval, which so covers residuals that are correlated; it is found twice, the second time with the drift
+of the first taken out of each part.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import PROGRAM
-from bota_clients.export.frame_times import Clock, messages, stamp_ns
+from bota_clients.export.frame_times import Clock, messages
 from bota_clients.identify.program import choose
 from bota_clients.numbers import moment
 from bota_clients.program import interrupt_on_signals, say
@@ -40,32 +40,19 @@ _T_95: Final = 2.447  # Student's t for as many parts, less two
 _SHORTEST_S: Final = 10.0
 _LEAST_RATE: Final = 0.05  # rad/s, root mean square
 _EXPLAINED: Final = 0.5
-_CANDIDATES: Final = 4
-_APART_S: Final = 0.5  # one from the other
-_OTHER: Final = 0.9  # of what the best candidate explains: another that does as much may be right, too
-_WIDEST_MS: Final = 5.0
+_APART_S: Final = 0.5
+_OTHER: Final = 0.9  # of the highest correlation: another so far apart may be right, too
+_WIDEST_S: Final = 0.005
 
 
-class ClockOffset(NamedTuple):
-    """One clock, x, by another, y: x = y + offset + drift (y - at)."""
+def find_offset(
+    times_ns: Ints, rates: Array, robot_ns: Ints, robot_rates: Array
+) -> tuple[Clock, dict[str, float]]:
+    """From (n,), (n, 3) rad/s of the sensor and (m,), (m, 3) of the robot, each by its own clock.
 
-    at_s: float  # y
-    offset_s: float
-    interval_ms: float  # half of the 95 % interval, as drift_interval_ppm
-    drift_ppm: float
-    drift_interval_ppm: float
-
-
-def find_offset(times: Array, rates: Array, other_times: Array, other_rates: Array) -> ClockOffset:
-    """From (n,) s, (n, 3) rad/s of the sensor and (m,), (m, 3) of the robot, each by its own clock.
-
-    RecordingError if the motion does not show it.
+    The robot's clock, and half of the 95 % intervals. RecordingError if the motion does not show it.
     """
-    sensor, robot = _smooth("sensor", times, rates), _smooth("robot", other_times, other_rates)
-
-    def looks_at(offset: float) -> Array:
-        begin, end = max(robot[0][0], sensor[0][0] - offset), min(robot[0][-1], sensor[0][-1] - offset)
-        return np.arange(begin + _AROUND_S, end - _AROUND_S, _STEP_S / 2)
+    sensor, robot = _smooth("sensor", times_ns, rates), _smooth("robot", robot_ns, robot_rates)
 
     def left(looks: Array, offset: float | Array) -> float:
         """The part of the sensor's rates that no rotation of the robot's explains."""
@@ -73,71 +60,59 @@ def find_offset(times: Array, rates: Array, other_times: Array, other_rates: Arr
         felt = at_times(looks + offset, *sensor)
         return float(((felt - basis @ (basis.T @ felt)) ** 2).sum() / (felt.var(axis=0).sum() * len(looks)))
 
-    tried = [
-        (left(looks, offset), offset)
-        for offset in _candidates(sensor, robot)
-        if len(looks := looks_at(offset)) * _STEP_S / 2 > _SHORTEST_S - 4 * _AROUND_S
-    ]
-    (rest, coarse), (other, _) = [*sorted(tried), (1.0, 0.0), (1.0, 0.0)][:2]
+    sizes = [at_times(np.arange(0, times[-1], _STEP_S), times, turned) for times, turned in (sensor, robot)]
+    size = sum(map(len, sizes))
+    felt, turned = (np.fft.rfft(each - each.mean(axis=0), size, axis=0) for each in sizes)
+    found = np.fft.irfft(felt[:, :, np.newaxis] * turned[:, np.newaxis].conj(), size, axis=0)
+    agree, lags = (found**2).sum(axis=(1, 2)), np.arange(size)  # whatever the rotation
+    lags[len(sizes[0]) :] -= size
+    best = int(np.argmax(agree))
+    coarse = float(lags[best]) * _STEP_S
+    begin, end = max(0.0, -coarse), min(robot[0][-1], sensor[0][-1] - coarse)
+    looks = np.arange(begin + _AROUND_S, end - _AROUND_S, _STEP_S / 2)
+    rest = left(looks, coarse) if end - begin > _SHORTEST_S / 2 else 1.0
     if rest > 1 - _EXPLAINED:
         raise RecordingError(
             f"the robot's motion explains only {100 * (1 - rest):.0f} % of the sensor's: record both "
             "at the same time, of one body that turns about several axes"
         )
-    if 1 - other > _OTHER * (1 - rest):
+    if agree[abs(lags - lags[best]) * _STEP_S > _APART_S].max() > _OTHER * agree[best]:
         raise RecordingError("the motion repeats itself, so several offsets fit: move without a rhythm")
-    looks = looks_at(coarse)
     middle, line = float(looks.mean()), np.array([0.0, coarse])
     for around in (np.arange(-_AROUND_S, _AROUND_S, _STEP_S), np.zeros(1)):
         rows = []
         for part in np.array_split(looks, _PARTS):
-            at, expected = part - middle, np.polyval(line, part - middle)
+            expected = np.polyval(line, part - middle)
 
             def missed(offset: float, part: Array = part, expected: Array = expected) -> float:
                 return left(part, expected + offset)
 
-            best = lowest(missed, min(around.tolist(), key=missed), _STEP_S)
-            curve = missed(best - _STEP_S) - 2 * missed(best) + missed(best + _STEP_S)
-            rows.append((at.mean(), best, max(curve, 1e-12) ** 0.5))
+            fits = lowest(missed, min(around.tolist(), key=missed), _STEP_S)
+            curve = missed(fits - _STEP_S) - 2 * missed(fits) + missed(fits + _STEP_S)
+            rows.append((part.mean() - middle, fits, max(curve, 1e-12) ** 0.5))
         at, offsets, weights = np.array(rows).T
         change, covariance = np.polyfit(at, offsets, 1, w=weights, cov=True)
         line = line + change
-    drift_interval, interval = _T_95 * np.sqrt(np.diag(covariance))
-    if not interval * 1e3 < _WIDEST_MS:
+    drift_interval, interval = (_T_95 * np.sqrt(np.diag(covariance))).tolist()
+    if not interval < _WIDEST_S:
         raise RecordingError(
             f"the motion is too slow to tell (± {interval * 1e3:.0f} ms): turn faster, and about several axes"
         )
-    drift, offset = line.tolist()
-    return ClockOffset(middle, offset, float(interval) * 1e3, drift * 1e6, float(drift_interval) * 1e6)
+    stamp_ns, monotonic_ns = (round(at_s * 1e9) for at_s in (middle, middle + line[1]))
+    clock = Clock(int(robot_ns[0]) + stamp_ns, int(times_ns[0]) + monotonic_ns, float(line[0]) * 1e6)
+    return clock, {"interval_ms": interval * 1e3, "drift_interval_ppm": drift_interval * 1e6}
 
 
-def _smooth(which: str, times: Array, rates: Array) -> tuple[Array, Array]:
-    """Even times, and the rates at these; RecordingError if they are too few or too small."""
-    if times[-1] - times[0] < _SHORTEST_S:
+def _smooth(which: str, stamps_ns: Ints, rates: Array) -> tuple[Array, Array]:
+    """Even times from 0 on, s, and the rates at these; RecordingError if they are too few or too small."""
+    times = (stamps_ns - stamps_ns[0]) * 1e-9
+    if times[-1] < _SHORTEST_S:
         raise RecordingError(f"the {which} was recorded for less than {_SHORTEST_S:g} s: record a minute")
     if np.linalg.norm(rates.std(axis=0)) < _LEAST_RATE:
         raise RecordingError(f"the {which} hardly turned: turn it about several axes")
     period = float(np.median(np.diff(times)))
-    even = np.arange(times[0], times[-1], period)
+    even = np.arange(0, times[-1], period)
     return even, smoothed(at_times(even, times, rates), hann_window(_SMOOTH_S, period))
-
-
-def _candidates(sensor: tuple[Array, Array], robot: tuple[Array, Array]) -> list[float]:
-    """The offsets at which the magnitudes of the rates agree best, s."""
-    sizes = [
-        np.linalg.norm(at_times(np.arange(even[0][0], even[0][-1], _STEP_S), *even), axis=1)
-        for even in (sensor, robot)
-    ]
-    size = sum(map(len, sizes))
-    spectra = [np.fft.rfft(each - each.mean(), size) for each in sizes]
-    found, offsets = np.fft.irfft(spectra[0] * spectra[1].conj(), size), list[float]()
-    apart = round(_APART_S / _STEP_S)
-    for _ in range(_CANDIDATES):
-        best = int(np.argmax(found))
-        lag = best if best < len(sizes[0]) else best - size
-        offsets.append(float(sensor[0][0] - robot[0][0]) + lag * _STEP_S)
-        found[np.arange(best - apart, best + apart + 1) % size] = -np.inf
-    return offsets
 
 
 def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[Ints, Array]:
@@ -145,18 +120,18 @@ def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[
     joints = [] if urdf is None else _chain(urdf, link)
     turning = [name for name, _, axis in joints if axis.any()]
     stamps, rows = list[int](), list[list[float]]()
-    for message in messages(path, topic):
+    for stamp, message in messages(path, topic):
         if hasattr(message, "angular_velocity"):
             rate, joints = message.angular_velocity, []
-            rows.append([rate.x, rate.y, rate.z])
+            row = [rate.x, rate.y, rate.z]
         elif not joints or not hasattr(message, "position"):
             raise RecordingError(f"{topic} is no sensor_msgs/Imu, and no JointState with --urdf and --link")
-        elif set(turning) <= set(message.name):  # else of another part of the robot, a gripper say
-            at = dict(zip(message.name, message.position, strict=True))
-            rows.append([at[name] for name in turning])
         else:
-            continue
-        stamps.append(stamp_ns(message, topic))
+            at = dict(zip(message.name, message.position, strict=True))
+            row = [at[name] for name in turning if name in at]
+        if len(row) == len(turning) or not joints:  # else of another part of the robot, a gripper say
+            stamps.append(stamp)
+            rows.append(row)
     if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
         raise RecordingError(
             f"the messages of {topic} in {path} are too few, or not in the order of their stamps"
@@ -217,13 +192,11 @@ def run(options: argparse.Namespace) -> int:
     if (np.diff(instants) <= 0).any():
         raise RecordingError("the server's machine was restarted during the recording: record again")
     stamps, robot_rates = _robot_rates(options.bag, options.topic, options.urdf, options.link)
-    found = find_offset((instants - instants[0]) * 1e-9, rates, (stamps - stamps[0]) * 1e-9, robot_rates)
-    at_ns, offset_ns = round(found.at_s * 1e9), round(found.offset_s * 1e9)
-    clock = Clock(int(stamps[0]) + at_ns, int(instants[0]) + at_ns + offset_ns, found.drift_ppm)
+    clock, intervals = find_offset(instants, rates, stamps, robot_rates)
     # The server's clocks are as far apart as at the end of the recording.
     apart_ns = frames[-1].stamp_ns - frames[-1].monotonic_ns
-    values = clock._asdict() | {"offset_ms": (clock.monotonic_ns + apart_ns - clock.stamp_ns) * 1e-6}
-    values |= {"interval_ms": found.interval_ms, "drift_interval_ppm": found.drift_interval_ppm}
+    offset_ms = (clock.monotonic_ns + apart_ns - clock.stamp_ns) * 1e-6
+    values = clock._asdict() | {"offset_ms": offset_ms} | intervals
     text = (
         "to stamps of {topic} add {offset_ms:+.2f} ms (± {interval_ms:.2f} ms, 95 %) at {when}, and "
         "{drift_ppm:+.1f} ppm (± {drift_interval_ppm:.1f}) of the time since then: that is the server's "

@@ -134,7 +134,9 @@ class FrameTimes:
 
 def _interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
     """One clock by another, in ns, without loss of digits."""
-    return there[0] + np.rint(np.interp(at - here[0], here - here[0], there - there[0])).astype(np.int64)
+    return np.asarray(
+        there[0] + np.rint(np.interp(at - here[0], here - here[0], there - there[0])).astype(np.int64)
+    )
 
 
 def read_stamps(path: Path, column: str = "timestamp", topic: str | None = None) -> Ints:
@@ -145,7 +147,7 @@ def read_stamps(path: Path, column: str = "timestamp", topic: str | None = None)
     if topic is None:
         stamps = _read_column(path, column)
     else:
-        stamps = np.array([stamp_ns(message, topic) for message in messages(path, topic)], np.int64)
+        stamps = np.array([stamp for stamp, _ in messages(path, topic)], np.int64)
     if not len(stamps):
         raise RecordingError(f"{path} has no frames")
     if (wrong := np.flatnonzero((stamps < 0) | (stamps > _LATEST_NS))).size:
@@ -171,8 +173,11 @@ def _read_column(path: Path, column: str) -> Ints:
         ) from None
 
 
-def messages(path: Path, topic: str) -> Iterator[Any]:
-    """The messages of a topic of a ROS bag (the folder, .mcap, .db3, .bag); RecordingError."""
+def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
+    """`header.stamp`, ns since 1970, and message, of a topic of a ROS bag (folder, .mcap, .db3, .bag).
+
+    RecordingError.
+    """
     from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 - of the extra `dataset`
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
@@ -183,13 +188,10 @@ def messages(path: Path, topic: str) -> Iterator[Any]:
                 there = ", ".join(sorted({each.topic for each in bag.connections}))
                 raise RecordingError(f"{path} has no topic {topic}, but {there}")
             for connection, _, data in bag.messages(chosen):
-                yield bag.deserialize(data, connection.msgtype)
+                message: Any = bag.deserialize(data, connection.msgtype)
+                stamp = message.header.stamp
+                yield int(stamp.sec) * _SECOND + int(stamp.nanosec), message
+    except AttributeError:
+        raise RecordingError(f"messages of {topic} in {path} have no header, so no time") from None
     except (AnyReaderError, FileNotFoundError) as error:
         raise RecordingError(f"{path} cannot be read as a bag: {error}") from None
-
-
-def stamp_ns(message: Any, topic: str) -> int:
-    """Its `header.stamp`, ns since 1970; RecordingError if it has none."""
-    if not hasattr(message, "header"):
-        raise RecordingError(f"messages of {topic} have no header, so it is not known when they were stamped")
-    return int(message.header.stamp.sec) * _SECOND + int(message.header.stamp.nanosec)
