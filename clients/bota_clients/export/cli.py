@@ -5,16 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from bota_clients.arguments import add_force, add_imu_units, number, position, typed
+from bota_clients.arguments import add_force, add_imu_units, number, position
 from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.errors import FileError
 from bota_ethercat.program.arguments import Parser
-
-if TYPE_CHECKING:
-    from bota_clients.recording.reader import Recording
 
 PROGRAM: Final = "ethercat-export"
 DATASETS: Final = (".parquet", ".zarr", ".npz")
@@ -44,7 +42,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     add = group.add_argument
     add("--column", metavar="NAME", default="timestamp", help="the column of FRAMES (default timestamp)")
     add("--topic", metavar="TOPIC", help="the topic of the bag; its header.stamp is taken")
-    add("--window", type=typed(_window, f"from 1 to {_MOST_SAMPLES}"), default=32, metavar="K",
+    add("--window", type=number(1, _MOST_SAMPLES), default=32, metavar="K",
         help="samples for each frame (default 32)")  # fmt: skip
     add("--latency", type=number(-60, 60), default=0.0, metavar="S",
         help="seconds from a frame's exposure to its stamp (default 0)")  # fmt: skip
@@ -88,14 +86,8 @@ def _add_recording(made: argparse.ArgumentParser) -> None:
     add_imu_units(made)
 
 
-def _window(text: str) -> int:
-    if 1 <= (samples := int(text)) <= _MOST_SAMPLES:
-        return samples
-    raise ValueError
-
-
-def export(options: argparse.Namespace, write: Callable[[Recording, Advance], str]) -> int:
-    """Have the output written, and say what `write` says of it; returns the exit code.
+def run(options: argparse.Namespace) -> int:
+    """Have the output written, and say what `write` of its module says of it; returns the exit code.
 
     Ctrl-C ends it at any time and leaves no file.
     """
@@ -104,6 +96,9 @@ def export(options: argparse.Namespace, write: Callable[[Recording, Advance], st
 
     from bota_clients.recording.reader import open_recording  # noqa: PLC0415
 
+    write = import_module(
+        f"bota_clients.export.{'dataset' if options.output.suffix in DATASETS else 'table'}"
+    ).write
     interrupt_on_signals()
     console = Console(stderr=True)
     progress = Progress(console=console, transient=True, disable=not console.is_terminal)
@@ -114,7 +109,7 @@ def export(options: argparse.Namespace, write: Callable[[Recording, Advance], st
                 say(PROGRAM, f"{recording.path} {how}")
             chosen = [each.frames for each in recording.sensors if options.sensor in {None, each.sensor}]
             task = progress.add_task("", total=sum(chosen))
-            written = write(recording, lambda frames: progress.advance(task, frames))
+            written = write(options, recording, lambda frames: progress.advance(task, frames))
     except KeyboardInterrupt:
         say(PROGRAM, "stopped: nothing was written")
         return 1
@@ -129,5 +124,4 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["align"]:
         return start(PROGRAM, "export.align", parse_align(given[1:]))
-    options = parse_options(given)
-    return start(PROGRAM, f"export.{'dataset' if options.output.suffix in DATASETS else 'table'}", options)
+    return start(PROGRAM, "export.cli", parse_options(given))

@@ -12,16 +12,14 @@ import json
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from bota_clients.export.cli import DATASETS, PROGRAM, Advance, export
+from bota_clients.export.cli import DATASETS, PROGRAM, Advance
 from bota_clients.export.frame_times import Clock, FrameTimes, read_stamps
-from bota_clients.export.windows import Arrays, Tool, Windows
+from bota_clients.export.windows import Arrays, Windows, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.reader import Recording
@@ -67,29 +65,25 @@ def windows_of(
         raise times.refusal(done, windows.until_ns)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Export; returns the exit code."""
-    return export(options, partial(_write, options))
-
-
-def _write(options: argparse.Namespace, recording: Recording, advance: Advance) -> str:
+def write(options: argparse.Namespace, recording: Recording, advance: Advance) -> str:
+    """Windows for the frames that are asked for, into a file; says of how many samples."""
     clock = options.clock and Clock.read(options.clock)
-    tool = options.tool and Tool.read(options.tool)
+    tool = options.tool and read_tool(options.tool)
     stamps = options.at and read_stamps(options.at, options.column, options.topic)
     times = FrameTimes(
         stamps, fps=options.fps or 0.0, latency_s=options.latency, clock=clock, source=str(options.at)
     )
-    windows = Windows(options.window, hold=options.hold, tool=tool, imu_units=options.imu_units)
-    sensor, path = choose(recording, options.sensor), options.output
+    length, sensor, path = int(options.window), choose(recording, options.sensor), options.output
+    windows = Windows(length, hold=options.hold, tool=tool, imu_units=options.imu_units)
     about = {
         "program": f"{PROGRAM} {VERSION}",
         "options": vars(options),
         "recording": recording.metadata,
-        "sensor": sensor.history[0].identity._asdict() if sensor.history else {},
         # In force from `stamp_ns` on, with delays of the filters; null: unknown, and taken to be 0.
         "settings": [
-            {
-                **row.values, "stamp_ns": row.stamp_ns, "rate_hz": row.rate_hz,
+            row._asdict()
+            | {
+                "identity": row.identity._asdict(),
                 "delay_ms": delays_ms(known_settings(row.values), row.rate_hz),
             }
             for row in sensor.history
@@ -97,8 +91,8 @@ def _write(options: argparse.Namespace, recording: Recording, advance: Advance) 
         "units": _UNITS,
         "frames": {"force_torque": "ft_sensor", "imu": "ft_sensor_imu"},
         "clock": clock and clock._asdict(),
-        "tool": tool and asdict(tool),
-    }  # fmt: skip
+        "tool": tool,
+    }
     if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
         raise FileError(f"{path} {EXISTS}")
     with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
@@ -107,7 +101,7 @@ def _write(options: argparse.Namespace, recording: Recording, advance: Advance) 
         if path.is_dir():
             shutil.rmtree(path)
         made.replace(path)
-    return f"windows of {count(options.window, 'sample')}"
+    return f"windows of {count(length, 'sample')}"
 
 
 def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:

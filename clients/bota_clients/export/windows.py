@@ -14,9 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self, cast
+from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -31,17 +30,7 @@ from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import SettingValue, known_settings
 from ft_compensation.alignment import align
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import (
-    EXACT,
-    NO_PAYLOAD,
-    NO_WRENCH,
-    STILL,
-    ZERO,
-    Accelerometer,
-    Payload,
-    Turning,
-    Wrench,
-)
+from ft_compensation.quantities import EXACT, NO_WRENCH, STILL, ZERO, Accelerometer, Payload, Turning, Wrench
 from ft_compensation.specific_force import ImuSpecificForce
 from ft_compensation.stationary import BAD_WRENCH
 
@@ -57,38 +46,19 @@ _SLOT: Final = np.dtype([
 ])  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Tool:
-    """What is subtracted for the compensated wrench."""
+def read_tool(path: Path) -> Mapping[str, Any]:
+    """Parameters of the ROS 2 node, as `ethercat-identify --yaml` writes them; RecordingError."""
+    import yaml  # noqa: PLC0415 - of the extra `dataset`
 
-    payload: Payload = NO_PAYLOAD
-    bias: Wrench = NO_WRENCH
-    accelerometer: Accelerometer = EXACT
-    imu_position: Vector3 = ZERO  # m from the wrench origin; zeros: by the sensor's model
-
-    @classmethod
-    def read(cls, path: Path) -> Self:
-        """Parameters of the ROS 2 node, as `ethercat-identify --yaml` writes them; RecordingError."""
-        import yaml  # noqa: PLC0415 - of the extra `dataset`
-
-        try:
-            rows: Any = yaml.safe_load(path.read_bytes())["/**"]["ros__parameters"]
-            corrected = {
-                name: tuple(rows.get(f"accelerometer.{name}", EXACT[at]))
-                for at, name in enumerate(EXACT._fields)
-            }
-            inertia = tuple(rows.get("tool_inertia", NO_PAYLOAD.inertia))
-            return cls(
-                Payload(rows["tool_mass"], tuple(rows["tool_center_of_gravity"]), inertia),
-                Wrench.of(rows.get("bias", NO_WRENCH.values)),
-                Accelerometer(**corrected),
-                tuple(rows.get("imu_position", ZERO)),
-            )
-        except (OSError, yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError) as error:
-            why = " ".join(str(error).split())
-            raise RecordingError(
-                f"{path} does not have a tool's parameters, as ethercat-identify --yaml writes them: {why}"
-            ) from None
+    try:
+        found: Mapping[str, Any] = yaml.safe_load(path.read_bytes())["/**"]["ros__parameters"]
+        Windows(1, tool=found)
+    except (OSError, yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError) as error:
+        why = " ".join(str(error).split())
+        raise RecordingError(
+            f"{path} does not have a tool's parameters, as ethercat-identify --yaml writes them: {why}"
+        ) from None
+    return found
 
 
 class Windows:
@@ -103,18 +73,26 @@ class Windows:
         length: int,
         *,
         hold: bool = False,
-        tool: Tool | None = None,
+        tool: Mapping[str, Any] | None = None,
         imu_units: ImuUnits = ImuUnits.G_DPS,
     ) -> None:
-        """Of `length` samples. With a `tool` there is a compensated wrench.
+        """Of `length` samples. With a `tool`, parameters of the ROS 2 node, there is a compensated wrench.
 
         `hold`: an empty slot has value and age of the last valid one of its window, instead of NaN.
         """
         self.begin_ns = -1
-        self._length, self._hold, self._tool, self._units = length, hold, tool, imu_units
+        self._length, self._hold, self._units, self._compensator = length, hold, imu_units, None
         self._slots = np.zeros(0, _SLOT)
         self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._in_force: tuple[Mapping[str, object], float] | None = None
+        if tool is None:
+            return
+        center, inertia = tuple(tool["tool_center_of_gravity"]), tuple(tool.get("tool_inertia", (0.0,) * 6))
+        self._payload = Payload(float(tool["tool_mass"]), center, inertia)
+        self._compensator = Compensator(self._payload, Wrench.of(tool.get("bias", NO_WRENCH.values)))
+        rows = {name: tool.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
+        self._accelerometer = Accelerometer(**{name: tuple(row) for name, row in rows.items()})
+        self._imu_position: Vector3 = tuple(tool.get("imu_position", ZERO))
 
     def configure(self, settings: Mapping[str, object], rate_hz: float, name: str = "") -> None:
         """Settings and rate of what follows, as `describe` has them; the sensor's `name`; RecordingError."""
@@ -125,14 +103,14 @@ class Windows:
         self._in_force, self._known, self._rate_hz = (settings, rate_hz), known_settings(settings), rate_hz
         # Where a delay is unknown, a sample counts as measured only when it was stamped: never too early.
         self._delay_ns = np.array([delay or 0 for delay in Delays.parse(delays_ms(self._known, rate_hz))])
-        if self._tool is None:
+        if self._compensator is None:
             return
-        (cx, cy, cz), position = self._tool.payload.center, self._tool.imu_position
+        (cx, cy, cz), position = self._payload.center, self._imu_position
         x, y, z = position if any(position) else (0.0, 0.0, IMU_HEIGHTS.get(name[4:8], 0.0))
         alignment = align(self._known, rate_hz)
-        self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), self._tool.accelerometer, alignment)
+        self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), self._accelerometer, alignment)
         wrong: dict[str, SettingValue] = {"calibration_matrix": False}
-        if self._tool.payload.mass:
+        if self._payload.mass:
             wrong |= {"inertia_compensation": True, "coordinate_system": True, "imu_active": 0}
         if found := [setting for setting, value in wrong.items() if self._known.get(setting) == value]:
             raise RecordingError(f"the wrench cannot be compensated by how {found[0]} was set: omit --tool")
@@ -177,26 +155,26 @@ class Windows:
         )
         for channel, (part, bits) in enumerate(zip(_CHANNELS.values(), wrong, strict=True)):
             slots["valid"][end, channel] = (bits == 0) & np.isfinite(values[:, part]).all(axis=1)
-        if self._tool is not None:
-            slots["compensated"][end] = self._compensated(samples, self._tool)
+        slots["compensated"][end] = self._compensated(samples)
         self._slots = np.concatenate([self._slots, slots])
         return samples
 
-    def _compensated(self, samples: Columns, tool: Tool) -> Array:
-        """(n, 6) N, Nm, as the ROS 2 node has it."""
+    def _compensated(self, samples: Columns) -> Array | float:
+        """(n, 6) N, Nm, as the ROS 2 node has it; NaN without a tool."""
+        if self._compensator is None:
+            return math.nan
         felt, turning = np.zeros((len(samples), 3)), cast(Any, STILL)
-        if tool.payload.mass:
-            follow, rows, turned = self._imu.follow, list[Vector3](), list[Turning]()
-            times = (samples.monotonic_ns * 1e-9).tolist()
-            for acceleration, rate, time_s in zip(
-                samples.acceleration.tolist(), samples.angular_rate.tolist(), times, strict=True
-            ):
-                rows.append((any(acceleration) and follow(acceleration, rate, time_s)) or _UNKNOWN)
+        if self._payload.mass:
+            rows, turned = list[Vector3](), list[Turning]()
+            times = samples.monotonic_ns * 1e-9
+            each = (column.tolist() for column in (samples.acceleration, samples.angular_rate, times))
+            for acceleration, rate, time_s in zip(*each, strict=True):
+                rows.append((any(acceleration) and self._imu.follow(acceleration, rate, time_s)) or _UNKNOWN)
                 turned.append(self._imu.turning)
             felt = np.array(rows)
-            if any(tool.payload.inertia):
+            if any(self._payload.inertia):
                 turning = np.moveaxis(np.array(turned), 0, 2)
-        compensate = cast(Any, Compensator(tool.payload, tool.bias).compensate)  # of arrays as of numbers
+        compensate = cast(Any, self._compensator.compensate)  # of arrays as of numbers
         return np.vstack(compensate(samples.force.T, samples.torque.T, felt.T, turning).final).T
 
     def at(self, instants_ns: Ints) -> Arrays:
@@ -223,7 +201,7 @@ class Windows:
             values, wrench = slots["values"][index, part], slots["compensated"][index]
             age_s[empty] = values[empty] = wrench[empty] = math.nan
             found |= {name: values, f"{name}_age": age_s.astype(np.float32), f"{name}_valid": valid}
-            if self._tool is not None and not channel:
+            if self._compensator is not None and not channel:
                 found[f"{name}_compensated"] = wrench
                 found[f"{name}_compensated_valid"] = valid & np.isfinite(wrench).all(axis=2)
         found["imu"] = np.concatenate([found.pop("acceleration"), found.pop("angular_rate")], axis=2)
