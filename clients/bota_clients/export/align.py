@@ -20,11 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.cli import PROGRAM
-from bota_clients.export.frame_times import Clock, messages
+from bota_clients.export.dataset import Clock, messages
 from bota_clients.identify.program import choose
-from bota_clients.numbers import moment
-from bota_clients.program import interrupt_on_signals, say
+from bota_clients.program import interrupt_on_signals
 from bota_clients.recording.columns import Ints, decode
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import angular_rate_response
@@ -197,11 +195,5 @@ def run(options: argparse.Namespace) -> int:
     apart_ns = frames[-1].stamp_ns - frames[-1].monotonic_ns
     offset_ms = (clock.monotonic_ns + apart_ns - clock.stamp_ns) * 1e-6
     values = clock._asdict() | {"offset_ms": offset_ms} | intervals
-    text = (
-        "to stamps of {topic} add {offset_ms:+.2f} ms (± {interval_ms:.2f} ms, 95 %) at {when}, and "
-        "{drift_ppm:+.1f} ppm (± {drift_interval_ppm:.1f}) of the time since then: that is the server's "
-        "CLOCK_REALTIME"
-    )
-    say(PROGRAM, text.format(topic=options.topic, when=moment(clock.stamp_ns), **values))
     sys.stdout.write(json.dumps(values, indent=1) + "\n")
     return 0

@@ -10,6 +10,7 @@ chunk; `cut_off` says so. `columns.py` gives NumPy arrays.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -213,22 +214,17 @@ class Recording(McapFile):
 
     def batches(self, sensor: int) -> Iterator[tuple[Settings, list[DataMessage]]]:
         """Frames of the sensor at this position, a few thousand at once, with the settings in force."""
-        histories, frames = Histories(), list[DataMessage]()
-        known = [each.history for each in self.sensors if each.sensor == sensor and each.history]
-        settings = known[0][0] if known else Settings()
-        for item in self.everything(sensor):
-            if isinstance(item, DataMessage):
-                frames.append(item)
-                if len(frames) < _BATCH:
-                    continue
-            else:
-                histories.take(item)
-            if frames:
-                yield settings, frames
-                frames = []
-            settings = (histories.of(sensor) or (settings,))[-1]
-        if frames:
-            yield settings, frames
+        histories = Histories()
+        known = [each.history[0] for each in self.sensors if each.sensor == sensor and each.history]
+        settings = known[0] if known else Settings()
+        for kind, items in itertools.groupby(self.everything(sensor), type):
+            while batch := cast(Any, [*itertools.islice(items, _BATCH)]):
+                if kind is DataMessage:
+                    yield settings, batch
+                else:
+                    for note in batch:
+                        histories.take(note)
+                    settings = (histories.of(sensor) or (settings,))[-1]
 
     def _channels(self, sensor: int | None) -> set[int]:
         return {number for number, position in self._sensor_of.items() if sensor in (None, position)}
