@@ -12,27 +12,24 @@ from rosbags.typesys import Stores, get_typestore
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES: Any = STORE.types
+NONE = np.zeros(9)
 
 
 def _header(stamp_ns: int) -> Any:
-    time = TYPES["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), 10**9))
-    return TYPES["std_msgs/msg/Header"](time, "")
+    return TYPES["std_msgs/msg/Header"](TYPES["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9)), "")
 
 
 def imu(stamp_ns: int, rate: Sequence[float] = (0.0, 0.0, 0.0)) -> Any:
     """sensor_msgs/Imu with this angular rate, rad/s."""
-    vector, none = TYPES["geometry_msgs/msg/Vector3"], np.zeros(9)
-    turned = TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    return TYPES["sensor_msgs/msg/Imu"](
-        _header(stamp_ns), turned, none, vector(*rate), none, vector(0.0, 0.0, 0.0), none
-    )
+    vector, turned = TYPES["geometry_msgs/msg/Vector3"], TYPES["geometry_msgs/msg/Quaternion"](0, 0, 0, 1)
+    parts = turned, NONE, vector(*rate), NONE, vector(0, 0, 0), NONE
+    return TYPES["sensor_msgs/msg/Imu"](_header(stamp_ns), *parts)
 
 
 def joint_states(stamp_ns: int, **positions: float) -> Any:
     """sensor_msgs/JointState, rad."""
-    none = np.zeros(0)
     values = np.array([*positions.values()])
-    return TYPES["sensor_msgs/msg/JointState"](_header(stamp_ns), [*positions], values, none, none)
+    return TYPES["sensor_msgs/msg/JointState"](_header(stamp_ns), [*positions], values, NONE[:0], NONE[:0])
 
 
 def write_bag(path: Path, topic: str, messages: Sequence[Any]) -> Path:

@@ -35,10 +35,11 @@ URDF = """<robot name="arm">
 
 
 def about(axis: int, angle: float) -> Array:
-    c, s = math.cos(angle), math.sin(angle)
-    rotation = np.eye(3)
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    rotation[[first, first, second, second], [first, second, first, second]] = c, -s, s, c
+    """(3, 3): turned about a coordinate axis, rad."""
+    rotation, (a, b) = np.eye(3), ((axis + 1) % 3, (axis + 2) % 3)
+    rotation[a, a] = rotation[b, b] = math.cos(angle)
+    rotation[b, a] = math.sin(angle)
+    rotation[a, b] = -rotation[b, a]
     return rotation
 
 

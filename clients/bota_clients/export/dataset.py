@@ -138,15 +138,15 @@ def _interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
     return np.asarray(there[0] + np.rint(passed).astype(np.int64))
 
 
-def read_stamps(path: Path, column: str = "timestamp", topic: str | None = None) -> Ints:
-    """The frames' stamps, ns since 1970: of a column, or the `header.stamp` of a topic; RecordingError.
+def read_stamps(path: Path, name: str = "timestamp") -> Ints:
+    """The frames' stamps, ns since 1970: a column, or the `header.stamp` of a bag's topic; RecordingError.
 
     A column has times (ISO 8601), integers, ns since 1970, or other numbers, s since 1970.
     """
-    if topic is None:
-        stamps = _read_column(path, column)
+    if path.suffix in (".csv", ".parquet"):
+        stamps = _read_column(path, name)
     else:
-        stamps = np.array([stamp for stamp, _ in messages(path, topic)], np.int64)
+        stamps = np.array([stamp for stamp, _ in messages(path, name)], np.int64)
     if not len(stamps):
         raise RecordingError(f"{path} has no frames")
     return stamps
@@ -166,7 +166,7 @@ def _read_column(path: Path, column: str) -> Ints:
         return np.asarray(found.to_numpy().astype(np.int64))
     except (OSError, KeyError, pa.ArrowInvalid) as error:
         raise RecordingError(
-            f"{path} has no times in a column {column} (choose one with --column; of a bag, --topic): {error}"
+            f"{path} has no times in a column {column} (choose one with --column): {error}"
         ) from None
 
 
@@ -233,7 +233,7 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
     if options.at is None:
         times = FrameTimes.at_rate(options.fps, clock_history(recording, sensor.sensor))
     else:
-        stamps = read_stamps(options.at, options.column, options.topic)
+        stamps = read_stamps(options.at, options.column)
         clocks = clock.history() if clock else clock_history(recording, sensor.sensor)
         times = FrameTimes.of(stamps, clocks, str(options.at), options.latency)
     windows = Windows(length, hold=options.hold, tool=tool, imu_units=options.imu_units)
