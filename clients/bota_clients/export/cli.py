@@ -41,7 +41,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--fps", type=number(1e-3, 1e5), metavar="HZ", help="frames at this rate")
     add = group.add_argument
     add("--column", "--topic", dest="column", metavar="NAME", default="timestamp",
-        help="the column of a table (default timestamp), or the topic of a bag (its header.stamp)")  # fmt: skip
+        help="column of a table (default timestamp), or topic of a bag (its header.stamp)")  # fmt: skip
     add("--window", type=number(1, _MOST_SAMPLES), default=32, metavar="K",
         help="samples for each frame (default 32)")  # fmt: skip
     add("--latency", type=number(-60, 60), default=0.0, metavar="S",

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.recording.columns import Columns, Ints, decode
+from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.client.reading import Delays
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, Vector3
@@ -120,12 +121,11 @@ class Windows:
         """The last instant of which nothing that comes later can be a part; -1 before the first sample."""
         return int(self._slots["measured_ns"].max(axis=0, initial=-1).min())
 
-    def take(self, frames: Sequence[DataMessage]) -> Columns:
-        """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
-        table = decode(frames, self._units)
-        samples = table.where(table.fresh)
+    def take(self, frames: Sequence[DataMessage]) -> None:
+        """Take the next frames of the sensor, also REPEATED and INVALID ones; RecordingError."""
+        samples = decode((each for each in frames if not each.flags & NOT_NEW), self._units)
         if not len(samples):
-            return samples
+            return
         stamps, sequence = samples.monotonic_ns, samples.sequence
         if self.begin_ns < 0:
             self.begin_ns, self._newest = int(stamps[0]), (int(stamps[0]) - 1, int(sequence[0]) - 1)
@@ -157,7 +157,6 @@ class Windows:
             slots["valid"][end, channel] = (bits == 0) & np.isfinite(values[:, part]).all(axis=1)
         slots["compensated"][end] = self._compensated(samples)
         self._slots = np.concatenate([self._slots, slots])
-        return samples
 
     def _compensated(self, samples: Columns) -> Array | float:
         """(n, 6) N, Nm, as the ROS 2 node has it; NaN without a tool."""
@@ -184,10 +183,8 @@ class Windows:
         of each channel `..._age` (f, length) s before the instant and `..._valid` (f, length). ValueError for
         an instant after `until_ns`.
         """
-        if len(instants_ns) and instants_ns[-1] > self.until_ns:
-            raise ValueError(
-                f"{instants_ns[-1]} ns is after {self.until_ns} ns: its samples are not all here"
-            )
+        if (instants_ns > self.until_ns).any():
+            raise ValueError(f"after {self.until_ns} ns not all samples are here: take more")
         slots, found = self._slots, Arrays()
         for channel, (name, part) in enumerate(_CHANNELS.items()):
             index = self._ends(instants_ns, channel)[:, np.newaxis] + np.arange(-self._length, 0)
@@ -196,10 +193,9 @@ class Windows:
             if self._hold:
                 held = np.maximum.accumulate(np.where(valid, np.arange(self._length), -1), axis=1)
                 index, filled = np.take_along_axis(index, held, 1), held >= 0
-            empty = ~filled
             age_s = (instants_ns[:, np.newaxis] - slots["measured_ns"][index, channel]) * 1e-9
             values, wrench = slots["values"][index, part], slots["compensated"][index]
-            age_s[empty] = values[empty] = wrench[empty] = math.nan
+            age_s[~filled] = values[~filled] = wrench[~filled] = math.nan
             found |= {name: values, f"{name}_age": age_s.astype(np.float32), f"{name}_valid": valid}
             if self._compensator is not None and not channel:
                 found[f"{name}_compensated"] = wrench
