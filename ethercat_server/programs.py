@@ -6,7 +6,7 @@ from pathlib import PurePath
 
 from bota_ethercat.program import start
 
-# What is missing after `pip install --no-deps .`, and on other systems.
+# What is missing after `pip install --no-deps`, and on other systems.
 _NEEDED = frozenset({"pysoem", "pyroute2", "fcntl", "grp", "pwd", "resource"})
 
 

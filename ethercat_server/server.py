@@ -15,6 +15,7 @@ from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import Wanted, bring_up
 from ethercat_server.acquisition.stream import make_streams
+from ethercat_server.acquisition.terminals import CycleWithTerminals
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.serving.actions import Actions
@@ -62,19 +63,21 @@ class Server:
         of `describe`.
         """
         self.bus, self.hub = bus, hub
-        self.sensors, slaves = bring_up(bus, wanted, check_interrupt)
+        self.sensors, slaves, terminals = bring_up(bus, wanted, check_interrupt)
         timing = ExchangeTiming(bus.clock.monotonic_ns())
         self.streams = make_streams(bus, self.sensors, timing)
         self.others = OtherSlaves(bus, slaves)
         self.recovery = Recovery(bus, self.sensors, self.streams, hub.broadcast, self.others)
         self.jobs = Jobs(bus, self.sensors)
-        self.cycle = Cycle(
+        self.cycle = (CycleWithTerminals if terminals else Cycle)(
             bus, self.sensors, self.streams, timing, hub, self.recovery, self.jobs, watchdog or NoWatchdog()
         )
+        extra = {"others": self.others.rows, **(extra or {})}
+        if isinstance(self.cycle, CycleWithTerminals):
+            self.cycle.terminals = terminals
+            extra["terminals"] = [terminal.row for terminal in terminals]
         self.actions = SensorActions(bus, hub, self.recovery, self.jobs, self.sensors, self.streams)
-        hub.start(
-            Actions(hub, self.cycle, self.actions, {"others": self.others.rows, **(extra or {})}).handle
-        )
+        hub.start(Actions(hub, self.cycle, self.actions, extra).handle)
 
     def run(self) -> None:
         """Stream until `stop`; then tell the clients."""

@@ -26,6 +26,7 @@ import contextlib
 import functools
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -59,7 +60,8 @@ from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
-from ethercat_server.virtual_sensor.signals import ClockReading, decode_clock
+from ethercat_server.virtual_sensor.world import ToldWorld, World
+from scripts.benchmarks.records import ClockReading, decode_clock
 from tests.server.running import OLD, Commanded, FramedClient
 
 PATIENCE_S = 60.0  # simulated time that anything may take
@@ -89,8 +91,12 @@ class Asked:
     sensor_name: str | None = None
     force = False
 
-    def __init__(self, settings: Mapping[str, SettingValue] = {}, *, keep_unset: bool = False) -> None:
+    def __init__(
+        self, settings: Mapping[str, SettingValue] = {}, *, keep_unset: bool = False,
+        terminals: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         self._settings = dict(settings)
+        self.terminals = terminals
         self.keep_unset = keep_unset
 
     def wanted_settings(self, _position: int, _name: str, _serial: int) -> dict[str, SettingValue]:
@@ -202,11 +208,20 @@ class Simulation(SimulatedBus):
         settings: Mapping[str, SettingValue] = {},
         backend: MemoryBackend | None = None,
         wanted: Wanted | None = None,
+        world: World | None = None,
         **extra: object,
     ) -> None:
-        """`backend` is that of a simulation before, for a server that is started again."""
+        """`backend` is that of a simulation before, for a server that is started again.
+
+        The sensors feel `world`, which is asked once a millisecond, with the simulated time, s.
+        """
+        told = ToldWorld()
+        if world is not None:
+            sensors = tuple(replace(each, world=told) for each in sensors or (SensorOptions(),))
         super().__init__(backend or MemoryBackend(*sensors, machine=machine))
         self.started_ns = self.clock.now_ns
+        if world is not None:
+            self._ask(world, told, 0)
         self.transport = InMemoryTransport(self.clock)
         self.frames: list[DataMessage] = []
         self.published_ns: list[int] = []  # when each was handed out
@@ -222,6 +237,12 @@ class Simulation(SimulatedBus):
         self.recovery, self.jobs, self.cycle = self.server.recovery, self.server.jobs, self.server.cycle
         self.clients: list[Client] = []
         self.hangs = False  # whether somebody has stopped it; time passes all the same
+
+    def _ask(self, world: World, told: ToldWorld, step: int) -> None:
+        """Tell the sensors what they feel in this millisecond, and in the following."""
+        due_ns = self.started_ns + step * 1_000_000
+        told.tell(due_ns * 1e-9, world(step * 1e-3), due_ns * 1e-9)
+        self.clock.at(due_ns + 1_000_000, functools.partial(self._ask, world, told, step + 1))
 
     def listen(self) -> Transport:
         """Where its clients come from."""

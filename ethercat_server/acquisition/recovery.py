@@ -19,7 +19,7 @@ from ethercat_server.acquisition.health import Causes
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, extended
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.clock import Clock, Deadline
 from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
@@ -67,6 +67,40 @@ class _Change(NamedTuple):
     done: Callable[[BusError | None], None]
     failed: BusError | None = None
     until: Deadline | None = None  # once it has failed: when it is answered even if the sensor is not back
+
+
+def pause(clock: Clock, seconds: float) -> Steps[None]:
+    """Steps that take at least `seconds`."""
+    deadline = Deadline(clock, seconds)
+    while not deadline.passed:
+        yield
+
+
+def restore_station(bus: Bus, number: int, position: int, is_kind: Callable[[int, int], bool]) -> Steps[bool]:
+    """Give a slave that lost its station address with its power the address again; whether it has it.
+
+    One that has another slave's address, is not in INIT, or whose vendor and product are of another kind, is
+    left alone; which one of its kind it is remains to be asked.
+    """
+    data = bus.read_at(position, reg.STATION_ADDRESS, 2)
+    if data is None:
+        return False
+    if (station := int.from_bytes(data, "little")) in bus.stations:
+        return station == bus.stations[number]
+    yield
+    status = bus.read_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
+    owner = bus.read_at(position, reg.SII_OWNER, 1)
+    if status is None or owner is None or AlStatus.parse(status).state is not AlState.INIT:
+        return False
+    yield
+    try:
+        words = yield from read_sii(ByPosition(bus), position, _SII_IDENTITY, 4, owner)
+    except BusError:
+        return False
+    if not is_kind(*struct.unpack("<II", words)):
+        yield from pause(bus.clock, _STRANGER_PAUSE_S)
+        return False
+    return bus.write_at(position, reg.STATION_ADDRESS, bus.stations[number].to_bytes(2, "little"))
 
 
 class SensorRecovery:
@@ -247,12 +281,13 @@ class SensorRecovery:
 
         Raises GoneError, DifferentSensorError, or BusError if the sensor refuses something.
         """
-        yield from self._pause(pause_s)
+        yield from pause(self._bus.clock, pause_s)
         while True:
             status = self._slave.status()
             if status is None:
-                if not (yield from self._restore_station()):
-                    yield from self._pause(_ABSENT_PAUSE_S)
+                where = self._bus, self._number, self._sensor.position
+                if not (yield from restore_station(*where, is_sensor)):
+                    yield from pause(self._bus.clock, _ABSENT_PAUSE_S)
             elif status.is_op:
                 if not self._left_op:
                     self._slave.latch_events()
@@ -274,7 +309,7 @@ class SensorRecovery:
         unanswered = 0
         while unanswered < _REMOVED_READS:
             unanswered = 0 if self._slave.status() is not None else unanswered + 1
-            yield from self._pause(_REFUSED_PAUSE_S)
+            yield from pause(self._bus.clock, _REFUSED_PAUSE_S)
         return (yield from self._bring_back())
 
     def _reconfigure(self) -> Steps[bool]:
@@ -284,33 +319,6 @@ class SensorRecovery:
         yield from self._set_up()
         self._left_op = False
         return True
-
-    def _restore_station(self) -> Steps[bool]:
-        """Give a sensor that lost its station address with its power the address again; whether it has it.
-
-        One that has another slave's address, is not in INIT, or is no Bota sensor, is left alone; which
-        sensor it is remains to be asked.
-        """
-        bus, number, position = self._bus, self._sensor.number, self._sensor.position
-        data = bus.read_at(position, reg.STATION_ADDRESS, 2)
-        if data is None:
-            return False
-        if (station := int.from_bytes(data, "little")) in bus.stations:
-            return station == bus.stations[number]
-        yield
-        status = bus.read_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
-        owner = bus.read_at(position, reg.SII_OWNER, 1)
-        if status is None or owner is None or AlStatus.parse(status).state is not AlState.INIT:
-            return False
-        yield
-        try:
-            words = yield from read_sii(ByPosition(bus), position, _SII_IDENTITY, 4, owner)
-        except BusError:
-            return False
-        if not is_sensor(*struct.unpack("<II", words)):
-            yield from self._pause(_STRANGER_PAUSE_S)
-            return False
-        return bus.write_at(position, reg.STATION_ADDRESS, bus.stations[number].to_bytes(2, "little"))
 
     def _set_up_anew(self) -> Steps[None]:
         identity = self._sensor.identity
@@ -326,12 +334,6 @@ class SensorRecovery:
         yield from set_up(self.sdo, self._sensor)
         self._slave.map()
         yield from self._slave.enter_op()
-
-    def _pause(self, seconds: float) -> Steps[None]:
-        """Steps that take at least `seconds`."""
-        deadline = Deadline(self._bus.clock, seconds)
-        while not deadline.passed:
-            yield
 
 
 class Recovery:

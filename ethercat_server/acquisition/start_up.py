@@ -6,12 +6,13 @@ What the sensors must be is checked before anything is written to one of them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple, Protocol, TypeVar
 
 from bota_ethercat.errors import PdoSizeError, SettingError
 from bota_ethercat.pdo import layout_for
 from bota_ethercat.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
+from ethercat_server.acquisition.terminals import Terminal, find_terminals, named_positions
 from ethercat_server.errors import BusError, SdoAbortError, SetUpError, UsageError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
@@ -44,6 +45,10 @@ class Wanted(Protocol):
     def keep_unset(self) -> bool:
         """Whether settings that nobody asked for stay as the sensors have them, not the defaults."""
 
+    @property
+    def terminals(self) -> Sequence[str]:
+        """The slaves beside the sensors that are read, too; see `find_terminals`."""
+
     def wanted_settings(self, number: int, name: str, serial: int, /) -> dict[str, SettingValue]:
         """The settings to be in force in a sensor."""
 
@@ -59,6 +64,7 @@ class AsFound:
 
     sensor_name = None
     keep_unset = True
+    terminals = ()
 
     def __init__(self, *, force: bool = False) -> None:
         self.force = force
@@ -74,10 +80,11 @@ class AsFound:
 
 
 class Started(NamedTuple):
-    """The sensors on a bus, by number, and the slaves beside them, which are left alone."""
+    """The sensors on a bus, by number, and the slaves beside them: left alone, and read."""
 
     sensors: list[Sensor]
     others: list[Slave]
+    terminals: list[Terminal]
 
 
 def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Started:
@@ -111,7 +118,8 @@ def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Start
 
 def _find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Started:
     """Find the sensors on the open `bus`, in PREOP, and ask them who they are; nothing is written."""
-    slaves = look_safely(bus, check_interrupt, force=wanted.force)
+    ours = named_positions(wanted.terminals)
+    slaves = look_safely(bus, check_interrupt, force=wanted.force, ours=ours)
     of_sensors = [slave for slave in slaves if slave.is_sensor]
     others = [slave for slave in slaves if not slave.is_sensor]
     unread = next((slave for slave in others if slave.sii is None), None)
@@ -130,12 +138,18 @@ def _find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> 
     for number, slave in enumerate(of_sensors):
         _check_mailboxes(bus.ifname, number, slave)
 
+    terminals = find_terminals(others, wanted.terminals)
+    bus.input_sizes = {terminal.slave.position: terminal.size for terminal in terminals}
+    others = [slave for slave in others if slave.position not in bus.input_sizes]
+
     def find(again: bool) -> list[Sensor]:
         positions, sii = [slave.position for slave in of_sensors], [slave.sii for slave in slaves]
         bus.scan(positions, sii, check_interrupt, again=again)
         return [_find(bus, number, slave, wanted, check_interrupt) for number, slave in enumerate(of_sensors)]
 
     sensors = _try_again(find)
+    for number, terminal in enumerate(terminals, len(sensors)):
+        terminal.start(bus, number)
     if wanted.sensor_name is not None and sensors[0].identity.name != wanted.sensor_name:
         raise BusError(
             f"the sensor on {bus.ifname} is a {sensors[0].identity.name}, not a {wanted.sensor_name}: "
@@ -148,7 +162,7 @@ def _find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> 
     for slave in others:
         level = logging.WARNING if slave.sii is None else logging.INFO
         log.log(level, "%s is left alone: it stays in %s", slave, slave.status)
-    return Started(sensors, others)
+    return Started(sensors, others, terminals)
 
 
 def _try_again(attempt: Callable[[bool], T]) -> T:

@@ -25,7 +25,7 @@ from ethercat_server.sensor.sensor import Sensor
 
 DISCARDED_AT_START: Final = 3  # Bota's own driver discards the first three frames after entering OP
 
-# A DATA frame, the number of its sensor, its flags.
+# A DATA frame, the number of its sensor (terminals are numbered after all sensors), its flags.
 OutgoingFrame = tuple[bytes, int, int]
 
 REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))

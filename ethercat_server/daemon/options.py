@@ -25,6 +25,7 @@ from bota_ethercat.settings import (
     start_up_defaults,
 )
 from bota_ethercat.text.did_you_mean import did_you_mean
+from ethercat_server.acquisition.terminals import CHOICE
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import realtime
@@ -112,6 +113,12 @@ _ROWS: Final = (
     ServerSetting(
         "rt_priority", "N", "SCHED_FIFO priority, if permitted; 0 for ordinary scheduling",
         _whole(0, 99), realtime.DEFAULT_PRIORITY,
+    ),
+    ServerSetting(
+        "terminals", "WHICH", "slave beside the sensors whose inputs are read, too: VENDOR:PRODUCT (such as "
+        "0x2:0x0C1E3052), its POSITION on the wire, or VENDOR:PRODUCT@POSITION",
+        _checked(str, CHOICE.fullmatch, "0xVENDOR:0xPRODUCT, POSITION or 0xVENDOR:0xPRODUCT@POSITION"), (),
+        many=True,
     ),
     ServerSetting("cpu", "N", "pin the server to this CPU, if permitted", _whole(0, 4095), None),
     ServerSetting(
@@ -208,6 +215,11 @@ class ServerOptions:
     allow_ip: bool = False  # whether to use an interface of the machine's network
     server: Mapping[str, Any] = field(default_factory=_defaults)  # by the names of SERVER_SETTINGS
     assigned: Mapping[str, SettingValue] = field(default_factory=dict)  # settings from the command line
+
+    @property
+    def terminals(self) -> Sequence[str]:
+        """The slaves beside the sensors that are read, too."""
+        return tuple(self.server["terminals"])
 
     @property
     def keep_unset(self) -> bool:

@@ -2,11 +2,14 @@
 
 Exchanges are `ProcessData`'s; single datagrams go between them (`Datagrams`). pysoem configures every slave
 that it finds, so it is the master of a bus with sensors only. Beside other slaves only the sensors are
-written to: of the others is read which station and logical addresses they answer to: no sensor gets one.
+written to, and terminals: of the others is read which station and logical addresses they answer to, which
+nobody else gets.
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import struct
 from collections.abc import Sequence
 from typing import Final, TypeVar
@@ -14,7 +17,7 @@ from typing import Final, TypeVar
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, Master
 from ethercat_server.ethercat.datagrams import Datagrams, repeat
-from ethercat_server.ethercat.exchange import DistributedClock, ProcessData, fit_a_frame, read_clock
+from ethercat_server.ethercat.exchange import Area, DistributedClock, ProcessData, fit_a_frame, read_clock
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import Emergencies, Steps, finish
@@ -38,6 +41,10 @@ class Bus(Datagrams):
     Attributes:
         positions: where the sensors are on the wire, by number.
         slaves: their slave controllers.
+        input_sizes: bytes of the inputs of each terminal, by position; to be set before the scan. As slaves
+            terminals are numbered after the sensors.
+        terminal_areas: these inputs in the logical address space.
+        terminals: their slave controllers, and the AL states in which they are left.
         emergencies: their CoE emergency messages.
         process_data: the exchange, once they are mapped.
     """
@@ -47,6 +54,9 @@ class Bus(Datagrams):
         self.emergencies = Emergencies(backend.clock)
         self.positions: list[int] = []
         self.slaves: list[SlaveController] = []
+        self.input_sizes: dict[int, int] = {}
+        self.terminal_areas: list[Area] = []
+        self.terminals: list[tuple[SlaveController, AlState]] = []
         self.process_data = ProcessData((), backend)
         self._sii: Sequence[Sii | None] = ()  # of all slaves on the wire
         self._soem: Master | None = None
@@ -74,13 +84,14 @@ class Bus(Datagrams):
         shared = len(positions) < len(sii)
         self._soem = None if shared or again else self.backend.master
         self.positions, self._sii, self.slaves = list(positions), sii, []
+        ours = [*positions, *self.input_sizes]
         if self._soem is not None:
             self._soem.scan(positions, check_interrupt)
         else:
-            self.assign_stations(positions)
+            self.assign_stations(ours)
         self.stations = [
             int.from_bytes(self.read_surely_at(position, reg.STATION_ADDRESS, 2), "little")
-            for position in positions
+            for position in ours
         ]
         for number, content in enumerate(self._sensors_sii()):
             mailboxes = content["mailboxes"]["out"], content["mailboxes"]["in"]
@@ -104,6 +115,8 @@ class Bus(Datagrams):
             logical = self._free_logical()
             for slave, content in zip(self.slaves, self._sensors_sii(), strict=True):
                 logical = self.map(slave, content, logical, check_interrupt)
+            ends = [*itertools.accumulate(self.input_sizes.values(), initial=logical)]
+            self.terminal_areas = [Area(*span, reg.FMMU_READ) for span in itertools.pairwise(ends)]
         return [slave.read_mapping() for slave in self.slaves]
 
     def enter_op(self, check_interrupt: CheckInterrupt) -> None:
@@ -112,12 +125,11 @@ class Bus(Datagrams):
         for slave in self.slaves:
             if not fit_a_frame(slave.areas, lrw=lrw):
                 raise slave.unmapped()
-        stations = [
-            station if slave.latch_events() else None
-            for station, slave in zip(self.stations, self.slaves, strict=True)
-        ]
+        stations = [self.stations[slave.number] if slave.latch_events() else None for slave in self.slaves]
         areas = [slave.areas for slave in self.slaves]
-        self.process_data = ProcessData(areas, self.backend, lrw=lrw, stations=stations)
+        self.process_data = ProcessData(
+            areas, self.backend, lrw=lrw, stations=stations, terminals=self.terminal_areas
+        )
         waiting = [slave.enter_op() for slave in self.slaves]
         while waiting:
             check_interrupt()
@@ -137,11 +149,14 @@ class Bus(Datagrams):
         """Take the sensors to INIT if they were scanned, and close the wire."""
         for number in range(len(self.stations)):
             repeat(_INIT_ATTEMPTS, self.write_register, number, reg.AL_CONTROL, AlState.INIT.request())
-        self.stations = []
+        for slave, state in self.terminals:
+            with contextlib.suppress(BusError):  # it has gone
+                finish(slave.leave(state), _PAUSE_S, self.clock)
+        self.stations, self.terminals = [], []
         self.backend.close()
 
     def assign_stations(self, positions: Sequence[int]) -> None:
-        """Give the sensors at these positions station addresses that no slave answers to, nor by an alias."""
+        """Give the slaves at these positions station addresses that no slave answers to, nor by an alias."""
         taken: set[int] = set()
         for position in self._others():
             taken.update(struct.unpack("<HH", self.read_surely_at(position, reg.STATION_ADDRESS, 4)))

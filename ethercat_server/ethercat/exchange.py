@@ -13,7 +13,7 @@ import struct
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from ethercat_server.errors import SetUpError
+from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.datagrams import Datagrams, repeat
 from ethercat_server.ethercat.slave import registers as reg
@@ -133,16 +133,27 @@ class Frame(NamedTuple):
     written: int  # end of the outputs if they have a datagram of their own, else 0
     tag: int
     counters: list[int]  # what each sensor adds to the working counter: 2 for its outputs, 1 for its inputs
+    # Of each terminal that has a datagram in it: number, start and end of the data, before its counter.
+    terminals: list[tuple[int, int, int]]
 
 
-def make_frames(areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool) -> list[Frame]:
+def make_frames(
+    areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool,
+    terminals: Sequence[Area] = (),
+) -> list[Frame]:  # fmt: skip
     """The frames that exchange the `areas` of each sensor, by number.
 
     Without `lrw` each reads (LRD) and writes (LWR) with datagrams of their own. `stations` are the addresses
-    of the sensors whose latched times are read, None for others. SetUpError if the inputs of a sensor are not
-    in one frame.
+    of the sensors whose latched times are read, None for others. The last frame reads each of the `terminals`
+    with a datagram of its own (LRD). SetUpError if the inputs of a sensor are not in one frame, BusError if
+    those of the terminals do not fit.
     """
-    frames = [_frame(*span, areas, stations, lrw=lrw) for span in _spans(areas, stations, lrw=lrw)]
+    spans = _spans(areas, stations, lrw=lrw)
+    frames = [
+        _frame(*span, areas, stations, terminals if span == spans[-1] else (), lrw=lrw) for span in spans
+    ]
+    if terminals and len(frames[-1].content) > FRAME_HEADER + _LONGEST:
+        raise BusError("the inputs of all terminals do not fit the frame with the sensors': name fewer")
     carried = [each.number for frame in frames for each in frame.inputs]
     for number in range(len(areas)):
         if carried.count(number) != 1:
@@ -178,8 +189,9 @@ def _spans(
 
 
 def _frame(
-    start: int, end: int, areas: Sequence[Sequence[Area]], stations: Sequence[int | None], *, lrw: bool
-) -> Frame:
+    start: int, end: int, areas: Sequence[Sequence[Area]], stations: Sequence[int | None],
+    terminals: Sequence[Area], *, lrw: bool,
+) -> Frame:  # fmt: skip
     """The frame for the logical addresses from `start` to `end`, with the inputs that lie in them."""
     length, commands = end - start, (Command.LRW,) if lrw else (Command.LRD, Command.LWR)
     datagrams = [(int(command), start & 0xFFFF, start >> 16, bytes(length)) for command in commands]
@@ -204,9 +216,14 @@ def _frame(
             latched, at = at, at + LATCHED_SIZE
             datagrams += latched_datagrams(station)
         inputs.append(Inputs(number, FIRST_DATA + first, FIRST_DATA + last, bytes(data[first:last]), latched))
+    alone = []
+    for number, (first, last, _) in enumerate(terminals):
+        datagrams.append((Command.LRD, first & 0xFFFF, first >> 16, bytes(last - first)))
+        alone.append((number, at, at + last - first))
+        at += last - first + _AROUND_DATA
     content = build(*datagrams, (Command.NOP, 0, 0, bytes(TAG_SIZE))).ljust(SHORTEST_FRAME, b"\0")
     content[FIRST_DATA:read] = data
-    return Frame(content, inputs, read, written, at, counters)
+    return Frame(content, inputs, read, written, at, counters, alone)
 
 
 # Single datagrams and SOEM use the indices below.
@@ -241,6 +258,7 @@ class ProcessData:
 
     Attributes:
         inputs: by frame, the sensors whose inputs it carries.
+        terminals: by frame, the terminals' (`Frame.terminals`).
         wire_ns: by frame, what its bytes take on the wire.
         counters: by sensor, what it adds to the working counter of each frame.
         most_wkc: by frame, the highest working counter that there can be.
@@ -256,12 +274,15 @@ class ProcessData:
         *,
         lrw: bool = True,
         stations: Sequence[int | None] = (),
+        terminals: Sequence[Area] = (),
     ) -> None:
         """See `make_frames`."""
         self._send, self._monotonic_ns = backend.send, backend.clock.monotonic_ns
-        self._frames = frames = make_frames(areas, stations or [None] * len(areas), lrw=lrw)
+        stations = stations or [None] * len(areas)
+        self._frames = frames = make_frames(areas, stations, lrw=lrw, terminals=terminals)
         self._command = int(Command.LRW if lrw else Command.LRD) if frames else -1  # no frame has that
         self.inputs = [frame.inputs for frame in frames]
+        self.terminals = [frame.terminals for frame in frames]
         self.wire_ns = [len(frame.content) * BYTE_NS for frame in frames]
         self.counters = [tuple(frame.counters[number] for frame in frames) for number in range(len(areas))]
         self.most_wkc = [sum(frame.counters) for frame in frames]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.pdo import LAYOUTS
@@ -37,6 +37,7 @@ _PAUSE_S: Final = 0.002
 _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
 _INPUTS: Final = 0x1180
 _SYNC_MANAGER: Final = struct.Struct("<HH4x")
+_LENGTH_AND_CONTROL: Final = struct.Struct("<2xHB3x")  # of a sync manager
 _NAMELESS: Final = "nameless"
 _KNOWN: Final = ("vendor", "product", "revision", "name")  # what `describe` says of a slave from its SII
 _MOST_LISTED: Final = 64
@@ -86,11 +87,14 @@ class Slave(NamedTuple):
         return f"{self.name!r} at position {self.position} ({who})"
 
 
-def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False) -> list[Slave]:
+def look_safely(
+    bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False, ours: Collection[int] = ()
+) -> list[Slave]:
     """All slaves, in their order on the wire, with their SIIs; NoSlaveError if there are none.
 
     BusError if using the bus would stop another machine: if another master is sending, or a slave that is
-    not Bota's is in SAFEOP, OP or BOOT. With `force`, such slaves are taken to PREOP instead.
+    not Bota's is in SAFEOP, OP or BOOT. With `force`, such slaves are taken to PREOP instead, and
+    those without outputs at the positions `ours`, where a server that was killed has left them.
     """
     if not force and (count := bus.listen(_LISTEN_S)) >= _MASTER_FRAMES:
         raise BusError(
@@ -107,7 +111,10 @@ def look_safely(bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = Fals
             f"no EtherCAT slave answers on {bus.ifname}: check the cable, that the sensor has power and "
             "that this is the interface it is connected to"
         )
-    at_work = [slave for slave in slaves if slave.at_work]
+    at_work = [
+        slave for slave in slaves
+        if slave.at_work and (slave.position not in ours or _has_outputs(bus, slave.position))
+    ]  # fmt: skip
     if at_work and not force:
         where = ", ".join(f"{slave.position} in {slave.status.state.name}" for slave in at_work)
         raise BusError(
@@ -186,6 +193,12 @@ def _has_sensors_managers(bus: Bus, position: int) -> bool:
     data = bus.read_surely_at(position, reg.SYNC_MANAGER, 4 * reg.SYNC_MANAGER_SIZE)
     *others, inputs = _SYNC_MANAGER.iter_unpack(data)
     return tuple(others) == _MAILBOXES_AND_OUTPUTS and inputs in [(_INPUTS, size) for size in LAYOUTS]
+
+
+def _has_outputs(bus: Bus, position: int) -> bool:
+    managers = bus.read_surely_at(position, reg.SYNC_MANAGER, 4 * reg.SYNC_MANAGER_SIZE)
+    kinds = [control for length, control in _LENGTH_AND_CONTROL.iter_unpack(managers) if length]
+    return any(control & reg.SM_WRITE and not control & reg.SM_MAILBOX for control in kinds)
 
 
 def _stopped(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:

@@ -104,17 +104,17 @@ class Actions:
         return reply(request, protocol=PROTOCOL_VERSION, version=VERSION, sensors=rows, **self._extra)
 
     def _subscribe(self, connection: Connection, request: Request) -> JsonObject:
-        numbers = request.values["sensors"]
-        absent = [number for number in numbers or () if number >= len(self._sensors)]
-        if absent:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST,
-                f"the key 'sensors' names sensor {absent[0]}, but the bus has {len(self._sensors)}, "
-                "counted from 0",
-            )
-        connection.subscription = Subscription(
-            len(self._sensors), numbers, request.values["every"], request.values["fresh_only"]
-        )
+        wanted: list[bool] = []
+        for kind, rows in ("sensor", self._sensors), ("terminal", self._extra.get("terminals", ())):
+            numbers = request.values[f"{kind}s"]
+            if absent := [number for number in numbers or () if number >= len(rows)]:
+                raise RequestError(
+                    ErrorCode.BAD_REQUEST,
+                    f"the key '{kind}s' names {kind} {absent[0]}, but the bus has {len(rows)}, counted "
+                    "from 0",
+                )
+            wanted += [numbers is None or number in numbers for number in range(len(rows))]
+        connection.subscription = Subscription(wanted, request.values["every"], request.values["fresh_only"])
         self._hub.subscriptions_changed()
         return self._describe(connection, request)
 

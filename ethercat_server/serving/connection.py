@@ -62,19 +62,17 @@ class Unreadable(NamedTuple):
 
 
 class Subscription:
-    """Which DATA a client wants. Lists are by the sensor's number."""
+    """Which DATA a client wants. Lists are by the sensor's number; the terminals follow."""
 
-    def __init__(
-        self, sensor_count: int, sensors: tuple[int, ...] | None, every: int, fresh_only: bool
-    ) -> None:
-        self.wanted = [sensors is None or number in sensors for number in range(sensor_count)]
+    def __init__(self, wanted: Sequence[bool], every: int, fresh_only: bool) -> None:
+        self.wanted = wanted
         self.every = every
-        self.chooses = every != 1 or not all(self.wanted)
+        self.chooses = every != 1 or not all(wanted)
         self.fresh_only = fresh_only
-        self.skipped = [every - 1] * sensor_count
+        self.skipped = [every - 1] * len(wanted)
         # Nothing was sent yet, which counts as long ago even if the clock starts at zero.
-        self.last_ns = [-_IDLE_FRAME_NS] * sensor_count
-        self.gap = [False] * sensor_count
+        self.last_ns = [-_IDLE_FRAME_NS] * len(wanted)
+        self.gap = [False] * len(wanted)
 
 
 class Outbox:

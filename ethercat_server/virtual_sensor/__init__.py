@@ -2,6 +2,5 @@
 
 From the wire inwards: `link` (raw socket), `bus` (a chain of slaves, in memory), `esc` and
 `distributed_clock` (slave controller), `application`, `mailbox` and `coe` (what every slave has behind it),
-`sensor` with its `dictionary`, `sampler`, `signals` and `filters`, `foreign` (slaves of other vendors),
-`faults`.
+`sensor` with its `dictionary`, `sampler`, `signals`, `world`, `filters`, `foreign` (other slaves), `faults`.
 """

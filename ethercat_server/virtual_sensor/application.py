@@ -36,7 +36,7 @@ class AlCode(IntEnum):
     INVALID_INPUT_CONFIGURATION = 0x001E
 
 
-# The state that needs a sync manager, and the AL status code where it is wrong.
+# In the order of `Device.sync_managers`, the state that needs one, and the AL status code where it is wrong.
 _NEEDED: Final = (
     *((AlState.PREOP, AlCode.INVALID_MAILBOX_CONFIGURATION),) * 2,
     (AlState.SAFEOP, AlCode.INVALID_OUTPUT_CONFIGURATION),
@@ -145,7 +145,7 @@ class Application:
         # that is how a master that looks only at the working counter sees it.
         inputs_on = state >= AlState.SAFEOP
         wanted = (mailbox_on, mailbox_on, inputs_on and not self.error, inputs_on)
-        for manager, on in zip(managers, wanted, strict=True):
+        for manager, on in zip(managers, wanted[-len(self.device.sync_managers) :], strict=False):
             if on == manager.locked:
                 manager.allow(on)
         latched = any(
@@ -157,8 +157,9 @@ class Application:
 
     def _fault_in(self, state: AlState) -> int:
         """The AL status code for sync managers that this state needs and that are wrong; 0 if none is."""
+        rows = self.device.sync_managers
         for (needed_in, code), manager, row in zip(
-            _NEEDED, self.esc.sync_managers, self.device.sync_managers, strict=False
+            _NEEDED[-len(rows) :], self.esc.sync_managers, rows, strict=False
         ):
             right = (row.start, row.length, row.control & _SM_CONTROL_MASK)
             found = (manager.start, manager.length, manager.control & _SM_CONTROL_MASK)

@@ -31,6 +31,7 @@ from ethercat_server.virtual_sensor.options import (
     whole,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
+from ethercat_server.virtual_sensor.world import FAULT, LOST, ToldWorld
 
 _PROGRAM: Final = "ethercat-virtual-sensor"
 _SERIAL_NUMBERS: Final = 100  # for each bus: more than it has slaves
@@ -54,16 +55,16 @@ def _sinc_length(text: str) -> int:
 
 _ALONG_THE_CHAIN: Final = ("model", "serial", "ppm", "dc")
 _SEVERAL = "; several, comma separated or repeated, for a chain"
-# Name, metavar, default, parser, help.
-_OPTIONS: Final[tuple[tuple[str, str, str | None, Callable[[str], Any], str], ...]] = (
-    ("chain", "SLAVES", None, parse_chain, f"all slaves in wire order: {SENSOR}, {', '.join(KINDS)}; "
+# Name, metavar, parser, help.
+_OPTIONS: Final[tuple[tuple[str, str, Callable[[str], Any], str], ...]] = (
+    ("chain", "SLAVES", parse_chain, f"all slaves in wire order: {SENSOR}, {', '.join(KINDS)}; "
      "KIND:STATE if another master has left one in this AL state"),
-    ("sensors", "N", None, whole(1, MOST_SLAVES), "sensors on the bus (default: as many as named, or 1)"),
-    ("model", "NAME", None, _model, f"default {MODELS[0]}{_SEVERAL}"),
-    ("serial", "N", None, whole(0, 2**32 - 1), f"default: by the interface's MAC address{_SEVERAL}"),
-    ("sinc", "N", None, _sinc_length, "SINC length after power-on (default 64)"),
-    ("ppm", "X", None, real(-PPM_LIMIT, PPM_LIMIT), f"clock error{_SEVERAL}"),
-    ("dc", "WORD[=VALUE][+...]", None, _clock, f"distributed clock, see below{_SEVERAL}"),
+    ("sensors", "N", whole(1, MOST_SLAVES), "sensors on the bus (default: as many as named, or 1)"),
+    ("model", "NAME", _model, f"default {MODELS[0]}{_SEVERAL}"),
+    ("serial", "N", whole(0, 2**32 - 1), f"default: by the interface's MAC address{_SEVERAL}"),
+    ("sinc", "N", _sinc_length, "SINC length after power-on (default 64)"),
+    ("ppm", "X", real(-PPM_LIMIT, PPM_LIMIT), f"clock error{_SEVERAL}"),
+    ("dc", "WORD[=VALUE][+...]", _clock, f"distributed clock, see below{_SEVERAL}"),
 )  # fmt: skip
 
 
@@ -80,12 +81,14 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("iface", metavar="IFACE", nargs="?", help="interface, one end of a veth pair")
-    for name, metavar, default, _, meaning in _OPTIONS:
+    for name, metavar, _, meaning in _OPTIONS:
         action = "append" if name in _ALONG_THE_CHAIN else "store"
-        parser.add_argument(f"--{name}", metavar=metavar, default=default, action=action, help=meaning)
+        parser.add_argument(f"--{name}", metavar=metavar, action=action, help=meaning)
     parser.add_argument("--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data")
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
-    parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of the scene")
+    parser.add_argument("--world", metavar="PATH", help="measure what datagrams to this Unix socket say")
+    parser.add_argument("--world-lost", choices=LOST, default=FAULT, help="when it stops (default fault)")
+    parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of scene and world")
     parser.add_argument(
         "--control", metavar="PATH", help=f"Unix socket for commands (default {link.own_socket()})"
     )
@@ -105,7 +108,7 @@ def _number_of(ifname: str) -> int:
 def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[SlaveOptions, ...]:
     """The slaves that parsed arguments ask for; UsageError if they are contradictory."""
     given: dict[str, Any] = {}
-    for name, _, _, parse, _ in _OPTIONS:
+    for name, _, parse, _ in _OPTIONS:
         text = getattr(args, name.replace("-", "_"))
         try:
             if name in _ALONG_THE_CHAIN:
@@ -139,6 +142,7 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
             ppm=of("ppm", position, 0.0),
             dc=of("dc", position, ""),
             signal=args.signal,
+            world=ToldWorld(args.world_lost) if args.world else None,
             noise=args.noise == "on",
             seed=position,
         )
@@ -175,7 +179,7 @@ def main(
     foreign = [slave.kind for slave in slaves if isinstance(slave, ForeignOptions)]
     ready = (
         f"ready: {len(models)} sensor(s) {', '.join(dict.fromkeys(models))} on {args.iface}, "
-        f"{args.pdo} bytes of process data, signal {args.signal}"
+        f"{args.pdo} bytes of process data, signal {args.world or args.signal}"
         + (f", beside {', '.join(foreign)}" if foreign else "")
     )
 
@@ -195,6 +199,7 @@ def main(
                 slaves,
                 stop=stopped,
                 control_path=args.control,
+                world_path=args.world,
                 commands=sys.stdin,
                 exit_on_eof=args.exit_on_eof,
                 on_open=opened,
@@ -219,3 +224,7 @@ def _send(path: str, command: str) -> int:
         return 1
     print(answer)
     return int(not answer.startswith("ok"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -19,7 +19,6 @@ MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS = range(1, 5)  # kinds of sync managers
 _NO_MAILBOX: Final = sii.MailboxProtocol(0)
 _COE_SDO, _COE_SDO_INFORMATION = 0x01, 0x02
 _IMAGE_SIZE: Final = 2048
-_PDO_LAYOUT: Final = struct.Struct("<HBBBBH")
 
 
 class SyncManagerRow(NamedTuple):
@@ -59,9 +58,10 @@ class Device:
 
     @property
     def sync_managers(self) -> tuple[SyncManagerRow, ...]:
-        """Of the mailbox, outputs, inputs, in this order; none without mailbox."""
+        """Of the mailbox, outputs, inputs, in this order; without a mailbox of inputs only."""
         if not self.protocols:
-            return ()
+            size = size_of(self.input_entries)
+            return (SyncManagerRow(0x1000, size, 0x00, INPUTS),) if size else ()
         return (
             SyncManagerRow(0x1000, 128, reg.SM_CONTROL_MAILBOX_OUT, MAILBOX_OUT),
             SyncManagerRow(0x1080, 128, reg.SM_CONTROL_MAILBOX_IN, MAILBOX_IN),
@@ -82,7 +82,12 @@ class Device:
 
 def size_of(entries: Iterable[ObjectEntry]) -> int:
     """Bytes of the process data that carries these."""
-    return sum(entry.type.size for entry in entries)
+    return (sum(map(bits_of, entries)) + 7) // 8
+
+
+def bits_of(entry: ObjectEntry) -> int:
+    """Bits of an entry in process data."""
+    return 1 if entry.type is ObjectType.BOOL else 8 * entry.type.size
 
 
 def _mapping_rows(device: Device) -> list[ObjectEntry]:
@@ -98,7 +103,7 @@ def _mapping_rows(device: Device) -> list[ObjectEntry]:
         for number, pdo in enumerate(pdos, 1):
             rows.append(ObjectEntry(assignment, number, f"PDO {number}", u16, ro, pdo.index))
             for n, entry in enumerate(pdo.entries, 1):
-                mapped = entry.index << 16 | entry.subindex << 8 | entry.type.size * 8
+                mapped = entry.index << 16 | entry.subindex << 8 | bits_of(entry)
                 rows.append(ObjectEntry(pdo.index, n, f"Entry {n}", u32, ro, mapped))
     return rows
 
@@ -130,9 +135,9 @@ def build_image(device: Device) -> bytes:
 
     def mapping(pdos: Sequence[Pdo], manager: int) -> bytes:
         heads = (
-            _PDO_LAYOUT.pack(pdo.index, len(pdo.entries), manager, 0, number(pdo.name), 0)
+            sii.PDO.pack(pdo.index, len(pdo.entries), manager, 0, number(pdo.name), 0)
             + b"".join(
-                _PDO_LAYOUT.pack(e.index, e.subindex, number(e.name), e.type.coe_code, e.type.size * 8, 0)
+                sii.PDO.pack(e.index, e.subindex, number(e.name), e.type.coe_code, bits_of(e), 0)
                 for e in pdo.entries
             )
             for pdo in pdos
@@ -140,7 +145,7 @@ def build_image(device: Device) -> bytes:
         return b"".join(heads)
 
     name, group = number(device.name), number(device.group)  # string 1: what masters show as its name
-    inputs = category(sii.Category.TXPDOS, mapping(device.inputs, 3))
+    inputs = category(sii.Category.TXPDOS, mapping(device.inputs, len(device.sync_managers) - 1))
     outputs = category(sii.Category.RXPDOS, mapping(device.outputs, 2))
     general = struct.pack(
         "<BBBBBBBBBBBBhHH14x",
@@ -166,9 +171,8 @@ def build_image(device: Device) -> bytes:
         bytes(head)
         + category(sii.Category.STRINGS, bytes([len(strings)]) + texts)
         + category(sii.Category.GENERAL, general)
-        + category(
-            sii.Category.FMMUS, b"\x01\x02\x03\xff" if managers else b""
-        )  # outputs, inputs, mailbox state
+        # Outputs, inputs, mailbox state.
+        + category(sii.Category.FMMUS, b"\1\2\3\xff" if device.protocols else b"\2\xff" if managers else b"")
         + category(sii.Category.SYNC_MANAGERS, managers)
         + inputs
         + outputs

@@ -264,12 +264,6 @@ class Esc:
         self.record: Callable[[int, bytes], None] | None = None  # gets all that a master writes, and where
         self._events = 0
 
-    def take_lrw_away(self) -> None:
-        """Be a controller that does not know LRW."""
-        self.has_lrw = False
-        features = _U16.unpack_from(self.memory, reg.FEATURES)[0]
-        _U16.pack_into(self.memory, reg.FEATURES, features | reg.NO_LRW)
-
     def count(self, counter: int) -> None:
         """Add one to the error counter at this register; it stays at 255."""
         self.memory[counter] = min(self.memory[counter] + 1, 0xFF)

@@ -1,8 +1,7 @@
 """The sensor's own filters, which make what it measures late, with the response that is derived in
 `bota_ethercat.sensor.response`.
 
-A signal is a function of the time since power-on, s, before which it was what it was then. The filters add
-up its values at some instants before the sample.
+A signal is a function of the time, s. The filters add up its values at some instants before the sample.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ class LoadFilter:
     def _look(self, number: int) -> list[Sequence[float]]:
         """In the period before a sample, the newest first."""
         end_s, step_s = self._begin_s + number * self._period_s, self._period_s / _STEPS
-        return [self._signal(max(0.0, end_s - (n + 0.5) * step_s)) for n in range(_STEPS)]
+        return [self._signal(end_s - (n + 0.5) * step_s) for n in range(_STEPS)]
 
 
 def imu_filter(row: ImuFilter) -> Past:
@@ -73,4 +72,4 @@ def imu_filter(row: ImuFilter) -> Past:
 
 def filtered(signal: Signal, past: Past, seconds: float) -> tuple[float, ...]:
     """The signal as it is measured at this time."""
-    return weighted([weight for _, weight in past], [signal(max(0.0, seconds - s)) for s, _ in past])
+    return weighted([weight for _, weight in past], [signal(seconds - s) for s, _ in past])

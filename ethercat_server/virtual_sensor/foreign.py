@@ -6,6 +6,7 @@ objects of the CiA 402 drive profile (IEC 61800-7-201) that say whether its moto
 
 from __future__ import annotations
 
+import math
 import struct
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -33,6 +34,11 @@ _STATUSWORD = ObjectEntry(0x6041, 0, "Statusword", ObjectType.U16, _RO)
 _VELOCITY = ObjectEntry(0x60FF, 0, "Target velocity", ObjectType.I32, _RW)  # increments per second
 
 
+def _bit(number: int) -> Pdo:
+    entry = ObjectEntry(0x6000 + 16 * number, 1, "Input", ObjectType.BOOL, _RO)
+    return Pdo(0x1A00 + number, f"Channel {number + 1}", (entry,))
+
+
 def _channel(number: int, value: int) -> Pdo:
     entries = (
         ObjectEntry(0x3100 + number, 1, "Status", ObjectType.U8, _RO, 0),
@@ -53,6 +59,10 @@ _DEVICES: Final = (
         "EL3102", "Analog input terminals", 2, 0x0C1E3052, 0x00100000, 0,
         (), (_channel(1, 0x4000), _channel(2, -0x2000)),  # 5 V and -2.5 V, of 10 V
         MailboxProtocol.CoE, device_type=0x00001389, bus_current_ma=130,
+    ),
+    Device(
+        "EL1008", "Digital input terminals", 2, 0x03F03052, 0x00120000,
+        inputs=tuple(map(_bit, range(8))), bus_current_ma=90,
     ),
     _DRIVE,
 )  # fmt: skip
@@ -112,6 +122,19 @@ class Drive(Application):
         return super().read(index, subindex)
 
 
+class InputTerminal(Application):
+    """An EL3102, whose channels are sines of 1 and 2 Hz and 5 V, sampled each ms, or an EL1008, whose bits
+    count tenths of a second."""
+
+    def inputs(self) -> bytes:
+        """See `Application`."""
+        ms = self.clock() // 1_000_000
+        if self.device.name == "EL1008":
+            return bytes([ms // 100 & 0xFF])
+        sines = (round(0x4000 * math.sin(math.tau * ms * hz / 1000)) for hz in (1, 2))
+        return b"".join(struct.pack("<Bh", 0, sine) for sine in sines)
+
+
 _WRITES_REMEMBERED: Final = 1000
 _VELOCITY_AT_WORK: Final = 1000
 
@@ -134,10 +157,11 @@ class ForeignSlave:
             self.life = None
         elif self.life is None:
             device = KINDS[self.options.kind]
+            kind = InputTerminal if device.inputs else Application
             self.life = (
                 Drive(self._clock)
                 if device is _DRIVE
-                else Application(device, self._clock, _objects_of(device), EEPROM_MS)
+                else kind(device, self._clock, _objects_of(device), EEPROM_MS)
             )
             self.life.esc.record = self._remember
 
@@ -175,7 +199,7 @@ def leave_in(life: Application, state: AlState, station: int, outputs_at: int, i
     write, rows = life.esc.write, life.device.sync_managers
     write(reg.STATION_ADDRESS, struct.pack("<H", station))
     write(reg.SII_OWNER, b"\x01")  # the firmware
-    used = rows[:2] if state is AlState.PREOP else rows
+    used = rows[:2] if state is AlState.PREOP and life.device.protocols else rows
     write(reg.SYNC_MANAGER, b"".join(reg.pack_sync_manager(*row[:3]) for row in used))
     mapped = ((outputs_at, reg.FMMU_WRITE), (inputs_at, reg.FMMU_READ))
     units = [

@@ -1,4 +1,4 @@
-"""The raw socket: frames from a network interface go through the bus; commands come by a stream and a socket.
+"""The raw socket: frames from a network interface go through the bus; commands and a world come by others.
 
 One thread, which polls for frames and commands, and checks watchdogs.
 """
@@ -16,15 +16,17 @@ import struct
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Final, Self, TextIO
+from typing import Final, TextIO
 
+from bota_ethercat.world import DATAGRAM, decode
 from ethercat_server.ethercat.nic import arrived_ns, look_up
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, QuitCommand, obey
 from ethercat_server.virtual_sensor.options import SlaveOptions
+from ethercat_server.virtual_sensor.world import ToldWorld
 
 _BUFFER = 2048
 _SOL_PACKET, _PACKET_AUXDATA, _ETH_P_ALL = 263, 8, 3
@@ -33,6 +35,7 @@ _VLAN_VALID: Final = 0x10
 _ADDRESSES: Final = 12  # bytes of an Ethernet frame before its VLAN tag
 _IDLE_MS = 10
 _FRAMES_PER_TURN = 64
+_DATAGRAMS_PER_TURN = 16
 _FIRST_HALF_NS: Final = 20_000.0
 # A frame that seems to have waited for longer has no usable time stamp: CLOCK_REALTIME was set.
 _LONGEST_WAIT_NS: Final = 100_000_000
@@ -46,7 +49,7 @@ _ANSWER_S: Final = 5.0
 
 
 class LinkError(Exception):
-    """The interface cannot be used, or no longer, or the control socket cannot be created."""
+    """The interface cannot be used, or no longer, or a Unix socket cannot be created."""
 
 
 def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
@@ -80,6 +83,7 @@ def run(
     slaves: Iterable[SlaveOptions],
     *,
     control_path: str | None = None,
+    world_path: str | None = None,
     commands: TextIO | None = None,
     exit_on_eof: bool = False,
     on_open: Callable[[], None] = lambda: None,
@@ -88,9 +92,9 @@ def run(
 ) -> None:
     """Answer EtherCAT frames on `ifname` until stopped.
 
-    Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the
-    end of `commands` if `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is
-    only down is waited for), or `control_path` cannot be used; without one `own_socket` is, if it is free.
+    Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the end of `commands` if
+    `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is only down is waited
+    for), or a path cannot; without `control_path` `own_socket` is used, if it is free.
     """
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
@@ -102,6 +106,7 @@ def run(
         poller = select.poll()
         poller.register(raw, select.POLLIN)
         channel = stack.enter_context(CommandChannel(bus, poller, control_path, commands))
+        world = stack.enter_context(bound(world_path, socket.SOCK_DGRAM, poller)) if world_path else None
         # All that is loaded need never be looked through again, which takes some 20 ms.
         gc.collect()
         gc.freeze()
@@ -110,52 +115,59 @@ def run(
         stack.enter_context(contextlib.suppress(QuitCommand))
         while not stop.is_set() and not (exit_on_eof and channel.ended):
             ready = [descriptor for descriptor, _ in poller.poll(_IDLE_MS)]
-            if not ready:
-                bus.idle(time.monotonic_ns())
-                # Down is like an unplugged cable: it may come back, unless the interface was deleted.
-                if not up and index not in dict(socket.if_nameindex()):
-                    raise LinkError(f"interface {ifname} has disappeared: create it again, and restart")
             for descriptor in ready:
-                if descriptor != raw.fileno():
+                if world is not None and descriptor == world.fileno():
+                    _hear(world, bus)
+                elif descriptor != raw.fileno():
                     bus.set_time(time.monotonic_ns())
                     channel.handle(descriptor)
             if raw.fileno() in ready:
                 up = answers.waiting()
+                continue
+            bus.idle(time.monotonic_ns())
+            # Down is like an unplugged cable: it may come back, unless the interface was deleted.
+            if not up and index not in dict(socket.if_nameindex()):
+                raise LinkError(f"interface {ifname} has disappeared: create it again, and restart")
 
 
-class CommandChannel:
+def _hear(world: socket.socket, bus: Bus) -> None:
+    """Tell the sensors what waiting datagrams say, some at a time; what is none of ours is dropped."""
+    with contextlib.suppress(BlockingIOError):
+        for _ in range(_DATAGRAMS_PER_TURN):
+            content = decode(world.recv(DATAGRAM.size + 1))
+            if content is not None and content[0] < len(bus.sensors):
+                sensor, time_s, felt = content
+                if isinstance(told := bus.sensors[sensor].options.world, ToldWorld):
+                    told.tell(time_s, felt, time.monotonic())
+
+
+class CommandChannel(contextlib.ExitStack):
     """Reads commands and writes one line of answer to each."""
 
     def __init__(
         self, bus: Bus, poller: select.poll, control_path: str | None, commands: TextIO | None
     ) -> None:
         """LinkError if `control_path` cannot be used."""
+        super().__init__()
         self._bus = bus
         self._poller = poller
         self._listener: socket.socket | None = None
         self._connections: dict[int, socket.socket] = {}
+        self.callback(self._hang_up)
         self._pending: dict[int, bytes] = {}  # the beginning of a line, by descriptor
         self.ended = False  # the text stream has
         with contextlib.suppress(LinkError) if control_path is None else contextlib.nullcontext():
-            self._path = control_path or own_socket()
-            self._listener = _listen(self._path)
-            poller.register(self._listener, select.POLLIN)
+            listener = bound(control_path or own_socket(), socket.SOCK_STREAM, poller)
+            self._listener = self.enter_context(listener)
+            self._listener.listen()
         if commands is not None:
             with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
                 self._pending[commands.fileno()] = b""
                 poller.register(commands, select.POLLIN)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def _hang_up(self) -> None:
         for connection in self._connections.values():
             connection.close()
-        self._connections.clear()
-        if self._listener is not None:
-            self._listener.close()
-            with contextlib.suppress(OSError):
-                Path(self._path).unlink()
 
     def handle(self, descriptor: int) -> None:
         """Handle what has come on `descriptor`. QuitCommand if the command was `quit`."""
@@ -237,21 +249,26 @@ def send(path: str, command: str) -> str:
         return sock.makefile(encoding="utf-8").readline().strip()
 
 
-def _listen(path: str) -> socket.socket:
-    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+@contextlib.contextmanager
+def bound(path: str, kind: socket.SocketKind, poller: select.poll) -> Iterator[socket.socket]:
+    """A Unix socket that this user's programs find at `path` until the end; LinkError if it cannot be."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, kind) as probe:
         # Remove a stale socket, left by a killed process; nothing else.
         if stat.S_ISSOCK(Path(path).stat().st_mode) and probe.connect_ex(path) != 0:
             Path(path).unlink()
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        listener.bind(path)
-        Path(path).chmod(0o600)
-        listener.listen()
-        listener.setblocking(False)
-    except OSError as error:
-        listener.close()
-        raise LinkError(f"cannot create the control socket {path!r}: {error.strerror or error}") from None
-    return listener
+    with socket.socket(socket.AF_UNIX, kind) as made:
+        try:
+            made.bind(path)
+            Path(path).chmod(0o600)
+            made.setblocking(False)
+        except OSError as error:
+            raise LinkError(f"cannot create the Unix socket {path!r}: {error.strerror or error}") from None
+        try:
+            poller.register(made, select.POLLIN)
+            yield made
+        finally:
+            with contextlib.suppress(OSError):
+                Path(path).unlink()
 
 
 class _Answers:

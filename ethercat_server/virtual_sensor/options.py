@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import MODELS
+from ethercat_server.virtual_sensor.world import World
 
 EEPROM_MS: Final = 2.0  # about what a real EEPROM needs for the eight bytes of a read command
 
@@ -30,6 +31,7 @@ class SensorOptions:
     ppm: float = 0.0  # error of its clock: positive is fast
     dc: str = ""  # its distributed clock, in `distributed_clock.CLOCK_WORDS`: `32-bit+ppm=20+late=50`
     signal: str = "scene"
+    world: World | None = None  # instead of the signal
     noise: bool = True
     seed: int = 0
     state: AlState = AlState.INIT  # in which another master has left it

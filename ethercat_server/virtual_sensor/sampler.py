@@ -15,7 +15,8 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import FORMULAS, MOTIONS, Formula, Reading, Scene, reading_of
+from ethercat_server.virtual_sensor.signals import FORMULAS, SCENES, Formula, Reading, reading_of
+from ethercat_server.virtual_sensor.world import Measured, ToldWorld
 
 _PPM_SCALE = 10**12  # ppm in steps of one millionth
 
@@ -121,15 +122,17 @@ class Sampler:
         self._skipped, self._skip_after = 0, 0
         self._number, self._data = -1, b""
         self._prepared_number, self._prepared = -1, b""
-        self._measure(options, now())
+        self.measure(options)
 
-    def _measure(self, options: SensorOptions, start: int) -> None:
-        motion = MOTIONS.get(options.signal)
-        self._signal: Scene | Formula = (
-            FORMULAS[options.signal] if motion is None else Scene(options.seed, options.noise, motion)
+    def measure(self, options: SensorOptions) -> None:
+        """Measure the signal in `options`, which begins with the next sample."""
+        world = options.world or SCENES.get(options.signal)
+        self._told = world if isinstance(world, ToldWorld) else None
+        self._signal_start = self.clock.instant(self._number + 1) if self._told is None else 0
+        self._signal: Measured | Formula = (
+            FORMULAS[options.signal] if world is None else Measured(world, options.seed, options.noise)
         )
-        self._signal_start = start
-        self.exact = self._signal.exact  # unaffected by settings, offsets and noise
+        self.exact = isinstance(self._signal, Formula) and self._signal.exact  # settings do not affect it
         self.settings_changed()
 
     def number_at(self, instant: int) -> int:
@@ -144,8 +147,11 @@ class Sampler:
         """The newest process data, `later` ns from now."""
         if self.stuck:
             return self.stuck
-        number = self.number_at(self._now() + later)
+        now = self._now() + later
+        number = self.number_at(now)
         if number != self._number:
+            if self._data and self._told is not None and self._told.is_faulty(now * 1e-9):
+                return self._data
             self._data = self._prepared if number == self._prepared_number else self._make(number)
             self._number = number
         return self._data
@@ -154,7 +160,7 @@ class Sampler:
         """Compute the next sample, or that which a frame at `expected` will read, while there is time."""
         number = self.number_at(expected)
         number += number == self._number
-        if number != self._prepared_number and not self.stuck:
+        if number != self._prepared_number and not self.stuck and self._told is None:
             self._prepared = self._make(number)
             self._prepared_number = number
 
@@ -228,7 +234,7 @@ class Sampler:
         if sinc_length != self.clock.sinc_length:
             self.clock.change(self._now(), sinc_length=sinc_length)
         settings = self._dictionary.settings()
-        if isinstance(self._signal, Scene):
+        if isinstance(self._signal, Measured):
             self._signal.set_filters(sinc_length, settings)
         self._offset, self._acceleration_offset, self._angular_rate_offset = (
             self._dictionary.offsets(index) for index in (0x8000, 0x8001, 0x8002)
@@ -239,10 +245,6 @@ class Sampler:
         self._acceleration_range = float(settings["acceleration_range_g"])
         self._angular_rate_range = float(settings["angular_rate_range_dps"])
         self.changed()
-
-    def set_signal(self, options: SensorOptions) -> None:
-        """Measure the signal in `options`, which begins with the next sample."""
-        self._measure(options, self.clock.instant(self.clock.number_at(self._now()) + 1))
 
     def set_ppm(self, ppm: float) -> None:
         """Set the error of the clock from the newest sample on."""

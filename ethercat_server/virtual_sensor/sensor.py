@@ -148,9 +148,9 @@ class VirtualSensor:
 
     def set_signal(self, signal: str) -> None:
         """Measure another signal, now and after a power cycle."""
-        self.options = replace(self.options, signal=signal)
+        self.options = replace(self.options, signal=signal, world=None)
         if self.life is not None:
-            self.life.sampler.set_signal(self.options)
+            self.life.sampler.measure(self.options)
 
     def statistics(self) -> dict[str, Any]:
         """Its part of what the command `stats` reports."""
@@ -163,6 +163,7 @@ class VirtualSensor:
             "samples_made": life.sampler.made if life else 0,
             "sinc_length": life.sampler.clock.sinc_length if life else None,
             "ppm": self.options.ppm,
+            "world": getattr(self.options.world, "counts", None),
             "calibration_writes": self.calibration_writes,
             "sdo_write_count": self.sdo_write_count,
             "sdo_writes": list(self.sdo_writes),

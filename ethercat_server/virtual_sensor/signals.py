@@ -1,4 +1,4 @@
-"""What the sensor measures: formulas of the sample number, or a tool on a moving wrist with contacts.
+"""What there is to measure without an outside world: formulas of the sample number, or a tool on a wrist.
 
 Frames: the sensor's, with z out of the tool side; the world's, with z up. An attitude is yaw, pitch and roll
 (rad) about z, y', x''; it turns sensor vectors into world vectors. Documented in docs/virtual-sensor.md.
@@ -8,17 +8,12 @@ from __future__ import annotations
 
 import math
 import operator
-import random
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from bota_ethercat.pdo import STANDARD_GRAVITY
-from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS
-from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
-from ethercat_server.virtual_sensor.filters import LoadFilter, Past, filtered, imu_filter
-
-Vector = tuple[float, float, float]
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.world import Felt
 
 
 class Reading(NamedTuple):
@@ -29,6 +24,11 @@ class Reading(NamedTuple):
     angular_rate: tuple[float, ...]  # °/s
     temperature: float  # °C
     orientation: tuple[float, ...]  # x, y, z, w: turns vectors of the sensor's frame into the world's
+
+
+def reading_of(values: Sequence[float], temperature: float, orientation: tuple[float, ...]) -> Reading:
+    """A reading from force, torque, acceleration and angular rate one after another."""
+    return Reading(tuple(values[:6]), tuple(values[6:9]), tuple(values[9:12]), temperature, orientation)
 
 
 CONSTANT: Final = (1.5, -2.25, -9.75, 0.125, -0.0625, 0.03125)  # exact in REAL32
@@ -71,34 +71,18 @@ FORMULAS: Final = {
 }
 
 
-class ClockReading(NamedTuple):
-    """Content of a sample of the signal `clock`."""
-
-    number: int  # modulo 2**24
-    instant_ns: int  # modulo 2**20 s
-
-
-def decode_clock(force_torque: Sequence[float]) -> ClockReading:
-    """Sample number and instant from force x, y, z and torque x of the signal `clock`.
-
-    Takes the values as they came off the bus. For tests and benchmarks.
-    """
-    number, seconds, micros, nanos = (int(value) for value in force_torque[:4])
-    return ClockReading(number, seconds * 10**9 + micros * 1000 + nanos)
-
-
-def cross(a: Vector, b: Vector) -> Vector:
+def cross(a: Vector3, b: Vector3) -> Vector3:
     """The vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def _cosines_and_sines(angles: Vector) -> tuple[float, float, float, float, float, float]:
+def _cosines_and_sines(angles: Vector3) -> tuple[float, float, float, float, float, float]:
     yaw, pitch, roll = angles
     cos, sin = math.cos, math.sin
     return cos(yaw), sin(yaw), cos(pitch), sin(pitch), cos(roll), sin(roll)
 
 
-def quaternion(attitude: Vector) -> tuple[float, ...]:
+def quaternion(attitude: Vector3) -> tuple[float, ...]:
     """The attitude as x, y, z, w."""
     cy, sy, cp, sp, cr, sr = _cosines_and_sines((attitude[0] / 2, attitude[1] / 2, attitude[2] / 2))
     return (
@@ -109,196 +93,83 @@ def quaternion(attitude: Vector) -> tuple[float, ...]:
     )
 
 
-def angular_rate(attitude: Vector, rates: Vector) -> Vector:
-    """Angular velocity in the sensor's frame, rad/s, from the derivatives of yaw, pitch and roll."""
-    _, _, cp, sp, cr, sr = _cosines_and_sines(attitude)
-    yaw_rate, pitch_rate, roll_rate = rates
-    return (
-        roll_rate - yaw_rate * sp,
-        pitch_rate * cr + yaw_rate * cp * sr,
-        -pitch_rate * sr + yaw_rate * cp * cr,
-    )
-
-
-def to_sensor(attitude: Vector, vector: Vector) -> Vector:
-    """A world vector in the sensor's frame."""
-    cy, sy, cp, sp, cr, sr = _cosines_and_sines(attitude)
-    x, y, z = vector
-    return (
-        cy * cp * x + sy * cp * y - sp * z,
-        (cy * sp * sr - sy * cr) * x + (sy * sp * sr + cy * cr) * y + cp * sr * z,
-        (cy * sp * cr + sy * sr) * x + (sy * sp * cr - cy * sr) * y + cp * cr * z,
-    )
-
-
-# Motions: attitude and its derivatives (rad/s) at a time since power-on, s.
-
-Motion = Callable[[float], tuple[Vector, Vector]]
 # Amplitude (rad) and angular frequency (rad/s) of yaw, pitch and roll.
 _SWINGS = ((0.5, 0.31), (0.45, 0.23), (0.6, 0.37))
-POSE_LENGTH: Final = 3.0  # duration of a pose, s
-MOVE_LENGTH: Final = 2.0  # of the move between poses, s
-_QUARTER: Final = math.pi / 2
-# The axis of the sensor that points up, and yaw, pitch and roll. After the last comes the first again.
-POSES: Final[tuple[tuple[str, Vector], ...]] = (
-    ("+z", (0.0, 0.0, 0.0)),
-    ("+y", (0.0, 0.0, _QUARTER)),
-    ("-z", (0.0, 0.0, 2 * _QUARTER)),
-    ("-y", (0.0, 0.0, 3 * _QUARTER)),
-    ("+x", (0.0, -_QUARTER, 4 * _QUARTER)),
-    ("-x", (0.0, _QUARTER, 4 * _QUARTER)),
-)
-TURN_LENGTH: Final = 60.0  # duration of a full turn, s
-_TURN_PITCH: Final = 0.6
+# Amplitude (m/s²) and angular frequency of the wrist's acceleration along each world axis.
+_SHAKE = ((0.15, 1.7), (0.10, 2.3), (0.20, 1.1))
+TOOL_MASS = 0.8  # kg
+TOOL_CENTRE: Vector3 = (0.004, -0.006, 0.055)  # center of gravity in the sensor's frame, m
+CONTACT_POINT: Vector3 = (0.0, 0.0, 0.12)  # on the tool, m
+CONTACT_START, CONTACT_LENGTH, CONTACT_PERIOD = 5.0, 0.6, 7.0  # s: of the first; from one to the next
+CONTACT_FORCE: Vector3 = (3.0, -2.0, -12.0)  # at its peak, N, in the sensor's frame
 
 
-def sway(seconds: float) -> tuple[Vector, Vector]:
+def sway(seconds: float) -> tuple[Vector3, Vector3]:
     """Never stationary: yaw, pitch and roll swing."""
     yaw, pitch, roll = (a * math.sin(w * seconds) for a, w in _SWINGS)
     yaw_rate, pitch_rate, roll_rate = (a * w * math.cos(w * seconds) for a, w in _SWINGS)
     return (yaw, pitch, roll), (yaw_rate, pitch_rate, roll_rate)
 
 
-def pose(seconds: float) -> tuple[Vector, Vector]:
-    """The six poses in which one axis of the sensor points up or down, one after another."""
-    number, passed = divmod(seconds, POSE_LENGTH + MOVE_LENGTH)
-    here = POSES[int(number) % len(POSES)][1]
-    if passed < POSE_LENGTH:
-        return here, (0.0, 0.0, 0.0)
-    following = POSES[(int(number) + 1) % len(POSES)][1]
-    s = (passed - POSE_LENGTH) / MOVE_LENGTH
-    # Smooth from standstill to standstill.
-    share = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
-    rate = 30.0 * s * s * (1.0 - s) ** 2 / MOVE_LENGTH
-    yaw, pitch, roll = (b - a for a, b in zip(here, following, strict=True))
-    if following is POSES[0][1]:  # the first pose again is a whole roll further on
-        roll += math.tau
-    return (
-        (here[0] + share * yaw, here[1] + share * pitch, here[2] + share * roll),
-        (rate * yaw, rate * pitch, rate * roll),
-    )
-
-
-def turn(seconds: float) -> tuple[Vector, Vector]:
-    """A slow whole turn, over and over: rolls round once while it pitches up and down."""
-    speed = math.tau / TURN_LENGTH
-    rolled = speed * seconds
-    pitch, rate = _TURN_PITCH * math.sin(rolled), _TURN_PITCH * speed * math.cos(rolled)
-    return (0.0, pitch, rolled), (0.0, rate, speed)
-
-
-MOTIONS: Final[dict[str, Motion]] = {"scene": sway, "poses": pose, "turn": turn}
-SIGNALS: Final = (*MOTIONS, *FORMULAS)
-
-TOOL_MASS = 0.8  # kg
-TOOL_CENTRE: Vector = (0.004, -0.006, 0.055)  # center of gravity in the sensor's frame, m
-CONTACT_POINT: Vector = (0.0, 0.0, 0.12)  # on the tool, m
-CONTACT_PERIOD = 7.0  # s from one contact to the next; the first begins 5 s after power-on
-CONTACT_START, CONTACT_LENGTH = 5.0, 0.6
-CONTACT_FORCE: Vector = (3.0, -2.0, -12.0)  # at its peak, N, in the sensor's frame
-# Amplitude (m/s²) and angular frequency of the swaying wrist's acceleration along each world axis.
-_SHAKE = ((0.15, 1.7), (0.10, 2.3), (0.20, 1.1))
-
-# Standard deviation at SINC 51, and the power with which it falls with the length: half of what Bota's
-# own test allows at 51, and a little under half of it at 1024.
-_REFERENCE_SINC = 51
-_NOISE = (*((0.3, 0.62),) * 3, (0.007, 0.78), (0.007, 0.78), (0.0025, 0.78))
-_FILTERS: Final = ("fir", "acceleration_filter", "angular_rate_filter")
-_ACCELERATION_NOISE = 0.002  # g
-_ANGULAR_RATE_NOISE = 0.04  # °/s
-
-
-def contact_force(seconds: float) -> Vector:
+def contact_force(seconds: float) -> Vector3:
     """Force of the contact in `scene` at `CONTACT_POINT`, N; zero most of the time."""
     phase = (seconds - CONTACT_START) % CONTACT_PERIOD
-    if seconds < CONTACT_START or phase >= CONTACT_LENGTH:
-        return (0.0, 0.0, 0.0)
-    push = math.sin(math.pi * phase / CONTACT_LENGTH) ** 2
+    touches = seconds >= CONTACT_START and phase < CONTACT_LENGTH
+    push = math.sin(math.pi * phase / CONTACT_LENGTH) ** 2 if touches else 0.0
     x, y, z = CONTACT_FORCE
     return x * push, y * push, z * push
 
 
-class Scene:
-    """The tool on the wrist.
+def carry(attitude: Vector3, rates: Vector3, acceleration: Vector3 = (0.0, 0.0, 0.0)) -> Felt:
+    """What a sensor with the tool feels: `rates` are the attitude's derivatives, rad/s; acceleration, m/s².
 
-    All readings follow from the attitude R(t) and the wrist's acceleration a(t): specific force
-    f = R^T (a - g), so +1 g upward when stationary; tool force F = m R^T (g - a) = -m f; torque r x F. The
-    tool's own rotational inertia and the lever arm to the IMU are neglected: the wrist turns slowly. Only
-    where it sways is it accelerated, too, and does the tool touch something.
+    Specific force f = R^T (a - g), so +1 g upward when stationary; tool force F = m R^T (g - a) = -m f;
+    torque r x F. The tool's own rotational inertia and the lever arm to the IMU are neglected.
     """
-
-    exact = False
-
-    def __init__(self, seed: int, noise: bool, motion: Motion = sway) -> None:
-        """Measured without filters, until there are some."""
-        self._motion = motion
-        self._gauss = random.Random(seed).gauss
-        self._noise = noise
-        self._settings: tuple[SettingValue, ...] = ()  # of the filters
-        self._load_filter: LoadFilter | None = None
-        self._acceleration_filter: Past = [(0.0, 1.0)]
-        self._rate_filter: Past = [(0.0, 1.0)]
-        self.set_sinc_length(_REFERENCE_SINC)
-
-    def set_sinc_length(self, sinc_length: int) -> None:
-        """A longer filter makes force (N) and torque (Nm) quieter: their standard deviations with FIR off."""
-        ratio = sinc_length / _REFERENCE_SINC
-        self.deviations = tuple(deviation * ratio**-power for deviation, power in _NOISE)
-
-    def set_filters(self, sinc_length: int, settings: Mapping[str, SettingValue]) -> None:
-        """Measure through these filters; `sinc_length` is that in effect."""
-        wanted = sinc_length, *(settings[name] for name in _FILTERS)
-        if wanted == self._settings:
-            return
-        self._settings = wanted
-        self.set_sinc_length(sinc_length)
-        fir, acceleration, rate = wanted[1:]
-        period_s = sinc_length / BASE_SAMPLING_RATE_HZ
-        self._load_filter = LoadFilter(self.load, self._load_noise, period_s, fir=bool(fir))
-        self._acceleration_filter = imu_filter(ACCELERATION_FILTERS[acceleration])
-        self._rate_filter = imu_filter(ANGULAR_RATE_FILTERS[rate])
-
-    def specific_force(self, seconds: float) -> Vector:
-        """m/s²."""
-        ax = ay = az = 0.0
-        if self._motion is sway:
-            ax, ay, az = (a * math.sin(w * seconds) for a, w in _SHAKE)
-        return to_sensor(self._motion(seconds)[0], (ax, ay, az + STANDARD_GRAVITY))
-
-    def load(self, seconds: float) -> tuple[float, ...]:
-        """Force (N) and torque (Nm) of tool and contact."""
-        fx, fy, fz = self.specific_force(seconds)
-        weight = (-TOOL_MASS * fx, -TOOL_MASS * fy, -TOOL_MASS * fz)
-        load = (*weight, *cross(TOOL_CENTRE, weight))
-        if self._motion is not sway or not any(contact := contact_force(seconds)):
-            return load
-        return tuple(map(operator.add, load, (*contact, *cross(CONTACT_POINT, contact))))
-
-    def rate(self, seconds: float) -> Vector:
-        """Angular rate, rad/s."""
-        return angular_rate(*self._motion(seconds))
-
-    def _load_noise(self) -> list[float]:
-        return [self._gauss(0.0, deviation) if self._noise else 0.0 for deviation in self.deviations]
-
-    def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
-        """See `Formula`."""
-        if self._load_filter is None:
-            load = tuple(map(operator.add, self.load(seconds), self._load_noise()))
-        else:
-            load = self._load_filter.at(number, seconds)
-        force = filtered(self.specific_force, self._acceleration_filter, seconds)
-        rate = filtered(self.rate, self._rate_filter, seconds)
-        values = [*load, *(a / STANDARD_GRAVITY for a in force), *map(math.degrees, rate)]
-        if self._noise:
-            for axis in range(6, 9):
-                values[axis] += self._gauss(0.0, _ACCELERATION_NOISE)
-                values[axis + 3] += self._gauss(0.0, _ANGULAR_RATE_NOISE)
-        # The temperature drifts by 2 °C about 35 °C in ten minutes.
-        temperature = 35.0 + 2.0 * math.sin(math.tau * seconds / 600.0)
-        return reading_of(values, temperature, quaternion(self._motion(seconds)[0]))
+    cy, sy, cp, sp, cr, sr = _cosines_and_sines(attitude)
+    yaw_rate, pitch_rate, roll_rate = rates
+    turning = (
+        roll_rate - yaw_rate * sp,
+        pitch_rate * cr + yaw_rate * cp * sr,
+        -pitch_rate * sr + yaw_rate * cp * cr,
+    )
+    x, y, z = acceleration
+    z += STANDARD_GRAVITY
+    fx = cy * cp * x + sy * cp * y - sp * z
+    fy = (cy * sp * sr - sy * cr) * x + (sy * sp * sr + cy * cr) * y + cp * sr * z
+    fz = (cy * sp * cr + sy * sr) * x + (sy * sp * cr - cy * sr) * y + cp * cr * z
+    weight = (-TOOL_MASS * fx, -TOOL_MASS * fy, -TOOL_MASS * fz)
+    return Felt((*weight, *cross(TOOL_CENTRE, weight)), (fx, fy, fz), turning, attitude=attitude)
 
 
-def reading_of(values: Sequence[float], temperature: float, orientation: tuple[float, ...]) -> Reading:
-    """A reading from force, torque, acceleration and angular rate one after another."""
-    return Reading(tuple(values[:6]), tuple(values[6:9]), tuple(values[9:12]), temperature, orientation)
+def scene(seconds: float) -> Felt:
+    """A tool on a swaying wrist, which is accelerated, too, and touches something now and then."""
+    ax, ay, az = (a * math.sin(w * seconds) for a, w in _SHAKE)
+    felt, contact = carry(*sway(seconds), (ax, ay, az)), contact_force(seconds)
+    if not any(contact):
+        return felt
+    touched = (*contact, *cross(CONTACT_POINT, contact))
+    return felt._replace(wrench=tuple(map(operator.add, felt.wrench, touched)))
+
+
+POSE_LENGTH, MOVE_LENGTH = 3.0, 2.0  # duration of a pose, and of the move to the next, s
+# Pitch and roll, in right angles: the axes +z, +y, -z, -y, +x and -x of the sensor point up.
+_POSES: Final = ((0, 0), (0, 1), (0, 2), (0, 3), (-1, 4), (1, 4), (0, 4))  # the last is the first again
+
+
+def poses(seconds: float) -> Felt:
+    """The tool held in six poses, one after another."""
+    number, passed = divmod(seconds, POSE_LENGTH + MOVE_LENGTH)
+    here, following = _POSES[int(number) % 6], _POSES[int(number) % 6 + 1]
+    s = max(0.0, passed - POSE_LENGTH) / MOVE_LENGTH
+    # Smooth from standstill to standstill.
+    share, rate = s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2 / MOVE_LENGTH
+    (pitch, pitch_rate), (roll, roll_rate) = (
+        (math.pi / 2 * (a + share * (b - a)), math.pi / 2 * rate * (b - a))
+        for a, b in zip(here, following, strict=True)
+    )
+    return carry((0.0, pitch, roll), (0.0, pitch_rate, roll_rate))
+
+
+SCENES: Final = {"scene": scene, "poses": poses}
+SIGNALS: Final = (*SCENES, *FORMULAS)

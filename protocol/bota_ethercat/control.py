@@ -100,10 +100,10 @@ def _boolean(value: object) -> bool:
     raise ValueError("true or false")
 
 
-def _sensor_list(value: object) -> tuple[int, ...]:
+def _numbers(value: object) -> tuple[int, ...]:
     if isinstance(value, list) and value and all(_is_int(item) and 0 <= item <= 255 for item in value):
         return tuple(value)
-    raise ValueError("a list of sensor positions on the bus, such as [0]")
+    raise ValueError("a list of numbers from 0, such as [0]")
 
 
 def six_numbers(value: object) -> tuple[float, ...]:
@@ -178,7 +178,8 @@ ACTIONS: Final[Mapping[str, Action]] = {
     "describe": Action({}),
     "subscribe": Action(
         {
-            "sensors": Parameter(_sensor_list),
+            "sensors": Parameter(_numbers),
+            "terminals": Parameter(_numbers, default=()),
             "every": Parameter(whole_number(1, 1_000_000), default=1),
             "fresh_only": Parameter(_boolean, default=True),
         },

@@ -26,6 +26,7 @@ class MessageType(IntEnum):
 
     DATA = 1
     JSON = 2
+    TERMINAL = 3  # as DATA, of a terminal beside the sensors
 
 
 class DataFlag(IntFlag):
@@ -48,6 +49,10 @@ class DataMessage(NamedTuple):
     process_data: bytes
 
 
+class TerminalMessage(DataMessage):
+    """One TERMINAL message: `sensor` is the number of the terminal."""
+
+
 _LENGTH: Final = struct.Struct(">I")
 _PREFIX: Final = struct.Struct(">IB")
 _DATA_MESSAGE: Final = struct.Struct(">IBQQQBBH")
@@ -65,11 +70,12 @@ MAX_DATA_MESSAGE_SIZE: Final = _LENGTH.size + max(_DATA_LENGTHS)
 
 
 def encode_data(
-    sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, process_data: bytes
-) -> bytes:
-    """A whole DATA message, ready to send. struct.error if a number does not fit its field."""
+    sequence: int, stamp_ns: int, monotonic_ns: int, sensor: int, flags: int, wkc: int, process_data: bytes,
+    kind: int = _DATA,
+) -> bytes:  # fmt: skip
+    """A whole DATA or TERMINAL message, ready to send. struct.error if a number does not fit its field."""
     length = _DATA_OVERHEAD + len(process_data)
-    head = _DATA_MESSAGE.pack(length, _DATA, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
+    head = _DATA_MESSAGE.pack(length, kind, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
     return head + process_data
 
 
@@ -88,7 +94,7 @@ class FrameDecoder:
     """
 
     def __init__(self, *, max_json_length: int = MAX_JSON_LENGTH, accept_data: bool = True) -> None:
-        """`accept_data=False`, for servers, makes DATA an unknown type."""
+        """`accept_data=False`, for servers, makes DATA and TERMINAL unknown types."""
         self._max_json_length = max_json_length
         self._accept_data = accept_data
         self._buffer = bytearray(65536)
@@ -142,8 +148,11 @@ class FrameDecoder:
         if kind == MessageType.DATA and self._accept_data:
             if length not in _DATA_LENGTHS:
                 self._break(f"DATA message of length {length}: it must be one of {sorted(_DATA_LENGTHS)}")
+        elif kind == MessageType.TERMINAL and self._accept_data:
+            if length < _DATA_OVERHEAD:
+                self._break(f"TERMINAL message of length {length}: it must be at least {_DATA_OVERHEAD}")
         elif kind != MessageType.JSON:
-            known = "1 (DATA) and 2 (JSON)" if self._accept_data else "2 (JSON)"
+            known = "1 (DATA), 2 (JSON) and 3 (TERMINAL)" if self._accept_data else "2 (JSON)"
             self._break(f"message type {kind}: this side understands {known}")
         elif length > self._max_json_length + _TYPE_SIZE:
             self._break(f"JSON message of length {length}: it must be at most {self._max_json_length + 1}")
@@ -152,6 +161,10 @@ class FrameDecoder:
         start, self._start = self._start, self._start + _LENGTH.size + length
         if kind == MessageType.DATA:
             return DataMessage._make(_UNPACK_DATA[length](self._buffer, start))
+        if kind == MessageType.TERMINAL:
+            _, _, *head = _DATA_MESSAGE.unpack_from(self._buffer, start)
+            data = bytes(self._buffer[start + _DATA_MESSAGE.size : self._start])
+            return TerminalMessage._make([*head, data])
         return parse_json_object(bytes(self._buffer[start + _PREFIX.size : self._start]))
 
     def __iter__(self) -> Iterator[DataMessage | JsonObject]:
@@ -159,8 +172,8 @@ class FrameDecoder:
         while (message := self.next_message()) is not None:
             yield message
 
-    def take_data(self, into: list[DataMessage]) -> JsonObject | None:
-        """Append the DATA messages that are next and whole to `into`; returns the JSON message after them.
+    def take_data(self, into: list[DataMessage]) -> TerminalMessage | JsonObject | None:
+        """Append the DATA messages that are next and whole to `into`; returns the message after them.
 
         As `next_message` until it returns something else, but faster, for streams. None and errors as there.
         """
@@ -177,7 +190,7 @@ class FrameDecoder:
             if start == end:
                 return None
         message = self.next_message()
-        assert not isinstance(message, DataMessage)  # a whole one was taken above
+        assert not isinstance(message, DataMessage) or isinstance(message, TerminalMessage)  # taken above
         return message
 
     def _break(self, reason: str) -> NoReturn:

@@ -31,6 +31,7 @@ from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import Worker, call_on_stop_signal, prepare
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.publishing.messages import Stamps, make_measured
+from bridge.publishing.terminals import TerminalTopics
 from bridge.rclpy_internals import is_about_arguments, make_executors, refuse_what_raises
 from bridge.services import BiasServices, IdentifyServices, SensorServices
 from bridge.spinning import Spinner
@@ -71,8 +72,9 @@ def _transition(act: Callable[[Any], object]) -> Callable[[Any, LifecycleState],
         try:
             with node.setting, _sentences():
                 act(node)
-        except StartError as error:
-            node.get_logger().error(str(error))
+        except Exception as error:  # noqa: BLE001 - rclpy would answer the same, without a word
+            text = str(error) if isinstance(error, StartError) else f"the transition failed: {error!r}"
+            node.get_logger().error(text)
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
@@ -127,6 +129,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.reader = Reader(
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
+        self.reader.on_terminal = TerminalTopics(self, parameters.terminals, self.reader.client).publish
         self.sensor_settings.link = link = self.reader.link
         self.compensation = CompensationControl(self, parameters, compensated, self.reader, self.live)
         self.live.apply = self._apply

@@ -8,13 +8,13 @@ import os
 from pathlib import Path
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 
+CONFIG = Path(__file__).parents[1] / "config"
 # Parameters of the node that are arguments here. Text must stay text, even if it looks like a number; what is
 # wrong with a number is for the node to say.
 TEXT, NUMBER = str, None
@@ -30,7 +30,8 @@ PARAMETERS = {
 IN_FILE = " (empty: as in params_file)"
 # Other drivers: the node's name and its names of our topics; config/compat_NAME.yaml has the parameters.
 COMPATIBLE = {"bota": ("bota_ft_sensor", [("wrench_compensated", "~/wrench"), ("imu/data_raw", "~/imu")])}
-PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+# Of Fast DDS 2 (Jazzy), and 3.
+PROFILES = {"FASTRTPS_DEFAULT_PROFILES_FILE": "fastdds.xml", "FASTDDS_DEFAULT_PROFILES_FILE": "fastdds3.xml"}
 REAL_TIME = 40  # SCHED_FIFO, below the 50 of a controller manager
 
 
@@ -45,18 +46,17 @@ def start_node(context):
     node, remappings, compatible = "bridge", [], []
     if compat := value("compat"):
         node, remappings = COMPATIBLE[compat]
-        name = f"compat_{compat}.yaml"
-        compatible = [PathJoinSubstitution([FindPackageShare("bota_ethercat_bridge"), "config", name])]
+        compatible = [CONFIG / f"compat_{compat}.yaml"]
     given = {
         name: ParameterValue(LaunchConfiguration(name), value_type=value_type)
         for name, (value_type, _) in PARAMETERS.items()
         if value(name)
     }
     environment = {}
-    if value("realtime").lower() in {"true", "1"}:
+    if value("realtime").lower() == "true":
         given["rt_priority"] = REAL_TIME
-        profiles = Path(__file__).parents[1] / "config" / "fastdds.xml"
-        environment = {PROFILES: os.environ.get(PROFILES) or str(profiles)}
+        if not any(map(os.environ.get, PROFILES)):
+            environment = {variable: str(CONFIG / file) for variable, file in PROFILES.items()}
     return [
         Node(
             package="bota_ethercat_bridge",
@@ -75,10 +75,11 @@ def start_node(context):
 
 
 def generate_launch_description():
-    file = PathJoinSubstitution([FindPackageShare("bota_ethercat_bridge"), "config", "client.yaml"])
     return LaunchDescription(
         [
-            DeclareLaunchArgument("params_file", default_value=file, description="The node's parameters"),
+            DeclareLaunchArgument(
+                "params_file", default_value=str(CONFIG / "client.yaml"), description="The node's parameters"
+            ),
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node"),
             DeclareLaunchArgument(
                 "compat",
@@ -93,6 +94,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "realtime",
                 default_value="false",
+                choices=["true", "false", "True", "False"],
                 description=f"true asks for SCHED_FIFO {REAL_TIME}, locked memory and our Fast DDS profile",
             ),
             DeclareLaunchArgument(

@@ -4,7 +4,6 @@
 import importlib
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -26,9 +25,3 @@ def test_the_program_says_how_it_is_used() -> None:
         [sys.executable, "-m", "bridge.client", "--help"], check=True, capture_output=True, text=True
     )
     assert run.stdout.startswith("usage: ros2 run bridge client")
-
-
-def test_the_files_it_shares_are_there() -> None:
-    package = Path(__file__).parent.parent
-    for name in ("launch/bridge.launch.py", "config/client.yaml", "urdf/bota_sensor.xacro"):
-        assert (package / name).stat().st_size, name

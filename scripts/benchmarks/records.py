@@ -8,13 +8,30 @@ from __future__ import annotations
 
 import os
 from array import array
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 PORT: Final = 12001  # of the server and what is compared with it
 REAL_TIME: Final = 40  # SCHED_FIFO of clients, the node among them, as the launch file's `realtime:=true`
 COLUMNS: Final = 5
 _NS: Final = 1_000_000_000
+
+
+class ClockReading(NamedTuple):
+    """Content of a sample of the signal `clock`."""
+
+    number: int  # modulo 2**24
+    instant_ns: int  # modulo 2**20 s
+
+
+def decode_clock(force_torque: Sequence[float]) -> ClockReading:
+    """Sample number and instant from force x, y, z and torque x of the signal `clock`.
+
+    Takes the values as they came off the bus.
+    """
+    number, seconds, micros, nanos = (int(value) for value in force_torque[:4])
+    return ClockReading(number, seconds * 10**9 + micros * 1000 + nanos)
 
 
 class Recording:

@@ -193,6 +193,11 @@ def test_a_managed_node(server: ScriptedServer, listener: Listener, start: Start
     node.says("parameter orientation.topic is")
     assert listener.set_parameter("gravity_source", "imu") == (True, "")
     change(Transition.TRANSITION_CONFIGURE)
+    node.node.open = lambda: 1 // 0  # type: ignore[assignment, method-assign]
+    change(Transition.TRANSITION_ACTIVATE, done=False)
+    node.says("the transition failed: ZeroDivisionError")
+    del node.node.open
+    change(Transition.TRANSITION_CONFIGURE)
     setting = threading.Thread(target=lambda: node.node.live.put(**{"filter.cutoff": 20.0}))
 
     def set_meanwhile() -> object:

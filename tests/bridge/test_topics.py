@@ -12,14 +12,17 @@ from typing import Any
 
 import pytest
 
+from bota_ethercat.framing import MessageType, encode_data
 from bota_ethercat.pdo import encode
 from bridge import rclpy_internals
 from bridge.node import StartError
 from bridge.parameters.table import ParameterError, parse_frames
+from bridge.process import Worker
 from ft_compensation.outputs import WrenchFilter
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.scripted_server import process_data
 from tests.bridge.simulated_node import RATE_HZ, STEP_S, UP, ZERO6, Node, Server, six, stamp_ns, values
+from tests.public_names import listed
 
 PACKAGE = Path(__file__).parents[2] / "ros2_bridge"
 QUATERNION = {"orientation.x": 0.5, "orientation.y": -0.5, "orientation.z": 0.5, "orientation.w": 0.5}
@@ -356,7 +359,9 @@ def node(server: Sensor, tf: FakeTf) -> Iterator[Node]:
         yield started
 
 
-def test_tf_is_not_listened_to_without_a_subscriber(node: Node, tf: FakeTf) -> None:
+def test_tf_is_not_listened_to_without_a_subscriber(
+    node: Node, tf: FakeTf, monkeypatch: pytest.MonkeyPatch
+) -> None:
     node.hear("wrench_compensated/tcp")
     node.run(2.0)
     words = "wrench_compensated/base has stopped: TF has no pose of ft_sensor in base: frame does not exist"
@@ -370,6 +375,11 @@ def test_tf_is_not_listened_to_without_a_subscriber(node: Node, tf: FakeTf) -> N
     assert tf.listening == 1
     assert set(tf.asked) == {("base", "ft_sensor")}
     node.unhear("wrench_compensated/base")
+    node.run(0.5)
+    assert tf.listening == 0
+    monkeypatch.setattr(Worker, "has_ended", lambda _: True)  # not begun here
+    node.node.compensation.output.frames.stop()  # as a managed node that is deactivated
+    node.hear("wrench_compensated/base")
     node.run(0.5)
     assert tf.listening == 0
 
@@ -477,6 +487,22 @@ def test_every_topic_is_reliable_unless_its_qos_is_overridden() -> None:
     assert got == dict.fromkeys(got, ("RELIABLE", "VOLATILE", 10))
 
 
+def test_topics_and_services_are_those_listed() -> None:
+    """In tests/public_names.txt, which docs/stability.md promises to keep."""
+    with Node(Sensor(), **{"filter.cutoff": 10.0}) as node:
+        namespace = node.name.removesuffix("bridge")
+        publishers = node.node.get_publisher_names_and_types_by_node("bridge", namespace[:-1])
+        subscribed = [each.topic_name for each in node.node.subscriptions]
+        services = [each.srv_name for each in node.node.services]
+        made = [each.service_name for each in node.stand_ins]
+    topics = {f"ROS: topic {name}" for name in [*(name for name, _ in publishers), *subscribed]}
+    names = topics | {f"ROS: service {name}" for name in [*services, *made]}
+    ours = {name.replace(namespace + "bridge", "~").replace(namespace, "") for name in names}
+    others = re.compile("parameter|rosout|get_type_description|typed/")  # rclpy's; typed only where built
+    ours = {name for name in ours if not others.search(name)}
+    assert sorted(ours) == listed(ros=True)
+
+
 def test_with_compat_bota_names_frames_and_tare_are_those_of_botas_driver() -> None:
     text = (PACKAGE / "launch" / "bridge.launch.py").read_text()
     (table,) = re.findall(r"^COMPATIBLE = (.+)$", text, re.MULTILINE)
@@ -494,3 +520,23 @@ def test_with_compat_bota_names_frames_and_tare_are_those_of_botas_driver() -> N
         assert six(node.fresh(wrenches, 0.1)[0]) == pytest.approx(ZERO6, abs=1e-6)
         frames = wrenches[-1].header.frame_id, motions[-1].header.frame_id
         assert frames == ("bota_ft_sensor_wrench", "bota_ft_sensor_imu")
+
+
+def test_terminals_are_published_as_numbers_and_with_names_and_stamp() -> None:
+    """Of a terminal that the server does not read, or whose values are not valid, nothing is."""
+    server = Server()
+    entries = (("Status", "u8", 0, 8), ("Value", "i16", 8, 16), ("Input", "bool", 24, 1))
+    layout = [dict(zip(("name", "type", "bit_offset", "bit_length"), row, strict=True)) for row in entries]
+    server.description["terminals"] = [{"terminal": 0, "layout": layout}]
+    with Node(server, terminals=1) as node:
+        arrays, stamped = node.hear("terminal_0"), node.hear("terminal_0/stamped")
+        node.run(0.2)
+        assert [each.get("terminals") for each in server.requests if each["action"] == "subscribe"] == [[0]]
+        for number, stamp, flags in ((0, 5, 1), (0, 6, 2), (0, 10**10, 0), (7, 8, 0)):
+            data = bytes.fromhex("07feff01")
+            server.send_raw(encode_data(0, stamp * 10**9, 1, number, flags, 1, data, MessageType.TERMINAL))
+        node.run(0.2)
+    (array,), (message,) = arrays, stamped
+    assert ([*array.data], array.layout.dim[0].label) == ([7.0, -2.0, 1.0], "Status, Value, Input")
+    assert ([*message.position], [*message.name]) == ([7.0, -2.0, 1.0], ["Status", "Value", "Input"])
+    assert stamp_ns(message) == 5 * 10**9

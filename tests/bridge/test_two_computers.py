@@ -18,8 +18,7 @@ from tests.served_simulation import served
 from tests.server.running import HERE, Program, Veth, another_machine, free_port, on_a_bus
 from tests.simulation import more_if_long
 
-# Shared memory does not know network namespaces.
-ENVIRONMENT = ["env", "FASTDDS_BUILTIN_TRANSPORTS=UDPv4", "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"]
+ENVIRONMENT = ["env", "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"]
 ASK = """
 import os, rclpy
 from geometry_msgs.msg import WrenchStamped

@@ -3,9 +3,14 @@ stand-ins with the fields of the .srv files."""
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import math
+import os
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import field, make_dataclass
 from pathlib import Path
@@ -16,6 +21,8 @@ import pytest
 from rclpy.parameter import parameter_value_to_python
 
 from bridge import services
+from tests.bridge.real_node import Listener, Start
+from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import QUICK, SETTINGS, UP, Node, Server, Stages, sensed, six
 from tests.compensation.making import AXES, BIAS, TOOL
 
@@ -137,6 +144,61 @@ def test_an_identification(node: Node, server: Server) -> None:
     assert 0.0 < max(numbers(response.bias_interval)) < 0.1
     assert 0.0 < response.force_residual < 1e-3
     assert 0.0 < response.torque_residual < 1e-3
+
+
+@pytest.fixture
+def generated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The services as rosidl generates them, with the packages of PyPI."""
+    if services.TYPED:
+        return services.TYPED
+    if not (Path(sys.prefix) / "share/rosidl_default_generators").exists() or not shutil.which("cmake"):
+        pytest.skip("rosidl (the extra of that name) or cmake is missing")
+    base, installed = tmp_path / "ros", tmp_path / "installed"
+    shutil.copytree(Path(sys.prefix) / "share", base / "share")
+    for folder in ("bin", "include", "lib"):
+        (base / folder).symlink_to(Path(sys.prefix) / folder)
+    for file in base.glob("share/*/cmake/*_pyExport.cmake"):  # has paths of the machine that made the wheel
+        file.write_text(re.sub(r'(INTERFACE_INCLUDE_DIRECTORIES) "[^"]*"', r'\1 ""', file.read_text()))
+    at = {"CMAKE_INSTALL_PREFIX": installed, "CMAKE_INSTALL_RPATH": installed / "lib"}
+    defined = [f"-D{name}={value}" for name, value in (at | {"Python3_EXECUTABLE": sys.executable}).items()]
+    for command in (
+        ["cmake", "-S", str(PACKAGE), "-B", str(tmp_path / "build"), *defined],
+        ["cmake", "--build", str(tmp_path / "build"), "--target", "install", "--parallel", "2"],
+    ):
+        environment = os.environ | {"AMENT_PREFIX_PATH": str(base), "CMAKE_PREFIX_PATH": str(base)}
+        done = subprocess.run(command, env=environment, check=False, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+    for library in installed.glob("lib/*.so"):  # which ROS looks for by name
+        ctypes.CDLL(str(library))
+    (modules,) = installed.glob("lib/python*/site-packages")
+    monkeypatch.syspath_prepend(modules)
+    for name in ("bota_ethercat_msgs", "bota_ethercat_msgs.srv"):  # its folder in clients/ passes for it
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    made = importlib.import_module("bota_ethercat_msgs.srv")
+    return {name: getattr(made, kind) for name, kind in SERVICES.items()}
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)  # of compiling
+def test_as_generated_over_the_middleware(
+    generated: dict[str, Any], listener: Listener, start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(services, "TYPED", generated)
+
+    def ask(name: str, **fields: object) -> Any:
+        return listener.ask(generated[name], f"typed/{name}", generated[name].Request(**fields))
+
+    with ScriptedServer() as server:
+        server.description["sensors"][0]["settings"] = SETTINGS
+        told = {"old_offset": [1] * 6, "new_offset": [0.5] * 6, "residual": [1e-3] * 6}
+        server.answers["tare"] = lambda _: {"ok": True, **told}
+        start(server.port).says("connected to")
+        assert numbers(ask("sensor_tare", samples=300).bias) == [-0.5] * 6
+        assert server.requests[-1]["samples"] == 300
+        response = ask("get_settings")
+        assert {row.name: parameter_value_to_python(row.value) for row in response.settings} == SETTINGS
+        assert "came in" in ask("tare").message
+        assert "call identify/start first" in ask("identify/solve").message
 
 
 def test_without_the_package_there_are_the_triggers_only(monkeypatch: pytest.MonkeyPatch) -> None:

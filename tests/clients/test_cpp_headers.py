@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import socket
 import subprocess
 import tomllib
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from typing import Final
 import pytest
 
 from bota_ethercat.client.reading import Condition
+from bota_ethercat.world import Felt, encode
 from tests.clients.cpp_programs import (
     CLIENT,
     HEADERS,
@@ -137,6 +139,16 @@ def test_every_header_alone(tmp_path: Path) -> None:
         sources[-1].write_text(f"#include <{path.relative_to(INCLUDE)}>\n")
     (tmp_path / "alone.cpp").write_text("int main() {}\n")
     build(tmp_path / "alone.cpp", PLAIN, tuple(sources))
+
+
+def test_a_world_sends_what_the_python_one_does(tmp_path: Path) -> None:
+    command = [str(driver_program()), "world", str(tmp_path / "world")]
+    assert subprocess.run(command, check=False).returncode == 1, "no sensor"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sensor:
+        sensor.bind(command[-1])
+        subprocess.run(command, check=True)
+        felt = Felt((1, 2, 3, 4, 5, 6), (7, 8, 9), (10, 11, 12), 13)
+        assert sensor.recv(200) == encode(0.5, felt, 2)
 
 
 # -- real time, in the words of the Python client

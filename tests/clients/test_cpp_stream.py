@@ -233,10 +233,6 @@ CONVERSATIONS: dict[str, tuple[Any, list[Any]]] = {
         {"event": "reconfigured", "sensor": 0}, latest(condition="silent"), info(reconfigurations=1),
     ]),
     "peek does not read the socket": ({}, [F(1), peek(has_sample=False), latest(has_sample=True)]),
-    "counts": ({"every": 7}, [
-        F(10), F(11, REPEATED), F(12, INVALID), F(20, GAP), latest(passed_over=1),
-        info(frames=4, samples=2, repeated=1, invalid=1, gaps=1, withheld=1, skipped=6, passed_over=1),
-    ]),
     "next gives every sample in order": ({}, [
         F(1), F(2, REPEATED), F(3, INVALID), F(4, GAP), F(5),
         following(sequence=1, gap=False, is_new=True, passed_over=0),

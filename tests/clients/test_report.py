@@ -19,8 +19,9 @@ from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from bota_ethercat.sensor.meaning import meaning
-from ethercat_server.virtual_sensor import signals
+from ethercat_server.virtual_sensor.signals import poses
 from tests.clients.simulated import Script, decoded, described, sensor, simulate, subject_of
+from tests.virtual_sensor.motions import measured, turning
 
 SLOW = 512  # SINC length for what does not depend on the rate: 100 Hz
 SINC, SECONDS = 128, 7  # of `healthy`: 400 Hz
@@ -78,14 +79,14 @@ def frames() -> tuple[DataMessage, ...]:
         (256, 20, {"seed": 7, "ppm": 200.0}),
         (1024, 40, {"seed": 8}),
         (SLOW, 10, {"script": Script(lost_frames=0.05)}),  # frames that the bus loses are no lost samples
-        (32, 4.2, {"signal": "scene", "pdo_size": 77, "seed": 2, "begin": 2.0}),
+        (32, 4.2, {"pdo_size": 77, "seed": 2, "begin": 2.0}),
         *(
             (
                 length,
                 seconds,
-                {"signal": signal, "pdo_size": 77, "seed": 2, "begin": 2.0 * (signal == "scene")},
+                {"world": world, "pdo_size": 77, "seed": 2, "begin": 2.0 * (world is None)},
             )
-            for signal in ("scene", "poses", "turn")
+            for world in (None, poses, turning)
             for length, seconds in ((128, 5), (512, 10), (1024, 20))
         ),
     ],
@@ -98,8 +99,7 @@ def test_nothing_is_found_on_a_healthy_sensor(sinc_length: int, seconds: float, 
 
 def test_the_noise_is_that_of_the_sensor_whatever_it_does(healthy: Subject) -> None:
     examination = expect(healthy)
-    source = signals.Scene(0, noise=True)
-    source.set_sinc_length(SINC)
+    source = measured(sinc=SINC, noise=True)
     readings = np.array([source.reading(n, 0, 0.0).force_torque for n in range(2000)])
     assert examination.noise.deviation[:6] == pytest.approx(readings.std(axis=0), rel=0.06)
     assert np.ptp(healthy.columns.force[:, 2]) > 20 * examination.noise.deviation[2], "there was a contact"

@@ -452,6 +452,18 @@ def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> Non
         loop.do("stop")
 
 
+def test_the_first_sample_while_the_sensor_turns(running: Loop, server: PlayedSensor) -> None:
+    """How fast it spins up, and so the inertia of the tool, is not known yet."""
+    loop = running.opened(server.port, "compensated", tool_mass=1, on_invalid="hold")
+    begin_ns = time.monotonic_ns()
+    for number, condition in ((1, NOT_FINITE), (2, FRESH)):
+        data = encode(61, {"acceleration.z": 1.0, "angular_rate.x": 100.0, "force.x": number})
+        server.send(encode_data(number, 5, begin_ns + number * 1_250_000, 0, 0, 3, data))
+        seen = loop.until(condition)
+    assert wrench(seen) == 2
+    assert seen["compensated.force.x"] == pytest.approx(2)
+
+
 def test_without_a_payload_the_log_says_what_zero_is(running: Loop, server: PlayedSensor) -> None:
     loop = running.opened(server.port)
     assert loop.do("tare")["ok"]

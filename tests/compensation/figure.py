@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from ethercat_server.virtual_sensor import signals
-from ethercat_server.virtual_sensor.signals import TURN_LENGTH
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import Payload, Wrench
 from ft_compensation.specific_force import QuaternionGravity
+from tests.virtual_sensor.motions import TURN_LENGTH, measured, turning
 
 Array = NDArray[np.float64]
 
 FIGURE: Final = Path(__file__).parents[2] / "docs" / "compensation.svg"
 BIAS: Final = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)  # what this sensor reads without load, N and Nm
-_RATE: Final = 100
+_SINC: Final = 512
+_RATE: Final = 51200 // _SINC  # Hz
 _EVERY: Final = 40  # one sample in this many is drawn
 _COLUMNS: Final = 3
 _PANEL: Final = (270, 180)
@@ -49,7 +50,7 @@ class Samples(NamedTuple):
 
 def samples(noise: bool = True) -> Samples:
     """One slow full turn."""
-    signal = signals.Scene(1, noise, signals.turn)
+    signal = measured(turning, _SINC, seed=1, noise=noise)
     rows: list[tuple[float, ...]] = []
     for number in range(int(TURN_LENGTH * _RATE)):
         time_s = number / _RATE
@@ -57,8 +58,8 @@ def samples(noise: bool = True) -> Samples:
         ax, ay, az = (part * STANDARD_GRAVITY for part in reading.acceleration)
         push = _PUSH if _TOUCH[0] <= time_s < _TOUCH[1] else (0.0, 0.0, 0.0)
         load = [*push, *signals.cross(signals.CONTACT_POINT, push)]
-        measured = [a + b + c for a, b, c in zip(reading.force_torque, BIAS, load, strict=True)]
-        rows.append((time_s, *measured, -ax, -ay, -az, *reading.orientation))
+        wrench = [a + b + c for a, b, c in zip(reading.force_torque, BIAS, load, strict=True)]
+        rows.append((time_s, *wrench, -ax, -ay, -az, *reading.orientation))
     table = np.array(rows)
     return Samples(table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7:10], table[:, 10:14])
 
@@ -122,7 +123,7 @@ def draw(path: Path, data: Samples, shown: Mapping[str, Array]) -> None:
         f'<rect width="{width}" height="{height}" fill="white"/>',
         f'<text x="{width / 2:g}" y="14" font-size="11" text-anchor="middle">{title}:{legend}</text>',
     ]
-    three_sigma = 3 * signals.Scene(1, noise=True).deviations[0]
+    three_sigma = 3 * measured(sinc=_SINC).deviations[0]
     for number, (name, left) in enumerate(shown.items()):
         down, across = divmod(number, _COLUMNS)
         lines.append(f'<g transform="translate({across * _PANEL[0] + 26} {down * _PANEL[1] + 38})">')

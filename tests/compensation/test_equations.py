@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bota_ethercat.pdo import STANDARD_GRAVITY
 from ethercat_server.virtual_sensor import signals
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
@@ -44,9 +43,9 @@ def test_stages_add_up_and_have_their_signs() -> None:
 @pytest.mark.parametrize("seconds", [0.0, 2.7, 5.3, 11.0])
 def test_signs_are_those_of_the_sensor(seconds: float) -> None:
     """The scene's tool, from physics written elsewhere: what is left is the contact, and nothing else."""
-    reading = signals.Scene(0, noise=False).reading(0, 0, seconds)
-    fx, fy, fz, mx, my, mz = reading.force_torque
-    ax, ay, az = (STANDARD_GRAVITY * part for part in reading.acceleration)
+    felt = signals.scene(seconds)
+    fx, fy, fz, mx, my, mz = felt.wrench
+    ax, ay, az = felt.acceleration
     stages = Compensator(Payload(signals.TOOL_MASS, signals.TOOL_CENTRE)).compensate(
         (fx, fy, fz), (mx, my, mz), (ax, ay, az)
     )

@@ -23,13 +23,14 @@ from bota_ethercat.errors import RequestError
 
 def test_subscribe_gets_its_defaults() -> None:
     parsed = parse_request({"action": "subscribe"})
-    assert parsed.values == {"sensors": None, "every": 1, "fresh_only": True}
+    assert parsed.values == {"sensors": None, "terminals": (), "every": 1, "fresh_only": True}
     assert not parsed.has_id
 
 
 def test_subscribe_takes_what_the_contract_names() -> None:
-    message = request("subscribe", 5, sensors=[0, 2], every=4, fresh_only=False)
-    assert parse_request(message).values == {"sensors": (0, 2), "every": 4, "fresh_only": False}
+    message = request("subscribe", 5, sensors=[0, 2], terminals=[1], every=4, fresh_only=False)
+    values = {"sensors": (0, 2), "terminals": (1,), "every": 4, "fresh_only": False}
+    assert parse_request(message).values == values
 
 
 def test_only_what_changes_something_needs_authority() -> None:

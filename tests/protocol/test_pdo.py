@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from bota_ethercat.errors import PdoSizeError
 from bota_ethercat.pdo import LAYOUTS, PDO_FIELDS, SampleDecoder, encode, layout_for
+from bota_ethercat.terminal import decode_terminal
 
 # Name, offset, struct code, sub-index.
 TABLE = [
@@ -115,3 +116,17 @@ def test_infinities_that_cancel_are_noticed() -> None:
 @given(st.sampled_from((61, 77)).flatmap(lambda n: st.binary(min_size=n, max_size=n)))
 def test_any_bytes_decode_to_something(data: bytes) -> None:
     assert len(SampleDecoder(len(data)).decode(data).array) == 12
+
+
+@pytest.mark.parametrize(
+    ("kind", "at", "length", "value"),
+    [
+        ("bool", 3, 1, 1), ("u8", 0, 8, 0x68), ("u3", 4, 3, 6), ("i16", 8, 16, -2), ("i3", 4, 3, -2),
+        ("f32", 24, 32, -0.5), ("f32", 24, 16, 0), ("STRING", 0, 56, 0xBF000000_FFFE68),
+        ("u8", -1, 8, None), ("u8", 0, 57, None), ("u8", 0, 1 << 70, None),
+    ],
+)  # fmt: skip
+def test_an_entry_of_a_terminal_is_decoded(kind: str, at: int, length: int, value: float | None) -> None:
+    data = struct.pack("<Bhf", 0x68, -2, -0.5)
+    entry = {"name": "Value", "type": kind, "bit_offset": at, "bit_length": length}
+    assert decode_terminal({"layout": [entry]}, data).get("Value") == value

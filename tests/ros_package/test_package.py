@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import configparser
 import functools
-import os
 import re
-import shutil
-import subprocess
 import sys
 import tomllib
-import zipfile
 from pathlib import Path
 from typing import Final
 
@@ -18,10 +14,11 @@ import pytest
 from catkin_pkg.package import parse_package
 from catkin_pkg.packages import find_packages
 
-from tests.ros_package.package_files import PACKAGE, PACKAGES, ROOT, SHARED_FOLDERS, commands, shared_files
+from tests.ros_package.package_files import PACKAGE, PACKAGES, ROOT, SHARED_FOLDERS, shared_files
 from tests.test_architecture import imports
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+CLIENTS = tomllib.loads((ROOT / "clients/pyproject.toml").read_text())
 MARKER = "share/ament_index/resource_index/packages"
 
 
@@ -34,10 +31,12 @@ def test_the_manifests_and_one_version() -> None:
     folders |= {str(folder.relative_to(ROOT)): name for name, folder in PACKAGES.items()}
     assert {path: package.name for path, package in found.items()} == folders
     version = PROJECT["project"]["version"]
+    assert CLIENTS["project"]["version"] == version
     for package in found.values():
         assert (package.version, package.licenses, package.package_format) == (version, ["Apache-2.0"], 3)
         # colcon takes a package with an invalid address for plain Python.
         assert all(re.fullmatch(r"[^@ ]+@[^@ ]+\.[a-z]+", each.email) for each in package.maintainers)
+        assert not any("example" in each.email for each in package.maintainers)
         if package.name in PACKAGES:
             assert package.get_build_type() == "ament_python"
             metadata = setup_of(PACKAGES[package.name])["metadata"]
@@ -104,44 +103,6 @@ def test_both_install_the_same_everything_in_the_shared_folders() -> None:
     folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] not in "._"}
     code = {"bridge", "ft_compensation", "resource", "test"}
     assert {name for name in folders if not name.endswith(".egg-info")} == {*SHARED_FOLDERS, *code}
-
-
-@pytest.mark.long
-def test_what_is_for_an_index_is_built_and_checked_and_has_its_files_where_ros_looks(tmp_path: Path) -> None:
-    if (wheels := os.environ.get("TEST_WHEELS")) is None:
-        pytest.skip("build and twine come from PyPI: run scripts/test --long with a network")
-    copy = tmp_path / "copy"  # what is built would otherwise be left in the checkout
-    ignored = shutil.ignore_patterns(".*", "build", "*.egg-info", "__pycache__")
-    shutil.copytree(ROOT, copy, symlinks=True, ignore=ignored)
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--find-links", wheels]
-    subprocess.run([*pip, "--target", tmp_path / "tools", "build", "twine"], check=True)
-    environment = os.environ | {"PYTHONPATH": str(tmp_path / "tools")}
-
-    def run(*command: str | Path) -> None:
-        done = subprocess.run(
-            [sys.executable, "-m", *command], env=environment, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-
-    run("build", "--no-isolation", "--outdir", tmp_path / "dist", copy)
-    wheel, source = sorted((tmp_path / "dist").iterdir(), key=lambda path: path.suffix, reverse=True)
-    assert (wheel.suffix, source.suffix) == (".whl", ".gz")
-    run("twine", "check", "--strict", wheel, source)
-    with zipfile.ZipFile(wheel) as archive:
-        names = {name.partition(".data/data/")[2] for name in archive.namelist()}
-    for name, package in PACKAGES.items():
-        assert {f"share/{name}/{file}" for file in {"package.xml", *shared_files(package)}} <= names
-        assert f"{MARKER}/{name}" in names
-
-    bota = tmp_path / "bota"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", bota], check=True)
-    pip = [sys.executable, "-m", "pip", f"--python={bota}/bin/python", "install", "--quiet"]
-    subprocess.run([*pip, "--no-deps", "--no-index", wheel], check=True)
-    (export,) = [command for command in commands("ros2-workspace.md") if command.startswith("export")]
-    shell = f'{export}; cd "${{AMENT_PREFIX_PATH%%:*}}" && for each in lib/*/client; do $each --help; done'
-    environment = os.environ | {"HOME": str(tmp_path)}
-    used = subprocess.run(["bash", "-c", shell], env=environment, check=True, capture_output=True, text=True)
-    assert used.stdout.count("usage: ros2 run bridge client") == 2
 
 
 # Topics of the node in the root namespace, with what a layout plots of them.

@@ -20,7 +20,7 @@ import pytest
 
 from bota_ethercat.control import request
 from bota_ethercat.errors import ConnectionFailedError
-from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, TerminalMessage, encode_json
 from bota_ethercat.text.json_text import JsonObject
 from tests.rights import socket_of
 
@@ -359,7 +359,7 @@ def another_machine(veth: Veth) -> Iterator[list[str]]:
 
 @contextlib.contextmanager
 def virtual_sensor(
-    *arguments: str, module: str = "ethercat_server.virtual_sensor", first: tuple[str, ...] = ()
+    *arguments: str, module: str = "ethercat_server.virtual_sensor.cli", first: tuple[str, ...] = ()
 ) -> Iterator[tuple[Veth, VirtualSensor]]:
     """A veth pair with a virtual sensor on its far end: `module first... IFACE arguments...`."""
     with Veth() as veth:
@@ -379,12 +379,16 @@ class FramedClient:
     ) -> None:
         self.send_all, self.wait = send_all, wait
         self.frames: list[DataMessage] = []
+        self.terminal_frames: list[TerminalMessage] = []
         self.events: list[JsonObject] = []  # those that `wait_event` has not returned
         self.replies: list[JsonObject] = []
         self._decoder = FrameDecoder()
         self._id = 0
 
-    def keep(self, message: JsonObject) -> None:
+    def keep(self, message: TerminalMessage | JsonObject) -> None:
+        if isinstance(message, TerminalMessage):
+            self.terminal_frames.append(message)
+            return
         (self.events if "event" in message else self.replies).append(message)
 
     def send(self, action: str, **keys: object) -> int:
@@ -486,7 +490,7 @@ class Client(FramedClient):
             if not data:
                 raise ConnectionFailedError("the server closed it")
             self._decoder.feed(data)
-        if isinstance(message, DataMessage):
+        if isinstance(message, DataMessage) and not isinstance(message, TerminalMessage):
             self.frames.append(message)
         else:
             self.keep(message)

@@ -12,18 +12,27 @@ from bota_ethercat.framing import DataFlag
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.datagrams import LateAnswers
 from ethercat_server.ethercat.exchange import DUPLICATE, FIRST_INDEX
 from ethercat_server.ethercat.exchange import Exchange as Taken
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build, parse
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
 from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.sensor import Firmware
 from tests.simulation import Asked, Exchange, Simulation, check_frames, fresh, life_of, more_if_long
 
 STATION = 0x1001
 LRW_OR_NOT = pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
 INDICES = 0x100 - FIRST_INDEX
 Answer = Callable[[bytearray], list[bytes]]
+
+
+def take_lrw_away(life: Firmware) -> None:
+    """Let it have a controller that does not know LRW."""
+    life.esc.has_lrw = False
+    life.esc.memory[reg.FEATURES + 1] |= reg.NO_LRW >> 8
 
 
 class ScriptedWire:
@@ -140,7 +149,7 @@ def operational(
 ) -> tuple[Bus, MemoryBackend]:
     backend = MemoryBackend(*sensors, machine=machine)
     if not lrw:
-        life_of(backend, -1).esc.take_lrw_away()
+        take_lrw_away(life_of(backend, -1))
     bus = Bus(backend)
     bring_up(bus, Asked(), lambda: None)
     return bus, backend
@@ -204,6 +213,17 @@ def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() 
     assert process_data.duplicates == 0, "it was given up, not taken"
 
 
+def test_a_late_answer_makes_datagrams_wait_longer_but_never_long() -> None:
+    late, pending = LateAnswers(clock := SimulatedClock(Machine())), 0x80 + 3
+    for stall_s in (0.01, 10.0):
+        late.pending_ns[3] = clock.now_ns
+        clock.sleep(stall_s)
+        late.in_time(3)
+        assert 0.02 <= late.timeout_s <= 0.25
+        late.note(done(build((Command.NOP, 0, 0, b""), first_index=pending)))
+        assert 0.02 <= late.timeout_s <= 0.25
+
+
 # -- whatever comes from the wire the loop goes on
 
 Change = Callable[[bytes], list[bytes]]
@@ -256,7 +276,7 @@ def test_of_frames_that_arrive_several_times_each_counts_once(copies: int, read_
 def test_a_working_counter_that_cannot_be_is_no_complete_exchange(lrw: bool) -> None:
     wire = HostileWire(SensorOptions(signal="clock"))
     if not lrw:
-        life_of(wire).esc.take_lrw_away()
+        take_lrw_away(life_of(wire))
     running = Simulation(backend=wire)
     running.run(0.3)
     # One adds 1 for what is read, and 1 for what is written, twice in an LRW: these add up to 3, or more.
@@ -286,7 +306,7 @@ def test_no_bytes_from_the_wire_end_the_loop(seed: int, lrw: bool, caplog: pytes
     chance = random.Random(seed)
     wire = HostileWire(SensorOptions(), SensorOptions(serial=2))
     if not lrw:
-        life_of(wire).esc.take_lrw_away()
+        take_lrw_away(life_of(wire))
     running = Simulation(backend=wire)
     running.run(0.7)  # until event times are in use
 

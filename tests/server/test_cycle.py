@@ -398,6 +398,13 @@ def test_percentiles_are_exact_to_a_few_percent() -> None:
     assert recent.summaries_us()[0]["max"] == pytest.approx(10**12)
 
 
+def test_negative_durations_count_as_zero() -> None:
+    recent = RecentDistribution()
+    for duration in (-5, -5e9, 7):
+        recent.record(duration)
+    assert recent.summaries_us()[0] == {"p50": 0, "p99": 0.007, "p999": 0.007, "max": 0.007}
+
+
 def test_recent_forgets_after_ten_rolls_and_reading_takes_no_longer_with_time() -> None:
     noise, recent = random.Random(1), RecentDistribution()
     recent.record(5_000_000)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.access.adapters import Adapter, adapters
 from ethercat_server.daemon.server import serve
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat import nic
@@ -53,6 +54,12 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return found
 
 
+def listed(veth: Veth) -> Adapter:
+    """What tool and doctor know of the interface."""
+    (found,) = [each for each in adapters() if each.name == veth.near]
+    return found
+
+
 def refusal(ifname: str) -> str:
     with pytest.raises(InterfaceError) as refused, claimed(ifname):
         pass
@@ -79,6 +86,7 @@ def test_a_part_of_a_bridge_is_refused_and_the_bridge_is_named(veth: Veth) -> No
         veth.ip("link", "set", veth.near, "master", bridge)
         assert f"{veth.near} is part of {bridge} (a bridge or bond)" in refusal(veth.near)
         assert bridge in why_silent(veth.near)
+        assert listed(veth).master == bridge
     finally:
         veth.ip("link", "del", bridge)
     with claimed(veth.near):
@@ -88,8 +96,10 @@ def test_a_part_of_a_bridge_is_refused_and_the_bridge_is_named(veth: Veth) -> No
 def test_an_interface_that_is_down_or_gone_is_why_nothing_comes_back(veth: Veth) -> None:
     veth.ip("link", "set", veth.far, "down")
     assert "has no carrier" in why_silent(veth.near)
+    assert (listed(veth).up, listed(veth).carrier) == (True, False)
     veth.ip("link", "set", veth.near, "down")
     assert f"{veth.near} is down: bring it up" in why_silent(veth.near)
+    assert not listed(veth).up
     veth.ip("link", "set", veth.near, "up")
     veth.ip("link", "set", veth.far, "up")
     wait_until(lambda: look_up(veth.near).has_carrier, "the carrier")

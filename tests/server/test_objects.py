@@ -31,7 +31,6 @@ from ethercat_server.sensor.objects.dictionary import (
     BY_SETTING,
     FACTORY_CALIBRATION,
     KNOWN_OBJECTS,
-    NOTE_NAMES,
     OBJECTS,
     Access,
     ObjectType,
@@ -43,14 +42,20 @@ from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from ethercat_server.sensor.set_up import read_offset, read_settings, write_offset
 from ethercat_server.sensor.tare import tare
 
-# Names in Table III.1 and Listing III.6 beside those of `NOTE_NAMES`.
+# Names in Table III.1 and Listing III.6.
 IN_THE_NOTE = (
-    (0x7000, 0, "Digital Output"), (0x8000, 0, "Force/Torque Offset"), (0x8001, 0, "Acceleration Offset"),
-    (0x8003, 0, "Force/Torque Range"), (0x8004, 0, "Acceleration Range"), (0x8006, 0, "Force/Torque Filter"),
-    (0x8006, 1, "SINC Length"), (0x8006, 2, "FIR disable"), (0x8006, 3, "FAST enable"),
-    (0x8006, 4, "CHOP enable"), (0x8007, 0, "Acceleration Filter"), (0x8010, 1, "Calibration Matrix Active"),
-    (0x8010, 2, "Temperature Compensation"), (0x8010, 3, "IMU Active"), (0x8011, 0, "Sampling Rate"),
-    (0x8030, 0, "Control"), (0x8030, 1, "Command"), (0x8030, 2, "Status"),
+    (0x2000, 0, "Calibration"), (0x6000, 0, "Sensor Data"), (0x7000, 0, "Digital Output"),
+    (0x8000, 0, "Force/Torque Offset"), (0x8001, 0, "Acceleration Offset"),
+    (0x8002, 0, "Angular Velocities Offset"), (0x8003, 0, "Force/Torque Range"),
+    (0x8004, 0, "Acceleration Range"), (0x8005, 0, "Angular Velocities Range"),
+    (0x8006, 0, "Force/Torque Filter"), (0x8006, 1, "SINC Length"), (0x8006, 2, "FIR disable"),
+    (0x8006, 3, "FAST enable"), (0x8006, 4, "CHOP enable"), (0x8007, 0, "Acceleration Filter"),
+    (0x8008, 0, "Angular Velocities Filter"), (0x8010, 0, "Device configuration"),
+    (0x8010, 1, "Calibration Matrix Active"), (0x8010, 1, "Force/Torque Calibration Matrix Active"),
+    (0x8010, 2, "Temperature Compensation Active"), (0x8010, 2, "Temperature Compensation"),
+    (0x8010, 3, "IMU Active"), (0x8010, 4, "Coordinate System Cong. Active"),
+    (0x8010, 5, "Inertia and Gravity Comp. Active"), (0x8010, 6, "Orientation Estimation Active"),
+    (0x8011, 0, "Sampling Rate"), (0x8030, 0, "Control"), (0x8030, 1, "Command"), (0x8030, 2, "Status"),
 )  # fmt: skip
 
 
@@ -78,7 +83,7 @@ def test_no_setting_is_held_by_the_factory_calibration() -> None:
 
 
 def test_objects_have_every_name_that_people_know_them_by() -> None:
-    for index, subindex, name in (*NOTE_NAMES, *IN_THE_NOTE):
+    for index, subindex, name in IN_THE_NOTE:
         found = [row.address for row in find_objects(name)]
         assert (index, subindex) in found, name
         assert find_objects(name.upper().replace(" ", "_")) == find_objects(name)

@@ -362,6 +362,25 @@ def test_pauses_between_trials_double_until_event_times_have_proved_right_for_lo
     assert pause_s() == pytest.approx(10, abs=0.5)
 
 
+@pytest.mark.parametrize("seconds", [0.8, 3.0], ids=["on trial", "trusted"])
+def test_what_does_not_fit_while_the_machine_is_busy_is_not_held_against_event_times(seconds: float) -> None:
+    """An exchange was away for long then: who knows what has held up what."""
+    for took_ns, counts in ((20e6, False), (100e3, True)):
+        simulation = run(HONEST, seconds=seconds)
+        events = simulation.clock.events
+        assert events is not None
+        for number in range(300):
+            sent = int(simulation.now_ns + number * 30e6)
+            back = sent + int(took_ns)
+            long_ago = HONEST.local(sent - 1e9)
+            events.take((HONEST.local(sent), 1, long_ago, 1), sent, back, True, simulation.clock.period_ns)
+            if events.are_trusted:
+                events.date(sent, simulation.clock.period_ns, 1e6, sent, back)
+            else:
+                events.compare(0.0, 1e6, back)
+        assert bool(trust(simulation).why) is counts
+
+
 @pytest.mark.parametrize("jump_ns", [3e6, 30e3, -30e3, -1e9])
 def test_a_clock_that_jumps_is_not_believed_until_it_has_proved_right_again(jump_ns: float) -> None:
     simulation = run(Controller(jump_ns=jump_ns, lies_from_s=LIES_FROM_S), seconds=9.0)

@@ -672,7 +672,7 @@ def test_addresses_that_others_answer_to_are_not_taken() -> None:
     class Forced(Asked):
         force = True
 
-    sensors, others = bring_up(bus := Bus(backend), Forced(), lambda: None)
+    sensors, others, _ = bring_up(bus := Bus(backend), Forced(), lambda: None)
     assert [sensor.streams for sensor in sensors] == [True]
     assert [slave.status.state.name for slave in others] == ["PREOP"] * 2
     theirs = {before[at][reg.STATION_ADDRESS : reg.STATION_ADDRESS + 2] for at in (0, 2)}

@@ -1,5 +1,5 @@
-"""scripts/install-service below a temporary root: installs, is repeatable, keeps what was edited, leaves; and
-the unit files: what systemd makes of them, and that they leave the server no more than it needs."""
+"""scripts/install-service: its Debian packages, installed, updated and purged in a root of their own; and
+and the unit files: what systemd makes of them, and that they leave the server no more than it needs."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+from bota_ethercat.program.version import VERSION
 from bota_ethercat.settings import check_settings, start_up_defaults
 from ethercat_server.daemon.options import EMPTY, SERVER_SETTINGS, parse_options, read_config
 from ethercat_server.ethercat import nic
@@ -26,10 +27,6 @@ UNITS = ROOT / "systemd"
 SERVER_UNIT = UNITS / "ethercat-server@.service"
 BRIDGE_UNIT = UNITS / "ethercat-bridge.service"
 CAPABILITIES = ("CAP_NET_RAW", "CAP_NET_ADMIN", "CAP_SYS_NICE", "CAP_IPC_LOCK")
-
-
-CONFIGURATION = "/etc/ethercat-server/default.toml"
-RECORD = "/var/lib/ethercat-server/installed"
 
 
 def need_systemd() -> None:
@@ -55,164 +52,67 @@ def install_service(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-class Stage:
-    """A root directory to install into, with programs that do nothing in the place of the real ones."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.prefix = path / "opt" / "ethercat-server"
-        for program in (
-            self.prefix / "bin" / "ethercat-server",
-            self.prefix / "bridge" / "bin" / "bridge-client",
-        ):
-            program.parent.mkdir(parents=True, exist_ok=True)
-            program.write_text("#!/bin/sh\n")
-            program.chmod(0o755)
-
-    def run(self, *arguments: str) -> str:
-        """What install-service says; it must succeed."""
-        done = install_service("--root", str(self.path), *arguments)
-        assert done.returncode == 0, done.stderr
-        return done.stderr
-
-    def install(self, *arguments: str) -> str:
-        return self.run("--keep-environment", *arguments)
-
-    def files(self) -> dict[str, str]:
-        """Every installed file outside the virtual environment, with its content."""
-        return {
-            f"/{path.relative_to(self.path)}": path.read_text()
-            for path in sorted(self.path.rglob("*"))
-            if path.is_file() and self.prefix not in path.parents
-        }
-
-
-@pytest.fixture
-def stage(tmp_path: Path) -> Stage:
+def interface_package(folder: Path, *arguments: str) -> tuple[str, dict[str, str]]:
+    """The name and the files of the package for one interface, with those for dpkg."""
     need_systemd()
-    return Stage(tmp_path / "stage")
+    done = install_service("--keep-environment", "--build", str(folder), *arguments)
+    assert done.returncode == 0, done.stderr
+    (package,) = folder.glob("*.deb")
+    subprocess.run(["dpkg-deb", "--raw-extract", package, folder / "files"], check=True)
+    paths = [path for path in (folder / "files").rglob("*") if path.is_file()]
+    return package.name, {f"/{path.relative_to(folder / 'files')}": path.read_text() for path in paths}
 
 
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Stage, str]:
-    """A whole installation, and what was said; not to be changed."""
-    need_systemd()
-    made = Stage(tmp_path_factory.mktemp("installed") / "stage")
-    return made, made.install("--bridge", "ens5", "13000")
-
-
-@pytest.fixture
-def copied(installed: tuple[Stage, str], tmp_path: Path) -> Stage:
-    """The same, to be changed."""
-    return Stage(Path(shutil.copytree(installed[0].path, tmp_path / "stage")))
-
-
-def test_everything_gets_its_place(installed: tuple[Stage, str]) -> None:
-    files, said = installed[0].files(), installed[1]
-    assert set(files) == {
-        CONFIGURATION,
-        "/etc/ethercat-server/bridge.yaml",
-        "/etc/ethercat-server/ens5.env",
-        "/etc/NetworkManager/conf.d/90-ethercat-server-ens5.conf",
-        "/etc/systemd/network/05-ethercat-server-ens5.network",
-        "/etc/systemd/system/ethercat-bridge.service",
-        "/etc/systemd/system/ethercat-server@.service",
-        "/etc/sysusers.d/ethercat-server.conf",
-        RECORD,
-    }
-    assert "\nPORT=13000\n" in files["/etc/ethercat-server/ens5.env"]
-    assert not [path for path in set(files) - {RECORD} if f"wrote {path}\n" not in said]
-
-
-def test_network_managers_leave_the_interface_alone(installed: tuple[Stage, str]) -> None:
-    files = installed[0].files()
+def test_a_package_keeps_network_managers_off_its_interface(tmp_path: Path) -> None:
+    name, files = interface_package(tmp_path, "ens5", "13000")
+    assert name == "ethercat-server-ens5_0.1.0_all.deb"
+    settings = "/etc/ethercat-server/ens5.env"
+    manager_file = "/usr/lib/NetworkManager/conf.d/90-ethercat-server-ens5.conf"
+    networkd_file = "/usr/lib/systemd/network/05-ethercat-server-ens5.network"
+    for_dpkg = {f"/DEBIAN/{part}" for part in ("control", "conffiles", "postinst", "prerm", "postrm")}
+    assert set(files) == {settings, manager_file, networkd_file} | for_dpkg
+    assert files["/DEBIAN/conffiles"] == f"{settings}\n"
+    assert "\nPORT=13000\n" in files[settings]
     manager, networkd = configparser.ConfigParser(), configparser.ConfigParser()
-    manager.read_string(files["/etc/NetworkManager/conf.d/90-ethercat-server-ens5.conf"])
+    manager.read_string(files[manager_file])
     section = manager["device-ethercat-ens5"]
     assert (section["match-device"], section["managed"]) == ("interface-name:ens5", "0")
-    networkd.read_string(files["/etc/systemd/network/05-ethercat-server-ens5.network"])
+    networkd.read_string(files[networkd_file])
     assert (networkd["Match"]["Name"], networkd["Link"]["Unmanaged"]) == ("ens5", "yes")
 
 
-def test_units_name_their_folder_and_an_interface_with_a_dash_is_escaped_for_systemd_only(
-    stage: Stage,
-) -> None:
-    stage.prefix.rename(stage.path / "opt" / "elsewhere")
-    stage.install("--prefix", "/opt/elsewhere", "--bridge", "enp3s0-1")
-    files = stage.files()
-    for path, text in files.items():
-        assert not path.endswith(".service") or "/opt/ethercat-server" not in text, path
-    unit = files["/etc/systemd/system/ethercat-bridge.service"]
-    assert "Wants=ethercat-server@enp3s0\\x2d1.service\n" in unit
-    assert "/etc/ethercat-server/enp3s0-1.env" in files
+def test_a_dash_is_escaped_for_systemd_only_and_a_package_has_a_name_that_dpkg_allows(tmp_path: Path) -> None:
+    name, files = interface_package(tmp_path, "Enp3_s0-1")
+    assert name.startswith("ethercat-server-enp3-s0-1_")
+    assert "/etc/ethercat-server/Enp3_s0-1.env" in files
+    assert "\nservices='ethercat-server@Enp3_s0\\x2d1.service'\n" in files["/DEBIAN/prerm"]
 
 
-def test_a_second_time_changes_nothing(copied: Stage) -> None:
-    before = copied.files()
-    said = copied.install("--bridge", "ens5")
-    after = copied.files()
-    assert sorted(before.pop(RECORD).splitlines()) == sorted(after.pop(RECORD).splitlines())
-    assert before == after
-    assert "wrote" not in said
+def test_no_network_manager_has_the_virtual_interface(tmp_path: Path) -> None:
+    _, files = interface_package(tmp_path, "virtual")
+    assert [path for path in files if "DEBIAN" not in path] == ["/etc/ethercat-server/virtual.env"]
 
 
-def test_another_port_and_a_second_interface_and_the_end_of_all(copied: Stage) -> None:
-    copied.install("ens5", "13001")
-    copied.install("ens6", "13002")
-    files = copied.files()
-    assert "\nPORT=13001\n" in files["/etc/ethercat-server/ens5.env"]
-    assert "\nPORT=13002\n" in files["/etc/ethercat-server/ens6.env"]
-    (copied.prefix / "pyvenv.cfg").touch()
-    edited = copied.path / CONFIGURATION[1:]
-    edited.write_text(edited.read_text() + "# mine\n")
-    said = copied.run("--uninstall")
-    assert set(copied.files()) == {CONFIGURATION}
-    assert f"kept {CONFIGURATION}, which was edited" in said
-    assert not copied.prefix.exists()
-    assert "nothing is installed" in copied.run("--uninstall")
-
-
-def test_a_dry_run_says_what_would_be_done_and_does_nothing(copied: Stage, tmp_path: Path) -> None:
-    fresh = Stage(tmp_path / "fresh")
-    said = fresh.run("--dry-run", "--keep-environment", "--bridge", "ens5")
-    assert fresh.files() == {}
-    assert "would write /etc/systemd/system/ethercat-bridge.service\n" in said
-    install, start, watch = said.splitlines()[-3:]
-    assert f"first: sudo {ROOT}/scripts/install-service " in install
+def test_a_dry_run_says_what_would_be_done() -> None:
+    need_systemd()
+    done = install_service("--dry-run", "--bridge", "ens5")
+    assert done.returncode == 0, done.stderr
+    written = set(re.findall(r"would write (\S+)\n", done.stderr))
+    assert written == {
+        "/etc/ethercat-server/bridge.yaml",
+        "/etc/ethercat-server/default.toml",
+        "/etc/ethercat-server/ens5.env",
+        "/usr/lib/NetworkManager/conf.d/90-ethercat-server-ens5.conf",
+        "/usr/lib/systemd/network/05-ethercat-server-ens5.network",
+        "/usr/lib/systemd/system/ethercat-bridge.service",
+        "/usr/lib/systemd/system/ethercat-server@.service",
+        "/usr/lib/sysusers.d/ethercat-server.conf",
+    }
+    start, watch = done.stderr.splitlines()[-2:]
     assert start.startswith(
         "install-service: next: systemctl enable --now 'ethercat-server@ens5' ethercat-bridge "
     )
     assert "then: journalctl -fu 'ethercat-server@ens5'" in watch
-    before = copied.files()
-    (copied.prefix / "pyvenv.cfg").touch()
-    edited = copied.path / CONFIGURATION[1:]
-    edited.write_text(before[CONFIGURATION] + "# mine\n")
-    before = copied.files()
-    said = copied.run("--dry-run", "--uninstall")
-    assert copied.files() == before
-    assert copied.prefix.exists()
-    assert f"kept {CONFIGURATION}, which was edited" in said
-    assert "would remove /etc/ethercat-server/ens5.env\n" in said
-    assert "would remove /opt/ethercat-server\n" in said
-
-
-def test_edited_configuration_is_kept_and_an_old_unit_is_not(copied: Stage) -> None:
-    edited = copied.path / CONFIGURATION[1:]
-    edited.write_text("[sensor]\nfir = true\n")
-    unit = copied.path / "etc/systemd/system/ethercat-server@.service"
-    new_unit = unit.read_text()
-    unit.write_text("[Service]\n")
-    assert f"{CONFIGURATION} was edited and is kept" in copied.install("ens5")
-    assert edited.read_text() == "[sensor]\nfir = true\n"
-    assert unit.read_text() == new_unit
-
-
-def test_uninstall_leaves_nothing_that_was_not_edited_and_touches_no_folder_of_others(copied: Stage) -> None:
-    (copied.prefix / "precious").touch()
-    copied.run("--uninstall")
-    assert not copied.files()
-    assert [path.name for path in copied.path.iterdir()] == ["opt"], "no empty folders"
-    assert (copied.prefix / "precious").exists()
 
 
 @pytest.mark.parametrize(
@@ -226,10 +126,8 @@ def test_uninstall_leaves_nothing_that_was_not_edited_and_touches_no_folder_of_o
         (["ens5", "port"], "port 'port' must be from 1024 to 65535"),
         (["ens5", "80"], "port '80' must be from 1024 to 65535"),
         (["ens5", "65536"], "port '65536' must be from 1024 to 65535"),
-        (["--prefix", "relative", "ens5"], "--prefix takes an absolute path"),
-        (["--prefix", "/usr", "ens5"], "must be a folder of its own"),
-        (["--prefix"], "--prefix takes an absolute path"),
-        (["--prefix", "/opt/a b", "ens5"], "only letters, digits"),
+        (["--build"], "--build takes a folder"),
+        (["--bridge", "--keep-environment", "ens5"], "--bridge installs programs, --keep-environment none"),
         (["--quick", "ens5"], "unknown option --quick"),
         (["--uninstall", "ens5"], "--uninstall takes no arguments"),
     ],
@@ -257,57 +155,82 @@ def test_it_needs_root() -> None:
     assert done.stderr.count("\n") == 1
 
 
-IN_A_MACHINE_OF_ITS_OWN = """
+IN_A_ROOT_OF_ITS_OWN = """
 set -e
 mount -t tmpfs tmpfs "$1"
-mkdir "$1/etc" "$1/opt" "$1/lib"
-cp -r --no-preserve=ownership /etc/. "$1/etc" 2>/dev/null || true  # what an ordinary user may read
-rm -rf "$1/etc/ethercat-server"
-for place in etc opt; do mount --bind "$1/$place" "/$place"; done
-mount --bind "$1/lib" /var/lib
-mount -t tmpfs tmpfs /run
-mkdir -p /opt/ethercat-server/bin
-cp /bin/true /opt/ethercat-server/bin/ethercat-server
-touch /opt/ethercat-server/pyvenv.cfg
-cd "$2"
-refused=0
-scripts/install-service --keep-environment virtual || refused=$?
-scripts/install-service --no-start --dry-run --keep-environment virtual
-echo "refused with $refused, files $(find /etc/ethercat-server /var/lib -type f 2>/dev/null | wc -l)"
-before=$(find /etc /opt /var/lib -type d | sort)
-rm -rf /etc/systemd
-scripts/install-service --no-start --keep-environment virtual
-getent passwd ethercat ethercat-bridge
-echo "installed $(find /etc/ethercat-server /opt /var/lib -type f | wc -l)"
-echo "network managers told $(find /etc -path '*etwork*ethercat*' | wc -l)"
-scripts/install-service --uninstall
-echo "left $(find /etc/ethercat-server /opt /var/lib -type f 2>/dev/null | wc -l)"
-echo "folders $(comm -13 <(echo "$before") <(find /etc /opt /var/lib -type d | sort) | wc -l)"
-[ ! -e /etc/systemd ]
+mkdir "$1/upper" "$1/work" "$1/root"
+mount -t overlay overlay -o "lowerdir=/,upperdir=$1/upper,workdir=$1/work" "$1/root"
+for each in dev proc sys; do mount --rbind "/$each" "$1/root/$each"; done
+mount -t tmpfs tmpfs "$1/root/run"
+for each in "$2" "$3"; do  # which may be of other file systems
+    mkdir -p "$1/root$each"
+    mount --bind "$each" "$1/root$each"
+done
+exec chroot "$1/root" bash -c "$4" bash "$2"
 """
-"""The real thing, without --root: in a mount namespace with an /etc, /opt, /var/lib and /run of its own."""
+"""This machine as it is, in a mount namespace: what is written there is written to memory."""
+
+INSTALLED_AND_PURGED = """
+set -e
+cd "$1"
+config=/etc/ethercat-server
+everything() { find /etc /opt /usr/lib /var/lib /run ! -path '*/var/lib/dpkg/*' ! -name '*-' | sort; }
+# systemd-sysusers writes a password in its own way.
+accounts() { cut -d: -f 1,3,4 /etc/passwd; cut -d: -f 1,3 /etc/group; }
+before=$(everything; accounts)
+scripts/install-service ens5 13000
+echo "users $(getent passwd ethercat ethercat-bridge | grep -c nologin)"
+[ /opt/ethercat-server/bin/python -ef /usr/bin/python3 ]  # gets its updates
+setpriv --reuid=ethercat --regid=ethercat --clear-groups /opt/ethercat-server/bin/ethercat-server --version
+mkdir /var/lib/ethercat-sensors  # as the service does
+echo "# mine" >>$config/ens5.env
+scripts/install-service --keep-environment ens5 14000
+scripts/install-service --keep-environment ens6
+scripts/install-service --keep-environment ens6 15000
+grep -H ^PORT $config/*.env
+systemctl enable --quiet ethercat-server@ens5 ethercat-server@ens6
+echo "enabled $(ls /etc/systemd/system/multi-user.target.wants | grep -c ethercat)"
+scripts/install-service --uninstall
+echo "enabled $(ls /etc/systemd/system/multi-user.target.wants | grep -c ethercat)"
+[ ! -e /opt/ethercat-server ]
+tail -n 1 $config/ens5.env
+dpkg --purge ethercat-server ethercat-server-ens5 ethercat-server-ens6 >/dev/null
+scripts/install-service --uninstall
+echo "left <$(comm -13 <(sort <<<"$before") <({ everything; accounts; } | sort))>"
+"""
 
 
-@pytest.mark.skipif(ROOT.parts[1] in {"etc", "opt", "run"}, reason="the checkout would be hidden")
-def test_without_a_staging_root_it_makes_users_and_cleans_up(tmp_path: Path) -> None:
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_packages_are_installed_updated_and_purged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """dpkg and pip for real, with packages that were downloaded before: there is no network here."""
     need_systemd()
-    enter = ["unshare", "--mount"]
-    if subprocess.run([*enter, "mount", "-t", "tmpfs", "tmpfs", tmp_path], check=False).returncode:
-        pytest.skip("no mount namespaces here: run as root")
+    if (wheels := os.environ.get("TEST_WHEELS")) is None:
+        pytest.skip("pip needs packages to install: run scripts/test --long with a network")
+    overlay = f"mount -t tmpfs tmpfs {tmp_path} && cd {tmp_path} && mkdir a b c"
+    overlay += " && mount -t overlay overlay -o lowerdir=/,upperdir=a,workdir=b c"
+    if subprocess.run(["unshare", "--mount", "sh", "-c", overlay], check=False).returncode:
+        pytest.skip("no overlay of this machine's root: run as root")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", wheels)
+    script = [IN_A_ROOT_OF_ITS_OWN, "bash", str(tmp_path), str(ROOT), wheels, INSTALLED_AND_PURGED]
     done = subprocess.run(
-        [*enter, "bash", "-c", IN_A_MACHINE_OF_ITS_OWN, "bash", tmp_path, ROOT],
-        check=False, capture_output=True, text=True,
-    )  # fmt: skip
+        ["unshare", "--mount", "bash", "-c", *script], check=False, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
-    refused, *users = done.stdout.splitlines()[:3]
-    files = done.stdout.splitlines()[3:]
-    assert refused == "refused with 1, files 0"
-    assert "systemd does not run here, so no service could start: " in done.stderr
-    assert "would write /etc/systemd/system/ethercat-server@.service" in done.stderr
-    assert [line.split(":")[0] for line in users] == ["ethercat", "ethercat-bridge"]
-    assert all(line.endswith("nologin") for line in users)
-    assert files == ["installed 5", "network managers told 0", "left 0", "folders 0"]
+    settings = "/etc/ethercat-server/ens{}.env:PORT={}"
+    assert done.stdout.splitlines() == [
+        "users 2",
+        f"ethercat-server {VERSION}",
+        settings.format(5, 13000),
+        settings.format(6, 15000),
+        "enabled 2",
+        "enabled 0",
+        "# mine",
+        "left <>",
+    ]
     assert "systemd does not run here: nothing starts it" in done.stderr
+    assert done.stderr.endswith("install-service: nothing is installed\n")
 
 
 @pytest.mark.parametrize(("file", "extra"), [("requirements.txt", ""), ("requirements-bridge.txt", "ros")])
@@ -323,26 +246,6 @@ def test_the_lock_files_have_what_the_package_needs_with_hashes(file: str, extra
         assert requirement.specifier.contains(locked[requirement.name.lower()]), requirement
 
 
-@pytest.mark.long
-def test_the_program_finds_its_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """pip for real, with packages that were downloaded before: there is no network here."""
-    need_systemd()
-    if (wheels := os.environ.get("TEST_WHEELS")) is None:
-        pytest.skip("pip needs packages to install: run scripts/test --long with a network")
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
-    monkeypatch.setenv("PIP_FIND_LINKS", wheels)
-    done = install_service("--root", str(tmp_path), "ens5")
-    assert done.returncode == 0, done.stderr
-    programs = tmp_path / "opt/ethercat-server/bin"
-    shebang, *_ = (programs / "ethercat-server").read_text().splitlines()
-    assert shebang == "#!/opt/ethercat-server/bin/python"
-    version = subprocess.run(
-        [programs / "python", "-I", "-m", "ethercat_server.daemon.cli", "--version"],
-        check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    assert version.stdout.startswith("ethercat-server ")
-
-
 MOST_EXPOSURE = 2.5
 
 
@@ -355,13 +258,17 @@ def analyze(*arguments: str, units: Path | None = None) -> subprocess.CompletedP
     )  # fmt: skip
 
 
-def test_the_installed_units_are_without_fault(stage: Stage) -> None:
-    stage.install("--bridge", "enp3s0-1")
-    folder = stage.path / "etc/systemd/system"
-    units = [folder / SERVER_UNIT.name, folder / BRIDGE_UNIT.name]
+def test_the_units_are_without_fault(tmp_path: Path) -> None:
+    need_systemd()
+    for program in ("bin/ethercat-server", "bridge/bin/bridge-client"):
+        path = tmp_path / program
+        path.parent.mkdir(parents=True)
+        path.write_text("#!/bin/sh\n")
+        path.chmod(0o755)
+    units = [tmp_path / SERVER_UNIT.name, tmp_path / BRIDGE_UNIT.name]
     for unit in units:
-        unit.write_text(unit.read_text().replace("/opt/ethercat-server", str(stage.prefix)))
-    checked = analyze("verify", "--man=no", "--recursive-errors=no", *map(str, units), units=folder)
+        unit.write_text((UNITS / unit.name).read_text().replace("/opt/ethercat-server", str(tmp_path)))
+    checked = analyze("verify", "--man=no", "--recursive-errors=no", *map(str, units), units=tmp_path)
     ours = [line for line in checked.stderr.splitlines() if "ethercat" in line]
     assert not ours
     assert checked.returncode == 0, checked.stderr
@@ -397,9 +304,11 @@ def test_a_unit_says(unit: Path, key: str, expected: list[str]) -> None:
     assert values(unit, key) == expected
 
 
-def test_the_nodes_real_time_priority_is_below_the_servers(installed: tuple[Stage, str]) -> None:
+def test_the_nodes_real_time_priority_is_below_the_servers() -> None:
     (limit,) = values(BRIDGE_UNIT, "LimitRTPRIO")
-    (node,) = re.findall(r"rt_priority: (\d+)", installed[0].files()["/etc/ethercat-server/bridge.yaml"])
+    installer = (ROOT / "scripts/install-service").read_text()
+    (default, node) = re.findall(r"rt_priority: (\d+)", installer)
+    assert f"rt_priority: {default}\n" in (ROOT / "ros2_bridge/config/client.yaml").read_text()
     assert 0 < int(node) <= int(limit) < realtime.DEFAULT_PRIORITY
 
 
@@ -422,8 +331,8 @@ def test_the_default_configuration_says_nothing_new() -> None:
     assert tomllib.loads(servers).keys() == SERVER_SETTINGS.keys()
     for name, value in tomllib.loads(servers).items():
         setting = SERVER_SETTINGS[name]
-        checked = setting.check(value)
-        assert checked == setting.default or name in {"control_users", "control_groups", "cpu", "user"}, name
+        examples = {"control_users", "control_groups", "cpu", "terminals", "user"}
+        assert setting.check(value) == setting.default or name in examples, name
     assert read_config(UNITS / "default.toml") == EMPTY
     common = tomllib.loads("calibration_matrix" + sensors.rpartition("\n")[0])
     assert check_settings(common) == start_up_defaults()

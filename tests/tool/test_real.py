@@ -5,9 +5,6 @@ What it does with the sensors is tested in memory.
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 
 import pytest
@@ -15,17 +12,13 @@ import pytest
 from ethercat_server.access.adapters import adapters
 from ethercat_server.tool import bus as find
 from tests.server.running import (
-    ATTEMPTS,
-    PATIENCE_S,
     Veth,
     VirtualSensor,
     needs_bus,
     server,
-    starved,
     virtual_sensor,
-    wait_until,
 )
-from tests.tool.running import MODULE, complaints, one_sentence, refused, told, tool, tool_here
+from tests.tool.running import one_sentence, refused, told, tool, tool_here
 
 pytestmark = [pytest.mark.bus, needs_bus]
 Bench = tuple[Veth, VirtualSensor]
@@ -74,32 +67,6 @@ def test_a_whole_command_on_the_interface(bench: Bench) -> None:
     assert {row[0] for row in sensor.written(1)} == {"0x8006"}
     assert sensor.written(0) == []
     assert sensor.stats()["al_state"] == "INIT"
-
-
-def test_watch_ends_with_ctrl_c_and_leaves_the_bus(bench: Bench) -> None:
-    """A signal from outside while pysoem's frames are under way."""
-    veth, sensor = bench
-    for attempt in range(ATTEMPTS):
-        watching = subprocess.Popen(
-            [sys.executable, "-m", MODULE, "watch", veth.near, "--interval", "0.1"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        assert watching.stdout is not None
-        while (line := watching.stdout.readline()) and "samples" not in line:
-            pass
-        if line:
-            break
-        out, err = watching.communicate()
-        assert attempt < ATTEMPTS - 1, err
-        assert starved(err), err
-    watching.send_signal(signal.SIGINT)
-    out, err = watching.communicate(timeout=PATIENCE_S)
-    assert watching.returncode == 0
-    assert not [line for line in complaints(err) if not starved(line) and "is back" not in line]
-    assert "sensor 1 " in out.splitlines()[-1]
-    wait_until(lambda: sensor.stats()["al_state"] == "INIT", "INIT")
 
 
 def test_a_server_that_holds_the_interface_is_found_and_said(bench: Bench) -> None:

@@ -236,6 +236,8 @@ def test_another_sensors_snapshot_is_refused(chain: SimulatedBus, tmp_path: Path
     assert "serial 10, but this is the BFT-SENS-ECAT-M8 with serial 20" in said
     assert chain.written(1) == []
     assert "sinc_length  512  128" in tool_here("restore", near, path, "--sensor", 1, "--force").out
+    tool_here("snapshot", near, path, "--sensor", 1, "--force")
+    assert json.loads(path.read_text())["serial"] == 20
 
 
 @pytest.mark.parametrize("how", ["--undo", "--clear"])

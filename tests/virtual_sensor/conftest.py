@@ -27,7 +27,7 @@ def start() -> Iterator[Start]:
     with contextlib.ExitStack() as running:
 
         def launch(*arguments: str, ready: bool = True, under: Sequence[str] = ()) -> VirtualSensor:
-            program = VirtualSensor("ethercat_server.virtual_sensor", arguments, under)
+            program = VirtualSensor("ethercat_server.virtual_sensor.cli", arguments, under)
             running.callback(program.close)
             if ready:
                 program.wait_for("ready")

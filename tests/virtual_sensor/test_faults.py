@@ -14,7 +14,8 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.faults import COMMANDS, QuitCommand, obey
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import CONSTANT, decode_clock
+from ethercat_server.virtual_sensor.signals import CONSTANT
+from scripts.benchmarks.records import decode_clock
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, Abort, RawMaster, chain, do
 
 PERIOD = 1_250_000

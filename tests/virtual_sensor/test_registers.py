@@ -162,6 +162,27 @@ def test_memory_that_sync_managers_guard() -> None:
     assert master.read(0x1F00, 4) == b"note"
 
 
+def receive_times(master: RawMaster, position: int) -> tuple[int, int]:
+    out, back = struct.unpack("<II", master.read(0x0900, 8, position))
+    return out, back
+
+
+def test_receive_times_are_latched_by_a_write() -> None:
+    master = RawMaster(*chain(3))
+    assert [receive_times(master, n) for n in range(3)] == [(0, 0)] * 3
+    master.wait(1_000_000)
+    assert master.one(Command.BWR, 0, 0x0900, bytes(4))[1] == 3
+    times = [receive_times(master, n) for n in range(3)]
+    master.wait(1_000_000)
+    assert [receive_times(master, n) for n in range(3)] == times
+    (first, first_back), (second, second_back), (last, last_back) = times
+    # As a master computes delays: half of what the round trip takes longer than from the next slave.
+    assert (first_back - first) - (second_back - second) == 2 * (second - first) > 0
+    assert last_back == 0, "nothing is behind it"
+    assert last > second
+    assert struct.unpack("<Q", master.read(0x0918, 8, 1)) == (second,)
+
+
 def test_the_system_time_runs_with_its_offset() -> None:
     master = RawMaster()
 

@@ -137,3 +137,43 @@ def test_save_outlives_a_power_cut_and_nothing_else_does() -> None:
     assert master.upload(0x8010, 1) == b"\1"
     master.download(0x8030, 1, b"\x07")
     assert master.upload(0x8030, 2) != b"\0", "an unknown command"
+
+
+def test_object_lists() -> None:
+    master = RawMaster().go(PREOP)
+    expected = sorted({index for index, _ in sensor_entries(61)})
+    fragments = master.information(1, struct.pack("<H", 1))
+    assert [f[0] & 0x80 for f in fragments] == [0x80] * (len(fragments) - 1) + [0]
+    assert [struct.unpack_from("<H", f, 2)[0] for f in fragments] == list(range(len(fragments)))[::-1]
+    found = b"".join(f[4:] for f in fragments)
+    assert found[:2] == b"\1\0"
+    assert list(struct.unpack(f"<{len(found) // 2}H", found)[1:]) == expected
+    [lengths] = master.information(1, struct.pack("<H", 0))
+    counts = struct.unpack("<6H", lengths[4:])
+    assert counts[:2] == (0, len(expected))
+    for kind in range(2, 6):
+        [one] = master.information(1, struct.pack("<H", kind))
+        assert (len(one) - 6) // 2 == counts[kind]
+    [error] = master.information(1, struct.pack("<H", 9))
+    assert error[0] == 7
+
+
+def test_descriptions() -> None:
+    master = RawMaster().go(PREOP)
+    [reply] = master.information(3, struct.pack("<H", 0x8006))
+    index, _, highest, code = struct.unpack_from("<HHBB", reply, 4)
+    assert (reply[0], index, highest, code) == (4, 0x8006, 4, 9)
+    assert reply[10:]
+    [reply] = master.information(3, struct.pack("<H", 0x1008))
+    assert struct.unpack_from("<HHBB", reply, 4) == (0x1008, 0x0009, 0, 7)
+    [reply] = master.information(5, struct.pack("<HBB", 0x8006, 1, 0))
+    assert struct.unpack_from("<HBBHHH", reply, 4) == (0x8006, 1, 0, 0x0006, 16, 0x0F)
+    assert reply[14:] == b"SINC length"
+    for index, subindex in [(0x8004, 0), (0x8005, 0), (0x8007, 0), (0x8008, 0), (0x8010, 1), (0x8010, 6)]:
+        [reply] = master.information(5, struct.pack("<HBB", index, subindex, 0))
+        assert struct.unpack_from("<HH", reply, 8) == (0x0037, 8), "one-byte settings are BIT8"
+    [reply] = master.information(5, struct.pack("<HBB", 0x6000, 4, 0))
+    assert struct.unpack_from("<H", reply, 12)[0] == 0x87
+    for request in ((3, struct.pack("<H", 0x5555)), (5, struct.pack("<HBB", 0x1018, 9, 0)), (9, b"")):
+        [reply] = master.information(*request)
+        assert reply[0] == 7

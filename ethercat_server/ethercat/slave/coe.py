@@ -266,14 +266,16 @@ class MailboxSdo:
         number: int,
         areas: Sequence[tuple[int, int]],
         emergencies: Emergencies | None = None,
+        name: str = "",
     ) -> None:
         """`areas`: offset and size of the mailbox to the slave, and of the one from it."""
         self._bus, self._number, self._emergencies = bus, number, emergencies
+        self._name = name or f"sensor {number}"
         self.clock = bus.clock
         (self._out, self._out_size), (self._in, self._in_size) = areas
-        if not all(_SHORTEST <= size <= _LONGEST for _, size in areas):
+        if not all(size == 0 or _SHORTEST <= size <= _LONGEST for _, size in areas):  # 0: it has none
             raise BusError(
-                f"sensor {number} has mailboxes of {self._out_size} and {self._in_size} bytes, which no "
+                f"{self._name} has mailboxes of {self._out_size} and {self._in_size} bytes, which no "
                 "frame can carry: power it off and on"
             )
         self._counter = 0
@@ -296,7 +298,7 @@ class MailboxSdo:
         most = self._out_size - _HEADER.size - _SDO_HEADER.size - _SIZE_BYTES
         if not 0 < len(data) <= most:
             raise BusError(
-                f"object 0x{index:04X}:{subindex} of sensor {self._number} cannot be written: 1 to {most} "
+                f"object 0x{index:04X}:{subindex} of {self._name} cannot be written: 1 to {most} "
                 f"bytes fit its mailbox, not {len(data)}"
             )
         if len(data) <= _LONGEST_EXPEDITED:
@@ -345,7 +347,7 @@ class MailboxSdo:
                     if answer[0] == _ABORT:
                         code = int.from_bytes(answer[1][:4], "little")
                         raise SdoAbortError(
-                            f"sensor {self._number} refused {doing} object 0x{index:04X}:{subindex}: "
+                            f"{self._name} refused {doing} object 0x{index:04X}:{subindex}: "
                             f"{abort_meaning(code)} (abort 0x{code:08X})",
                             code,
                         )
@@ -395,4 +397,4 @@ class MailboxSdo:
         return body
 
     def _unanswered(self, doing: str, index: int, subindex: int, what: str) -> str:
-        return f"sensor {self._number} did not answer {doing} object 0x{index:04X}:{subindex}: {what}"
+        return f"{self._name} did not answer {doing} object 0x{index:04X}:{subindex}: {what}"

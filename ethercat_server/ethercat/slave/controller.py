@@ -1,4 +1,4 @@
-"""One sensor's slave controller: AL states, mailbox, and the registers that it needs in OP.
+"""The slave controller of a sensor, or a terminal: AL states, mailbox, and the registers that it needs in OP.
 
 At the start and when a sensor comes back the same steps take it to OP, one or two datagrams each.
 Source: ETG.1000.4 and ETG.1000.6.
@@ -31,10 +31,10 @@ class GoneError(SetUpError):
 
 
 class SlaveController:
-    """The slave controller of sensor `number`.
+    """The slave controller of slave `number` of a `Bus`.
 
     Attributes:
-        number: of the sensor.
+        number: of the sensor; terminals are numbered after all sensors.
         attempts: how often an unanswered datagram is sent; more than once only while nothing streams.
         sdo: its mailbox.
         areas: its process data in the logical address space, as `read_mapping` has found it.
@@ -42,14 +42,15 @@ class SlaveController:
     """
 
     def __init__(
-        self, bus: Datagrams, number: int, mailboxes: Sequence[tuple[int, int]], emergencies: Emergencies
-    ) -> None:
-        """`mailboxes`: offset and size of the one to the sensor and of the one from it."""
-        self._bus = bus
+        self, bus: Datagrams, number: int, mailboxes: Sequence[tuple[int, int]],
+        emergencies: Emergencies | None = None, name: str = "",
+    ) -> None:  # fmt: skip
+        """`mailboxes`: offset and size of the one to the slave and of the one from it."""
+        self._bus, self._name = bus, name or f"sensor {number}"
         self.number = number
         self.attempts = _START_ATTEMPTS
         out, back = mailboxes
-        self.sdo = MailboxSdo(bus, number, (out, back), emergencies)
+        self.sdo = MailboxSdo(bus, number, (out, back), emergencies, self._name)
         self._mailboxes = reg.pack_sync_manager(*out, reg.SM_CONTROL_MAILBOX_OUT)
         self._mailboxes += reg.pack_sync_manager(*back, reg.SM_CONTROL_MAILBOX_IN)
         self.areas: list[Area] = []
@@ -81,8 +82,7 @@ class SlaveController:
                 return
             if status.error or deadline.passed:
                 raise SetUpError(
-                    f"sensor {self.number} does not go to {state.name}: it is in {status}; power it off and "
-                    "on"
+                    f"{self._name} does not go to {state.name}: it is in {status}; power it off and on"
                 )
 
     def enter_preop(self) -> Steps[None]:
@@ -95,6 +95,27 @@ class SlaveController:
         self.write(reg.SYNC_MANAGER, self._mailboxes.ljust(self._count * reg.SYNC_MANAGER_SIZE, b"\0"))
         self.write(reg.SII_OWNER, OF_FIRMWARE)  # a slave reads its SII on the way to PREOP
         yield from self.go(AlState.PREOP)
+
+    def map_inputs(self, logical: int, inputs: Sequence[tuple[int, int, int, int]]) -> None:
+        """Map inputs from a logical address on, and nothing else: sync manager, its start, bytes, control."""
+        units = b""
+        for manager, start, size, control in inputs:
+            at = reg.SYNC_MANAGER + manager * reg.SYNC_MANAGER_SIZE
+            self.write(at, reg.pack_sync_manager(start, size, control))
+            units += reg.FMMU_LAYOUT.pack(logical, size, 0, 7, start, 0, reg.FMMU_READ, 1)
+            logical += size
+        self.write(reg.FMMU, units)
+
+    def leave(self, state: AlState) -> Steps[None]:
+        """Go to INIT, or PREOP if it was found there, with nothing mapped and without a station address."""
+        self.attempts = _START_ATTEMPTS
+        yield from self.go(AlState.INIT)
+        self._read_hardware()
+        self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
+        self.write(reg.SYNC_MANAGER, bytes(self._count * reg.SYNC_MANAGER_SIZE))
+        if state >= AlState.PREOP:
+            yield from self.enter_preop()
+        self.write(reg.STATION_ADDRESS, bytes(2))
 
     def mapped_size(self, assignment: int, in_sii: int) -> Steps[int]:
         """Bytes of process data by the PDOs that the object `assignment` lists; `in_sii` if there is none.
@@ -109,7 +130,7 @@ class SlaveController:
                     bits += (yield from self._read_number(pdo, entry, 0xFFFFFFFF)) & 0xFF
                     if bits > 8 * _MOST_BYTES:
                         raise BusError(
-                            f"sensor {self.number} maps more than {_MOST_BYTES} bytes of process data, which "
+                            f"{self._name} maps more than {_MOST_BYTES} bytes of process data, which "
                             "fit no frame: power it off and on"
                         )
         except SdoAbortError:
@@ -119,7 +140,7 @@ class SlaveController:
     def _read_number(self, index: int, subindex: int, most: int) -> Steps[int]:
         if (value := int.from_bytes((yield from self.sdo.read(index, subindex)), "little")) > most:
             raise BusError(
-                f"sensor {self.number} has {value:#x} in object 0x{index:04X}:{subindex}, which cannot be: "
+                f"{self._name} has {value:#x} in object 0x{index:04X}:{subindex}, which cannot be: "
                 "power it off and on"
             )
         return value
@@ -170,7 +191,7 @@ class SlaveController:
 
     def unmapped(self) -> SetUpError:
         """The error to be raised if its mapping cannot be."""
-        return SetUpError(f"sensor {self.number} did not answer when it was mapped: check cable and power")
+        return SetUpError(f"{self._name} did not answer when it was mapped: check cable and power")
 
     def _acknowledge(self, status: AlStatus) -> Steps[None]:
         # The next request must wait for the error to clear: the slave sees only the last write to AL control.
@@ -178,9 +199,7 @@ class SlaveController:
         deadline = Deadline(self._bus.clock, ACKNOWLEDGE_S)
         while (now := (yield from self._next_status())).error:
             if deadline.passed:
-                raise BusError(
-                    f"sensor {self.number} keeps its error although it was acknowledged: it is in {now}"
-                )
+                raise BusError(f"{self._name} keeps its error although it was acknowledged: it is in {now}")
 
     def _next_status(self) -> Steps[AlStatus]:
         yield
@@ -190,7 +209,7 @@ class SlaveController:
         return status
 
     def _gone(self) -> GoneError:
-        return GoneError(f"sensor {self.number} does not answer: check cable and power")
+        return GoneError(f"{self._name} does not answer: check cable and power")
 
     def _read_hardware(self) -> None:
         if not self._count:

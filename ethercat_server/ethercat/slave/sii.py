@@ -53,6 +53,9 @@ CHECKED_BYTES: Final = 14  # the check byte follows them
 CATEGORIES_WORD: Final = 0x40  # the categories begin here
 CATEGORY_HEADER: Final = struct.Struct("<HH")  # category, length in words
 SYNC_MANAGER: Final = struct.Struct("<HHBBBB")  # start, length, control, status, enable, type
+# Of a PDO: index, number of its entries, sync manager, clock, name, flags. Of each of them, which follow it:
+# index, subindex, name, data type, bits, flags.
+PDO: Final = struct.Struct("<HBBBBH")
 
 _RAW_WORDS: Final = 0x80
 _MOST_WORDS: Final = 0x2000
@@ -135,6 +138,8 @@ def decode(image: bytes) -> Sii:
                 managers[: len(managers) // SYNC_MANAGER.size * SYNC_MANAGER.size]
             )
         ],
+        "tx_pdos": _pdos(parts.get(Category.TXPDOS, b""), text),
+        "rx_pdos": _pdos(parts.get(Category.RXPDOS, b""), text),
         "fmmus": list(parts.get(Category.FMMUS, b"").rstrip(b"\xff")),
         "categories": {
             _CATEGORY_NAMES.get(kind, f"category {kind}"): len(body) for kind, body in parts.items()
@@ -151,6 +156,20 @@ def _categories(image: bytes) -> dict[int, bytes]:
             break
         found[kind] = image[at + 4 : at + 4 + words * 2]
         at += 4 + words * 2
+    return found
+
+
+def _pdos(body: bytes, text: Callable[[int], str]) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = []
+    missing = 0  # entries of the last PDO that are to come
+    for index, second, third, fourth, fifth, _ in PDO.iter_unpack(body[: len(body) // PDO.size * PDO.size]):
+        if missing:
+            missing -= 1
+            entry = {"index": index, "subindex": second, "name": text(third), "type": fourth, "bits": fifth}
+            found[-1]["entries"].append(entry)
+        else:
+            missing = second
+            found.append({"index": index, "name": text(fifth), "sync_manager": third, "entries": []})
     return found
 
 

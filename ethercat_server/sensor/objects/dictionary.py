@@ -38,6 +38,7 @@ MODELS: Final = (
 class ObjectType(Enum):
     """CoE base data type: its number in the SDO Information service, and its struct format."""
 
+    BOOL = (0x0001, "<?")
     I8 = (0x0002, "<b")
     I16 = (0x0003, "<h")
     I32 = (0x0004, "<i")

@@ -28,9 +28,11 @@ from bota_ethercat.client.reading import Condition, Reading
 from bota_ethercat.client.real_time import Scheduling, make_real_time
 from bota_ethercat.client.session import ClientEvent, Session, check_granted
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, ProtocolError, UnreachableError
-from bota_ethercat.framing import DataMessage
+from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.pdo import ImuUnits, Sample
+from bota_ethercat.terminal import decode_terminal
 from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import rows
 
 ANSWER_TIMEOUT_S: Final = 5.0
 _MOST_EVENTS: Final = 1000
@@ -57,6 +59,7 @@ def connect(
     fresh_only: bool = True,
     timeout_s: float | None = None,
     imu_units: ImuUnits = ImuUnits.G_DPS,
+    terminals: Sequence[int] = (),
     rt_priority: int = 0,
     cpu: int = -1,
 ) -> Client:
@@ -66,7 +69,7 @@ def connect(
     """
     client = Client(
         port, host, sensors=sensors, every=every, fresh_only=fresh_only, timeout_s=timeout_s,
-        imu_units=imu_units,
+        imu_units=imu_units, terminals=terminals,
     )  # fmt: skip
     try:
         client.scheduling = make_real_time(rt_priority, cpu)
@@ -82,6 +85,7 @@ class Client:
     Attributes:
         events: `Connected`, `Disconnected` and the server's events, oldest first, the last thousand; take
             them out with `popleft`.
+        terminal_frames: of terminals, valid ones, as `events`; `decode_terminal` decodes them.
         frame: the DATA message that the last sample came from: its sequence, stamps, sensor, flags.
         scheduling: what `connect` was granted of `rt_priority` and `cpu`.
         session: what is known of the server and its sensors.
@@ -101,6 +105,7 @@ class Client:
         reconnect: bool = True,
         timeout_s: float | None = None,
         imu_units: ImuUnits = ImuUnits.G_DPS,
+        terminals: Sequence[int] = (),
         receive_buffer: int = RECEIVE_BUFFER,
         channel: Channel | None = None,
     ) -> None:
@@ -108,6 +113,7 @@ class Client:
 
         `sensors`: by position on the bus, of those that are there; None for all. `every`: one frame in
         `every`. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames come, too.
+        `terminals`: by number.
         `stream` False: no frames, only requests and events. `reconnect` False: ConnectionFailedError tells
         that the only connection has ended. `timeout_s`: how long `receive` waits for a sample; by default 5
         periods, at least 20 ms. `channel`: another one than TCP.
@@ -117,8 +123,10 @@ class Client:
         self.frame: DataMessage | None = None
         self.scheduling = Scheduling()
         self.session = Session(
-            sensors, every=every, fresh_only=fresh_only, raw=raw, stream=stream, imu_units=imu_units
-        )
+            sensors, every=every, fresh_only=fresh_only, raw=raw, stream=stream, imu_units=imu_units,
+            terminals=terminals,
+        )  # fmt: skip
+        self.terminal_frames = self.session.terminal_frames
         self.channel: Channel = TcpChannel(host, port, receive_buffer) if channel is None else channel
         self._reconnect, self._timeout_s = reconnect, timeout_s
         self._open = False
@@ -237,6 +245,11 @@ class Client:
         """The sample in `frame`."""
         return self.session.state(frame.sensor).decode(frame)
 
+    def decode_terminal(self, frame: TerminalMessage) -> dict[str, float]:
+        """The values in a terminal's frame by name, in their order; units are not known."""
+        described = rows(self.description.get("terminals"))[frame.sensor : frame.sensor + 1]
+        return decode_terminal(described[0] if described else {}, frame.process_data)
+
     def measured_ns(self, frame: DataMessage, channel: str = "force_torque") -> int | None:
         """As `Reading.measured_ns`, with the filters as of now."""
         delay_ns = getattr(self.session.state(frame.sensor).delay_ns, channel)
@@ -289,10 +302,11 @@ class Client:
     def _gather(self, timeout_s: float) -> None:
         """Wait at most `timeout_s` until there is something in `session.items`; take all that has arrived."""
         items, monotonic_ns = self.session.items, self.channel.monotonic_ns
+        of_terminals = len(self.terminal_frames)
         left_s, begun_ns = 0.0 if items else timeout_s, monotonic_ns()
         for _ in range(_MOST_READS):
             count = self._step(left_s)
-            if count < _BACKLOG and (items or left_s <= 0):
+            if count < _BACKLOG and (items or left_s <= 0 or len(self.terminal_frames) != of_terminals):
                 return
             left_s = 0.0 if items else timeout_s - (monotonic_ns() - begun_ns) * 1e-9
 

@@ -30,7 +30,7 @@ from bota_ethercat.errors import (
     RefusedError,
     RemoteProtocolError,
 )
-from bota_ethercat.framing import DataMessage, FrameDecoder, encode_json
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, TerminalMessage, encode_json
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.sensor_choice import MOST_PLACES
 from bota_ethercat.text.json_text import JsonObject
@@ -74,6 +74,7 @@ class Session:
         description: the server's newest description; empty before the first connection.
         items: what has arrived and was not taken yet, in order: new and valid frames, or all of them if
             `raw`; the server's events; `Connected` and `Disconnected`.
+        terminal_frames: the last thousand of terminals, likewise.
         same_machine: whether the server's CLOCK_MONOTONIC is this machine's.
         sensors: by position on the bus.
         connections: number of those that were made.
@@ -90,9 +91,12 @@ class Session:
         raw: bool = False,
         stream: bool = True,
         imu_units: ImuUnits = ImuUnits.G_DPS,
+        terminals: Sequence[int] = (),
     ) -> None:
         """What to subscribe to, `sensors` None for all; nothing unless `stream`."""
         self.wanted = None if sensors is None else tuple(sensors)
+        self._terminals = list(terminals)
+        self.terminal_frames: deque[TerminalMessage] = deque(maxlen=_MOST_ITEMS // 64)
         self.connected = self.same_machine = False
         self.description: JsonObject = {}
         self.items: deque[DataMessage | ClientEvent] = deque(maxlen=_MOST_ITEMS)
@@ -164,7 +168,10 @@ class Session:
                     self._take(now_ns)
                 if message is None:
                     return answer
-                answer += self._take_json(message)
+                if not isinstance(message, TerminalMessage):
+                    answer += self._take_json(message)
+                elif self._raw or not message.flags & DataFlag.INVALID:
+                    self.terminal_frames.append(message)
         except (RemoteProtocolError, BadMessageError) as error:
             raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
 
@@ -230,6 +237,8 @@ class Session:
                 has = ", ".join(map(str, there[:16])) or "none"
                 raise ConnectionFailedError(f"the server has no sensor {text} (it has: {has})")
             values["sensors"] = found
+        if self._terminals:
+            values["terminals"] = self._terminals
         return self._ask_first(self._granted, "subscribe", **values)
 
     def _granted(self, reply: JsonObject) -> bytes:

@@ -3,7 +3,10 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
-try:
-    VERSION = version("bota-ethercat-bridge")
-except PackageNotFoundError:  # run from a checkout that was never installed
-    VERSION = "0+unknown"
+VERSION = "0+unknown"  # run from a checkout that was never installed
+for _distribution in ("bota-ethercat", "bota-ethercat-bridge"):  # a checkout is installed as the latter only
+    try:
+        VERSION = version(_distribution)
+        break
+    except PackageNotFoundError:
+        pass

@@ -118,6 +118,8 @@ PARAMETERS: Final = (
     Row("server_port", _PORT, "TCP port of ethercat-server", 1, 65535, live=False),
     Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535, live=False),
     Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255, live=False),
+    Row("terminals", 0, "How many of the server's terminals are published: terminal_0, terminal_1, ...",
+        0, 255, live=False),
     Row("rt_priority", 0,
         "SCHED_FIFO priority of the stream's thread, if allowed; 0 = as the node was started",
         0, HIGHEST_PRIORITY, live=False),
@@ -221,6 +223,7 @@ class Parameters(NamedTuple):
     server_host: str
     server_port: int
     sensor: int
+    terminals: int
     rt_priority: int
     cpu: int
     publishing_frequency: float

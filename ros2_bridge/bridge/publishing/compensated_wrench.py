@@ -203,11 +203,14 @@ class TfFrames:
 
     def _listen(self) -> None:
         """Listen to TF, or no longer; for the executor's thread."""
-        if self._is_wanted and self._tf is None:
-            self._tf = Tf(self._node)
-        elif not self._is_wanted and self._tf is not None:
-            self._tf.close()
-            self._tf = None
+        with self._node.setting:  # not while it is deactivated
+            if self._stopping.is_set():
+                return
+            if self._is_wanted and self._tf is None:
+                self._tf = Tf(self._node)
+            elif not self._is_wanted and self._tf is not None:
+                self._tf.close()
+                self._tf = None
 
     def look(self) -> bool:
         """Publish what can be. True: a sample waits for its pose."""

@@ -19,7 +19,7 @@ from bota_ethercat.client.client import Client
 from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
 from bota_ethercat.control import Event
 from bota_ethercat.errors import ConnectionFailedError
-from bota_ethercat.framing import DataMessage
+from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import no_server
 from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
 from bridge.parameters.table import Parameters
@@ -160,8 +160,10 @@ class Reader:
         self.not_finite = 0
         self._decoders = {size: SampleDecoder(size, parameters.imu_units) for size in LAYOUTS}
         self.client = Client(
-            parameters.server_port, parameters.server_host, sensors=[self._sensor], channel=channel
-        )
+            parameters.server_port, parameters.server_host, sensors=[self._sensor],
+            terminals=range(parameters.terminals), channel=channel,
+        )  # fmt: skip
+        self.on_terminal: Callable[[TerminalMessage], object] = lambda _: None  # gets their frames
         self.accounting = self.client.session.state(self._sensor).accounting
         self.accounting.counts = self.counts
         self._clock = clock
@@ -202,6 +204,10 @@ class Reader:
             frames = []
             self._take_event(item)
         self._publish(frames)
+        while self.client.terminal_frames:
+            frame = self.client.terminal_frames.popleft()
+            if _FIRST_STAMP_NS <= frame.stamp_ns <= _LAST_STAMP_NS:
+                self.on_terminal(frame)
 
     def _publish(self, frames: Sequence[DataMessage]) -> None:
         if not frames:

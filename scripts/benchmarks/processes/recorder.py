@@ -19,8 +19,7 @@ from bota_ethercat.client import make_real_time
 from bota_ethercat.control import request
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from bota_ethercat.pdo import SampleDecoder
-from ethercat_server.virtual_sensor.signals import decode_clock
-from scripts.benchmarks.records import PORT, Recording
+from scripts.benchmarks.records import PORT, Recording, decode_clock
 
 SIZE: Final = 61
 _DEPTH: Final = 50

@@ -20,8 +20,7 @@ from typing import Final
 import bota_driver  # type: ignore[import-not-found]
 
 from bota_ethercat.client.real_time import make_real_time
-from ethercat_server.virtual_sensor.signals import decode_clock
-from scripts.benchmarks.records import Recording
+from scripts.benchmarks.records import Recording, decode_clock
 
 _ATTEMPTS: Final = 5
 

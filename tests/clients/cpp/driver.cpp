@@ -9,6 +9,7 @@
 //
 // Built with ASan, whose hook counts what `latest` and `next` allocate.
 #include <bota_ethercat.hpp>
+#include <bota_ethercat/world.hpp>
 
 #include <cinttypes>
 #include <cstdlib>
@@ -176,6 +177,7 @@ int main(int argc, char** argv) {
     if (argc > 1 && std::string_view(argv[1]) == "decode") return decode(argc > 2 && std::string_view(argv[2]) == "accounting");
     if (argc > 3 && std::string_view(argv[1]) == "real_time") return real_time(std::atoi(argv[2]), std::atoi(argv[3])), 0;
     if (argc > 1 && std::string_view(argv[1]) == "conditions") return conditions(), 0;
+    if (argc > 2 && std::string_view(argv[1]) == "world") return !World(argv[2]).send(0.5, {{1, 2, 3, 4, 5, 6}, {7, 8, 9}, {10, 11, 12}, 13}, 2);
     __sanitizer_install_malloc_and_free_hooks([](const volatile void*, std::size_t) { ++allocations; }, [](const volatile void*) {});
     std::optional<Client> maybe_client;
     std::optional<Control> maybe_control;

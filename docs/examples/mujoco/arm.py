@@ -1,0 +1,126 @@
+"""The arm in `arm.xml`: what moves it, and what its force/torque sensor feels."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import mujoco
+from bota_ethercat.client import Reading, World, connect
+from bota_ethercat.world import Felt
+
+STEP_S: Final = 0.001
+READY: Final = (0.0, 20.0, 100.0, 0.0, -30.0, 0.0)  # degrees: the tool before the wall, level
+_DAMPING: Final = 1e-4  # of the inverse of the Jacobian
+_SHOWN_EVERY: Final = 20  # steps
+_LARGEST_LAG_S: Final = 0.05  # behind which no step is made up for
+
+
+class Arm:
+    """Six position-controlled joints in MuJoCo, one step a millisecond.
+
+    `velocity` (3,), m/s, is what the tip is to have, in the base's frame, without turning.
+    """
+
+    def __init__(self) -> None:
+        self.model: Any = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("arm.xml")))
+        self.data: Any = mujoco.MjData(self.model)
+        self.velocity = np.zeros(3)
+        self._tip, self._sensor = (self.model.site(name).id for name in ("tip", "sensor"))
+        self._jacobian = np.zeros((6, self.model.nv))
+        self.data.qpos[:] = self.data.ctrl[:] = np.radians(READY)
+        mujoco.mj_forward(self.model, self.data)
+
+    @property
+    def tip(self) -> NDArray[np.float64]:
+        """Position of the tip, (3,) m, in the base's frame."""
+        position: NDArray[np.float64] = self.data.site_xpos[self._tip].copy()
+        return position
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """Turns the sensor's vectors into the base's, (3, 3)."""
+        rotation: NDArray[np.float64] = self.data.site_xmat[self._sensor].reshape(3, 3).copy()
+        return rotation
+
+    @property
+    def joints(self) -> NDArray[np.float64]:
+        """Where the joints are to be, (6,) rad."""
+        return np.array(self.data.ctrl)
+
+    def turn_to(self, joints: ArrayLike) -> None:
+        """Where the joints are to be from the next step on, (6,) rad."""
+        self.data.ctrl[:] = joints
+
+    def step(self, _seconds: float = 0.0) -> Felt:
+        """Go on by a millisecond; what the sensor feels then. A world: `Simulation(world=arm.step)`."""
+        if self.velocity.any():
+            mujoco.mj_jacSite(self.model, self.data, self._jacobian[:3], self._jacobian[3:], self._tip)
+            twist = np.append(self.velocity, np.zeros(3)) * STEP_S
+            jacobian = self._jacobian
+            self.data.ctrl += jacobian.T @ np.linalg.solve(
+                jacobian @ jacobian.T + _DAMPING * np.eye(6), twist
+            )
+        mujoco.mj_step(self.model, self.data)
+        values = self.data.sensordata.tolist()
+        # MuJoCo gives what the arm does to the tool; the sensor feels the opposite.
+        return Felt(tuple(-value for value in values[:6]), tuple(values[6:9]), tuple(values[9:12]))
+
+    @contextlib.contextmanager
+    def shown(self) -> Iterator[Any]:
+        """A window, where there is a screen: `sync` renews it; None where there is none."""
+        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            yield None
+            return
+        from mujoco import viewer  # noqa: PLC0415 - it needs a screen
+
+        with viewer.launch_passive(self.model, self.data) as window:
+            yield window
+
+
+class Task(Protocol):
+    """What an arm is to do, one control cycle at a time."""
+
+    @property
+    def done(self) -> bool:
+        """Whether it has ended."""
+
+    def update(self, reading: Reading, seconds: float) -> None:
+        """Move the arm by the newest sample; `seconds` are of any clock."""
+
+
+def arguments(description: str) -> argparse.ArgumentParser:
+    """What all examples take."""
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
+    parser.add_argument("--world", default="/tmp/world", metavar="PATH")  # noqa: S108 - as in the documentation
+    parser.add_argument("--port", type=int, default=12001, help="of the server (%(default)s)")
+    return parser
+
+
+def perform(task: Task, arm: Arm, options: argparse.Namespace) -> None:
+    """In real time, a cycle a millisecond, until the task is done; says what samples are worth."""
+    with World(options.world) as world, connect(options.port) as sensor, arm.shown() as window:
+        condition, due = None, time.monotonic()
+        for number in itertools.count():
+            felt = arm.step()
+            world.send(due, felt.wrench, felt.acceleration, felt.angular_rate)
+            reading = sensor.latest()
+            task.update(reading, number * STEP_S)
+            if task.done:
+                return
+            if reading.condition is not condition:
+                condition = reading.condition
+                print(f"{number * STEP_S:7.3f} s: {condition}")
+            if window is not None and number % _SHOWN_EVERY == 0:
+                window.sync()
+            due = max(due + STEP_S, time.monotonic() - _LARGEST_LAG_S)
+            time.sleep(max(0.0, due - time.monotonic()))

@@ -1,0 +1,102 @@
+"""What the sensor feels, and what it measures of that: through its filters, with its noise."""
+
+from __future__ import annotations
+
+import bisect
+import math
+import operator
+import random
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from bota_ethercat.pdo import STANDARD_GRAVITY
+from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+from bota_ethercat.world import Felt
+from ethercat_server.virtual_sensor.filters import LoadFilter, filtered, imu_filter
+from ethercat_server.virtual_sensor.signals import Reading, quaternion, reading_of
+
+World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MONOTONIC if it is told
+
+_HOLD, ZERO, FAULT = LOST = ("hold", "zero", "fault")  # what a world that has stopped is taken for
+LOST_AFTER_S: Final = 0.1  # also by how much a time stamp may differ from the time
+_REMEMBERED: Final = 4096  # moments, of which the filters look at the last second at most
+_REST: Final = Felt((0.0,) * 6)
+
+# Standard deviation at SINC 51, and the power with which it falls with the length: half of what Bota's
+# own test allows at 51, and a little under half of it at 1024.
+_REFERENCE_SINC = 51
+_NOISE = (*((0.3, 0.62),) * 3, (0.007, 0.78), (0.007, 0.78), (0.0025, 0.78))
+_FILTERS: Final = ("fir", "acceleration_filter", "angular_rate_filter")
+_ACCELERATION_NOISE, _ANGULAR_RATE_NOISE = 0.002, 0.04  # g, °/s
+
+
+class ToldWorld:
+    """A world that is told moment by moment, each of which holds until the next; at rest before the first."""
+
+    def __init__(self, lost: str = FAULT) -> None:
+        self._lost = lost
+        self._told = deque([(-math.inf, _REST)], maxlen=_REMEMBERED)
+        self.counts = {"taken": 0, "refused": 0}  # moments
+
+    def tell(self, time_s: float, felt: Felt, now_s: float) -> None:
+        """A moment later than the one before; any other, or one far from now, is refused."""
+        is_good = time_s > self._told[-1][0] and abs(time_s - now_s) <= LOST_AFTER_S
+        self.counts["taken" if is_good else "refused"] += 1
+        if is_good:
+            self._told.append((time_s, felt))
+
+    def is_faulty(self, now_s: float) -> bool:
+        """Whether it has stopped, and the sensor gives nothing new therefore."""
+        return self._lost == FAULT and LOST_AFTER_S < now_s - self._told[-1][0] < math.inf
+
+    def __call__(self, seconds: float) -> Felt:
+        """What the sensor feels."""
+        at = bisect.bisect_right(self._told, seconds, key=operator.itemgetter(0))
+        begin_s, felt = self._told[max(0, at - 1)]
+        return _REST if self._lost == ZERO and seconds - begin_s > LOST_AFTER_S else felt
+
+
+class Measured:
+    """A world as the sensor measures it, once it has filters."""
+
+    def __init__(self, world: World, seed: int, noise: bool) -> None:
+        self._world, self._noise = world, noise
+        self._gauss = random.Random(seed).gauss
+        self._settings: tuple[SettingValue, ...] = ()  # of the filters
+
+    def set_filters(self, sinc_length: int, settings: Mapping[str, SettingValue]) -> None:
+        """Measure through these filters; `sinc_length` is that in effect."""
+        wanted = sinc_length, *(settings[name] for name in _FILTERS)
+        if wanted == self._settings:
+            return
+        self._settings = wanted
+        # Standard deviations of force (N) and torque (Nm) with FIR off: a longer filter makes them quieter.
+        ratio = sinc_length / _REFERENCE_SINC
+        self.deviations = tuple(deviation * ratio**-power for deviation, power in _NOISE)
+        _, fir, acceleration, rate = wanted
+        period_s = sinc_length / BASE_SAMPLING_RATE_HZ
+        self._load_filter = LoadFilter(
+            lambda seconds: self._world(seconds).wrench, self._load_noise, period_s, fir=bool(fir)
+        )
+        self._acceleration_filter = imu_filter(ACCELERATION_FILTERS[acceleration])
+        self._rate_filter = imu_filter(ANGULAR_RATE_FILTERS[rate])
+
+    def _load_noise(self) -> list[float]:
+        return [self._gauss(0.0, deviation) if self._noise else 0.0 for deviation in self.deviations]
+
+    def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
+        """See `Formula`."""
+        world = self._world
+        felt = world(seconds)
+        load = self._load_filter.at(number, seconds)
+        acceleration = filtered(lambda t: world(t).acceleration, self._acceleration_filter, seconds)
+        rate = filtered(lambda t: world(t).angular_rate, self._rate_filter, seconds)
+        values = [*load, *(a / STANDARD_GRAVITY for a in acceleration), *map(math.degrees, rate)]
+        if self._noise:
+            for axis in range(6, 9):
+                values[axis] += self._gauss(0.0, _ACCELERATION_NOISE)
+                values[axis + 3] += self._gauss(0.0, _ANGULAR_RATE_NOISE)
+        orientation = (0.0, 0.0, 0.0, 0.0) if felt.attitude is None else quaternion(felt.attitude)
+        return reading_of(values, felt.temperature, orientation)
