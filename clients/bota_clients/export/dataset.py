@@ -15,6 +15,7 @@ import argparse
 import json
 import shutil
 import tempfile
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -71,7 +72,7 @@ def clock_history(recording: Recording, sensor: int = 0) -> Clocks:
     """Both stamps of every sample; RecordingError."""
     samples = (each for each in recording.frames(sensor) if not each.flags & NOT_NEW)
     rows = ((each.stamp_ns, each.monotonic_ns) for each in samples)
-    stamps = np.fromiter(rows, np.dtype((np.uint64, 2))).astype(np.int64)
+    stamps = np.fromiter(rows, np.dtype((np.uint64, 2))).view(np.int64)
     if not len(stamps):
         raise RecordingError(f"{recording.path} has no new and valid samples")
     return stamps[:, 0], stamps[:, 1]
@@ -234,8 +235,12 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         times = FrameTimes.at_rate(options.fps, clock_history(recording, sensor.sensor))
     else:
         stamps = read_stamps(options.at, options.column)
-        clocks = clock.history() if clock else clock_history(recording, sensor.sensor)
-        times = FrameTimes.of(stamps, clocks, str(options.at), options.latency)
+        times = FrameTimes.of(
+            stamps,
+            clock.history() if clock else clock_history(recording, sensor.sensor),
+            str(options.at),
+            options.latency,
+        )
     windows = Windows(length, hold=options.hold, tool=tool, imu_units=options.imu_units)
     about = {
         "program": f"{PROGRAM} {VERSION}",
@@ -284,8 +289,14 @@ def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
 
 def _npz(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
     """An array for each name, and `attributes`, text."""
-    made = [*blocks]
-    arrays = {name: np.concatenate([block.pop(name) for block in made]) for name in [*made[0]]}
+    flat, like = defaultdict[str, bytearray](bytearray), Arrays()
+    for like in blocks:
+        for name, array in like.items():
+            flat[name] += array.tobytes()
+    arrays = {
+        name: np.frombuffer(flat[name], array.dtype).reshape(-1, *array.shape[1:])
+        for name, array in like.items()
+    }
     np.savez(path, attributes=np.array(about), allow_pickle=False, **arrays)
 
 
