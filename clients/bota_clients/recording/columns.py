@@ -67,11 +67,6 @@ def columns(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS)
 
     `imu_units` are the units in which the firmware sends acceleration and angular rate.
     """
-    return decode(recording.frames(sensor), imu_units)
-
-
-def decode(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
-    """These frames of one sensor."""
     heads, data = array("q"), bytearray()
     for frame in frames:
         # 64-bit values that do not fit an int64 are no valid times.
