@@ -18,7 +18,6 @@ import pytest
 from scripts.benchmarks import contact, modes, statistics
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.chain import ScriptError, Setup, Turn
-from scripts.benchmarks.processes import masters
 from scripts.benchmarks.records import Recording, began
 from scripts.benchmarks.statistics import Arrivals
 from tests.server.running import needs_bus
@@ -195,7 +194,7 @@ def test_the_contact_is_by_the_ages_of_the_same_run(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(
         modes, "turn", lambda _, name: statistics.summary([arrivals(range(100), turns[name])])
     )
-    monkeypatch.setattr(masters, "build", lambda _: tmp_path)
+    monkeypatch.setattr(modes, "build", lambda _: tmp_path)
     monkeypatch.setattr(modes, "VENDOR", tmp_path)
     (tmp_path / "has-bota-driver==1").touch()
     monkeypatch.setenv("DEMO_DIRECTORY", str(tmp_path))

@@ -99,7 +99,7 @@ def test_it_stops_while_the_sensor_is_disconnected(robot: Callable[[], Any]) -> 
 
 
 def test_a_controller_that_is_wrong_by_sign_diverges() -> None:
-    made = SpringArm()
+    made: Any = SpringArm()
     simulation, touch = simulated(made), Touch(made)
     made.rotation = -made.rotation
     perform(simulation, touch, lambda _: touch.rows and abs(touch.rows[-1].force) > 5 * FORCE)

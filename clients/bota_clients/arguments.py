@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from typing import TypeVar
 
 from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program import server_choice
+from bota_ethercat.program.arguments import typed
 from bota_ethercat.sensor_choice import MOST_PLACES
-
-_Value = TypeVar("_Value")
 
 
 def add_server(parser: argparse.ArgumentParser, what: str = "the server") -> None:
@@ -43,29 +40,6 @@ def add_imu_units(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def typed(convert: Callable[[str], _Value], what: str = "") -> Callable[[str], _Value]:
-    """The type of an argument; for a ValueError argparse says `what` it must be, or else the error."""
-
-    def converted(text: str) -> _Value:
-        try:
-            return convert(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(f"{text!r}: it must be {what}" if what else str(error)) from None
-
-    return converted
-
-
-def number(low: float, high: float, what: str = "") -> Callable[[str], float]:
-    """The type of an argument that is a number from `low` to `high`; `what` is in the error if it is not."""
-
-    def within(text: str) -> float:
-        if low <= (value := float(text)) <= high:
-            return value
-        raise ValueError
-
-    return typed(within, what or f"from {low:g} to {high:g}")
-
-
 def _position(text: str) -> int:
     if text.isascii() and text.isdecimal() and int(text) < MOST_PLACES:
         return int(text)
@@ -73,5 +47,4 @@ def _position(text: str) -> int:
 
 
 address = typed(Address.parse)
-seconds = number(1e-9, 1e9, "a number of seconds, such as 60")
 position = typed(_position, f"a position on the bus, from 0 to {MOST_PLACES - 1}")

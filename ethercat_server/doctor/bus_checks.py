@@ -10,8 +10,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby
-from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import Address
@@ -19,9 +17,9 @@ from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import history
 from bota_ethercat.health.judge import Observation, emergency, judge
-from bota_ethercat.health.observer import StreamObserver
+from bota_ethercat.health.observer import StreamObserver, by_sensor
 from bota_ethercat.health.verdict import LIMITS, Level
-from bota_ethercat.text.untrusted import number
+from bota_ethercat.text.untrusted import mapping, number
 from ethercat_server.access.adapters import Holder, find_holder, links
 from ethercat_server.access.private_server import open_interface
 from ethercat_server.access.sensors import Sensors
@@ -284,7 +282,6 @@ def age_finding(what: str, summary: Mapping[str, Any]) -> Finding:
     )  # fmt: skip
 
 
-_POSITION: Final = attrgetter("sensor")
 _FATES: Final = frozenset({Event.SENSOR_LOST, Event.SENSOR_BACK})
 _LOG: Final = "see the server's log (journalctl -u 'ethercat-server@*')"
 _COUNTS: Final = ("fresh", "repeated", "invalid", "lost_samples", "recoveries")
@@ -319,9 +316,8 @@ class ServerView:
         self._summaries: dict[str, Any] = self.after if self._own else self.after["last_10s"]
 
     def _take(self, frames: Sequence[DataMessage], now_ns: int, *, same_machine: bool) -> None:
-        for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
+        for position, batch in by_sensor(frames).items():
             if position < len(self._observers):
-                batch = list(of_one)
                 self._observers[position].take(batch, now_ns)
                 if same_machine:
                     self._observers[position].note_age(batch[-1], now_ns)
@@ -329,23 +325,18 @@ class ServerView:
     def observation(self, position: int) -> Observation:
         """What was seen of a sensor's stream."""
         described, after = self.described[position], self.after["sensors"][position]
-        settings = described.get("settings")
         fates = [event["event"] for event in self._events if event.get("sensor") == position]
-        return (
-            self._observers[position]
-            .observation(self._end_ns)
-            ._replace(
-                locked=after["clock"]["mode"] == "locked",
-                recoveries=max(
-                    0, int(after["recoveries"]) - int(self.before["sensors"][position]["recoveries"])
-                ),
-                missed_deadlines=self._grown("missed_deadlines"),
-                is_lost=[fate for fate in fates if fate in _FATES][-1:] == [Event.SENSOR_LOST],
-                state=str(described["state"]),
-                emergency=emergency(after.get("emergency")),
-                drift=history.drift(after, LIMITS),
-                settings=settings if isinstance(settings, dict) else {},
-            )
+        recoveries = int(after["recoveries"]) - int(self.before["sensors"][position]["recoveries"])
+        seen = self._observers[position].observation(self._end_ns)
+        return seen._replace(
+            locked=after["clock"]["mode"] == "locked",
+            recoveries=max(0, recoveries),
+            missed_deadlines=self._grown("missed_deadlines"),
+            is_lost=[fate for fate in fates if fate in _FATES][-1:] == [Event.SENSOR_LOST],
+            state=str(described["state"]),
+            emergency=emergency(after.get("emergency")),
+            drift=history.drift(after, LIMITS),
+            settings=mapping(described.get("settings")),
         )
 
     def _grown(self, name: str) -> int:

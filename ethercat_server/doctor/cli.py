@@ -13,7 +13,7 @@ from typing import Final
 
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.program import server_choice
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, number
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import visible
 from ethercat_server.access.adapters import find_holder, is_elsewhere, server_here
@@ -46,7 +46,7 @@ def build_parser() -> argparse.ArgumentParser:
         f"the server {server_choice.HELP}",
     )  # fmt: skip
     parser.add_argument(
-        "--seconds", type=_seconds, default=10.0, metavar="N",
+        "--seconds", type=number(0, _LONGEST_S), default=10.0, metavar="N",
         help="duration of the measurement (default 10; 0: none)",
     )  # fmt: skip
     for name in ("rt_priority", "cpu"):
@@ -58,16 +58,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     return parser
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0 <= value <= _LONGEST_S:
-        raise argparse.ArgumentTypeError(f"{text} must be from 0 to {_LONGEST_S:.0f} seconds")
-    return value
-
-
-_seconds.__name__ = "number"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -11,7 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from ethercat_server.access.adapters import Adapter
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE
@@ -32,18 +32,10 @@ from ethercat_server.ethercat.nic import ALLOW_IP, Routes, network_trouble
 Look = Callable[[Machine], Finding | Iterable[Finding]]
 
 
-class Check(NamedTuple):
-    """One check of the machine or the interface."""
-
-    subject: str
-    name: str
-    look: Look
-
-
 def examine_machine(machine: Machine) -> Iterator[Finding]:
     """All checks that need no bus."""
     there = True
-    for subject, name, look in CHECKS:
+    for (subject, name), look in CHECKS.items():
         about_the_interface = subject in {"interface", "other software"}
         if about_the_interface and not there:
             continue
@@ -350,14 +342,17 @@ def _membership(machine: Machine) -> Iterator[Finding]:
         yield ok("no bridge, bond or VLAN")
 
 
-_BY_SUBJECT: Final[Mapping[str, Mapping[str, Look]]] = {
-    "kernel": {"preemption": _preemption},
-    "rights": {"capabilities": _capabilities},
-    "processors": {"governor": _governor, "idle states": _idle_states},
-    "interface": {"link": _link_state, "speed": _speed, "driver": _driver, "coalescing": _coalescing,
-                  "EEE": _energy_efficient_ethernet},
-    "other software": {"managers": _managers, "addresses": _addresses, "membership": _membership},
-}  # fmt: skip
-CHECKS: Final = tuple(
-    Check(subject, name, look) for subject, checks in _BY_SUBJECT.items() for name, look in checks.items()
-)
+CHECKS: Final[Mapping[tuple[str, str], Look]] = {
+    ("kernel", "preemption"): _preemption,
+    ("rights", "capabilities"): _capabilities,
+    ("processors", "governor"): _governor,
+    ("processors", "idle states"): _idle_states,
+    ("interface", "link"): _link_state,
+    ("interface", "speed"): _speed,
+    ("interface", "driver"): _driver,
+    ("interface", "coalescing"): _coalescing,
+    ("interface", "EEE"): _energy_efficient_ethernet,
+    ("other software", "managers"): _managers,
+    ("other software", "addresses"): _addresses,
+    ("other software", "membership"): _membership,
+}  # by subject and name, in the order of the report

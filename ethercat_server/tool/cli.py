@@ -73,7 +73,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = COMMANDS[parser.parse_args(arguments[:1] if named else arguments).command]
     description = f"{command.summary[0].upper()}{command.summary[1:]}."
     parser = _Parser(f"{_PROGRAM} {command.name}", description, _EXIT_CODES)
-    command.add_arguments(parser)
+    for add in command.arguments:
+        add(parser)
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
     args = parser.parse_intermixed_args(arguments[1:])
     return command_line.run(_PROGRAM, lambda: command.run(args), as_json=args.json)
 

@@ -20,7 +20,7 @@ DONE: Final = 0
 CHANGES: Final = 3  # exit code of `plan` when there is something to change
 _FORCE: Final = "--force"
 
-Argument = Callable[[Any], object]  # adds it to a parser, or to a group of arguments
+Argument = Callable[[Any], object]  # adds it to a parser
 
 
 def argument(name: str, help_text: str, **options: Any) -> Argument:
@@ -30,17 +30,6 @@ def argument(name: str, help_text: str, **options: Any) -> Argument:
     return lambda parser: parser.add_argument(name, help=help_text, **options)
 
 
-def one_of(*arguments: Argument) -> Argument:
-    """Of which one may be given."""
-
-    def add(parser: argparse.ArgumentParser) -> None:
-        group = parser.add_mutually_exclusive_group()
-        for each in arguments:
-            each(group)
-
-    return add
-
-
 class Command(NamedTuple):
     """One subcommand."""
 
@@ -48,12 +37,6 @@ class Command(NamedTuple):
     summary: str
     arguments: Sequence[Argument]
     run: Callable[[argparse.Namespace], int]  # returns the exit code; raises ServerError
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add those of the command, and --json."""
-        for add in self.arguments:
-            add(parser)
-        parser.add_argument("--json", action="store_true", help="machine-readable output")
 
 
 def sensor_arguments(*, all_if_none: bool = False, take_over: str = _FORCE) -> tuple[Argument, ...]:

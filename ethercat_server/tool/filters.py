@@ -10,7 +10,8 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
-from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
+from bota_ethercat.program.arguments import number
+from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS, SHORT_SINC, noise_limit
 from bota_ethercat.sensor.response import Response, Source, force_torque_response, noise_bandwidth
 from bota_ethercat.settings import start_up_defaults
 from ethercat_server.tool.command import DONE, Command, argument, columns, say, say_json, value_text
@@ -18,8 +19,8 @@ from ethercat_server.tool.command import DONE, Command, argument, columns, say, 
 FREQUENCIES_HZ: Final = (5, 10, 20, 50)
 DESIGNED_DEG: Final = 60.0  # phase margin of the loop if its sensor were ideal
 LEAST_DEG: Final = 30.0  # of it that a recommended setting leaves
-# What Bota's own test allows at two SINC lengths: standard deviation of Fx and Fy, N.
-_NOISE_LIMITS: Final = ((51, 0.6), (1024, 0.1))
+_HERTZ: Final = number(0.1, 100_000)
+_NOISE_LIMITS: Final = (0.6, 0.1)  # of Fx and Fy by Bota's test, standard deviation, N
 
 
 class Choice(NamedTuple):
@@ -69,21 +70,12 @@ def choices(bandwidth_hz: float) -> list[Choice]:
             power = noise_bandwidth(fir) * row.rate_hz / (noise_bandwidth(False) * default.rate_hz)
             # The newest sample is half a period old on average when the loop reads it.
             lost = (response.phase_deg(bandwidth_hz) or 0.0) + 360.0 * bandwidth_hz / (2 * row.rate_hz)
-            limit = None if fir else noise_limit_n(length)
+            limit = None if fir or length < SHORT_SINC else noise_limit(*_NOISE_LIMITS, length)
             found.append(
                 Choice(length, fir, row.rate_hz, row.cutoff_hz(fir), math.sqrt(power), limit, response,
                        DESIGNED_DEG - lost)
             )  # fmt: skip
     return found
-
-
-def noise_limit_n(sinc_length: int) -> float | None:
-    """Bota's limit between its two lengths, linear in the logarithms; None for a length beyond them."""
-    (shortest, high), (longest, low) = _NOISE_LIMITS
-    if not shortest <= sinc_length <= longest:
-        return None
-    share = math.log(sinc_length / shortest) / math.log(longest / shortest)
-    return float(high * (low / high) ** share)
 
 
 def recommend(found: Sequence[Choice], loop_hz: float) -> tuple[Choice, str]:
@@ -101,13 +93,6 @@ def recommend(found: Sequence[Choice], loop_hz: float) -> tuple[Choice, str]:
         f"the most phase margin, with {sample}; to have {LEAST_DEG:g}° lower the loop's bandwidth to "
         f"{slower_hz:.0f} Hz"
     )
-
-
-def _hertz(text: str) -> float:
-    value = float(text)
-    if not 0.1 <= value <= 100_000:
-        raise argparse.ArgumentTypeError("from 0.1 to 100000")
-    return value
 
 
 def _filters(args: argparse.Namespace) -> int:
@@ -135,8 +120,8 @@ COMMANDS = (
     Command(
         "filters", "filters for a control loop: noise, delay, phase margin; needs no sensor",
         (
-            argument("--loop", "rate of the control loop", metavar="HZ", type=_hertz, required=True),
-            argument("--bandwidth", "its bandwidth (default: loop / 10)", metavar="HZ", type=_hertz),
+            argument("--loop", "rate of the control loop", metavar="HZ", type=_HERTZ, required=True),
+            argument("--bandwidth", "its bandwidth (default: loop / 10)", metavar="HZ", type=_HERTZ),
         ),
         _filters,
     ),

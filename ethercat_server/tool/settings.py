@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
 from bota_ethercat.errors import SettingError
+from bota_ethercat.pdo import AXES
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.tare_memory import former, remember
 from bota_ethercat.sensor.meaning import meaning, value_meaning
@@ -36,7 +37,6 @@ from ethercat_server.tool.command import (
     Command,
     argument,
     columns,
-    one_of,
     report,
     sensor_arguments,
     sensor_of,
@@ -172,12 +172,12 @@ def _save(args: argparse.Namespace) -> int:
 
 # -- tare
 
-_AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
-
 
 def _tare(args: argparse.Namespace) -> int:
     if not 1 <= args.samples <= MAX_TARE_SAMPLES:
         raise UsageError(f"--samples {args.samples}: it must be from 1 to {MAX_TARE_SAMPLES}")
+    if args.undo and args.clear:
+        raise UsageError("--undo and --clear exclude each other: give one of them")
     if not all(map(math.isfinite, args.target)):
         raise UsageError("--target must be six finite numbers: Fx Fy Fz in N, Mx My Mz in Nm")
     try:
@@ -196,7 +196,7 @@ def _tare(args: argparse.Namespace) -> int:
     except OSError as error:
         note(f"--undo will not know this tare: {error.strerror or error}")
     rows: list[tuple[str, ...]] = [("", *(key.replace("_", " ") for key in keys), "")]
-    for n, axis in enumerate(_AXES):
+    for n, axis in enumerate(AXES):
         rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
     lines = columns(rows, indent=2), _lasts(opened, _TARE_IN_SERVER)
     report(args.json, opened, found, {key: tared[key] for key in keys}, *lines)
@@ -214,7 +214,7 @@ def _taken_back(opened: Sensors, found: Found, *, undo: bool) -> dict[str, Seque
         try:
             after = former(found.identity.serial, before, str(found))
         except ValueError as error:
-            raise BusError(f"{error}: use --clear, or tare again") from None
+            raise BusError(str(error)) from None
     with signals_held_back():
         try:
             finish(write_offset(sdo, after), clock=opened.clock)
@@ -420,11 +420,9 @@ COMMANDS: Final = (
         (
             *_SENSOR,
             argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
-            argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=_AXES),
-            one_of(
-                argument("--undo", "restore the offset of before the last tare"),
-                argument("--clear", "set the offset to zero"),
-            ),
+            argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=AXES),
+            argument("--undo", "restore the offset of before the last tare"),
+            argument("--clear", "set the offset to zero"),
         ),
         _tare,
     ),

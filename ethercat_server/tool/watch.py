@@ -11,9 +11,10 @@ from typing import Any, Final
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.judge import Observation, judge
-from bota_ethercat.health.observer import COMMON, StreamObserver
+from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
 from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS
+from bota_ethercat.program.arguments import seconds
 from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import number, whole
@@ -88,10 +89,10 @@ def _follow(opened: Sensors, args: argparse.Namespace, watched: Mapping[int, _Wa
     awaited = set[int]()
     for frames, events in opened.stream(sensors=list(watched), fresh_only=False):
         settling = {event["sensor"] for event in events if _tell(opened, event, watched)}
+        came = by_sensor(frames)
         for sensor, each in watched.items():
             left = 0 if sensor in awaited | settling else most - each.samples
-            of_one = [frame for frame in frames if frame.sensor == sensor]
-            each.take(of_one, opened.clock.monotonic_ns(), left)
+            each.take(came.get(sensor, []), opened.clock.monotonic_ns(), left)
         if end.passed or all(each.samples >= most for each in watched.values()):
             return
         opened.wait_settled(settling)
@@ -117,16 +118,6 @@ def _line(row: dict[str, Any]) -> str:
         parts.append("F {:+.3f} {:+.3f} {:+.3f} N".format(*row["force"]))
         parts.append("M {:+.4f} {:+.4f} {:+.4f} Nm".format(*row["torque"]))
     return "  ".join([*parts, *(f"{each['severity']}: {each['meaning']}" for each in row["warnings"])])
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < 1e9:
-        raise ValueError(text)
-    return value
-
-
-_positive.__name__ = "positive number"
 
 
 def _watch(args: argparse.Namespace) -> int:
@@ -162,8 +153,8 @@ COMMANDS: Final = (
         (
             *sensor_arguments(all_if_none=True),
             argument("--samples", "stop after N samples of each sensor", type=int, metavar="N"),
-            argument("--seconds", "stop after S seconds", type=_positive, metavar="S"),
-            argument("--interval", "time between two lines (%(default)s)", type=_positive, metavar="S",
+            argument("--seconds", "stop after S seconds", type=seconds, metavar="S"),
+            argument("--interval", "time between two lines (%(default)s)", type=seconds, metavar="S",
                      default=1.0),
         ),
         _watch,

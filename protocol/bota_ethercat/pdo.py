@@ -17,6 +17,7 @@ from bota_ethercat.errors import PdoSizeError
 
 STANDARD_GRAVITY: Final = 9.80665  # m/s² in one g, as Bota's own drivers convert it
 
+AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")  # of a wrench: N, Nm
 INPUT_OBJECT: Final = 0x6000  # the object whose sub-indices the TxPDO maps
 
 

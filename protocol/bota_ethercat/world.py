@@ -18,11 +18,7 @@ class Felt(NamedTuple):
     """What the sensor feels at one moment, in its own frame."""
 
     wrench: tuple[float, ...]  # (6,) force N, torque Nm
-    acceleration: tuple[float, ...] = (
-        0.0,
-        0.0,
-        STANDARD_GRAVITY,
-    )  # (3,) specific force, m/s²; at rest it points up
+    acceleration: tuple[float, ...] = (0.0, 0.0, STANDARD_GRAVITY)  # (3,) specific force, m/s²; up at rest
     angular_rate: tuple[float, ...] = (0.0, 0.0, 0.0)  # (3,) rad/s
     temperature: float = 35.0  # °C
     attitude: tuple[float, float, float] | None = None

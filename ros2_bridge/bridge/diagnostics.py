@@ -24,7 +24,7 @@ from bota_ethercat.health.judge import SATURATIONS, Observation, emergency, judg
 from bota_ethercat.health.observer import p99
 from bota_ethercat.health.verdict import About, Level, Limits
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import number, printable, whole
+from bota_ethercat.text.untrusted import mapping, number, printable, whole
 from bridge.process import Worker
 from bridge.publishing.messages import Stamps, create_publisher
 from bridge.stream.reader import Flags, Outputs, Reader
@@ -374,11 +374,6 @@ class Monitor:
 def text_of(value: object) -> str:
     """A value as a KeyValue carries it."""
     return str(value).lower() if isinstance(value, bool) else printable(value)
-
-
-def mapping(value: object) -> Mapping[str, Any]:
-    """`value` if it is a JSON object, else an empty one: the server's word is not trusted to have a form."""
-    return value if isinstance(value, dict) else {}
 
 
 def row_of(rows: object, position: int) -> Mapping[str, Any]:

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
-from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.pdo import AXES, STANDARD_GRAVITY, Vector3
 
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
 ZERO: Final[Vector3] = (0.0, 0.0, 0.0)
@@ -68,8 +68,7 @@ class Payload(NamedTuple):
 
 def wrench_text(wrench: Wrench) -> str:
     """A wrench for people."""
-    axes = "Fx", "Fy", "Fz", "Mx", "My", "Mz"
-    numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(axes, wrench.values, strict=True))
+    numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, wrench.values, strict=True))
     return f"{numbers} (N, Nm)"
 
 

@@ -98,9 +98,8 @@ class Child:
 
 def used_s(pid: int) -> float:
     """CPU time of a process, s; finer than the ticks of `stat`."""
-    return (
-        sum(int(task.read_text().split()[0]) for task in Path(f"/proc/{pid}/task").glob("*/schedstat")) / 1e9
-    )
+    tasks = Path(f"/proc/{pid}/task").glob("*/schedstat")
+    return sum(int(task.read_text().split()[0]) for task in tasks) / 1e9
 
 
 def rss(pid: int) -> float:

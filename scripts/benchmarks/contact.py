@@ -1,16 +1,14 @@
 """What a fresh sample is worth in contact: a simulated axis presses on a wall, by samples as old as measured.
 
 The axis follows the commanded velocity with a lag; the controller commands, once a millisecond, a velocity
-in proportion to the force that lacks by the newest sample. Samples pass through the virtual sensor's filters,
+proportional to the force error of the newest sample. Samples pass through the virtual sensor's filters,
 without noise. When each arrives, and which are lost, is as with the program that delivered samples in this
 run; one that comes again changes nothing.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,13 +18,12 @@ import numpy as np
 
 from ethercat_server.virtual_sensor.filters import LoadFilter
 from scripts.benchmarks import modes
-from scripts.benchmarks.chain import OVERSAMPLING_HZ, Figures, ScriptError, Setup, Turn
+from scripts.benchmarks.chain import OVERSAMPLING_HZ, Figures, Setup, Turn
 from scripts.benchmarks.modes import BARE_C, DRIVER, THIS
-from scripts.benchmarks.processes import masters
 from scripts.benchmarks.statistics import Floats
 
-FORCE: Final = 10.0  # N that is wanted
-GAIN: Final = 0.002  # m/s for each N that lacks
+FORCE: Final = 10.0  # set point, N
+GAIN: Final = 0.002  # m/s for each N of error
 APPROACH: Final = 0.02  # m/s at most
 LAG_S: Final = 0.002  # of the axis behind its command
 CYCLE_S: Final = 0.001  # of the controller
@@ -92,7 +89,7 @@ def press(wall: float, sinc: int, fir: bool, delivery: Delivery) -> Floats:
 
 
 def overshoot(forces: Floats) -> float:
-    """Above the wanted force, N."""
+    """Above the set point, N."""
     return max(0.0, float(forces.max()) - FORCE)
 
 
@@ -111,12 +108,8 @@ def stiffest(sinc: int, fir: bool, delivery: Delivery) -> float:
 
 def measure(setup: Setup, with_driver: bool, picture: Path | None) -> list[Figures]:
     """A row for each program; the picture, if there is to be one."""
-    names = [THIS]
-    with contextlib.suppress(ScriptError):
-        masters.build(Path(os.environ["DEMO_DIRECTORY"]))
-        names.append(BARE_C)
-    if with_driver and [*modes.VENDOR.glob("has-bota-driver*")]:
-        names.append(DRIVER)
+    missing = modes.find_missing(with_driver)
+    names = [name for name in (THIS, BARE_C, DRIVER)[: 2 + with_driver] if name not in missing]
     delivered = {}
     for sinc in {sinc for sinc, _ in FILTERS.values()}:
         at = replace(setup, rate_hz=OVERSAMPLING_HZ // sinc)

@@ -77,23 +77,29 @@ def first_ages(arrivals: Arrivals) -> Floats:
     return arrivals.ages[np.unique(arrivals.number, return_index=True)[1]]
 
 
-def compare(setup: Setup, with_driver: bool) -> list[Figures]:
-    """A row for each program."""
-    missing: dict[str, str] = {}
-    alternating = [THIS, C_CLIENT, BARE_C]
+def find_missing(with_driver: bool) -> dict[str, str]:
+    """Build the C program; which of the others cannot be compared here, and why."""
+    missing = {}
     try:
         build(Path(os.environ["DEMO_DIRECTORY"]))
     except ScriptError as error:
-        missing[BARE_C], alternating = str(error), [THIS]
+        missing[BARE_C] = str(error)
+    if with_driver and not [*VENDOR.glob("has-bota-driver*")]:
+        missing[DRIVER] = "bota-driver could not be installed by scripts/benchmark"
+    return missing
+
+
+def compare(setup: Setup, with_driver: bool) -> list[Figures]:
+    """A row for each program."""
+    with_driver = with_driver and setup.sensors == 1  # it knows one sensor only
+    missing = find_missing(with_driver)
+    alternating = [THIS] if BARE_C in missing else [THIS, C_CLIENT, BARE_C]
     count = max(1, min(_MOST_TURNS, int(setup.seconds)))
     short = replace(setup, seconds=setup.seconds / count)
     rounds = [{name: turn(short, name) for name in alternating} for _ in range(count)]
     taken = {name: together([each[name] for each in rounds]) for name in alternating}
-    if with_driver and setup.sensors == 1:  # it knows one sensor only
-        if [*VENDOR.glob("has-bota-driver*")]:
-            taken[DRIVER] = turn(setup, DRIVER)
-        else:
-            missing[DRIVER] = "bota-driver could not be installed by scripts/benchmark"
+    if with_driver and DRIVER not in missing:
+        taken[DRIVER] = turn(setup, DRIVER)
     if setup.ros:
         taken[ROS] = turn(setup, ROS)
     if BARE_C in taken:

@@ -21,7 +21,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bota_clients.arguments import number
+from bota_ethercat.program.arguments import number
 from scripts.benchmarks import contact, path
 from scripts.benchmarks.chain import (
     OVERSAMPLING_HZ,
@@ -84,14 +84,13 @@ def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> 
 
 def measure(name: str, options: argparse.Namespace, priority: int, *, ros: bool) -> list[Figures]:
     """The rows of a table, of all configurations."""
+    seconds = options.seconds or (3.0 if options.quick else 6.0)
     if name == "path":
         return path.measure()
     if name == "contact":
         picture = options.page and options.page.with_name("contact.png")
-        setup = Setup(800, 1, options.seconds or (3.0 if options.quick else 6.0), priority, ros)
-        return contact.measure(setup, options.vendor, picture)
+        return contact.measure(Setup(800, 1, seconds, priority, ros), options.vendor, picture)
     whole = name == "comparison" and not options.quick
-    seconds = options.seconds or (3.0 if options.quick else 6.0)
     rows = []
     for rate in options.rates or ((800, 1600) if whole else (800,)):
         for sensors in (1, 2) if whole else (1,):

@@ -17,8 +17,8 @@ from typing import Any, Final
 from rich.console import Console
 from rich.table import Table
 
-from bota_clients.arguments import number
 from bota_ethercat.client import Client
+from bota_ethercat.program.arguments import number
 from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from scripts.benchmarks.chain import (
     Chain,

@@ -528,10 +528,11 @@ def test_terminals_are_published_as_numbers_and_with_names_and_stamp() -> None:
     entries = (("Status", "u8", 0, 8), ("Value", "i16", 8, 16), ("Input", "bool", 24, 1))
     layout = [dict(zip(("name", "type", "bit_offset", "bit_length"), row, strict=True)) for row in entries]
     server.description["terminals"] = [{"terminal": 0, "layout": layout}]
-    with Node(server, terminals=1) as node:
+    with Node(server, terminals=2) as node:
         arrays, stamped = node.hear("terminal_0"), node.hear("terminal_0/stamped")
         node.run(0.2)
         assert [each.get("terminals") for each in server.requests if each["action"] == "subscribe"] == [[0]]
+        assert "the server reads 1 of 2 terminals" in node.log
         for number, stamp, flags in ((0, 5, 1), (0, 6, 2), (0, 10**10, 0), (7, 8, 0)):
             data = bytes.fromhex("07feff01")
             server.send_raw(encode_data(0, stamp * 10**9, 1, number, flags, 1, data, MessageType.TERMINAL))

@@ -88,18 +88,8 @@ def simulate(
     return tuple(frames)
 
 
-class Frames:
-    """Frames where a `Recording` is wanted."""
-
-    def __init__(self, frames: Sequence[DataMessage]) -> None:
-        self._frames = frames
-
-    def frames(self, sensor: int | None = None) -> list[DataMessage]:
-        return [frame for frame in self._frames if sensor in (None, frame.sensor)]
-
-
 def decoded(frames: Sequence[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
-    return columns(Frames(frames), 0, imu_units)
+    return columns([frame for frame in frames if frame.sensor == 0], imu_units)
 
 
 def described(sinc_length: int = 64, **settings: Any) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def test_columns_are_what_the_decoder_gives(path: Path) -> None:
     ]
     record(path, made)
     with open_recording(path) as recording:
-        table = columns(recording)
+        table = columns(recording.frames())
     for row, item in enumerate(made):
         sample = SampleDecoder(len(item.process_data)).decode(item.process_data)
         for name in ("force", "torque", "acceleration", "angular_rate"):
@@ -123,7 +123,7 @@ def test_columns_are_what_the_decoder_gives(path: Path) -> None:
 
     record(path, [])
     with open_recording(path) as recording:
-        table = columns(recording)
+        table = columns(recording.frames())
     assert (len(table), table.force.shape, table.orientation.shape) == (0, (0, 3), (0, 4))
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from bota_clients.report.checks import Check, Examination
-from bota_clients.report.series import CHANNELS, Subject, limit_origin, noise_limit, subject
+from bota_clients.report.series import CHANNELS, Subject, channel_limit, limit_origin, subject
+from bota_clients.report.subjects import past
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
@@ -345,11 +346,18 @@ def test_a_rate_that_chop_divides_is_that_of_the_report() -> None:
 def test_limits_are_botas_at_the_published_lengths_and_between_them_in_between() -> None:
     table = {51: [0.6, 0.6, 0.6, 0.014, 0.014, 0.005], 1024: [0.1, 0.1, 0.08, 0.0015, 0.0015, 0.0007]}
     for length, limits in table.items():
-        assert [noise_limit(channel, length) for channel in CHANNELS] == pytest.approx([*limits, *[0.1] * 6])
+        assert [channel_limit(channel, length) for channel in CHANNELS] == pytest.approx(
+            [*limits, *[0.1] * 6]
+        )
     for channel in CHANNELS[:6]:
-        limits = [noise_limit(channel, length) for length in (32, 51, 64, 128, 256, 341, 1024, 2048)]
+        limits = [channel_limit(channel, length) for length in (32, 51, 64, 128, 256, 341, 1024, 2048)]
         assert limits == sorted(limits, reverse=True)
-    assert noise_limit(CHANNELS[0], 229) == pytest.approx(np.sqrt(0.6 * 0.1), rel=0.01), "half-way in a log"
+    assert channel_limit(CHANNELS[0], 229) == pytest.approx(np.sqrt(0.6 * 0.1), rel=0.01), "half-way in a log"
     assert "own test limits for SINC 51" in limit_origin(51)
     assert "interpolated between" in limit_origin(64)
     assert "extrapolated from" in limit_origin(32)
+
+
+def test_what_the_server_says_of_the_past_is_not_trusted() -> None:
+    row = {"sensor": 0, "drift": {"wrench": [2, 0, 0, 0, 0, 0], "ago_s": 60, "kelvin": 0}, "history": 7}
+    assert past({"sensors": [{"sensor": []}, row]}, 0) == ["Fx has drifted 2.0 N since the start 1 min ago."]

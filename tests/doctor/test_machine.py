@@ -176,8 +176,8 @@ SOFTWARE = [
 
 def looks(name: str, subject: Machine) -> list[Finding]:
     """What a check finds."""
-    (check,) = (check for check in CHECKS if check.name == name)
-    found = list(examine(*check, subject))
+    ((check, look),) = (row for row in CHECKS.items() if row[0][1] == name)
+    found = list(examine(*check, look, subject))
     assert not faults(found)
     return found
 
@@ -199,7 +199,7 @@ def test_what_is_said(case: Case, tmp_path: Path) -> None:
 def test_nothing_is_wrong_with_a_good_machine(tmp_path: Path) -> None:
     found = list(examine_machine(machine(tmp_path)))
     assert [finding for finding in found if finding.level is not FINE] == []
-    assert {finding.check for finding in found} == {check.name for check in CHECKS}
+    assert {finding.check for finding in found} == {name for _, name in CHECKS}
 
 
 def test_without_the_interface_the_machine_is_looked_at_all_the_same(tmp_path: Path) -> None:
@@ -266,7 +266,7 @@ def test_garbage_in_every_file(tmp_path: Path, number: int) -> None:
 def test_no_files_at_all(tmp_path: Path) -> None:
     unknown = but(**dict.fromkeys(FACTS, "no") | {"link": {"counters": {}}})
     found = list(examine_machine(Machine("ens5", facts=dict(unknown), root=tmp_path)))
-    assert {finding.check for finding in found} == {check.name for check in CHECKS}
+    assert {finding.check for finding in found} == {name for _, name in CHECKS}
     assert {finding.level for finding in found} <= {FINE, SKIP}
     skipped = [finding.found for finding in found if finding.level is SKIP]
     assert len(skipped) > len(CHECKS) // 2

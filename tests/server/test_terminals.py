@@ -245,15 +245,15 @@ def test_more_than_a_frame_carries_is_refused() -> None:
 def test_the_python_client_decodes_by_the_layout() -> None:
     simulation = reading("BOTA,EL3102,EL1008", ANALOG, DIGITAL)
     wait_for(simulation, "OP", "OP")
-    with StreamClient(1, terminals=[0, 1], channel=MemoryChannel(simulation)).connect() as client:
+    with StreamClient(1, terminals=[0, 1, 7], channel=MemoryChannel(simulation)).connect() as client:
         while len(client.terminal_frames) < 20:
             client.poll(0.1)
         newest = {frame.sensor: frame for frame in client.terminal_frames}
         analog, digital = (client.decode_terminal(newest[number]) for number in (0, 1))
         assert [*analog] == [f"Channel {n} {what}" for n in (1, 2) for what in ("Status", "Value")]
         assert [*digital.values()] == [newest[1].process_data[0] >> bit & 1 for bit in range(8)]
-    with pytest.raises(RefusedError, match="terminal 2, but the bus has 2"):
-        StreamClient(1, terminals=[2], channel=MemoryChannel(simulation)).connect()
+        with pytest.raises(RefusedError, match="terminal 2, but the bus has 2"):
+            client.ask("subscribe", terminals=[2])
 
 
 @pytest.mark.long

@@ -23,7 +23,7 @@ from bota_clients.errors import RecordingError
 from bota_clients.export.dataset import Clock, messages
 from bota_clients.identify.program import choose
 from bota_clients.program import interrupt_on_signals
-from bota_clients.recording.columns import Ints, decode
+from bota_clients.recording.columns import Ints, columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import angular_rate_response
 from bota_ethercat.settings import known_settings
@@ -182,7 +182,7 @@ def run(options: argparse.Namespace) -> int:
     with open_recording(options.recording) as recording:
         rows = []
         for settings, frames in recording.batches(choose(recording, options.sensor).sensor):
-            table = decode(frames, options.imu_units)
+            table = columns(frames, options.imu_units)
             table = table.where(table.fresh & np.isfinite(table.angular_rate).all(axis=1))
             delay_s = angular_rate_response(known_settings(settings.values)).delay_s or 0.0
             rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))

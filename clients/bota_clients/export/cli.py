@@ -9,10 +9,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import add_force, add_imu_units, number, position
+from bota_clients.arguments import add_force, add_imu_units, position
 from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.errors import FileError
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, number
 
 PROGRAM: Final = "ethercat-export"
 DATASETS: Final = (".parquet", ".zarr", ".npz")

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
-from bota_clients.recording.columns import Columns, Ints, decode
+from bota_clients.recording.columns import Columns, Ints, columns
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.client.reading import Delays
 from bota_ethercat.framing import DataFlag, DataMessage
@@ -123,7 +123,7 @@ class Windows:
 
     def take(self, frames: Sequence[DataMessage]) -> None:
         """Take the next frames of the sensor, also REPEATED and INVALID ones; RecordingError."""
-        samples = decode((each for each in frames if not each.flags & NOT_NEW), self._units)
+        samples = columns((each for each in frames if not each.flags & NOT_NEW), self._units)
         if not len(samples):
             return
         stamps, sequence = samples.monotonic_ns, samples.sequence

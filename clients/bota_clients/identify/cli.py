@@ -10,10 +10,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import add_force, add_imu_units, number, position
+from bota_clients.arguments import add_force, add_imu_units, position
 from bota_clients.program import start
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, number
 from ft_compensation.quantities import StationaryLimits
 
 _LIMITS: Final = tuple(field.name for field in fields(StationaryLimits))
@@ -28,7 +28,6 @@ class IdentifyOptions(argparse.Namespace):
     gravity: float | None  # m/s², if given
     least_seconds: float
     limits: StationaryLimits
-    confidence: float
     yaml: Path | None
     force: bool
     json: bool
@@ -52,8 +51,6 @@ def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
         help="shortest stationary period that is a pose (default 1)")  # fmt: skip
     add("--limit", type=_limit, action="append", default=[], metavar="NAME=VALUE",
         help=f"change a limit of what counts as stationary: {', '.join(_LIMITS)}")  # fmt: skip
-    add("--confidence", type=number(0.5, 0.9999), default=0.95, metavar="P",
-        help="confidence level of the intervals (default 0.95)")  # fmt: skip
     add("--yaml", type=Path, metavar="OUT", help="write the result as parameters of the ROS 2 node")
     add_force(made)
     add("--json", action="store_true", help="print everything as JSON instead of a table")

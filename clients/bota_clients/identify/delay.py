@@ -24,7 +24,7 @@ def run(options: IdentifyOptions) -> int:
     """Find it; returns the exit code."""
     with open_recording(options.path) as recording:
         sensor = choose(recording, options.sensor)
-        data = columns(recording, sensor.sensor, options.imu_units)
+        data = columns(recording.frames(sensor.sensor), options.imu_units)
     if any(row.values != sensor.settings for row in sensor.history):
         raise RecordingError(f"{options.path}: settings were changed during it: record without that")
     settings, found, error = known_settings(sensor.settings), None, ""

@@ -129,7 +129,7 @@ def run(options: IdentifyOptions) -> int:
         sensor = choose(recording, options.sensor)
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
-        data = columns(recording, sensor.sensor, options.imu_units)
+        data = columns(recording.frames(sensor.sensor), options.imu_units)
     periods, rejected = find_stationary_periods(data, options.least_seconds, options.limits)
     if len(periods) > MOST_POSES:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
@@ -199,6 +199,6 @@ def _solve(
     if not poses:
         return poses, None, error
     try:
-        return poses, identify([pose for _, pose in poses], confidence=options.confidence), None
+        return poses, identify([pose for _, pose in poses]), None
     except CompensationError as refusal:
         return poses, None, str(refusal)

@@ -15,7 +15,7 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from bota_clients.arguments import add_imu_units, add_server, address, seconds, server_of
+from bota_clients.arguments import add_imu_units, add_server, address, server_of
 from bota_clients.monitor.model import Model
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.web.hub import is_loopback
@@ -25,7 +25,7 @@ from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.health.sentences import no_server
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, seconds
 
 DEFAULT_WEB: Final = Address(DEFAULT_HOST, 12080)
 _PERIOD_S: Final = 1.0

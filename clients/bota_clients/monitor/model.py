@@ -12,22 +12,20 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import groupby
-from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import history
 from bota_ethercat.health.judge import Observation, emergency, judge, saturated_axes
-from bota_ethercat.health.observer import COMMON, StreamObserver
+from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
 from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import SETTINGS, SettingValue
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import number, rows, text, whole
+from bota_ethercat.text.untrusted import mapping, number, rows, text, whole
 
 SILENT_S: Final = LIMITS.stale_after  # a server normally sends a frame per sample period
 _WRENCH: Final = tuple(COMMON.index(f.name) for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
@@ -35,7 +33,6 @@ _WINDOW_NS: Final = 5 * 10**9  # of rate, jitter and age
 _JUDGED_NS: Final = 10**9  # of a verdict
 _JUDGED_S: Final = _JUDGED_NS * 1e-9
 _MESSAGE_S: Final = 30.0
-_POSITION: Final = attrgetter("sensor")
 
 
 class Range(NamedTuple):
@@ -118,7 +115,7 @@ class SensorState:
     lost_on_bus: int | None = None
     recoveries: int | None = None
     hand_out_us: Spread | None = None  # age when the server hands them out
-    zero: str = ""  # how far it has drifted, and how it goes by temperature, in words
+    zero: str = ""  # its drift, and its slope by temperature, in words
 
     @property
     def units(self) -> tuple[str, str]:
@@ -252,7 +249,7 @@ class _Sensor:
             self._seen[finding.key] = worst, now_s
 
     def _observation(self, now_s: float) -> Observation:
-        mode = _mapping(self._status.get("clock")).get("mode")
+        mode = mapping(self._status.get("clock")).get("mode")
         said, at_s = self._emergency
         grown = {name: by for name, (by, then_s) in self._grown.items() if now_s - then_s < _JUDGED_S}
         seen = self.observer.observation(_ns(now_s), _JUDGED_NS)
@@ -266,7 +263,7 @@ class _Sensor:
             state=text(self._row.get("state")),
             emergency=said if now_s - at_s < LIMITS.emergency_s else "",
             drift=history.drift(self._status, LIMITS),
-            settings=_mapping(self._row.get("settings")),
+            settings=mapping(self._row.get("settings")),
         )
 
     def state(self, now_s: float, *, server_speaks: bool) -> SensorState:
@@ -283,7 +280,7 @@ class _Sensor:
             if key not in keys
         ]
         row, status, clock = self._row, self._status, self._status.get("clock")
-        settings = _mapping(row.get("settings"))
+        settings = mapping(row.get("settings"))
         sample = self._newest and SampleDecoder(len(self._newest), self._imu_units).decode(self._newest)
         return SensorState(
             position=self.position,
@@ -372,9 +369,9 @@ class Model:
         with self._lock:
             if frames:
                 self._heard_s = now_s
-            for position, of_one in groupby(sorted(frames, key=_POSITION), _POSITION):
+            for position, of_one in by_sensor(frames).items():
                 if position in self._sensors:
-                    self._sensors[position].take(list(of_one), now_s)
+                    self._sensors[position].take(of_one, now_s)
 
     def note_age(self, frame: DataMessage, now_ns: int) -> None:
         """This frame arrived exactly at this CLOCK_MONOTONIC."""
@@ -386,7 +383,7 @@ class Model:
         """A reply to `status`."""
         with self._lock:
             self._heard_s = now_s
-            ages: Any = _mapping(status.get("last_10s")).get("age_us")
+            ages: Any = mapping(status.get("last_10s")).get("age_us")
             for place, row in enumerate(rows(status.get("sensors"))):
                 if (sensor := self._sensor(row)) is not None:
                     hand_out = ages[place] if isinstance(ages, list) and place < len(ages) else None
@@ -433,7 +430,7 @@ class Model:
             if now_s > self._message_ends_s:
                 self._message = None
             status, connected = self._status, self._server.connected
-            timing = _mapping(status.get("last_10s")) or status
+            timing = mapping(status.get("last_10s")) or status
             up_s = number(status.get("uptime_s"))
             server = replace(
                 self._server,
@@ -458,7 +455,7 @@ class Model:
 
     def _describe(self, description: JsonObject, now_s: float, *, anew: bool) -> None:
         replay = description.get("replay")
-        files = _mapping(replay).get("files")
+        files = mapping(replay).get("files")
         name = text(files[0]) if isinstance(files, list) and files else "a recording"
         replayed = name if isinstance(replay, dict) else ""
         self._server = replace(self._server, version=text(description.get("version")), replay=replayed)
@@ -490,12 +487,8 @@ def _widest(one: Range, other: Range) -> Range:
 
 def _spread(values: Any) -> Spread | None:
     """The distribution in a reply to `status`; None if there is none."""
-    middle, end = number(_mapping(values).get("p50")), number(_mapping(values).get("p99"))
+    middle, end = number(mapping(values).get("p50")), number(mapping(values).get("p99"))
     return None if middle is None or end is None else Spread(middle, end)
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, dict) else {}
 
 
 def _ns(seconds: float) -> int:

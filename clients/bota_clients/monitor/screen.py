@@ -19,7 +19,7 @@ from rich.text import Text
 from bota_clients import numbers
 from bota_clients.monitor import words
 from bota_clients.monitor.model import Alert, Range, SensorState, State
-from bota_ethercat.health.history import AXES
+from bota_ethercat.pdo import AXES
 
 KEYS: Final = (
     ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),

@@ -52,7 +52,7 @@ def tare(address: Address, position: int, way: str = "tare") -> tuple[str, bool]
                     residual = _residual(reply.get("residual"))
                 else:
                     before = _offset(client.description, position)
-                    after = _former(serial, position, before) if way == "undo" else [0.0] * 6
+                    after = former(serial, before, f"sensor {position}") if way == "undo" else [0.0] * 6
                     _replace(client, position, before, after)
             except ConnectionFailedError as error:
                 return f"It is unknown whether {done}: {error}", True
@@ -73,13 +73,6 @@ def _offset(description: JsonObject, position: int) -> Sequence[float]:
         return six_numbers(_row(description, position).get("offset"))
     except ValueError:
         raise ValueError("its offset is unknown to the server") from None
-
-
-def _former(serial: int | None, position: int, now: Sequence[float]) -> Sequence[float]:
-    try:
-        return former(serial, now, f"sensor {position}")
-    except ValueError as error:
-        raise ValueError(f"{error}; clear the offset, or tare again") from None
 
 
 def _replace(client: Client, position: int, before: Sequence[float], after: Sequence[float]) -> None:

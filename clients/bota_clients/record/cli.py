@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import add_force, add_server, position, server_of, typed
+from bota_clients.arguments import add_force, add_server, position, server_of
 from bota_clients.program import Signals, start
 from bota_ethercat.address import Address
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, typed
 from bota_ethercat.program.server_choice import is_address
 
 _UNITS_S: Final = {"": 1, "s": 1, "min": 60, "h": 3600}

@@ -6,7 +6,7 @@ import math
 from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -62,23 +62,11 @@ class Columns:
         return Columns(*(getattr(self, name)[mask] for name in self.__slots__))
 
 
-class FrameSource(Protocol):
-    """A source of frames: a `bota_clients.recording.reader.Recording`, or frames received live."""
-
-    def frames(self, sensor: int | None = None) -> Iterable[DataMessage]:
-        """The frames of the sensor at this position, or of all, in the order in which they came."""
-
-
-def columns(recording: FrameSource, sensor: int = 0, imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
-    """All frames of the sensor at this position. DamagedError as `Recording.frames`.
+def columns(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
+    """The frames of one sensor, for example `recording.frames(sensor=0)`.
 
     `imu_units` are the units in which the firmware sends acceleration and angular rate.
     """
-    return decode(recording.frames(sensor), imu_units)
-
-
-def decode(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
-    """These frames of one sensor."""
     heads, data = array("q"), bytearray()
     for frame in frames:
         # 64-bit values that do not fit an int64 are no valid times.

@@ -39,9 +39,8 @@ MAX_CHANNELS: Final = 4096
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _INDEX: Final = struct.Struct("<HI")  # channel, bytes that follow: 16 for each message
-_FOOTER_SIZE: Final = struct.calcsize(
-    "<BQQQI8s"
-)  # with the trailing magic: the last bytes of a complete file
+# With the trailing magic: the last bytes of a complete file.
+_FOOTER_SIZE: Final = struct.calcsize("<BQQQI8s")
 _UNREADABLE: Final = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 
 _Record = TypeVar("_Record", Channel, Chunk, Metadata)

@@ -84,9 +84,7 @@ class RecordedSensor(NamedTuple):
     pdo_size: int
     rate_hz: float  # nominal; 0 if unknown
     settings: Mapping[str, Any]
-    history: tuple[
-        Settings, ...
-    ]  # settings and identity over time, oldest first; the first are the ones here
+    history: tuple[Settings, ...]  # over time, oldest first; the first are the ones here
     frames: int  # number of its frames in the recording
 
 

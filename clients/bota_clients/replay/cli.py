@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import address, number, typed
+from bota_clients.arguments import address
 from bota_clients.program import Signals, start
 from bota_ethercat.address import DEFAULT_HOST, Address
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, number, typed
 from bota_ethercat.program.server_choice import own_server
 
 _HOSTS: Final = ["127.0.0.1", "::1"]

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bota_clients.arguments import add_force, add_imu_units, add_server, number, server_of, typed
+from bota_clients.arguments import add_force, add_imu_units, add_server, server_of
 from bota_clients.errors import ReportError
 from bota_clients.program import discard_output, interrupt_on_signals, say, start
 from bota_ethercat.address import Address
@@ -17,7 +17,7 @@ from bota_ethercat.errors import UnreachableError
 from bota_ethercat.health.sentences import no_server
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, number, typed
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.server_choice import is_address
 from bota_ethercat.program.version import VERSION

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_clients.recording.columns import Floats, Ints
-from bota_clients.report.series import CHANNELS, Bools, Series, noise_limit
+from bota_clients.report.series import CHANNELS, Bools, Series, channel_limit
 
 _WINDOW_S: Final = 0.5
 _FEWEST_SAMPLES: Final = 32  # in a window
@@ -86,7 +86,7 @@ def _limits(series: Series) -> Floats:
     length = series.subject.sinc_length if series.subject.settings.get("calibration_matrix") else None
     return np.array([
         math.nan if (series.imu_off if channel.group.is_imu else length is None)
-        else noise_limit(channel, length or 1)
+        else channel_limit(channel, length or 1)
         for channel in CHANNELS
     ])  # fmt: skip
 

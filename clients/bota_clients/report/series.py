@@ -7,7 +7,6 @@ seconds of CLOCK_MONOTONIC since the first frame.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
@@ -19,6 +18,7 @@ from bota_clients.recording.columns import Columns, Floats, Ints
 from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.errors import SettingError
 from bota_ethercat.health.verdict import LIMITS
+from bota_ethercat.sensor.filters import LONG_SINC, SHORT_SINC, noise_limit
 from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor
 from bota_ethercat.text.untrusted import printable, whole
@@ -142,20 +142,12 @@ CHANNELS: Final = tuple(
     for group in GROUPS
     for axis in range(3)
 )
-# The two lengths for which limits are published.
-SHORT_SINC: Final = 51
-LONG_SINC: Final = 1024
 
 
-def noise_limit(channel: Channel, sinc_length: int) -> float:
-    """Noise (standard deviation) below which the channel is healthy at this SINC length.
-
-    Interpolated along the straight line through the two published limits in a log-log plot, as noise falls
-    with a power of the averaging length; beyond the two lengths the same line is followed.
-    """
-    short, long = channel.group.limits_short[channel.axis], channel.group.limits_long[channel.axis]
-    power = math.log(long / short) / math.log(LONG_SINC / SHORT_SINC)  # 0 of the IMU: it has its own filter
-    return short * math.pow(sinc_length / SHORT_SINC, power)
+def channel_limit(channel: Channel, sinc_length: int) -> float:
+    """Noise (standard deviation) below which the channel is healthy at this SINC length."""
+    group, axis = channel.group, channel.axis
+    return noise_limit(group.limits_short[axis], group.limits_long[axis], sinc_length)
 
 
 def limit_origin(sinc_length: int) -> str:

@@ -33,7 +33,6 @@ from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import history
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.sensor_choice import SensorChoice
-from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
 _MOST_EVENTS_NAMED: Final = 10
@@ -91,24 +90,19 @@ def _meant(sensor: RecordedSensor, choice: SensorChoice | None) -> list[int]:
     ]
 
 
-class _Frames:
-    """The frames of one sensor, and how many of them came before each entry of its history."""
+def _frames(recording: Recording, sensor: int, before: list[int]) -> Iterator[DataMessage]:
+    """The frames of a sensor; `before` gets how many of them came before each entry of its history.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self.before: list[int] = []
-
-    def frames(self, sensor: int | None = None) -> Iterator[DataMessage]:
-        """Its frames. The order in the file decides what came first, because clocks differ."""
-        assert sensor is not None
-        histories, so_far = Histories(), 0
-        for item in self._recording.everything(sensor):
-            if isinstance(item, DataMessage):
-                so_far += 1
-                yield item
-            else:
-                histories.take(item)
-                self.before += [so_far] * (len(histories.of(sensor)) - len(self.before))
+    The order in the file decides what came first, because clocks differ.
+    """
+    histories, so_far = Histories(), 0
+    for item in recording.everything(sensor):
+        if isinstance(item, DataMessage):
+            so_far += 1
+            yield item
+        else:
+            histories.take(item)
+            before += [so_far] * (len(histories.of(sensor)) - len(before))
 
 
 def _subject(
@@ -119,12 +113,12 @@ def _subject(
     source: str,
 ) -> Subject:
     """Its longest stretch without a change of settings or sensor."""
-    counted, history = _Frames(recording), sensor.history
-    frames = columns(counted, sensor.sensor, imu_units)
+    before, history = list[int](), sensor.history
+    frames = columns(_frames(recording, sensor.sensor, before), imu_units)
     row, values, remarks = sensor._asdict(), None, list[str]()
     if history:
         # The first settings were in effect before they were received.
-        ends = [0, *counted.before[1:], len(frames)]
+        ends = [0, *before[1:], len(frames)]
         longest = max(_meant(sensor, choice), key=lambda number: ends[number + 1] - ends[number])
         kept, numbers = history[longest], np.arange(len(frames))
         row |= {**kept.identity._asdict(), "rate_hz": kept.rate_hz}
@@ -184,17 +178,17 @@ def of_server(
             show(completed=passed)
             recorder.put(source.batch(min(_BATCH_S, seconds - passed)))
         recorder.stop("")
-        past: dict[object, JsonObject] = {}
+        status: Mapping[str, Any] = {}
         with contextlib.suppress(ProtocolError):  # the stream is enough
-            past = {row.get("sensor"): row for row in rows(source.ask("status").get("sensors"))}
+            status = source.ask("status")
         subjects = of_recording(path, choice, imu_units, str(address))
-        return [each.with_remarks(_past(past.get(each.position, {}))) for each in subjects]
+        return [each.with_remarks(past(status, each.position)) for each in subjects]
 
 
-def _past(row: Mapping[str, Any]) -> list[str]:
-    """What the server knows of a sensor's past."""
+def past(status: Mapping[str, Any], position: int) -> list[str]:
+    """What the server knows of a sensor's past, from its reply to `status`: sentences."""
+    row = next((row for row in rows(status.get("sensors")) if row.get("sensor") == position), {})
     overload, overloaded = history.overload(row)
     texts = [history.drift(row), history.temperature_line(row), overload]
-    return [f"{text[0].upper()}{text[1:]}." for text in texts if text] + (
-        ["Have it checked for damage by overload."] if overloaded else []
-    )
+    texts += ["have it checked for damage by overload"] if overloaded else []
+    return [f"{text[0].upper()}{text[1:]}." for text in texts if text]

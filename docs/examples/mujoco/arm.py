@@ -9,14 +9,18 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import mujoco
-from bota_ethercat.client import Reading, World, connect
+from bota_ethercat.client import Client, World
 from bota_ethercat.world import Felt
+
+if TYPE_CHECKING:
+    from docs.examples.mujoco.identify import Identification
+    from docs.examples.mujoco.touch import Touch
 
 STEP_S: Final = 0.001
 READY: Final = (0.0, 20.0, 100.0, 0.0, -30.0, 0.0)  # degrees: the tool before the wall, level
@@ -28,7 +32,7 @@ _LARGEST_LAG_S: Final = 0.05  # behind which no step is made up for
 class Arm:
     """Six position-controlled joints in MuJoCo, one step a millisecond.
 
-    `velocity` (3,), m/s, is what the tip is to have, in the base's frame, without turning.
+    `velocity` (3,), m/s, is commanded of the tip, in the base's frame, without turning.
     """
 
     def __init__(self) -> None:
@@ -87,17 +91,6 @@ class Arm:
             yield window
 
 
-class Task(Protocol):
-    """What an arm is to do, one control cycle at a time."""
-
-    @property
-    def done(self) -> bool:
-        """Whether it has ended."""
-
-    def update(self, reading: Reading, seconds: float) -> None:
-        """Move the arm by the newest sample; `seconds` are of any clock."""
-
-
 def arguments(description: str) -> argparse.ArgumentParser:
     """What all examples take."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
@@ -106,9 +99,9 @@ def arguments(description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def perform(task: Task, arm: Arm, options: argparse.Namespace) -> None:
-    """In real time, a cycle a millisecond, until the task is done; says what samples are worth."""
-    with World(options.world) as world, connect(options.port) as sensor, arm.shown() as window:
+def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace) -> None:
+    """In real time, a cycle a millisecond, until the task is done; prints each change of condition."""
+    with World(options.world) as world, Client(options.port) as sensor, arm.shown() as window:
         condition, due = None, time.monotonic()
         for number in itertools.count():
             felt = arm.step()

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import contextlib
 import math
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from bota_ethercat.client import Reading
 from ft_compensation.identification.payload import Identified, identify
 from ft_compensation.identification.poses import Pose, pose_of
 from ft_compensation.stationary import NotStationaryError, StationaryWindow
+
+if TYPE_CHECKING:  # the task does without MuJoCo
+    from docs.examples.mujoco.arm import Arm
 
 MASS: Final = 0.65  # kg, as in arm.xml
 CENTER: Final = (0.01, -0.015, 0.05)  # in the sensor's frame, m
@@ -29,21 +31,10 @@ POSES: Final = (
 _MOVE_S, _SETTLE_S = 2.0, 0.5
 
 
-class Robot(Protocol):
-    """What the task has of an arm."""
-
-    @property
-    def joints(self) -> NDArray[np.float64]:
-        """Where the joints are to be, rad."""
-
-    def turn_to(self, joints: ArrayLike) -> None:
-        """Where they are to be, rad."""
-
-
 class Identification:
     """The task, one control cycle at a time: `update` until it is `done`; then there is a `result`."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Arm) -> None:
         self.robot, self.poses = robot, list[Pose]()
         self._begun_s: float | None = None  # the move to the next pose
         self._from = robot.joints
@@ -78,7 +69,7 @@ class Identification:
 
 def main() -> None:
     """The command line."""
-    from docs.examples.mujoco.arm import Arm, arguments, perform  # noqa: PLC0415 - the task does without MuJoCo
+    from docs.examples.mujoco.arm import Arm, arguments, perform  # noqa: PLC0415 - as above
 
     options, arm = arguments(str(__doc__)).parse_args(), Arm()
     task = Identification(arm)

@@ -10,12 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.client import Condition, Reading
+
+if TYPE_CHECKING:  # the controller does without MuJoCo
+    from docs.examples.mujoco.arm import Arm
 
 Array = NDArray[np.float64]
 
@@ -31,20 +34,6 @@ _NEAR: Final = 0.0005  # m
 _WANTED: Final = np.array((-FORCE, 0.0, 0.0))  # of the wall on the tip, in the base's frame
 
 
-class Robot(Protocol):
-    """What the controller has of an arm. All in the base's frame, but what `rotation` takes there."""
-
-    velocity: Array  # (3,) of the tip, m/s: to be set
-
-    @property
-    def tip(self) -> Array:
-        """Position, (3,) m."""
-
-    @property
-    def rotation(self) -> Array:
-        """(3, 3), turns the sensor's vectors."""
-
-
 class Row(NamedTuple):
     """What a control cycle saw."""
 
@@ -57,7 +46,7 @@ class Row(NamedTuple):
 class Touch:
     """The task, one control cycle at a time, until it is `done`. Without a fresh sample it stops."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Arm) -> None:
         self.robot, self.rows, self.done = robot, list[Row](), False
         self._unloaded: list[tuple[float, ...]] = []
         self._plan = self._steps()
@@ -118,7 +107,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
 
 def main() -> None:
     """The command line."""
-    from docs.examples.mujoco.arm import Arm, arguments, perform  # noqa: PLC0415 - the controller does without MuJoCo
+    from docs.examples.mujoco.arm import Arm, arguments, perform  # noqa: PLC0415 - as above
 
     parser = arguments(str(__doc__))
     parser.add_argument("--picture", type=Path, metavar="FILE", help="of force and position over time")

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from bota_ethercat.pdo import INPUT_OBJECT, PDO_FIELDS, PdoType
+from bota_ethercat.pdo import AXES, INPUT_OBJECT, PDO_FIELDS, PdoType
 from bota_ethercat.sensor.meaning import value_meaning
 from bota_ethercat.settings import SETTINGS, SettingValue
 
@@ -151,7 +151,6 @@ STRING, OCTETS, BIT8, I8 = ObjectType.STRING, ObjectType.OCTETS, ObjectType.BIT8
 RO, RW, RW_PREOP = Access
 
 _PDO_TYPES = {PdoType.USINT: U8, PdoType.UINT: U16, PdoType.UDINT: U32, PdoType.REAL: REAL32}
-_AXES = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _INVERTED: Mapping[SettingValue, int] = {True: 0, False: 1}
 
 # Writable on the device in every state. Never write it: the calibration is lost.
@@ -199,7 +198,7 @@ OBJECTS: Final[tuple[ObjectEntry, ...]] = (
     ObjectEntry(0x7000, 0, "Digital output", I8, RO),
     *(
         ObjectEntry(FORCE_TORQUE_OFFSET, sub, f"{axis} offset", REAL32, RW, 0, "N" if sub <= 3 else "Nm")
-        for sub, axis in enumerate(_AXES, 1)
+        for sub, axis in enumerate(AXES, 1)
     ),
     *(
         ObjectEntry(0x8001, sub, f"Acceleration offset {sub}", REAL32, RW, 0, "g" if sub <= 3 else "")

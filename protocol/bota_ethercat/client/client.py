@@ -113,7 +113,7 @@ class Client:
 
         `sensors`: by position on the bus, of those that are there; None for all. `every`: one frame in
         `every`. `fresh_only`: REPEATED frames only every 10 ms. `raw`: REPEATED and INVALID frames come, too.
-        `terminals`: by number.
+        `terminals`: by number, of those that the server reads.
         `stream` False: no frames, only requests and events. `reconnect` False: ConnectionFailedError tells
         that the only connection has ended. `timeout_s`: how long `receive` waits for a sample; by default 5
         periods, at least 20 ms. `channel`: another one than TCP.

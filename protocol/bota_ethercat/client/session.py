@@ -237,8 +237,9 @@ class Session:
                 has = ", ".join(map(str, there[:16])) or "none"
                 raise ConnectionFailedError(f"the server has no sensor {text} (it has: {has})")
             values["sensors"] = found
-        if self._terminals:
-            values["terminals"] = self._terminals
+        read = len(rows(self.description.get("terminals")))
+        if terminals := [number for number in self._terminals if number < read]:
+            values["terminals"] = terminals
         return self._ask_first(self._granted, "subscribe", **values)
 
     def _granted(self, reply: JsonObject) -> bytes:

@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from bota_ethercat.control import known_six
 from bota_ethercat.health.verdict import LIMITS, Limits
-from bota_ethercat.text.untrusted import number, whole
+from bota_ethercat.pdo import AXES
+from bota_ethercat.text.untrusted import mapping, number, whole
 
-AXES: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 _UNITS: Final = ("N", "N", "N", "Nm", "Nm", "Nm")
 _SINCE: Final = {"tare": "the tare", "change": "its settings changed", "return": "it came back"}
 _LAST_DAY: Final = 4e9  # s of the Unix epoch
@@ -19,12 +19,9 @@ _LAST_DAY: Final = 4e9  # s of the Unix epoch
 
 def drift(row: Mapping[str, Any], limits: Limits | None = None) -> str:
     """How far the zero has drifted; with `limits`, empty unless that is worth a look."""
-    found, least = _mapping(row.get("drift")), limits or LIMITS
-    wrench, ago_s, kelvin = (
-        known_six(found.get("wrench")),
-        number(found.get("ago_s")),
-        number(found.get("kelvin")),
-    )
+    found, least = mapping(row.get("drift")), limits or LIMITS
+    wrench, ago_s = known_six(found.get("wrench")), number(found.get("ago_s"))
+    kelvin = number(found.get("kelvin"))
     if wrench is None or ago_s is None or kelvin is None:
         return ""
     share = [abs(v) / (least.drift_force if n < 3 else least.drift_torque) for n, v in enumerate(wrench)]
@@ -39,8 +36,8 @@ def drift(row: Mapping[str, Any], limits: Limits | None = None) -> str:
 
 
 def temperature_line(row: Mapping[str, Any]) -> str:
-    """How the zero goes by temperature, with 95 % intervals; empty if that is not known."""
-    found, slope = _mapping(row.get("temperature_line")), line_slope(row)
+    """The slope of the offset by temperature, with 95 % intervals; empty if that is not known."""
+    found, slope = mapping(row.get("temperature_line")), line_slope(row)
     if slope is None:
         return ""
     each = zip(AXES, slope, found["interval"], _UNITS, strict=True)
@@ -51,8 +48,8 @@ def temperature_line(row: Mapping[str, Any]) -> str:
 
 
 def line_slope(row: Mapping[str, Any]) -> list[float] | None:
-    """N/K and Nm/K by axis, 0 where the line is not told from none; None if there is no line."""
-    found = _mapping(row.get("temperature_line"))
+    """N/K and Nm/K by axis, 0 where it is not significant; None if there is no line."""
+    found = mapping(row.get("temperature_line"))
     slope, interval = known_six(found.get("slope")), known_six(found.get("interval"))
     if slope is None or interval is None:
         return None
@@ -61,12 +58,9 @@ def line_slope(row: Mapping[str, Any]) -> list[float] | None:
 
 def overload(row: Mapping[str, Any]) -> tuple[str, bool]:
     """The largest wrench, and whether the sensor was ever overloaded; empty if that is not known."""
-    found = _mapping(row.get("history"))
-    peak, since, last = (
-        known_six(found.get("peak")),
-        _day(found.get("since")),
-        _day(found.get("saturated_at")),
-    )
+    found = mapping(row.get("history"))
+    peak = known_six(found.get("peak"))
+    since, last = _day(found.get("since")), _day(found.get("saturated_at"))
     if peak is None or not since:
         return "", False
     largest = ", ".join(f"{a} {value:.3g} {u}" for a, value, u in zip(AXES, peak, _UNITS, strict=True))
@@ -79,7 +73,3 @@ def overload(row: Mapping[str, Any]) -> tuple[str, bool]:
 def _day(value: object) -> str:
     at = number(value)
     return time.strftime("%Y-%m-%d", time.localtime(at)) if at is not None and 0 < at < _LAST_DAY else ""
-
-
-def _mapping(value: object) -> Mapping[str, Any]:
-    return value if isinstance(value, dict) else {}

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
-from bota_ethercat.health.history import AXES
 from bota_ethercat.health.sentences import STOOD_STILL
 from bota_ethercat.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
+from bota_ethercat.pdo import AXES
 from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain
-from bota_ethercat.text.untrusted import number, printable, whole
+from bota_ethercat.text.untrusted import mapping, number, printable, whole
 
 
 class Observation(NamedTuple):
@@ -237,7 +237,7 @@ def _circumstances(seen: Observation) -> Iterator[Finding]:
 
 def emergency(row: object, limits: Limits = LIMITS) -> str:
     """In words, the `emergency` in a reply to `status`; empty if there is none, or none that matters now."""
-    last: Mapping[str, object] = row if isinstance(row, dict) else {}
+    last = mapping(row)
     code, ago_s = whole(last.get("code")), number(last.get("ago_s"))
     if code is None or not code & _ERROR_CLASS or ago_s is None or not 0 <= ago_s < limits.emergency_s:
         return ""

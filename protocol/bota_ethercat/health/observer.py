@@ -7,7 +7,7 @@ import functools
 import math
 import operator
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.accounting import NOT_NEW, FrameKind, StreamAccounting, StreamCounts
@@ -23,6 +23,14 @@ _FLAGS: Final = tuple(
 _TEMPERATURE: Final = COMMON.index("temperature")
 _MOST_KEPT: Final = 1 << 16
 _HIGHEST_HZ: Final = 1e6  # a rate beyond it is no sensor's, and not known
+
+
+def by_sensor(frames: Iterable[DataMessage]) -> dict[int, list[DataMessage]]:
+    """The frames of each sensor, in the order in which they came."""
+    found: dict[int, list[DataMessage]] = {}
+    for frame in frames:
+        found.setdefault(frame.sensor, []).append(frame)
+    return found
 
 
 class _Batch(NamedTuple):

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line of every program: its help begins with three examples, `--version` is the package's."""
+"""The command line of every program: help with three examples first, `--version`, numbers within limits."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Any, Final, TypeVar
 
 from bota_ethercat.program.version import VERSION
+
+_Value = TypeVar("_Value")
 
 EXAMPLES: Final = """\
 ethercat-server virtual 12001                              # a simulated sensor
@@ -53,3 +56,29 @@ class Parser(argparse.ArgumentParser):
         """The examples, then what argparse has."""
         rows = [row for row in EXAMPLES.splitlines() if self.prog in row.removeprefix("sudo ").split()[:1]]
         return "\n".join([*(["examples:", *rows, ""] if rows else []), super().format_help()])
+
+
+def typed(convert: Callable[[str], _Value], what: str = "") -> Callable[[str], _Value]:
+    """The type of an argument; for a ValueError argparse says `what` it must be, or else the error."""
+
+    def converted(text: str) -> _Value:
+        try:
+            return convert(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{text!r}: it must be {what}" if what else str(error)) from None
+
+    return converted
+
+
+def number(low: float, high: float, what: str = "") -> Callable[[str], float]:
+    """The type of an argument that is a number from `low` to `high`; `what` is in the error if it is not."""
+
+    def within(text: str) -> float:
+        if low <= (value := float(text)) <= high:
+            return value
+        raise ValueError
+
+    return typed(within, what or f"from {low:g} to {high:g}")
+
+
+seconds = number(1e-9, 1e9, "a number of seconds, such as 60")

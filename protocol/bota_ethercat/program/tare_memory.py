@@ -11,6 +11,7 @@ from bota_ethercat.control import six_numbers
 from bota_ethercat.program import state
 
 _NAME: Final = "tares.json"
+_INSTEAD: Final = "clear the offset, or tare again"
 
 
 def remember(serial: int, before: Sequence[float], after: Sequence[float]) -> None:
@@ -25,7 +26,7 @@ def former(serial: int | None, now: Sequence[float], sensor: str) -> list[float]
     try:
         before, after = six_numbers(row["before"]), six_numbers(row["after"])
     except (KeyError, TypeError, ValueError):
-        raise ValueError(f"no tare of {sensor} by this user is known") from None
+        raise ValueError(f"no tare of {sensor} by this user is known; {_INSTEAD}") from None
     if array("f", after) != array("f", now):  # as the sensor keeps it
-        raise ValueError(f"the offset of {sensor} has changed since its last tare here")
+        raise ValueError(f"the offset of {sensor} has changed since its last tare here; {_INSTEAD}")
     return list(before)

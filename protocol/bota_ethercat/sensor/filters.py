@@ -6,6 +6,7 @@ Bota's publications differ in the cut-off frequencies: use these to compare sett
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
@@ -84,3 +85,14 @@ ACCELERATION_FILTERS: Final[Mapping[int, ImuFilter]] = {
     )
 }
 """Accelerometer, by filter profile."""
+
+SHORT_SINC, LONG_SINC = 51, 1024  # for which Bota gives limits of the noise of a healthy sensor
+
+
+def noise_limit(short: float, long: float, sinc_length: int) -> float:
+    """The limit at another SINC length, by the limits at `SHORT_SINC` and `LONG_SINC`.
+
+    Noise falls with a power of the averaging length: a straight line in a log-log plot, also beyond the two.
+    """
+    power = math.log(long / short) / math.log(LONG_SINC / SHORT_SINC)
+    return float(short * (sinc_length / SHORT_SINC) ** power)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 
@@ -37,6 +38,11 @@ def whole(value: object) -> int | None:
     if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= 1 << 64:
         return None
     return value
+
+
+def mapping(value: object) -> Mapping[str, Any]:
+    """A JSON object; an empty one if it is none."""
+    return value if isinstance(value, dict) else {}
 
 
 def rows(value: object) -> list[dict[str, Any]]:

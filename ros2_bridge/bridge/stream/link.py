@@ -20,7 +20,7 @@ from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedErr
 from bota_ethercat.health.sentences import event_sentence, no_server
 from bota_ethercat.settings import SettingValue, known_settings
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import number, printable, rows
+from bota_ethercat.text.untrusted import mapping, number, printable, rows
 from ft_compensation.quantities import Wrench, wrench_text
 
 CONFIGURE_TIMEOUT_S: Final = 10.0
@@ -215,8 +215,7 @@ def known_rate(rate_hz: object) -> float:
 
 def known_delays(delay_ms: object) -> Mapping[str, float]:
     """The delays of the filters that a message gives, ms by channel; without those that it does not know."""
-    given = delay_ms if isinstance(delay_ms, dict) else {}
-    found = {channel: number(given.get(channel)) for channel in ("force_torque", "acceleration")}
+    found = {channel: number(mapping(delay_ms).get(channel)) for channel in ("force_torque", "acceleration")}
     return {channel: ms for channel, ms in found.items() if ms is not None and 0 <= ms <= LONGEST_DELAY_MS}
 
 

@@ -22,6 +22,7 @@ from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import no_server
 from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
+from bota_ethercat.text.untrusted import rows
 from bridge.parameters.table import Parameters
 from bridge.process import Worker
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
@@ -163,6 +164,7 @@ class Reader:
             parameters.server_port, parameters.server_host, sensors=[self._sensor],
             terminals=range(parameters.terminals), channel=channel,
         )  # fmt: skip
+        self._terminals = parameters.terminals
         self.on_terminal: Callable[[TerminalMessage], object] = lambda _: None  # gets their frames
         self.accounting = self.client.session.state(self._sensor).accounting
         self.accounting.counts = self.counts
@@ -254,6 +256,8 @@ class Reader:
             link.connected(event.description)
             again = " again" if event.again else ""
             self._log.info(f"connected{again} to {link.address}: {link.info}")
+            if (read := len(rows(event.description.get("terminals")))) < self._terminals:
+                self._log.warning(f"the server reads {read} of {self._terminals} terminals: name them there")
             self._problem = None
         elif isinstance(event, Disconnected):
             if event.reason.startswith("the server has no sensor"):

@@ -28,10 +28,9 @@ from bota_clients.numbers import duration
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health.history import AXES
 from bota_ethercat.health.observer import COMMON
 from bota_ethercat.health.verdict import Level
-from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits, PdoType
+from bota_ethercat.pdo import AXES, STANDARD_GRAVITY, ImuUnits, PdoType
 from bota_ethercat.sensor.meaning import value_meaning
 from bota_ethercat.sensor_choice import MOST_PLACES
 from bota_ethercat.text.json_text import JsonObject, finite, parse_json_object

@@ -108,7 +108,7 @@ inline Message& begin_error(Message& error, const Options& options) noexcept {
 }
 
 /// The name of this process's CLOCK_MONOTONIC, as a server names its own in `boot_id`: the kernel's boot and, in a time
-/// namespace that shifts the clock, by how much. Empty if it cannot be known. protocol/address.py in C++.
+/// namespace that shifts the clock, by how much. Empty if it cannot be known. bota_ethercat/address.py in C++.
 inline std::string clock_name() {
     std::string name, word, seconds, ns;
     if (!(std::ifstream("/proc/sys/kernel/random/boot_id") >> name)) return {};

@@ -20,7 +20,7 @@
 namespace bota_ethercat {
 
 inline constexpr int kProtocolVersion = 1;
-inline constexpr std::size_t kMaxJsonLength = 65536;  // bytes of one JSON message, as protocol/framing.py
+inline constexpr std::size_t kMaxJsonLength = 65536;  // bytes of one JSON message, as bota_ethercat/framing.py
 inline constexpr std::size_t kMaxSensors = 16;        // of which a description is kept
 inline constexpr double kStandardGravity = 9.80665;  // m/s^2 in one g
 inline constexpr double kPi = 3.14159265358979323846;
@@ -121,7 +121,7 @@ inline double real(const std::uint8_t* bytes) noexcept {
     return static_cast<double>(value);
 }
 
-/// Offsets in the process data, docs/protocol.md; a test compares them with the table in protocol/pdo.py.
+/// Offsets in the process data, docs/protocol.md; a test compares them with the table in bota_ethercat/pdo.py.
 enum PdoOffset : std::size_t {
     kStatusAt = 0,
     kWarningsAt = 1,

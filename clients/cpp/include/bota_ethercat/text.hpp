@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Texts from the network, without allocation or recursion: `Text`, and JSON as strict as protocol/text/json_text.py.
+// Texts from the network, without allocation or recursion: `Text`, and JSON as strict as bota_ethercat/text/json_text.py.
 //
 // `json::is_object` checks a text whole; after that a `json::Value` is a piece of it that is known to be well-formed.
 #pragma once
