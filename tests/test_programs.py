@@ -19,7 +19,6 @@ import pytest
 from bota_clients.identify.cli import main as identify
 from bota_ethercat.program.arguments import Parser
 from ethercat_server import programs
-from ethercat_server.virtual_sensor.cli import main as virtual_sensor
 from tests.ended import run_here
 from tests.simulation import more_if_long
 
@@ -166,18 +165,3 @@ for name, entry in {[(name, PROGRAMS[name]) for name in CLIENTS]!r}:
     assert (done.returncode, done.stderr) == (0, "")
     for name in CLIENTS:
         assert f"usage: {name}" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("--sensors", "99"),
-        ("--sinc", "1"),
-        ("--serial", "x"),
-        ("--ppm", "x"),
-    ],
-)
-def test_the_virtual_sensor_names_the_option(option: str, value: str) -> None:
-    ended = run_here(virtual_sensor, "veth0", option, value)
-    assert ended.code == 2
-    assert ended.err.startswith(f"ethercat-virtual-sensor: {option}: ")

@@ -18,7 +18,7 @@ from bota_clients.recording.columns import Columns, Floats
 from bota_clients.report import page as page_module
 from bota_clients.report.checks import Examination
 from bota_clients.report.page import as_json, render
-from bota_clients.report.plots import envelope, stretches
+from bota_clients.report.plots import envelope
 from bota_clients.report.series import GROUPS
 from bota_ethercat.framing import DataFlag
 from tests.clients import pictures
@@ -102,14 +102,6 @@ def test_it_can_be_read_without_seeing_it(page: str) -> None:
     headings = [tag for tag, _ in reader.tags if re.fullmatch("h[1-6]", tag)]
     assert headings[0] == "h1"
     assert headings.count("h1") == 1
-
-
-def test_every_color_of_a_plot_is_the_pages(page: str) -> None:
-    for plot in re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL):
-        assert not re.findall(r"(?:fill|stroke|color): *#", plot)
-        used = set(re.findall(r"var\((--[a-z]+)\)", plot)) - {"--font"}
-        assert used
-        assert all(page.count(f"{name}:") >= 2 for name in used), "light and dark"
 
 
 def test_outcomes_are_words_and_not_colors_alone(page: str) -> None:
@@ -217,11 +209,6 @@ def test_a_spike_is_never_averaged_away() -> None:
     assert high[int(31.415 / 100 * len(middles))] == 5.0
     assert np.nanmin(low) == 0.0
     assert 0 < np.nanmax(mean) < 0.1
-
-
-def test_stretches_join_neighbours() -> None:
-    assert stretches(np.array([]), 10.0, 10).shape == (0, 2)
-    assert stretches(np.array([0.5, 1.5, 1.6, 5.5, 99.0]), 10.0, 10).tolist() == [[0, 2], [5, 6], [9, 10]]
 
 
 def test_figures_and_spans_of_time() -> None:

@@ -119,6 +119,8 @@ def test_a_seed_gives_a_run_to_the_bit() -> None:
         simulation = Simulation(
             SensorOptions(seed=seed), machine=machine, settings={"sinc_length": 512}, world=rising
         )
+        simulation.at(1.0, "skip 3")
+        simulation.at(2.0, "noise force.x 3")
         simulation.run(10.0)
         return [frame.process_data + frame.monotonic_ns.to_bytes(8) for frame in simulation.frames]
 
