@@ -18,10 +18,6 @@ from tests.server.running import wait_until
 
 pytestmark = needs_chromium
 
-COLOR = (
-    "(e => (document.body.append(e), e.style.color = 'var(--{})', getComputedStyle(e).color))"
-    "(document.createElement('i'))"
-)
 PAPER = "getComputedStyle(document.body).backgroundColor.match(/\\d+/g).reduce((a, b) => a + Number(b), 0)"
 SPIKE = 501
 COUNT = 800
@@ -140,22 +136,6 @@ def test_what_a_slow_page_missed_is_told_from_what_was_lost(page: Page, web: Web
     page.wait_for("document.querySelector('#force').plot.data[1].filter(each => each === null).length == 2")
     ((start, end),) = page.value("document.querySelector('#force').plot.skipped")
     assert 0.25 < end - start < 0.35
-
-
-def test_warnings_alone_are_amber(page: Page, web: Web) -> None:
-    def edge() -> str:
-        return str(page.value("getComputedStyle(document.querySelector('#warnings')).borderColor"))
-
-    colors = {name: page.value(COLOR.format(name)) for name in ("warn", "bad")}
-    for start, bits, said, color in (
-        (0, 0b0100000, ".look.present", "warn"),
-        (1600, 0b1100000, ".trouble.present", "bad"),
-    ):
-        for first in range(start, start + 1600, 80):
-            web.feed(*(frame(k, {**moving(k), "warnings": bits}) for k in range(first, first + 80)))
-        page.wait_for(f"document.querySelectorAll('#warnings .present').length === {bits.bit_count()}")
-        assert page.text(f"#warnings {said}")
-        assert edge() == colors[color]
 
 
 @pytest.mark.long

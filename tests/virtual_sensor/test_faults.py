@@ -311,6 +311,7 @@ def test_stats_tell_what_was_written() -> None:
         "noise force 1", "noise force.w 1", "noise force.x -1", "noise force.x", "limit force.x",
         "limit force.x nan", "freeze", "freeze orientation.x", "thaw temperature",
         "skip 91", "skip -1", "skip nan",
+        "dc lat 5", "dc none", "dc late", "dc stuck 5", "dc ppm fast",
     ],
 )  # fmt: skip
 def test_bad_commands_are_answered_with_a_sentence(line: str) -> None:

@@ -25,7 +25,6 @@ from ethercat_server.virtual_sensor.signals import (
     sway,
 )
 from ethercat_server.virtual_sensor.world import World
-from scripts.benchmarks.records import decode_clock
 from tests.virtual_sensor.motions import measured, turning
 from tests.virtual_sensor.raw_master import OP, PREOP, RawMaster, do
 
@@ -59,18 +58,6 @@ def test_a_change_of_rate_neither_skips_nor_repeats() -> None:
     assert clock.instant(4) == 3 * PERIOD + int(PERIOD / 1.1)
     clock.change(clock.instant(10), sinc_length=128)
     assert clock.number_at(clock.instant(11)) == 11
-
-
-def test_the_newest_sample_is_what_a_frame_carries() -> None:
-    master = RawMaster(SensorOptions(signal="clock", sinc_length=64)).go(OP)
-    previous = -1
-    for step in (700_000, 10_000, PERIOD, 5 * PERIOD, 333, 90_000_000):
-        master.wait(step)
-        number, instant = decode_clock(load(master.inputs()))
-        assert instant <= master.now < instant + PERIOD
-        assert instant == 5_000_000_123 + number * PERIOD
-        assert number >= previous
-        previous = number
 
 
 def test_the_same_sample_is_the_same_bytes_also_if_computed_ahead() -> None:
