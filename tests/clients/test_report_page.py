@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from bota_clients.numbers import figure, seconds
-from bota_clients.recording.columns import Columns
+from bota_clients.recording.columns import Columns, Floats
 from bota_clients.report import page as page_module
 from bota_clients.report.checks import Examination
 from bota_clients.report.page import as_json, render
+from bota_clients.report.plots import envelope, stretches
 from bota_clients.report.series import GROUPS
 from bota_ethercat.framing import DataFlag
 from tests.clients import pictures
@@ -197,6 +198,22 @@ def test_more_samples_make_no_larger_a_page(page: str) -> None:
     assert len(long) < 1.1 * len(page)
     spike = f"z from {figure(float(tile.force[:, 2].min()))} to 77.0"
     assert spike in long, "the spike is in the plot"
+
+
+def test_a_spike_is_never_averaged_away() -> None:
+    time: Floats = np.linspace(0.0, 99.999, 100_000)
+    values = np.zeros(100_000)
+    values[31_415], values[27_182] = 5.0, np.nan
+    middles, low, high, mean = envelope(time, values, 100.0)
+    assert np.nanmax(high) == 5.0
+    assert high[int(31.415 / 100 * len(middles))] == 5.0
+    assert np.nanmin(low) == 0.0
+    assert 0 < np.nanmax(mean) < 0.1
+
+
+def test_stretches_join_neighbours() -> None:
+    assert stretches(np.array([]), 10.0, 10).shape == (0, 2)
+    assert stretches(np.array([0.5, 1.5, 1.6, 5.5, 99.0]), 10.0, 10).tolist() == [[0, 2], [5, 6], [9, 10]]
 
 
 def test_figures_and_spans_of_time() -> None:
