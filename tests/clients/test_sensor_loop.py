@@ -464,14 +464,10 @@ def test_the_first_sample_while_the_sensor_turns(running: Loop, server: PlayedSe
     assert seen["compensated.force.x"] == pytest.approx(2)
 
 
-def test_without_a_payload_the_log_says_what_zero_is(running: Loop, server: PlayedSensor) -> None:
+def test_a_tare_without_a_payload_and_one_that_is_refused(running: Loop, server: PlayedSensor) -> None:
     loop = running.opened(server.port)
     assert loop.do("tare")["ok"]
     loop.logged("info: tared to zero in this pose, the weight of a tool included")
-
-
-def test_a_tare_that_is_refused(running: Loop, server: PlayedSensor) -> None:
-    loop = running.opened(server.port)
     server.refusal = {"code": "not_ready", "message": "sensor 0 moves: hold it still"}
     assert loop.do("tare") == {
         "ok": False,
