@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +19,6 @@ import pytest
 from bota_clients.identify.cli import main as identify
 from bota_ethercat.program.arguments import Parser
 from ethercat_server import programs
-from ethercat_server.virtual_sensor.cli import main as virtual_sensor
 from tests.ended import run_here
 from tests.simulation import more_if_long
 
@@ -79,18 +78,14 @@ def test_a_signal_while_interfaces_are_listed_is_no_traceback(number: int) -> No
     assert (code, said, found) == (1, "ethercat-sensor: stopped\n", "")
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_every_program_starts_so(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def main_of(name: str, monkeypatch: pytest.MonkeyPatch) -> Callable[[Sequence[str]], int]:
+    """What runs once a program has started."""
     package, _, entry = PROGRAMS[name].partition(":")
-    before = signal.getsignal(signal.SIGINT)
-    try:
-        module = importlib.import_module(package)
-        started: list[str] = []
-        monkeypatch.setattr(module, "run", started.append)
-        getattr(module, entry)()
-        assert callable(importlib.import_module(started[0]).main)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    started: list[str] = []
+    monkeypatch.setattr(f"{package}.run", started.append)
+    getattr(importlib.import_module(package), entry)()
+    main: Callable[[Sequence[str]], int] = importlib.import_module(started[0]).main
+    return main
 
 
 def test_what_is_missing_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -110,13 +105,7 @@ def test_what_is_missing_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest
 
 @pytest.mark.parametrize("name", ["ethercat-sensor", "ethercat-doctor", "ethercat-record", "ethercat-replay"])
 def test_every_option_is_documented(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    package, _, entry = PROGRAMS[name].partition(":")
-    started: list[str] = []
-    monkeypatch.setattr(f"{package}.run", started.append)
-    getattr(importlib.import_module(package), entry)()
-    options = set(
-        re.findall(r"--[a-z][a-z-]+", run_here(importlib.import_module(started[0]).main, "--help").out)
-    )
+    options = set(re.findall(r"--[a-z][a-z-]+", run_here(main_of(name, monkeypatch), "--help").out))
     text = "".join(page.read_text() for page in (ROOT / "docs").glob("*.md"))
     assert not {option for option in options - {"--help", "--version"} if option not in text}
 
@@ -125,11 +114,7 @@ def test_every_option_is_documented(name: str, monkeypatch: pytest.MonkeyPatch) 
 def test_help_begins_with_three_examples_that_are_understood(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    package, _, entry = PROGRAMS[name].partition(":")
-    started: list[str] = []
-    monkeypatch.setattr(f"{package}.run", started.append)
-    getattr(importlib.import_module(package), entry)()
-    main = importlib.import_module(started[0]).main
+    main = main_of(name, monkeypatch)
     head, *rows, end, usage = run_here(main, "--help").out.splitlines()[:6]
     assert (head, end, usage.split()[:2]) == ("examples:", "", ["usage:", name])
 
@@ -166,18 +151,3 @@ for name, entry in {[(name, PROGRAMS[name]) for name in CLIENTS]!r}:
     assert (done.returncode, done.stderr) == (0, "")
     for name in CLIENTS:
         assert f"usage: {name}" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [
-        ("--sensors", "99"),
-        ("--sinc", "1"),
-        ("--serial", "x"),
-        ("--ppm", "x"),
-    ],
-)
-def test_the_virtual_sensor_names_the_option(option: str, value: str) -> None:
-    ended = run_here(virtual_sensor, "veth0", option, value)
-    assert ended.code == 2
-    assert ended.err.startswith(f"ethercat-virtual-sensor: {option}: ")

@@ -13,6 +13,7 @@ from bota_ethercat.control import Event, event
 from bota_ethercat.framing import FrameDecoder, encode_data, encode_json
 from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
+from tests.bridge.scripted_server import Script
 from tests.server.running import PATIENCE_S, wait_until
 
 SETTINGS = {
@@ -31,15 +32,15 @@ def described(**changed: Any) -> JsonObject:
     return sensor | changed | {"settings": settings}
 
 
-class PlayedSensor:
-    """Listens until `close`; `sensor` is what it describes."""
+class PlayedSensor(Script):
+    """Listens until `close`; a connection that subscribes stays, any other is for one request."""
 
     def __init__(self, port: int = 0, **sensor: Any) -> None:
-        self.sensor: JsonObject = described(**sensor)
-        self.protocol = 1
-        self.refusal: JsonObject | None = None
+        super().__init__()
+        self.description["sensors"] = [described(**sensor)]
+        zeros = dict.fromkeys(("old_offset", "new_offset", "residual", "deviation"), [0] * 6)
+        self.answers["tare"] = lambda _: {"ok": True, **zeros}
         self.streams: list[socket.socket] = []
-        self.asked: list[JsonObject] = []
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
         self._thread = threading.Thread(target=self._serve, name="played sensor")
@@ -48,29 +49,19 @@ class PlayedSensor:
     def _serve(self) -> None:
         with contextlib.suppress(OSError):  # the listener was closed
             while True:
-                connection, _ = self._listener.accept()
-                connection.settimeout(PATIENCE_S)
-                self._answer(connection)
+                self._asking, _ = self._listener.accept()
+                self._asking.settimeout(PATIENCE_S)
+                self.subscribed.clear()
+                decoder, before = FrameDecoder(), len(self.requests)
+                while len(self.requests) == before and (data := self._asking.recv(4096)):
+                    self.receive(decoder, data)
+                if self.subscribed.is_set():
+                    self.streams.append(self._asking)
+                else:
+                    self._asking.close()
 
-    def _answer(self, connection: socket.socket) -> None:
-        decoder = FrameDecoder()
-        while (message := decoder.next_message()) is None:
-            data = connection.recv(4096)
-            if not data:
-                return
-            decoder.feed(data)
-        assert isinstance(message, dict)
-        self.asked.append(message)
-        reply = {"reply": message["action"], "ok": True, "protocol": self.protocol, "sensors": [self.sensor]}
-        if message["action"] == "tare":
-            reply |= dict.fromkeys(("old_offset", "new_offset", "residual", "deviation"), [0] * 6)
-        if self.refusal:
-            reply = {"reply": message["action"], "ok": False, "error": self.refusal}
-        connection.sendall(encode_json(reply))
-        if message["action"] == "subscribe":
-            self.streams.append(connection)
-        else:
-            connection.close()
+    def send_raw(self, data: bytes) -> None:
+        self._asking.sendall(data)
 
     def send(self, *messages: bytes | JsonObject) -> None:
         """To the newest subscriber."""
@@ -79,12 +70,9 @@ class PlayedSensor:
             self.streams[-1].sendall(message if isinstance(message, bytes) else encode_json(message))
 
     def reconfigure(self, **changed: Any) -> None:
-        self.sensor = described(**changed)
-        self.send(
-            event(
-                Event.RECONFIGURED, sensor=0, settings=self.sensor["settings"], rate_hz=self.sensor["rate_hz"]
-            )
-        )
+        row = described(**changed)
+        self.description["sensors"] = [row]
+        self.send(event(Event.RECONFIGURED, sensor=0, settings=row["settings"], rate_hz=row["rate_hz"]))
 
     def close(self) -> None:
         with contextlib.suppress(OSError):

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 
 import pytest
 
 from bota_ethercat.address import Address
-from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.cpp_programs import (
     Reading,
@@ -80,34 +78,6 @@ def count(reading: Reading, total: dict[str, int | bool]) -> None:
 
 
 # -- a healthy server
-
-
-def test_every_sample_in_order_and_the_same_as_in_python(shared: ServedSimulation) -> None:
-    """Whoever is not scheduled for seconds has samples withheld, but that is told."""
-    with driver(shared.port, **PATIENT) as running, shared.client() as client:
-        running.connect()
-        client.ask("subscribe")
-        frames = {frame.sequence: frame for frame in client.collect(200)}
-        readings = [running.do("next", 60_000) for _ in range(200)]
-        assert all(reading["is_new"] for reading in readings)
-        decoder = SampleDecoder(61)
-        for reading in readings:
-            assert reading["passed_over"] == 0
-            frame = frames.get(reading["sequence"])
-            if frame is None:
-                continue
-            sample = decoder.decode(frame.process_data)
-            assert reading["array"] == sample.array
-            assert reading["temperature"] == sample.temperature
-            assert (reading["stamp_ns"], reading["monotonic_ns"]) == (frame.stamp_ns, frame.monotonic_ns)
-        assert frames.keys() & {reading["sequence"] for reading in readings}
-        for one, other in pairwise(readings):
-            assert other["sequence"] == one["sequence"] + 1 + other["withheld"]
-            assert other["gap"] == bool(other["withheld"])
-            assert other["monotonic_ns"] > one["monotonic_ns"]
-        told = running.info()
-        assert (told["passed_over"], told["allocated"]) == (0, 0)
-        assert told["names"] == ["BFT-SENS-ECAT-M8"]
 
 
 # -- requests

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import pytest
 
-from bota_clients.monitor.model import Model, Range, State
-from bota_clients.monitor.screen import KEYS, Look, bar, render, scale_for, table
+from bota_clients.monitor.model import Model, State
+from bota_clients.monitor.screen import Look, render, table
 from bota_clients.monitor.words import json_line
 from bota_ethercat.framing import DataMessage
 from tests.clients import monitor_states as made
@@ -88,12 +88,6 @@ def test_the_selected_sensor_comes_first() -> None:
     assert "0 trouble  1 worth a look" in first.splitlines()[0]
 
 
-def test_help_names_every_key() -> None:
-    text = plain(made.healthy(), Look(page="help"), 100)
-    for key, name, what in KEYS:
-        assert f"  {key}  {name.ljust(10)}{what}" in text
-
-
 def test_the_warnings_of_all_sensors_are_on_one_page() -> None:
     text = plain(made.troubled(), Look(page="warnings"))
     assert [text.count(row) for row in ("Sensor 0  ", "Sensor 1  ", "saturated: Fz", "Force N")] == [
@@ -125,13 +119,6 @@ def _texts(svg: str) -> list[str]:
     return [f"{text} {styles[name]}" for name, text in found]
 
 
-@pytest.mark.parametrize(
-    ("reach", "scale"), [(0.0, 5.0), (5.0, 5.0), (5.1, 10.0), (10.1, 20.0), (25.0, 30.0), (412.0, 500.0)]
-)
-def test_the_scale_is_a_round_number_that_shows_everything(reach: float, scale: float) -> None:
-    assert scale_for([Range(-reach, 0.0)], 5.0) == scale
-
-
 def test_whatever_a_sensor_sends_is_shown() -> None:
     noise = random.Random(1)
     model = Model(made.ADDRESS)
@@ -145,21 +132,3 @@ def test_whatever_a_sensor_sends_is_shown() -> None:
         render(state, Look(), 80)
         assert table(state)[-1].startswith(("Trouble: ", "Worth a look: ", "Good: "))
         json.loads(json_line(state, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("value", "peak", "drawn"),
-    [
-        (0.0, None, "─────┼─────"),
-        (5.0, None, "─────┼██▌──"),
-        (-5.0, None, "──▐██┼─────"),
-        (10.0, None, "─────┼█████"),
-        (99.0, None, "─────┼█████"),
-        (float("nan"), None, "─────┼─────"),
-        (2.0, Range(-6.0, 10.0), "──├──┼█───┤"),
-    ],
-)
-def test_a_bar_grows_from_zero_stays_in_its_width_and_marks_its_peaks(
-    value: float, peak: Range | None, drawn: str
-) -> None:
-    assert bar(value, peak, 10.0, 11).plain == drawn

@@ -172,7 +172,9 @@ def test_json_has_what_the_stream_and_its_server_are_like(shared: ServedSimulati
         assert low < high
     assert sensor["units"] == ["N", "Nm"]
     assert sensor["clock"]["mode"] in {"locked", "oversampling"}
-    assert any(client["this"] for client in line["clients"])
+    assert sensor["rate_hz"] > 0
+    assert sensor["jitter_us"] is not None
+    assert sum(client["this"] for client in line["clients"]) == 1
 
 
 def test_a_reader_that_goes_is_no_traceback(shared: ServedSimulation) -> None:
@@ -245,24 +247,6 @@ def state(model: Model) -> State:
 
 def samples(model: Model) -> int:
     return min((sensor.samples for sensor in state(model).sensors), default=0)
-
-
-def test_rate_jitter_age_and_the_own_row_among_the_clients_are_known(shared: ServedSimulation) -> None:
-    def is_whole(found: State) -> bool:  # only a sample that was waited for has an age
-        ages = [sensor.age_us for sensor in found.sensors]
-        return bool(found.clients) and None not in ages
-
-    with reading(shared.port) as model:
-        wait_until(lambda: samples(model) > 50 and is_whole(state(model)), "samples, their ages and a status")
-        found = state(model)
-    assert sum(client.this for client in found.clients) == 1
-    for sensor in found.sensors:
-        assert sensor.rate_hz
-        assert sensor.jitter_us is not None
-        assert sensor.age_us is not None
-        assert 0 < sensor.age_us.p50 <= sensor.age_us.high
-        assert sensor.clock is not None
-        assert sensor.peaks is not None
 
 
 @pytest.fixture(autouse=True)

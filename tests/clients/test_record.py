@@ -186,28 +186,6 @@ def test_what_was_lost_is_said(frames: list[DataMessage], sentence: str) -> None
     assert tally.losses() == sentence
 
 
-@pytest.mark.long
-def test_a_moment_without_running(out: Path) -> None:
-    """A process, to be stopped by SIGSTOP."""
-    with served(sinc_length=512) as server:
-        recorder = RecorderProcess(out, server.port)
-        try:
-            wait_until(lambda: frames_in(out) > 20, "frames")
-            recorder.signal(signal.SIGSTOP)
-            before = frames_in(out)
-            time.sleep(0.5)
-            recorder.signal(signal.SIGCONT)
-            wait_until(lambda: frames_in(out) > before + 100, "the frames of that time, and more")
-            recorder.signal(signal.SIGTERM)
-            assert recorder.wait() == 0
-            assert "nothing was lost" in recorder.said()
-        finally:
-            recorder.signal(signal.SIGCONT)
-            recorder.close()
-    assert is_whole(read(out))
-    assert end(out)["reason"] == "asked to stop"
-
-
 def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
     source = Source(Address("localhost", endless.port), None)
     source.connect()

@@ -104,14 +104,6 @@ def test_it_can_be_read_without_seeing_it(page: str) -> None:
     assert headings.count("h1") == 1
 
 
-def test_every_color_of_a_plot_is_the_pages(page: str) -> None:
-    for plot in re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL):
-        assert not re.findall(r"(?:fill|stroke|color): *#", plot)
-        used = set(re.findall(r"var\((--[a-z]+)\)", plot)) - {"--font"}
-        assert used
-        assert all(page.count(f"{name}:") >= 2 for name in used), "light and dark"
-
-
 def test_outcomes_are_words_and_not_colors_alone(page: str) -> None:
     words = " ".join(Reader(page).words)
     assert "✗ Trouble" in words
@@ -260,8 +252,3 @@ def test_chromium_draws_it_in_the_light_and_in_the_dark_and_prints_it(page: str,
         assert not light & dark_
         assert 4 <= len(re.findall(rb"/Type\s*/Page\b", shown.printed())) <= 12
         assert shown.complaints == []
-
-
-def test_the_picture_in_the_docs_is_of_this_page(page: str) -> None:
-    assert pictures.digest_in("report.png") == pictures.report_digest(page), pictures.AGAIN
-    assert (pictures.DOCS / "report.png").stat().st_size < 300_000

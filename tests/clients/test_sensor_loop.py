@@ -346,7 +346,7 @@ def test_how_long_a_sample_is_fresh_follows_the_rate(running: Loop, server: Play
 def test_wrong_ports_positions_and_versions(running: Loop, server: PlayedSensor) -> None:
     assert "nobody listens there" in running.refused(free_port())
     assert "sensor 3 is not on the bus" in running.refused(server.port, sensor=3)
-    server.protocol = 2
+    server.description["protocol"] = 2
     assert "another version of the protocol" in running.refused(server.port)
 
 
@@ -428,7 +428,7 @@ def test_a_tare_in_any_pose_is_right_in_every_pose(running: Loop, server: Played
     while not loop.has_answered():
         server.send(frame(sequence := sequence + 1, acceleration__y=0.5))
     assert loop.answer()["ok"]
-    (asked,) = (message for message in server.asked if message["action"] == "tare")
+    (asked,) = (message for message in server.requests if message["action"] == "tare")
     half = STANDARD_GRAVITY  # the weight of half of 2 kg
     assert asked["target"] == pytest.approx([0, -half, 0, 0.1 * half, 0, 0])
     loop.logged("info: tared to the load of the tool in this pose: right in every pose")
@@ -464,15 +464,12 @@ def test_the_first_sample_while_the_sensor_turns(running: Loop, server: PlayedSe
     assert seen["compensated.force.x"] == pytest.approx(2)
 
 
-def test_without_a_payload_the_log_says_what_zero_is(running: Loop, server: PlayedSensor) -> None:
+def test_a_tare_without_a_payload_and_one_that_is_refused(running: Loop, server: PlayedSensor) -> None:
     loop = running.opened(server.port)
     assert loop.do("tare")["ok"]
     loop.logged("info: tared to zero in this pose, the weight of a tool included")
-
-
-def test_a_tare_that_is_refused(running: Loop, server: PlayedSensor) -> None:
-    loop = running.opened(server.port)
-    server.refusal = {"code": "not_ready", "message": "sensor 0 moves: hold it still"}
+    error = {"code": "not_ready", "message": "sensor 0 moves: hold it still"}
+    server.answers["tare"] = lambda _: {"ok": False, "error": error}
     assert loop.do("tare") == {
         "ok": False,
         "why": "the sensor could not be tared: sensor 0 moves: hold it still",

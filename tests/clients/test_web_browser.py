@@ -18,10 +18,6 @@ from tests.server.running import wait_until
 
 pytestmark = needs_chromium
 
-COLOR = (
-    "(e => (document.body.append(e), e.style.color = 'var(--{})', getComputedStyle(e).color))"
-    "(document.createElement('i'))"
-)
 PAPER = "getComputedStyle(document.body).backgroundColor.match(/\\d+/g).reduce((a, b) => a + Number(b), 0)"
 SPIKE = 501
 COUNT = 800
@@ -126,14 +122,6 @@ def test_silence_and_a_lost_server_are_said_and_it_comes_back(page: Page, web: W
     assert times[hole[0] + 1] - times[hole[0] - 1] > 0.7  # type: ignore[operator]
 
 
-def test_labels_are_as_large_on_a_screen_of_three_pixels_in_one(page: Page) -> None:
-    page.size(1280, 900, ratio=3)
-    page.wait_for("document.querySelector('#force').plot.ctx.canvas.width > 1280")
-    fonts = "[...document.querySelectorAll('.trace')].flatMap(e => e.plot.axes.map(axis => axis.font[0]))"
-    for font in page.value(fonts):
-        assert 3 * 10 <= int(font.split("px")[0]) <= 3 * 16, "device pixels"
-
-
 def test_what_a_slow_page_missed_is_told_from_what_was_lost(page: Page, web: Web) -> None:
     feed(web, 160)
     page.wait_for("document.querySelector('#force').plot.data[0].length > 30")
@@ -148,22 +136,6 @@ def test_what_a_slow_page_missed_is_told_from_what_was_lost(page: Page, web: Web
     page.wait_for("document.querySelector('#force').plot.data[1].filter(each => each === null).length == 2")
     ((start, end),) = page.value("document.querySelector('#force').plot.skipped")
     assert 0.25 < end - start < 0.35
-
-
-def test_warnings_alone_are_amber(page: Page, web: Web) -> None:
-    def edge() -> str:
-        return str(page.value("getComputedStyle(document.querySelector('#warnings')).borderColor"))
-
-    colors = {name: page.value(COLOR.format(name)) for name in ("warn", "bad")}
-    for start, bits, said, color in (
-        (0, 0b0100000, ".look.present", "warn"),
-        (1600, 0b1100000, ".trouble.present", "bad"),
-    ):
-        for first in range(start, start + 1600, 80):
-            web.feed(*(frame(k, {**moving(k), "warnings": bits}) for k in range(first, first + 80)))
-        page.wait_for(f"document.querySelectorAll('#warnings .present').length === {bits.bit_count()}")
-        assert page.text(f"#warnings {said}")
-        assert edge() == colors[color]
 
 
 @pytest.mark.long
@@ -228,17 +200,6 @@ def test_warnings_have_their_remedies_and_hostile_text_is_text(page: Page, web: 
     wait_for_text(page, "#identity", "Sensor 1")
     wait_for_text(page, "#settings", "cut-off 209.5 Hz with FIR off")
     assert page.complaints == []
-
-
-@pytest.mark.long
-def test_nothing_is_wider_than_the_screen_in_light_and_dark(page: Page, web: Web) -> None:
-    web.model.connected(made.description(("one", "two")), made.OWN_PEER, web.now_s)
-    web.model.say("A long message " + 20 * "and more ", bad=True)
-    feed(web, 80)
-    wait_for_text(page, "#sensors", "1")
-    for width in (360, 390, 480, 481, 600, 819, 820, 1100, 1499, 1500, 2560):
-        page.size(width, 900, dark=width % 2 == 0)
-        fits(page, width)
 
 
 def fits(page: Page, width: int) -> None:

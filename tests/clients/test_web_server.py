@@ -20,7 +20,6 @@ from bota_clients.monitor import cli
 from bota_clients.monitor.web.hub import MOST_PAGES, TOO_MANY
 from bota_clients.monitor.web.server import HEADERS
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.clients.monitor_states import frame
 from tests.clients.web_pages import Web
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, Program, free_port, has_ipv6
@@ -73,22 +72,6 @@ def test_the_stream_is_refused_to_a_foreign_origin(web: Web, origin: str | None)
         pass
 
 
-def test_states_and_points_come_and_a_wish_is_answered(web: Web) -> None:
-    with stream_of(web.port) as stream:
-        assert message(stream, "state")["sensor"]["identity"].startswith("Sensor 0")
-        web.feed(*(frame(k) for k in range(40)))
-        assert message(stream, "points")["points"] == 0
-        stream.send('{"do":"tare"}')
-        assert "printed" in message(stream, "control")["refused"]
-        assert web.tared == []
-        stream.send(json.dumps({"token": web.hub.token}))
-        assert message(stream, "control") == {"control": True, "refused": None}
-        stream.send('{"do":"tare"}')
-        while "was tared" not in str(message(stream, "state")["message"]):
-            pass
-        assert web.tared == [(0, "tare")]
-
-
 @pytest.mark.parametrize(
     ("text", "code"), [("x" * 2000, 1009), ("[]", 1008), (b"\x00\x01", 1008)], ids=["long", "list", "bytes"]
 )
@@ -135,8 +118,10 @@ def test_the_program_shows_tares_and_ends_with_ctrl_c() -> None:
             assert link is not None
             with stream_of(port) as stream:
                 stream.send(json.dumps({"token": link[1]}))
+                assert message(stream, "control") == {"control": True, "refused": None}
                 while not (message(stream, "state")["sensor"] or {}).get("has_sample"):
                     pass
+                assert message(stream, "points")["points"] == 0
                 stream.send('{"do":"tare"}')
                 while "was tared; residual" not in (said := str(message(stream, "state")["message"])):
                     assert "not tared" not in said

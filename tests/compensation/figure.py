@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
@@ -28,12 +30,15 @@ BIAS: Final = (3.0, -1.5, 7.25, 0.2, -0.05, 0.125)  # what this sensor reads wit
 _SINC: Final = 512
 _RATE: Final = 51200 // _SINC  # Hz
 _EVERY: Final = 40  # one sample in this many is drawn
-_COLUMNS: Final = 3
-_PANEL: Final = (270, 180)
-_PLOT: Final = (236, 136)  # width and height of a panel, and of the plot in it, px
 _LARGEST: Final = 22.0  # N
-_MARKS: Final = (-20, -10, 0, 10, 20)  # N
 _COLORS: Final = {"x": "#d62728", "y": "#2ca02c", "z": "#1f77b4"}
+_STYLE: Final = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "compensation",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8,
+    "axes.titlesize": 8,
+}
 _TOUCH: Final = (20.0, 24.0)
 _PUSH: Final = (0.0, 0.0, -12.0)
 
@@ -113,47 +118,25 @@ def panels(data: Samples) -> Iterator[tuple[str, Array]]:
 
 def draw(path: Path, data: Samples, shown: Mapping[str, Array]) -> None:
     """Write the figure as SVG: three panels in a row, with the force along x, y and z in each."""
-    title = "A tool of 0.8 kg on the virtual sensor; gray: a push of 12 N along -z. Force in N over time in s"
-    legend = "".join(f' <tspan fill="{color}">{axis}</tspan>' for axis, color in _COLORS.items())
-    rows = -(-len(shown) // _COLUMNS)
-    width, height = _COLUMNS * _PANEL[0] + 8, rows * _PANEL[1] + 24
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        'font-family="sans-serif" font-size="9">',
-        f'<rect width="{width}" height="{height}" fill="white"/>',
-        f'<text x="{width / 2:g}" y="14" font-size="11" text-anchor="middle">{title}:{legend}</text>',
-    ]
     three_sigma = 3 * measured(sinc=_SINC).deviations[0]
-    for number, (name, left) in enumerate(shown.items()):
-        down, across = divmod(number, _COLUMNS)
-        lines.append(f'<g transform="translate({across * _PANEL[0] + 26} {down * _PANEL[1] + 38})">')
-        lines += _panel(name, data.times, left, three_sigma if name.endswith("(IV.5)") else None)
-        lines.append("</g>")
-    path.write_text("\n".join([*lines, "</svg>", ""]), encoding="utf-8")
-
-
-def _panel(name: str, times: Array, left: Array, limit: float | None) -> Iterator[str]:
-    """One panel, its upper left corner at the origin, with dotted lines at ± `limit` N."""
-    width, height = _PLOT
-    x_scale, y_scale = width / TURN_LENGTH, 0.5 * height / _LARGEST
-    middle = 0.5 * height
-    begin, end = (time_s * x_scale for time_s in _TOUCH)
-    yield f'<text x="{width / 2:g}" y="-4" text-anchor="middle">{name}</text>'
-    yield f'<path fill="#e6e6e6" d="M{begin:.1f} 0V{height}H{end:.1f}V0z"/>'
-    for force in _MARKS:
-        y = middle - force * y_scale
-        yield f'<path stroke="#ddd" d="M0 {y:.1f}H{width}"/>'
-        yield f'<text x="-3" y="{y + 3:.1f}" text-anchor="end">{force}</text>'
-    for time_s in range(0, int(TURN_LENGTH) + 1, 20):
-        yield f'<text x="{time_s * x_scale:.1f}" y="{height + 10}" text-anchor="middle">{time_s}</text>'
-    for sign in (-1, 1) if limit is not None else ():
-        y = middle - sign * (limit or 0.0) * y_scale
-        yield f'<path stroke="gray" stroke-dasharray="1 2" d="M0 {y:.1f}H{width}"/>'
-    for axis, color in enumerate(_COLORS.values()):
-        drawn = zip(times[::_EVERY] * x_scale, middle - left[::_EVERY, axis] * y_scale, strict=True)
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in drawn)
-        yield f'<polyline fill="none" stroke="{color}" stroke-width="0.7" points="{points}"/>'
-    yield f'<rect width="{width}" height="{height}" fill="none" stroke="black" stroke-width="0.8"/>'
+    with mpl.rc_context(_STYLE):
+        drawn = Figure(figsize=(11.0, 7.5), layout="constrained")
+        drawn.suptitle("A tool of 0.8 kg on the virtual sensor; gray: a push of 12 N along -z")
+        panel: Any
+        panels_drawn = drawn.subplots(3, 3, sharex=True, sharey=True).flat
+        for panel, (name, left) in zip(panels_drawn, shown.items(), strict=True):
+            panel.set_title(name)
+            panel.axvspan(*_TOUCH, color="#e6e6e6")
+            for axis, color in _COLORS.items():
+                column = left[::_EVERY, "xyz".index(axis)]
+                panel.plot(data.times[::_EVERY], column, color, linewidth=0.7, label=axis)
+            if name.endswith("(IV.5)"):
+                panel.hlines((-three_sigma, three_sigma), 0, TURN_LENGTH, "gray", "dotted")
+        panel.set(xlim=(0, TURN_LENGTH), ylim=(-_LARGEST, _LARGEST))
+        drawn.supxlabel("time, s")
+        drawn.supylabel("force, N")
+        drawn.legend(*panel.get_legend_handles_labels(), loc="outside upper right", ncols=3)
+        drawn.savefig(path, metadata={"Date": None})
 
 
 if __name__ == "__main__":

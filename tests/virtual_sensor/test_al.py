@@ -15,12 +15,6 @@ def al(master: RawMaster) -> tuple[int, int]:
     return master.read16(0x0130), master.read16(0x0134)
 
 
-def test_the_ordinary_way_up_and_down() -> None:
-    master = RawMaster().go(OP)
-    for state in (SAFEOP, OP, PREOP, SAFEOP, INIT):
-        assert master.request(state) == (state, 0)
-
-
 @pytest.mark.parametrize(
     ("at", "wanted", "code"),
     [

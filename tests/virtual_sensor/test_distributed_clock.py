@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import pytest
 
 from ethercat_server.ethercat.wire import Command
-from ethercat_server.virtual_sensor.distributed_clock import LocalClock, _deviation
+from ethercat_server.virtual_sensor.distributed_clock import _deviation
 from ethercat_server.virtual_sensor.faults import obey
-from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions
+from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, RawMaster, chain, do
 
 MS = 1_000_000
@@ -58,25 +58,6 @@ def test_a_frame_has_one_time_in_all_its_datagrams_and_slaves() -> None:
     answer = master.frame(*((Command.APRD, -position, 0x0910, bytes(8)) for position in (0, 1, 2, 0)))
     assert answer is not None
     assert {data for data, _ in answer} == {struct.pack("<Q", master.now - START)}
-
-
-def test_the_rate_changes_without_a_jump_of_the_time() -> None:
-    clock = LocalClock(1000)
-    clock.set(1000, 2**32 - 10)
-    clock.set_ppm(1000, 100.0)
-    assert clock.at(1000 + 10 * MS) == 2**32 - 10 + 10 * MS + 1000
-    clock.set_ppm(1000 + 10 * MS, -50.0)
-    before = clock.at(1000 + 10 * MS)
-    assert before == 2**32 - 10 + 10 * MS + 1000
-    assert clock.at(1000 + 20 * MS) == before + 10 * MS - 500
-    clock.steer(1000 + 15 * MS, 10**6)
-    assert clock.at(1000 + 20 * MS) == before + 10 * MS - 500 + 5
-    clock = LocalClock(0)
-    for number in range(1000):
-        clock.steer(number * 1000, 333_333)
-    assert clock.at(10**9) - 10**9 in range(333, 334), "changing it often accumulates no error"
-    clock.set_ppm(10**9, 1.0)
-    assert clock.at(2 * 10**9) - clock.at(10**9) in range(10**9 + 1332, 10**9 + 1335), "beside what steers it"
 
 
 def test_32_bits() -> None:
@@ -258,16 +239,3 @@ def test_faults_of_the_local_clock() -> None:
     do(master, "power cycle 0")
     master.wait(1)
     assert not any(look(master)[2:]), "all is as in the options again"
-
-
-def test_words_that_are_wrong() -> None:
-    master = RawMaster(SensorOptions(), ForeignOptions("EK1100"))
-    for line, sentence in {
-        "dc lat 5": "no 'lat' of a distributed clock: available: ok, no-events, stuck,",
-        "dc none": "no 'none' of a distributed clock: available: ok, no-events, stuck,",
-        "dc late": "wrong number of arguments: late US",
-        "dc stuck 5": "wrong number of arguments: stuck",
-        "dc ppm fast": "'fast' must be a number from -100000 to 100000",
-    }.items():
-        assert obey(master.bus, line).startswith(f"error: {sentence}")
-    do(master, "dc ppm 5 #1")

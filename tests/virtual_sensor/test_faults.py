@@ -84,6 +84,9 @@ def test_power_cycle_ends_by_itself() -> None:
     assert master.read16(0x0130) == INIT
     master.go(OP)
     assert clock_of(master) < 100, "sample numbers start afresh"
+    do(master, "power cycle 0.5")
+    master.wait(1_401_000_000)
+    assert stats(master)["sensors"][0]["sample"] == 720, "0.9 s: power returns at its own instant"
 
 
 def test_warnings_and_process_data_that_stays() -> None:
@@ -308,6 +311,7 @@ def test_stats_tell_what_was_written() -> None:
         "noise force 1", "noise force.w 1", "noise force.x -1", "noise force.x", "limit force.x",
         "limit force.x nan", "freeze", "freeze orientation.x", "thaw temperature",
         "skip 91", "skip -1", "skip nan",
+        "dc lat 5", "dc none", "dc late", "dc stuck 5", "dc ppm fast",
     ],
 )  # fmt: skip
 def test_bad_commands_are_answered_with_a_sentence(line: str) -> None:

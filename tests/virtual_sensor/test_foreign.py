@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import struct
 
 import pytest
@@ -201,21 +200,3 @@ def test_the_backend_in_memory_takes_a_mixed_chain_to_safeop(state: str) -> None
         finish(slave.go(AlState.SAFEOP), clock=bus.clock)
     states = [slave.life.state for slave in backend.sensors.slaves[1:] if slave.life]
     assert states == [SAFEOP] * 3
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_random_datagrams_do_no_harm(seed: int) -> None:
-    chance = random.Random(seed)
-    master = master_of("EK1100:OP,EL3102:PREOP,DRIVE:OP,BOTA:OP")
-    places = (0x0120, 0x0500, 0x0600, 0x0800, 0x0900, 0x0910, 0x0920, 0x1000, 0x1080, OUTPUTS, INPUTS)
-    for _ in range(2000):
-        command, adp = chance.randrange(16), chance.choice((0, -1, -2, -3, 0x1001, 0x1003))
-        ado = chance.choice((*places, chance.randrange(0x2000)))
-        master.one(command, adp & 0xFFFF, ado, chance.randbytes(chance.choice((1, 2, 4, 8, 16, 32, 128))))
-        if chance.random() < 0.1:
-            master.wait(chance.randrange(10) * MS)
-    for place in range(4):
-        obey(master.bus, f"power off #{place}")
-        obey(master.bus, f"power on #{place}")
-    for place in range(4):
-        assert master.read16(0x0130, place) == INIT

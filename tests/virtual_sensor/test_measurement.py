@@ -25,7 +25,6 @@ from ethercat_server.virtual_sensor.signals import (
     sway,
 )
 from ethercat_server.virtual_sensor.world import World
-from scripts.benchmarks.records import decode_clock
 from tests.virtual_sensor.motions import measured, turning
 from tests.virtual_sensor.raw_master import OP, PREOP, RawMaster, do
 
@@ -59,18 +58,6 @@ def test_a_change_of_rate_neither_skips_nor_repeats() -> None:
     assert clock.instant(4) == 3 * PERIOD + int(PERIOD / 1.1)
     clock.change(clock.instant(10), sinc_length=128)
     assert clock.number_at(clock.instant(11)) == 11
-
-
-def test_the_newest_sample_is_what_a_frame_carries() -> None:
-    master = RawMaster(SensorOptions(signal="clock", sinc_length=64)).go(OP)
-    previous = -1
-    for step in (700_000, 10_000, PERIOD, 5 * PERIOD, 333, 90_000_000):
-        master.wait(step)
-        number, instant = decode_clock(load(master.inputs()))
-        assert instant <= master.now < instant + PERIOD
-        assert instant == 5_000_000_123 + number * PERIOD
-        assert number >= previous
-        previous = number
 
 
 def test_the_same_sample_is_the_same_bytes_also_if_computed_ahead() -> None:
@@ -223,31 +210,6 @@ def test_a_sine_of_motion_is_late_by_the_profiles_delay(
             assert abs(found - expected) < 0.03 * share, (profile, share)
 
 
-@pytest.mark.parametrize("fir", [False, True])
-@pytest.mark.parametrize("sinc", [32, 64, 512])
-def test_a_step_of_force_settles_as_the_filters_do(sinc: int, fir: bool) -> None:
-    period, turned = sinc / 51200, 0.1
-
-    def stepping(t: float) -> Felt:
-        return carry((0.0, turned if t >= 100 * period else 0.0, 0.0), (0.0, 0.0, 0.0))
-
-    def sinc_step(x: float) -> float:
-        """Of three moving averages over a period: a sum of cubes."""
-        return sum(c * max(0.0, x - k) ** 3 for k, c in enumerate((1, -3, 3, -1))) / 6
-
-    source = measured(stepping, sinc, fir=fir)
-    whole = signals.TOOL_MASS * STANDARD_GRAVITY * math.sin(turned)
-    before = 0.0
-    for number in range(95, 130):
-        share = source.reading(number, 0, number * period).force_torque[0] / whole
-        taps = fir_taps() if fir else (1.0,)
-        expected = sum(tap * sinc_step(number - k - 100) for k, tap in enumerate(taps))
-        assert share == pytest.approx(expected, abs=0.01)
-        assert share >= before - 1e-9
-        before = share
-    assert share == pytest.approx(1)
-
-
 def test_what_is_not_read_does_not_change_what_is() -> None:
     """The filters look at samples that no master has read."""
     every, one = (measured(fir=True) for _ in range(2))
@@ -279,16 +241,6 @@ def test_poses_are_held_still_with_each_axis_up_and_down() -> None:
             wanted[ups[name]] = STANDARD_GRAVITY if name[0] == "+" else -STANDARD_GRAVITY
             assert felt.acceleration == pytest.approx(wanted, abs=1e-8)
             assert felt.angular_rate == (0.0, 0.0, 0.0)
-
-
-def test_moves_between_poses_begin_and_end_at_rest_and_within_the_gyroscopes_range() -> None:
-    cycle = signals.POSE_LENGTH + signals.MOVE_LENGTH
-    for number in range(6):
-        moving = [number * cycle + signals.POSE_LENGTH + k * signals.MOVE_LENGTH / 200 for k in range(200)]
-        rates = [math.degrees(math.hypot(*poses(seconds).angular_rate)) for seconds in moving]
-        assert rates[0] == 0.0
-        assert rates[-1] < 1.0
-        assert 60.0 < max(rates) < 240.0
 
 
 @pytest.mark.parametrize(

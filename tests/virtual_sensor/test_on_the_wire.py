@@ -17,8 +17,6 @@ import pytest
 from bota_ethercat.pdo import encode
 from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.wire import Command
-from ethercat_server.sensor.objects.dictionary import Access
-from ethercat_server.virtual_sensor.dictionary import sensor_entries
 from scripts.benchmarks.records import decode_clock
 from tests.server.running import VirtualSensor, wait_until
 from tests.virtual_sensor.conftest import Start
@@ -108,31 +106,6 @@ def test_to_op_with_the_clock_signal(size: int, bench: Bench) -> None:
         # Not older than one period when the frame went out.
         assert reading.instant_ns > before % (2**20 * 10**9) - 1_250_001
         previous = reading
-
-
-def test_the_whole_dictionary(bench: Bench) -> None:
-    _, master = bench("--pdo", "77")
-    bring_up(master)
-    slave = master.slaves[0]
-    entries = sensor_entries(77)
-    sizes = {}
-    for (index, subindex), row in entries.items():
-        data = read(slave, index, subindex)
-        assert len(data) == (row.type.size or len(data))
-        sizes[index, subindex] = len(data) * 8
-        if row.access is Access.RW_PREOP:
-            with pytest.raises(pysoem.SdoError) as caught:
-                slave.sdo_write(index, subindex, data)
-            assert caught.value.abort_code == 0x08000022
-    # Last, because the gap at 0x6000:03 leaves an error in SOEM's ring that the next call would raise.
-    variables, parts = set(), {}
-    for thing in slave.od:
-        variables.add((thing.index, 0))
-        for number, entry in enumerate(thing.entries):
-            if (thing.index, number) in entries:
-                parts[thing.index, number] = entry.bit_length
-    assert variables | set(parts) == set(entries)
-    assert all(sizes[address] == bits for address, bits in parts.items())
 
 
 @pytest.mark.parametrize("state", ["", ":OP"])
