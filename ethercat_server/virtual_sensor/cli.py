@@ -220,7 +220,8 @@ def _send(path: str, command: str) -> int:
     try:
         answer = link.send(path, command)
     except OSError as error:
-        _say(f"no virtual sensor of yours listens at {path} ({error.strerror}): start one, or give --control")
+        why = error.strerror or error
+        _say(f"no virtual sensor of yours answers at {path} ({why}): start one, or give --control")
         return 1
     print(answer)
     return int(not answer.startswith("ok"))

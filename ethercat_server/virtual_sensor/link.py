@@ -254,7 +254,7 @@ def bound(path: str, kind: socket.SocketKind, poller: select.poll) -> Iterator[s
     """A Unix socket that this user's programs find at `path` until the end; LinkError if it cannot be."""
     with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, kind) as probe:
         # Remove a stale socket, left by a killed process; nothing else.
-        if stat.S_ISSOCK(Path(path).stat().st_mode) and probe.connect_ex(path) != 0:
+        if probe.connect_ex(path) == errno.ECONNREFUSED and stat.S_ISSOCK(Path(path).stat().st_mode):
             Path(path).unlink()
     with socket.socket(socket.AF_UNIX, kind) as made:
         try:

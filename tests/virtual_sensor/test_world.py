@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
+import select
 import socket
 import statistics
 import struct
@@ -23,6 +24,7 @@ from bota_ethercat.client import World, connect
 from bota_ethercat.pdo import SampleDecoder
 from bota_ethercat.world import Felt, decode, encode
 from ethercat_server.simulation.machine import Machine
+from ethercat_server.virtual_sensor.link import LinkError, bound
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.world import LOST_AFTER_S, ToldWorld
 from tests.server.running import needs_bus, server, wait_until
@@ -229,3 +231,16 @@ def test_the_example_in_real_time_runs(tmp_path: Path) -> None:
             forces.append(sample.force[2])
             if len(forces) == 400 and abs(statistics.mean(forces) + 10.0) < 0.2:
                 break
+
+
+def test_the_live_socket_of_another_program_is_not_taken_for_a_stale_one(tmp_path: Path) -> None:
+    path = str(tmp_path / "socket")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as theirs:
+        theirs.bind(path)
+        theirs.listen()
+        with (
+            pytest.raises(LinkError, match="Address already in use"),
+            bound(path, socket.SOCK_DGRAM, select.poll()),
+        ):
+            pass
+        assert Path(path).is_socket()
