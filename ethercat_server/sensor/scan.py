@@ -113,7 +113,7 @@ def look_safely(
         )
     at_work = [
         slave for slave in slaves
-        if slave.at_work and (slave.position not in ours or _has_outputs(bus, slave.position))
+        if slave.at_work and not (slave.position in ours and _only_reads(bus, slave))
     ]  # fmt: skip
     if at_work and not force:
         where = ", ".join(f"{slave.position} in {slave.status.state.name}" for slave in at_work)
@@ -195,10 +195,12 @@ def _has_sensors_managers(bus: Bus, position: int) -> bool:
     return tuple(others) == _MAILBOXES_AND_OUTPUTS and inputs in [(_INPUTS, size) for size in LAYOUTS]
 
 
-def _has_outputs(bus: Bus, position: int) -> bool:
-    managers = bus.read_surely_at(position, reg.SYNC_MANAGER, 4 * reg.SYNC_MANAGER_SIZE)
+def _only_reads(bus: Bus, slave: Slave) -> bool:
+    """Whether it has no outputs; in BOOT nobody knows."""
+    managers = bus.read_surely_at(slave.position, reg.SYNC_MANAGER, 4 * reg.SYNC_MANAGER_SIZE)
     kinds = [control for length, control in _LENGTH_AND_CONTROL.iter_unpack(managers) if length]
-    return any(control & reg.SM_WRITE and not control & reg.SM_MAILBOX for control in kinds)
+    has_outputs = any(control & reg.SM_WRITE and not control & reg.SM_MAILBOX for control in kinds)
+    return not has_outputs and slave.status.state is not AlState.BOOT
 
 
 def _stopped(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:

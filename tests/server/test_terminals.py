@@ -132,6 +132,16 @@ def test_what_is_no_terminal_ends_the_start_with_a_sentence(text: str, choice: s
     assert [image[reg.AL_STATUS] for image in registers(backend)] == before
 
 
+def test_a_terminal_whose_firmware_is_being_written_is_not_touched() -> None:
+    backend = chain("BOTA,EL3102:OP")
+    terminal: Any = backend.sensors.slaves[1]
+    terminal.life.esc.memory[reg.AL_STATUS] = AlState.BOOT
+    before = registers(backend)
+    with pytest.raises(BusError, match=r"slaves at work .*position 1 in BOOT"):
+        Simulation(backend=backend, wanted=Asked(terminals=["1"]))
+    assert registers(backend) == before
+
+
 def test_nothing_is_read_that_nobody_names() -> None:
     simulation = reading("BOTA,EL3102")
     assert type(simulation.cycle) is Cycle
