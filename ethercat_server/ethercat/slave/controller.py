@@ -64,6 +64,11 @@ class SlaveController:
         data = repeat(self.attempts, self._bus.read_register, self.number, reg.AL_STATUS, reg.AL_STATUS_SIZE)
         return AlStatus.parse(data) if data else None
 
+    def _read(self, address: int, size: int) -> bytes:
+        if data := repeat(self.attempts, self._bus.read_register, self.number, address, size):
+            return data
+        raise self._gone()
+
     def write(self, address: int, data: bytes) -> None:
         """Write registers; GoneError if it does not answer."""
         if not repeat(self.attempts, self._bus.write_register, self.number, address, data):
@@ -156,10 +161,10 @@ class SlaveController:
         SetUpError if something was not written: SOEM writes it once and does not verify it.
         """
         self._read_hardware()
-        self._fmmus = self._bus.read_surely(self.number, reg.FMMU, self._units * reg.FMMU_SIZE)
+        self._fmmus = self._read(reg.FMMU, self._units * reg.FMMU_SIZE)
         rows = reg.FMMU_LAYOUT.iter_unpack(self._fmmus)
         self.areas = [Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1]
-        data = self._bus.read_surely(self.number, reg.SYNC_MANAGER, self._count * reg.SYNC_MANAGER_SIZE)
+        data = self._read(reg.SYNC_MANAGER, self._count * reg.SYNC_MANAGER_SIZE)
         used = {
             reg.FMMU_WRITE if control & reg.SM_WRITE else reg.FMMU_READ: at * reg.SYNC_MANAGER_SIZE
             for at, (length, control, active) in enumerate(_SYNC_MANAGER.iter_unpack(data))
@@ -213,6 +218,6 @@ class SlaveController:
 
     def _read_hardware(self) -> None:
         if not self._count:
-            data = self._bus.read_surely(self.number, reg.FMMU_AND_SM_COUNT, _HARDWARE.size)
+            data = self._read(reg.FMMU_AND_SM_COUNT, _HARDWARE.size)
             units, count, self.features = _HARDWARE.unpack(data)
             self._units, self._count = min(units, reg.MOST_FMMUS), min(count, reg.MOST_SYNC_MANAGERS)
