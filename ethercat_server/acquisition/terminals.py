@@ -28,7 +28,7 @@ from ethercat_server.sensor.scan import Slave
 CHOICE: Final = re.compile(r"(?:(0x[0-9a-fA-F]+):(0x[0-9a-fA-F]+)(?:@|$))?([0-9]+)?")
 _UNASSIGNED: Final = 0xFF  # sync manager of a PDO that is not assigned by default
 # By the number of a data type in the SII (ETG.1020); others are unsigned.
-_LETTERS: Final = {0x08: "f", 0x11: "f", **dict.fromkeys((0x02, 0x03, 0x04, *range(0x10, 0x16)), "i")}
+_LETTERS: Final = {**dict.fromkeys((0x02, 0x03, 0x04, 0x10, *range(0x12, 0x16)), "i"), 0x08: "f", 0x11: "f"}
 _BOOL: Final = 0x01
 _ASSIGNMENTS: Final = 0x1C10  # object with the PDOs of the first sync manager; those of the others follow
 _MOST_ENTRIES: Final = 256  # so that a reply with all of them is not too long
