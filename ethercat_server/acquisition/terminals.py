@@ -19,6 +19,7 @@ from ethercat_server.acquisition.stream import INVALID, REPEATED, OutgoingFrame
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.exchange import Exchange
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.controller import SlaveController
@@ -54,7 +55,7 @@ class Terminal:
         layout: list[dict[str, Any]] = []
         bits, content = 0, slave.sii or dict[str, Any](sync_managers=(), tx_pdos=(), rx_pdos=())
         outputs = [pdo for pdo in content["rx_pdos"] if pdo["sync_manager"] != _UNASSIGNED and pdo["entries"]]
-        for manager, row in enumerate(content["sync_managers"]):
+        for manager, row in enumerate(content["sync_managers"][: reg.MOST_SYNC_MANAGERS]):
             outputs += [row] if row["kind"] == "outputs" and row["size"] else []
             begin = bits
             for pdo in content["tx_pdos"]:

@@ -22,7 +22,6 @@ from ethercat_server.ethercat.slave.sii import OF_FIRMWARE
 _START_ATTEMPTS: Final = 20
 _MOST_BYTES: Final = 1486  # of process data in a frame
 _MAILBOXES_END: Final = 2 * reg.SYNC_MANAGER_SIZE
-_SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")  # length, control, activation
 _HARDWARE: Final = struct.Struct("<BBxxH")  # numbers of FMMUs and of sync managers, features
 
 
@@ -92,9 +91,7 @@ class SlaveController:
 
     def enter_preop(self) -> Steps[None]:
         """Through INIT, clearing what another master has set up (FMMUs, sync managers, SYNC0)."""
-        yield from self.go(AlState.INIT)
-        self._read_hardware()
-        self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
+        yield from self._enter_init()
         self._bus.write_register(self.number, reg.DC_ACTIVATION, b"\0\0")  # a controller without DC refuses
         yield
         self.write(reg.SYNC_MANAGER, self._mailboxes.ljust(self._count * reg.SYNC_MANAGER_SIZE, b"\0"))
@@ -114,13 +111,18 @@ class SlaveController:
     def leave(self, state: AlState) -> Steps[None]:
         """Go to INIT, or PREOP if it was found there, with nothing mapped and without a station address."""
         self.attempts = _START_ATTEMPTS
+        if state >= AlState.PREOP:
+            yield from self.enter_preop()
+        else:
+            yield from self._enter_init()
+            self.write(reg.SYNC_MANAGER, bytes(self._count * reg.SYNC_MANAGER_SIZE))
+        self.write(reg.STATION_ADDRESS, bytes(2))
+
+    def _enter_init(self) -> Steps[None]:
+        """Without FMMUs."""
         yield from self.go(AlState.INIT)
         self._read_hardware()
         self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
-        self.write(reg.SYNC_MANAGER, bytes(self._count * reg.SYNC_MANAGER_SIZE))
-        if state >= AlState.PREOP:
-            yield from self.enter_preop()
-        self.write(reg.STATION_ADDRESS, bytes(2))
 
     def mapped_size(self, assignment: int, in_sii: int) -> Steps[int]:
         """Bytes of process data by the PDOs that the object `assignment` lists; `in_sii` if there is none.
@@ -167,7 +169,7 @@ class SlaveController:
         data = self._read(reg.SYNC_MANAGER, self._count * reg.SYNC_MANAGER_SIZE)
         used = {
             reg.FMMU_WRITE if control & reg.SM_WRITE else reg.FMMU_READ: at * reg.SYNC_MANAGER_SIZE
-            for at, (length, control, active) in enumerate(_SYNC_MANAGER.iter_unpack(data))
+            for at, (_, length, control, _, active, _) in enumerate(reg.SYNC_MANAGER_LAYOUT.iter_unpack(data))
             if length and active & 1 and not control & reg.SM_MAILBOX
         }
         if {area.kind for area in self.areas} != used.keys():
