@@ -26,7 +26,7 @@ from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.sensor.scan import Slave
 
 # Which slaves are meant: vendor and product, position on the wire.
-CHOICE: Final = re.compile(r"(?:(0x[0-9a-fA-F]+):(0x[0-9a-fA-F]+)(?:@|$))?([0-9]+)?")
+CHOICE: Final = re.compile(r"(?!$)(?:(0x[0-9a-fA-F]+):(0x[0-9a-fA-F]+)(?:@(?=[0-9])|$))?([0-9]{1,5})?")
 _UNASSIGNED: Final = 0xFF  # sync manager of a PDO that is not assigned by default
 # By the number of a data type in the SII (ETG.1020); others are unsigned.
 _LETTERS: Final = {**dict.fromkeys((0x02, 0x03, 0x04, 0x10, *range(0x12, 0x16)), "i"), 0x08: "f", 0x11: "f"}
@@ -167,7 +167,7 @@ def find_terminals(slaves: Sequence[Slave], choices: Sequence[str]) -> list[Term
 
 def named_positions(choices: Sequence[str]) -> list[int]:
     """The positions on the wire that are named."""
-    return [int(position) for choice in choices for *_, position in CHOICE.findall(choice)[:1] if position]
+    return [int(position) for choice in choices if (position := CHOICE.findall(choice)[0][-1])]
 
 
 def _is_meant(slave: Slave, choice: str) -> bool:
