@@ -11,10 +11,8 @@ import statistics
 import struct
 import subprocess
 import sys
-import threading
 import time
 from collections import deque
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -155,50 +153,6 @@ def test_hostile_datagrams_do_not_stop_the_sensor(
         assert path.stat().st_mode & 0o777 == 0o600
     sensor.close()
     assert not path.exists()
-
-
-@contextlib.contextmanager
-def running(world: World) -> Iterator[None]:
-    """Sends ten times its time since a whole ten seconds, N, once a millisecond."""
-    stopped = threading.Event()
-
-    def run() -> None:
-        due = time.monotonic()
-        while not stopped.is_set():
-            world.send(due, (10.0 * (due % 1000.0), 0, 0, 0, 0, 0))
-            due += 1e-3
-            time.sleep(max(0.0, due - time.monotonic()))
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stopped.set()
-        thread.join()
-
-
-@pytest.mark.long
-@needs_bus
-def test_in_real_time_the_way_from_the_world_is_shorter_than_its_step(tmp_path: Path) -> None:
-    """The clock in the force: with the filter's 1.5 periods off, it is late by half a step and the way."""
-    path = tmp_path / "world"
-    arguments = f"--virtual=--world {path} --world-lost hold --noise off"
-    delays = list[float]()
-    with (
-        server("virtual", arguments) as started,
-        World(path) as world,
-        running(world),
-        connect(started.port) as client,
-    ):
-        time.sleep(0.5)
-        client.receive()
-        until = time.monotonic() + 3.0
-        while time.monotonic() < until:
-            for frame in client.receive():
-                felt_s = client.decode(frame).force[0] / 10.0
-                delays.append((frame.monotonic_ns * 1e-9 - felt_s) % 1000.0 - 1.5 / 800)
-    assert 0.0 < statistics.median(delays) < 1e-3
 
 
 def example(words: str) -> str:
