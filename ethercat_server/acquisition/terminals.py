@@ -25,7 +25,7 @@ from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.sensor.scan import Slave
 
-# Which slaves are meant: vendor and product, position on the wire.
+# A choice of slaves: vendor and product, position on the wire.
 CHOICE: Final = re.compile(r"(?!$)(?:(0x[0-9a-fA-F]+):(0x[0-9a-fA-F]+)(?:@(?=[0-9])|$))?([0-9]{1,5})?")
 _UNASSIGNED: Final = 0xFF  # sync manager of a PDO that is not assigned by default
 # By the number of a data type in the SII (ETG.1020); others are unsigned.
@@ -153,13 +153,13 @@ def _described(pdo: str, entry: dict[str, Any], at: int, others: Sequence[dict[s
 
 
 def find_terminals(slaves: Sequence[Slave], choices: Sequence[str]) -> list[Terminal]:
-    """Those that are meant among slaves that are no sensors; BusError if one is absent, or cannot be one."""
+    """The chosen ones of the slaves beside the sensors; BusError if one is absent, or cannot be one."""
     for choice in choices:
-        if not any(_is_meant(slave, choice) for slave in slaves):
+        if not any(_matches(slave, choice) for slave in slaves):
             there = ", ".join(map(str, slaves)) or "sensors only"
             raise BusError(f"no terminal {choice} is on the bus ({there}): connect it, or do not name it")
-    meant = [slave for slave in slaves if any(_is_meant(slave, choice) for choice in choices)]
-    found = [Terminal(number, slave) for number, slave in enumerate(meant)]
+    chosen = [slave for slave in slaves if any(_matches(slave, choice) for choice in choices)]
+    found = [Terminal(number, slave) for number, slave in enumerate(chosen)]
     if sum(len(terminal.row["layout"]) for terminal in found) > _MOST_ENTRIES:
         raise BusError(f"the terminals have more than {_MOST_ENTRIES} PDO entries together: name fewer")
     return found
@@ -170,7 +170,7 @@ def named_positions(choices: Sequence[str]) -> list[int]:
     return [int(position) for choice in choices if (position := CHOICE.findall(choice)[0][-1])]
 
 
-def _is_meant(slave: Slave, choice: str) -> bool:
+def _matches(slave: Slave, choice: str) -> bool:
     (vendor, product, position), row = CHOICE.findall(choice)[0], slave.as_json()
     is_kind = not vendor or (int(vendor, 0), int(product, 0)) == (row["vendor"], row["product"])
     return is_kind and position in ("", str(slave.position))
