@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.address import boot_id
 from bota_ethercat.errors import BadMessageError, RemoteProtocolError
-from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
+from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, MessageType, encode_data, encode_json
 from bota_ethercat.pdo import Sample, encode
 from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject
 
@@ -196,8 +196,9 @@ def expected(vectors: Sequence[Vector]) -> list[Outcome]:
 
 
 def outcomes(chunks: Sequence[bytes], max_json_length: int = MAX_JSON_LENGTH) -> list[Outcome]:
-    """What the Python decoder makes of these bytes."""
-    decoder, found = FrameDecoder(max_json_length=max_json_length), list[Outcome]()
+    """What the Python decoder makes of these bytes, without TERMINAL messages, which C++ does not know."""
+    accepts = MessageType.DATA, MessageType.JSON
+    decoder, found = FrameDecoder(max_json_length=max_json_length, accepts=accepts), list[Outcome]()
     for chunk in chunks:
         decoder.feed(chunk)
         while True:

@@ -66,7 +66,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     # Programs that are ordinary clients of the server.
     "bota_clients": {"bota_clients"} | PROTOCOL,
     "bota_clients.recording": CLIENTS,
-    "bota_clients.export": CLIENTS | {"bota_clients.export"},
+    "bota_clients.export": CLIENTS | {"bota_clients.export", "bota_clients.identify", "ft_compensation"},
     "bota_clients.record": CLIENTS | {"bota_clients.record"},
     "bota_clients.report": CLIENTS | {"bota_clients.report", "bota_clients.record"},
     "bota_clients.monitor": CLIENTS | {"bota_clients.monitor", "bota_clients.record"},
@@ -86,6 +86,10 @@ PACKAGES: Final[dict[str, set[str]]] = {
     "rich": {"bota_clients"},
     "textual": {"bota_clients.monitor.app"},
     "websockets": {"bota_clients.monitor.web.server"},
+    "pyarrow": {"bota_clients.export"},
+    "zarr": {"bota_clients.export"},
+    "rosbags": {"bota_clients.export"},
+    "yaml": {"bota_clients.export"},
 } | {
     ros: {"bridge"}
     for ros in (

@@ -10,13 +10,16 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from bota_clients.errors import ClientError
 from bota_ethercat.errors import ProtocolError
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
+
+
+_OF_DATASETS: Final = ("pyarrow", "zarr", "rosbags", "yaml")
 
 
 def say(program: str, sentence: str) -> None:
@@ -43,7 +46,8 @@ def start(program: str, module: str, *arguments: object) -> int:
 def not_installed(program: str, error: ImportError) -> int:
     """Say which package is not installed, and how to install it; returns the exit code."""
     package = (error.name or str(error)).partition(".")[0]
-    command = shlex.join([sys.executable, "-m", "pip", "install", ".[client]"])
+    extra = "dataset" if package in _OF_DATASETS else "client"
+    command = shlex.join([sys.executable, "-m", "pip", "install", f".[{extra}]"])
     say(program, f"{package} is not installed: in this project's folder run {command}")
     return 1
 

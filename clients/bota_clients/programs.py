@@ -9,7 +9,7 @@ def _program(module: str) -> Callable[[], int]:
     return lambda: run(f"bota_clients.{module}")
 
 
-export = _program("export")
+export = _program("export.cli")
 identify = _program("identify.cli")
 monitor = _program("monitor.cli")
 record = _program("record.cli")

@@ -8,7 +8,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from bota_ethercat.errors import BadMessageError, RemoteProtocolError
-from bota_ethercat.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, encode_json
+from bota_ethercat.framing import DATA_FLAGS_OFFSET, DataFlag, FrameDecoder, MessageType, encode_json
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.serving.bare_json import BARE_JSON_FIRST_BYTE, BareJsonDecoder, encode_bare_json
@@ -296,7 +296,9 @@ class Connection:
             if data.startswith(BARE_JSON_FIRST_BYTE):
                 decoder = self.bare = BareJsonDecoder(max_json_length=MAX_REQUEST_LENGTH)
             else:
-                decoder = self.framed = FrameDecoder(max_json_length=MAX_REQUEST_LENGTH, accept_data=False)
+                decoder = self.framed = FrameDecoder(
+                    max_json_length=MAX_REQUEST_LENGTH, accepts=(MessageType.JSON,)
+                )
         decoder.feed(data)
 
     def next_message(self) -> JsonObject | Unreadable | None:

@@ -12,7 +12,7 @@ The rules it keeps:
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import IntEnum, IntFlag
 from typing import Final, NamedTuple, NoReturn
 
@@ -93,10 +93,12 @@ class FrameDecoder:
     last received.
     """
 
-    def __init__(self, *, max_json_length: int = MAX_JSON_LENGTH, accept_data: bool = True) -> None:
-        """`accept_data=False`, for servers, makes DATA and TERMINAL unknown types."""
+    def __init__(
+        self, *, max_json_length: int = MAX_JSON_LENGTH, accepts: Sequence[MessageType] = tuple(MessageType)
+    ) -> None:
+        """Of other types than those that it `accepts` a message is a violation of the protocol."""
         self._max_json_length = max_json_length
-        self._accept_data = accept_data
+        self._accepts = accepts
         self._buffer = bytearray(65536)
         self._start = 0
         self._end = 0
@@ -145,15 +147,15 @@ class FrameDecoder:
         if available < _PREFIX.size:
             return None
         kind = self._buffer[self._start + _LENGTH.size]
-        if kind == MessageType.DATA and self._accept_data:
+        if kind not in self._accepts:
+            known = ", ".join(f"{each} ({each.name})" for each in self._accepts)
+            self._break(f"message type {kind}: this side understands {known}")
+        elif kind == MessageType.DATA:
             if length not in _DATA_LENGTHS:
                 self._break(f"DATA message of length {length}: it must be one of {sorted(_DATA_LENGTHS)}")
-        elif kind == MessageType.TERMINAL and self._accept_data:
+        elif kind == MessageType.TERMINAL:
             if length < _DATA_OVERHEAD:
                 self._break(f"TERMINAL message of length {length}: it must be at least {_DATA_OVERHEAD}")
-        elif kind != MessageType.JSON:
-            known = "1 (DATA), 2 (JSON) and 3 (TERMINAL)" if self._accept_data else "2 (JSON)"
-            self._break(f"message type {kind}: this side understands {known}")
         elif length > self._max_json_length + _TYPE_SIZE:
             self._break(f"JSON message of length {length}: it must be at most {self._max_json_length + 1}")
         if available < _LENGTH.size + length:
@@ -178,7 +180,7 @@ class FrameDecoder:
         As `next_message` until it returns something else, but faster, for streams. None and errors as there.
         """
         buffer, start, end = self._buffer, self._start, self._end
-        if self._accept_data and self._broken is None:
+        if MessageType.DATA in self._accepts and self._broken is None:
             prefix_size, length_size = _PREFIX.size, _LENGTH.size
             while end - start >= prefix_size:
                 length, kind = _PREFIX.unpack_from(buffer, start)

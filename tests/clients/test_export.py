@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from bota_clients import export as program
-from bota_clients.export import COLUMNS, main
+from bota_clients.export.cli import main
+from bota_clients.export.table import COLUMNS
+from bota_clients.recording.reader import Recording
 from bota_ethercat.framing import DataFlag
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
 from tests.ended import Result, run_here
@@ -110,7 +111,7 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
     path = tmp_path / "run.mcap"
     record(path, [frame(0)])
-    monkeypatch.setattr(program.Table, "lines", interrupted)
+    monkeypatch.setattr(Recording, "frames", interrupted)
     assert export(path, code=1).err == "ethercat-export: stopped: nothing was written\n"
     assert list(tmp_path.iterdir()) == [path]
 

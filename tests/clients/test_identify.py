@@ -209,6 +209,7 @@ def test_what_cannot_be_used_is_one_sentence(recording: Path, tmp_path: Path) ->
     assert "check imu_raw_units" in refused(recording, "--imu-raw-units", "si", *wide)
     record(path := tmp_path / "scene.mcap", frames(process_data(SensorOptions(), 4.0)))
     assert "never stationary for 1 s" in refused(path)
+    assert "never stationary for 3600 s" in refused(recording, "--least-seconds", 3600)
     assert "cannot be read: No such file" in refused(tmp_path / "none.mcap")
     (tmp_path / "text.mcap").write_text("hello")
     assert "text.mcap" in refused(tmp_path / "text.mcap")

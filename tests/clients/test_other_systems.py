@@ -46,7 +46,7 @@ for name, entry in CLIENTS.items():
         assert ended.code == 0, name
 
 import bota_clients.identify.program
-from bota_clients import export
+from bota_clients.export import cli as export
 from bota_clients.monitor import cli
 from bota_clients.program import Signals, call_on
 from bota_clients.record import cli as record, program as recording

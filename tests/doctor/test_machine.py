@@ -90,6 +90,7 @@ PROCESSORS = [
          commands=[f"echo performance | sudo tee {GOVERNOR}"]),
     Case("governor", FINE, {GOVERNOR.replace("*", str(n)): None for n in range(4)}, values={"governors": []}),
     Case("idle states", FINE, values={"latency_us": 2}),
+    Case("idle states", SKIP, {f"{IDLE}/state1/latency": "much"}, said="which is not a number"),
     Case("idle states", LOOK, DEEP, said="C8, 170 µs to wake", commands=TOO_DEEP),
     Case("idle states", NOTE, {**DEEP, f"{IDLE}/state3/disable": "1"}, said="C3, 40 µs"),
     # A program may limit the latency.

@@ -26,6 +26,7 @@ from bota_ethercat.framing import (
     DataFlag,
     DataMessage,
     FrameDecoder,
+    MessageType,
     encode_data,
     encode_json,
 )
@@ -48,7 +49,7 @@ Outcome = DataMessage | JsonObject | tuple[str, str]
 
 
 def server_side() -> FrameDecoder:
-    return FrameDecoder(max_json_length=LIMIT, accept_data=False)
+    return FrameDecoder(max_json_length=LIMIT, accepts=(MessageType.JSON,))
 
 
 def client_side() -> FrameDecoder:
@@ -150,7 +151,7 @@ def test_a_decoded_message_outlives_the_buffer() -> None:
         (FrameDecoder(), struct.pack(">IB", 90 - 1, 1), "DATA message of length"),
         (FrameDecoder(), struct.pack(">IB", 1, 1), "DATA message of length"),
         (FrameDecoder(max_json_length=80), encode_data(*SAMPLE) + struct.pack(">IB", 82, 2), "JSON"),
-        (FrameDecoder(accept_data=False), encode_data(*SAMPLE), "type 1"),
+        (FrameDecoder(accepts=(MessageType.JSON,)), encode_data(*SAMPLE), "type 1"),
     ],
 )  # fmt: skip
 def test_what_is_no_message_ends_it_for_good(decoder: FrameDecoder, wire: bytes, words: str) -> None:
@@ -219,7 +220,8 @@ def test_round_trip_in_any_pieces_one_by_one_and_in_bulk(
     for at, flip in flips:
         if at < len(stream):
             stream[at] ^= flip
-    one, bulk = FrameDecoder(accept_data=accept_data), FrameDecoder(accept_data=accept_data)
+    accepts = tuple(MessageType) if accept_data else (MessageType.JSON,)
+    one, bulk = FrameDecoder(accepts=accepts), FrameDecoder(accepts=accepts)
     found: list[Any] = []
     found_in_bulk: list[Any] = []
     take_in_bulk = partial(bulk.take_data, found_in_bulk)

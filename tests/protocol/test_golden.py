@@ -135,4 +135,4 @@ def test_readings(stream: ReadStream) -> None:
 
 def test_every_count_is_documented() -> None:
     page = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
-    assert all(f"| `{count}` |" in page for count in StreamCounts.__slots__)
+    assert all(f"\n- `{count}`: " in page for count in StreamCounts.__slots__)

@@ -191,6 +191,19 @@ def test_no_answer_is_taken_from_a_job_and_no_emergency_is_lost_to_it() -> None:
     assert simulation.streams[0].lost_samples == 0
 
 
+def test_emergencies_before_an_answer_are_read_by_the_job() -> None:
+    simulation = Simulation()
+    client = simulation.connect()
+    simulation.run(1.0)
+    for n in range(30):
+        simulation.command(f"emergency {n}")
+    assert client.ask("sdo_read", index=0x8011, type="u16")["value"] == 800
+    row = client.ask("status")["sensors"][0]
+    assert row["emergencies"] == 30
+    simulation.run(1.0)
+    assert len(told(simulation)) == 5
+
+
 def test_each_change_is_told_and_the_end_of_an_error_is_no_warning(log: pytest.LogCaptureFixture) -> None:
     simulation = Simulation()
     simulation.run(1.0)

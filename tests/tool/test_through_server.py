@@ -48,6 +48,7 @@ def test_the_first_name_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None
     found = told("read", "Sampling rate", "fir")["sensors"][0]["objects"]
     assert [row["name"] for row in found] == ["Sampling rate", "FIR disable"]
     assert len(told("read", "fir")["sensors"][0]["objects"]) == 1
+    assert "did you mean Sampling rate" in refused("read", *SERVER, "sampling rte", code=2)
 
 
 def test_plan_apply_save(bench: Bench) -> None:

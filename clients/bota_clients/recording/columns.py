@@ -74,8 +74,13 @@ def columns(recording: FrameSource, sensor: int = 0, imu_units: ImuUnits = ImuUn
 
     `imu_units` are the units in which the firmware sends acceleration and angular rate.
     """
+    return decode(recording.frames(sensor), imu_units)
+
+
+def decode(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
+    """These frames of one sensor."""
     heads, data = array("q"), bytearray()
-    for frame in recording.frames(sensor):
+    for frame in frames:
         # 64-bit values that do not fit an int64 are no valid times.
         heads.extend([min(value, _MAX) for value in frame[:6]])
         data += frame.process_data.ljust(_SIZE, b"\0")

@@ -10,6 +10,7 @@ chunk; `cut_off` says so. `columns.py` gives NumPy arrays.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,7 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import rows, visible
 
 _MAX_NOTES: Final = 1_000_000  # descriptions and events
+_BATCH: Final = 65536  # frames
 _LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions
 
 
@@ -209,6 +211,20 @@ class Recording(McapFile):
     def everything(self, sensor: int | None = None) -> Iterator[DataMessage | Description | Event]:
         """Descriptions, events and the frames of the sensor at this position, or of all, as they came."""
         return self._read(self._channels(sensor) | self._noted)
+
+    def batches(self, sensor: int) -> Iterator[tuple[Settings, list[DataMessage]]]:
+        """Frames of the sensor at this position, a few thousand at once, with the settings in force."""
+        histories = Histories()
+        known = [each.history[0] for each in self.sensors if each.sensor == sensor and each.history]
+        settings = known[0] if known else Settings()
+        for kind, items in itertools.groupby(self.everything(sensor), type):
+            while batch := cast(Any, [*itertools.islice(items, _BATCH)]):
+                if kind is DataMessage:
+                    yield settings, batch
+                else:
+                    for note in batch:
+                        histories.take(note)
+                    settings = (histories.of(sensor) or (settings,))[-1]
 
     def _channels(self, sensor: int | None) -> set[int]:
         return {number for number, position in self._sensor_of.items() if sensor in (None, position)}

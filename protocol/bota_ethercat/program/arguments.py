@@ -32,7 +32,7 @@ ethercat-replay run.mcap --loop                            # again and again
 ethercat-replay run.mcap --speed max --server 12002        # as fast as clients read, on another port
 ethercat-export run.mcap                                   # writes run.csv
 ethercat-export run.mcap /dev/stdout                       # into a pipe
-ethercat-export run.mcap second.csv --sensor 1             # of the second sensor
+ethercat-export run.mcap --at frames.csv                   # what was measured before each camera frame
 ethercat-report                                            # listen to the server, write report.html
 ethercat-report run.mcap                                   # of a recording, write run.html
 ethercat-report --sensor serial:1234 --note 'cell 3'       # of one sensor, with a remark

@@ -54,26 +54,26 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
     # On an even grid, so that stamps that jitter do not shake the derivative of the angular rate.
     period = float(np.median(np.diff(times)))
     stamps, times = times, np.arange(times[0], times[-1], period)
-    force, acceleration, rate = (_at(times, stamps, columns) for columns in (force, acceleration, rate))
+    force, acceleration, rate = (at_times(times, stamps, columns) for columns in (force, acceleration, rate))
     products = (rate[:, :, None] * rate[:, None]).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     turned = np.concatenate([np.gradient(rate, period, axis=0), products], axis=1)
     # All alike, and so long that little noise is left in what the motion is regressed on: that would pull the
     # lag. Noise would be least, and fit best, between two samples, too.
-    slow = _smoothed(force, _window(_SHORTEST_S, period))
+    slow = smoothed(force, hann_window(_SHORTEST_S, period))
     pace = float(np.linalg.norm(slow - slow.mean(axis=0)) / np.linalg.norm(np.gradient(slow, period, axis=0)))
     seconds = min(max(_SMOOTHED * pace, _SHORTEST_S), _LONGEST_S)
-    window = _window(seconds, period)
-    force, acceleration, turned = (_smoothed(columns, window) for columns in (force, acceleration, turned))
+    window = hann_window(seconds, period)
+    force, acceleration, turned = (smoothed(columns, window) for columns in (force, acceleration, turned))
     looks = np.arange(times[0] + _LATEST_S + seconds, times[-1] + _EARLIEST_S - seconds, seconds / 4)
     trend = np.linalg.qr(np.vander(looks - looks.mean(), _TREND))[0]  # a bias that drifts
 
     def drawn(columns: Array) -> Array:
         return np.asarray(columns - trend @ (trend.T @ columns))
 
-    force = drawn(_at(looks, times, force))
+    force = drawn(at_times(looks, times, force))
 
     def moved(lag: float) -> Array:
-        felt = _at(looks - lag, times, acceleration), _at(looks - lag + gyroscope_s, times, turned)
+        felt = at_times(looks - lag, times, acceleration), at_times(looks - lag + gyroscope_s, times, turned)
         return drawn(np.concatenate(felt, axis=1))
 
     def left(lag: float) -> float:
@@ -81,7 +81,7 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
         return float(((force - rows @ np.linalg.lstsq(rows, force, rcond=None)[0]) ** 2).sum())
 
     coarse = np.arange(_EARLIEST_S, _LATEST_S, max(period, 0.005))
-    best = _lowest(left, float(coarse[np.argmin([left(lag) for lag in coarse])]), max(period, 0.005))
+    best = lowest(left, float(coarse[np.argmin([left(lag) for lag in coarse])]), max(period, 0.005))
     rows = moved(best)
     tool = np.linalg.lstsq(rows, force, rcond=None)[0]
     total = float((force**2).sum())
@@ -112,22 +112,23 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
     return Lag(best, interval, explained)
 
 
-def _window(seconds: float, period: float) -> Array:
+def hann_window(seconds: float, period: float) -> Array:
     """Weights of a Hann window that is so long."""
     window = np.hanning(max(3, round(seconds / period) | 1) + 2)[1:-1]
     return np.asarray(window / window.sum())
 
 
-def _smoothed(columns: Array, window: Array) -> Array:
+def smoothed(columns: Array, window: Array) -> Array:
+    """Columns convolved with a window."""
     return np.stack([np.convolve(column, window, "same") for column in columns.T], axis=1)
 
 
-def _at(looks: Array, times: Array, columns: Array) -> Array:
+def at_times(looks: Array, times: Array, columns: Array) -> Array:
     """Columns at other times."""
     return np.stack([np.interp(looks, times, column) for column in columns.T], axis=1)
 
 
-def _lowest(left: Callable[[float], float], start: float, step: float) -> float:
+def lowest(left: Callable[[float], float], start: float, step: float) -> float:
     """The minimum of a function near `start`, by parabolas."""
     for _ in range(6):
         before, at, after = left(start - step), left(start), left(start + step)

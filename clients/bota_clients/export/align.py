@@ -1,0 +1,199 @@
+"""What `ethercat-export align` does: the offset between the server's clock and a robot's, by how both turned.
+
+The angular rates of two bodies that are mounted on each other are the same but for a rotation. The offset is
+first looked for by their cross-correlation, then in each of eight parts by least squares together with the
+rotation and the gyroscope's offset. A line through the eight has the drift, and how far they are off it tells
+the interval, which so covers residuals that are correlated; it is found twice, the second time with the drift
+of the first taken out of each part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any, Final
+from xml.etree import ElementTree
+
+import numpy as np
+import numpy.typing as npt
+
+from bota_clients.errors import RecordingError
+from bota_clients.export.dataset import Clock, messages
+from bota_clients.identify.program import choose
+from bota_clients.program import interrupt_on_signals
+from bota_clients.recording.columns import Ints, decode
+from bota_clients.recording.reader import open_recording
+from bota_ethercat.sensor.response import angular_rate_response
+from bota_ethercat.settings import known_settings
+from ft_compensation.identification.delay import at_times, hann_window, lowest, smoothed
+
+Array = npt.NDArray[np.float64]
+_SMOOTH_S: Final = 0.1
+_STEP_S: Final = 0.02
+_AROUND_S: Final = 0.4  # of a part: what a drift of 200 ppm in an hour takes
+_PARTS: Final = 8
+_T_95: Final = 2.447  # Student's t for as many parts, less two
+_SHORTEST_S: Final = 10.0
+_LEAST_RATE: Final = 0.05  # rad/s, root mean square
+_EXPLAINED: Final = 0.5
+_APART_S: Final = 0.5
+_OTHER: Final = 0.9  # of the highest correlation: another so far apart may be right, too
+_WIDEST_S: Final = 0.005
+
+
+def find_offset(
+    times_ns: Ints, rates: Array, robot_ns: Ints, robot_rates: Array
+) -> tuple[Clock, dict[str, float]]:
+    """From (n,), (n, 3) rad/s of the sensor and (m,), (m, 3) of the robot, each by its own clock.
+
+    The robot's clock, and half of the 95 % intervals. RecordingError if the motion does not show it.
+    """
+    sensor, robot = _smooth("sensor", times_ns, rates), _smooth("robot", robot_ns, robot_rates)
+
+    def left(looks: Array, offset: float | Array) -> float:
+        """The part of the sensor's rates that no rotation of the robot's explains."""
+        basis = np.linalg.qr(np.column_stack([at_times(looks, *robot), np.ones(len(looks))]))[0]
+        felt = at_times(looks + offset, *sensor)
+        return float(((felt - basis @ (basis.T @ felt)) ** 2).sum() / (felt.var(axis=0).sum() * len(looks)))
+
+    sizes = [at_times(np.arange(0, times[-1], _STEP_S), times, turned) for times, turned in (sensor, robot)]
+    size = sum(map(len, sizes))
+    felt, turned = (np.fft.rfft(each - each.mean(axis=0), size, axis=0) for each in sizes)
+    found = np.fft.irfft(felt[:, :, np.newaxis] * turned[:, np.newaxis].conj(), size, axis=0)
+    agree, lags = (found**2).sum(axis=(1, 2)), np.arange(size)  # whatever the rotation
+    lags[len(sizes[0]) :] -= size
+    best = int(np.argmax(agree))
+    coarse = float(lags[best]) * _STEP_S
+    begin, end = max(0.0, -coarse), min(robot[0][-1], sensor[0][-1] - coarse)
+    looks = np.arange(begin + _AROUND_S, end - _AROUND_S, _STEP_S / 2)
+    rest = left(looks, coarse) if end - begin > _SHORTEST_S / 2 else 1.0
+    if rest > 1 - _EXPLAINED:
+        raise RecordingError(
+            f"the robot's motion explains only {100 * (1 - rest):.0f} % of the sensor's: record both "
+            "at the same time, of one body that turns about several axes"
+        )
+    if agree[abs(lags - lags[best]) * _STEP_S > _APART_S].max() > _OTHER * agree[best]:
+        raise RecordingError("the motion repeats itself, so several offsets fit: move without a rhythm")
+    middle, line = float(looks.mean()), np.array([0.0, coarse])
+    for around in (np.arange(-_AROUND_S, _AROUND_S, _STEP_S), np.zeros(1)):
+        rows = []
+        for part in np.array_split(looks, _PARTS):
+            expected = np.polyval(line, part - middle)
+
+            def missed(offset: float, part: Array = part, expected: Array = expected) -> float:
+                return left(part, expected + offset)
+
+            fits = lowest(missed, min(around.tolist(), key=missed), _STEP_S)
+            curve = missed(fits - _STEP_S) - 2 * missed(fits) + missed(fits + _STEP_S)
+            rows.append((part.mean() - middle, fits, max(curve, 1e-12) ** 0.5))
+        at, offsets, weights = np.array(rows).T
+        change, covariance = np.polyfit(at, offsets, 1, w=weights, cov=True)
+        line = line + change
+    drift_interval, interval = (_T_95 * np.sqrt(np.diag(covariance))).tolist()
+    if not interval < _WIDEST_S:
+        raise RecordingError(
+            f"the motion is too slow to tell (± {interval * 1e3:.0f} ms): turn faster, and about several axes"
+        )
+    stamp_ns, monotonic_ns = (round(at_s * 1e9) for at_s in (middle, middle + line[1]))
+    clock = Clock(int(robot_ns[0]) + stamp_ns, int(times_ns[0]) + monotonic_ns, float(line[0]) * 1e6)
+    return clock, {"interval_ms": interval * 1e3, "drift_interval_ppm": drift_interval * 1e6}
+
+
+def _smooth(which: str, stamps_ns: Ints, rates: Array) -> tuple[Array, Array]:
+    """Even times from 0 on, s, and the rates at these; RecordingError if they are too few or too small."""
+    times = (stamps_ns - stamps_ns[0]) * 1e-9
+    if times[-1] < _SHORTEST_S:
+        raise RecordingError(f"the {which} was recorded for less than {_SHORTEST_S:g} s: record a minute")
+    if np.linalg.norm(rates.std(axis=0)) < _LEAST_RATE:
+        raise RecordingError(f"the {which} hardly turned: turn it about several axes")
+    period = float(np.median(np.diff(times)))
+    even = np.arange(0, times[-1], period)
+    return even, smoothed(at_times(even, times, rates), hann_window(_SMOOTH_S, period))
+
+
+def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[Ints, Array]:
+    """Stamps (n,), ns, and angular rates (n, 3), rad/s: as an IMU has them, or of a link in its own frame."""
+    joints = [] if urdf is None else _chain(urdf, link)
+    turning = [name for name, _, axis in joints if axis.any()]
+    stamps, rows = list[int](), list[list[float]]()
+    for stamp, message in messages(path, topic):
+        if hasattr(message, "angular_velocity"):
+            rate, joints = message.angular_velocity, []
+            row = [rate.x, rate.y, rate.z]
+        elif not joints or not hasattr(message, "position"):
+            raise RecordingError(f"{topic} is no sensor_msgs/Imu, and no JointState with --urdf and --link")
+        else:
+            at = dict(zip(message.name, message.position, strict=True))
+            row = [at[name] for name in turning if name in at]
+        if len(row) == len(turning) or not joints:  # else of another part of the robot, a gripper say
+            stamps.append(stamp)
+            rows.append(row)
+    if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
+        raise RecordingError(
+            f"the messages of {topic} in {path} are too few, or not in the order of their stamps"
+        )
+    times, values = np.array(stamps, np.int64), np.array(rows)
+    if not joints:
+        return times, values
+    angles = dict(zip(turning, values.T, strict=True))
+    pose = np.eye(3)
+    for name, origin, axis in joints:
+        pose = pose @ origin @ _turned(np.outer(angles.get(name, 0.0), axis))
+    step, passed = pose[:-1].swapaxes(1, 2) @ pose[1:], np.diff(times)
+    twice = step - step.swapaxes(1, 2)  # the sine of a small angle
+    return times[:-1] + passed // 2, twice[:, (2, 0, 1), (1, 2, 0)] / (2e-9 * passed[:, np.newaxis])
+
+
+def _chain(urdf: Path, link: str) -> list[tuple[str, Array, Array]]:
+    """Name, rotation (3, 3) and axis of each joint from the root to `link`; axis zeros: it does not turn."""
+    chain = list[tuple[str, Array, Array]]()
+    try:
+        joints: Any = ElementTree.parse(urdf).iterfind("joint")  # noqa: S314 - a file of the user's
+        above, at = {joint.find("child").get("link"): joint for joint in joints}, link
+        while (joint := above.pop(at, None)) is not None:
+            at = joint.find("parent").get("link")
+            tags = {each.tag: each for each in joint}
+            rpy, axis = (
+                np.array(tags[tag].get(key, given).split() if tag in tags else given.split(), float)
+                for tag, key, given in (("origin", "rpy", "0 0 0"), ("axis", "xyz", "1 0 0"))
+            )
+            roll, pitch, yaw = _turned(np.diag(rpy))
+            turns = joint.get("type") in ("revolute", "continuous")
+            chain.insert(0, (joint.get("name"), yaw @ pitch @ roll, turns * axis / np.linalg.norm(axis)))
+    except (OSError, ElementTree.ParseError, AttributeError, ValueError) as error:
+        raise RecordingError(f"{urdf} cannot be read as URDF: {error}") from None
+    if not any(axis.any() for _, _, axis in chain):
+        raise RecordingError(f"{urdf} has no joint that turns link {link}")
+    return chain
+
+
+def _turned(vectors: Array) -> Array:
+    """(n, 3, 3) rotations by rotation vectors (n, 3), rad."""
+    angle = np.linalg.norm(vectors, axis=1)[:, np.newaxis, np.newaxis] / np.pi
+    cross = np.cross(vectors[:, np.newaxis], np.eye(3)).swapaxes(1, 2)
+    return np.asarray(np.eye(3) + np.sinc(angle) * cross + np.sinc(angle / 2) ** 2 / 2 * (cross @ cross))
+
+
+def run(options: argparse.Namespace) -> int:
+    """Find it; returns the exit code. RecordingError."""
+    interrupt_on_signals()
+    with open_recording(options.recording) as recording:
+        rows = []
+        for settings, frames in recording.batches(choose(recording, options.sensor).sensor):
+            table = decode(frames, options.imu_units)
+            table = table.where(table.fresh & np.isfinite(table.angular_rate).all(axis=1))
+            delay_s = angular_rate_response(known_settings(settings.values)).delay_s or 0.0
+            rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
+    instants, rates = map(np.concatenate, zip(*rows, strict=True))
+    if (np.diff(instants) <= 0).any():
+        raise RecordingError("the server's machine was restarted during the recording: record again")
+    stamps, robot_rates = _robot_rates(options.bag, options.topic, options.urdf, options.link)
+    clock, intervals = find_offset(instants, rates, stamps, robot_rates)
+    # The server's clocks are as far apart as at the end of the recording.
+    apart_ns = frames[-1].stamp_ns - frames[-1].monotonic_ns
+    offset_ms = (clock.monotonic_ns + apart_ns - clock.stamp_ns) * 1e-6
+    values = clock._asdict() | {"offset_ms": offset_ms} | intervals
+    sys.stdout.write(json.dumps(values, indent=1) + "\n")
+    return 0

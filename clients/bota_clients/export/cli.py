@@ -1,0 +1,127 @@
+"""`ethercat-export`: its command lines; all else is imported when it is known what is to be done."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
+from bota_clients.arguments import add_force, add_imu_units, number, position
+from bota_clients.program import interrupt_on_signals, say, start
+from bota_ethercat.errors import FileError
+from bota_ethercat.program.arguments import Parser
+
+PROGRAM: Final = "ethercat-export"
+DATASETS: Final = (".parquet", ".zarr", ".npz")
+_MOST_SAMPLES: Final = 100_000  # in a window
+Advance = Callable[[int], object]  # is told how many DATA frames were read since the last call
+
+
+def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line; argparse exits with 2 if it is wrong."""
+    made = Parser(
+        PROGRAM,
+        "Writes the samples of a recording as CSV, one a line, or for each camera frame the last samples "
+        "that were measured before it, as .parquet, .zarr or .npz.",
+        "CSV is for pandas.read_csv(FILE, parse_dates=['stamp_utc']), MATLAB's readtable, or a spreadsheet. "
+        "'ethercat-export align' finds the offset of another computer's clock.",
+    )
+    add = made.add_argument
+    _add_recording(made)
+    add("output", type=Path, nargs="?", metavar="OUT",
+        help="file to write (default: RECORDING.csv, with --at or --fps RECORDING.parquet)")  # fmt: skip
+    add("--all", action="store_true", help="CSV: also frames that are no new sample: repeated, invalid")
+    add_force(made)
+    group = made.add_argument_group("for each camera frame")
+    add = group.add_mutually_exclusive_group().add_argument
+    add("--at", type=Path, metavar="FRAMES", help="times of the frames: CSV, Parquet, or a bag")
+    add("--fps", type=number(1e-3, 1e5), metavar="HZ", help="frames at this rate")
+    add = group.add_argument
+    add("--column", "--topic", dest="column", metavar="NAME", default="timestamp",
+        help="column of a table (default timestamp), or topic of a bag (its header.stamp)")  # fmt: skip
+    add("--window", type=number(1, _MOST_SAMPLES), default=32, metavar="K",
+        help="samples for each frame (default 32)")  # fmt: skip
+    add("--latency", type=number(-60, 60), default=0.0, metavar="S",
+        help="seconds from a frame's exposure to its stamp (default 0)")  # fmt: skip
+    add("--clock", type=Path, metavar="JSON",
+        help="clock of the stamps, by 'ethercat-export align' (default: the server's)")  # fmt: skip
+    add("--tool", type=Path, metavar="YAML",
+        help="also the compensated wrench, with these parameters of the ROS 2 node")  # fmt: skip
+    add("--hold", action="store_true", help="repeat the last sample where one was lost, instead of NaN")
+    options = made.parse_args(argv)
+    has_frames = options.at is not None or options.fps is not None
+    options.output = options.output or options.recording.with_suffix(DATASETS[0] if has_frames else ".csv")
+    if options.output.absolute() == options.recording.absolute():
+        made.error("the output would overwrite the recording: give another name")
+    if (options.output.suffix in DATASETS) != has_frames:
+        made.error(f"windows of samples, with --at or --fps, are written as {', '.join(DATASETS)} only")
+    return options
+
+
+def parse_align(argv: Sequence[str]) -> argparse.Namespace:
+    """Read the command line after `align`."""
+    made = Parser(
+        f"{PROGRAM} align",
+        "Finds the offset between the server's clock and a robot's, and its drift: from the angular rate of "
+        "the sensor's IMU and that of an IMU of the robot, or of its joints. Prints JSON, for --clock.",
+        "Both on one link, with any axes. Record both while the robot turns the sensor about several axes, "
+        "not periodically, for half a minute or more.",
+    )
+    _add_recording(made)
+    add = made.add_argument
+    add("bag", type=Path, metavar="BAG", help="a bag of ROS: the folder, .mcap, .db3 or .bag")
+    add("--topic", required=True, metavar="TOPIC", help="sensor_msgs/Imu or sensor_msgs/JointState")
+    add("--urdf", type=Path, metavar="FILE", help="of joint states: the robot")
+    add("--link", metavar="NAME", default="", help="of joint states: the link that carries the sensor")
+    return made.parse_args(argv)
+
+
+def _add_recording(made: argparse.ArgumentParser) -> None:
+    add = made.add_argument
+    add("recording", type=Path, metavar="RECORDING", help="a recording of ethercat-record")
+    add("--sensor", type=position, metavar="N", help="only the sensor at this position on the bus")
+    add_imu_units(made)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Have the output written, and say what `write` of its module says of it; returns the exit code.
+
+    Ctrl-C ends it at any time and leaves no file.
+    """
+    from rich.console import Console  # noqa: PLC0415 - needs the extra, and so do these
+    from rich.progress import Progress  # noqa: PLC0415
+
+    from bota_clients.recording.reader import open_recording  # noqa: PLC0415
+
+    write = import_module(
+        f"bota_clients.export.{'dataset' if options.output.suffix in DATASETS else 'table'}"
+    ).write
+    interrupt_on_signals()
+    console = Console(stderr=True)
+    progress = Progress(console=console, transient=True, disable=not console.is_terminal)
+    try:
+        with open_recording(options.recording) as recording, progress:
+            if recording.cut_off is not None:
+                how = f"was cut off ({recording.cut_off}): the intact part is exported"
+                say(PROGRAM, f"{recording.path} {how}")
+            chosen = [each.frames for each in recording.sensors if options.sensor in {None, each.sensor}]
+            task = progress.add_task("", total=sum(chosen))
+            written = write(options, recording, lambda frames: progress.advance(task, frames))
+    except KeyboardInterrupt:
+        say(PROGRAM, "stopped: nothing was written")
+        return 1
+    except OSError as error:
+        raise FileError(f"{options.output} cannot be written: {error.strerror or error}") from None
+    say(PROGRAM, f"{options.output}: {written}")
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Export; returns the exit code."""
+    given = sys.argv[1:] if argv is None else argv
+    if given[:1] == ["align"]:
+        return start(PROGRAM, "export.align", parse_align(given[1:]))
+    return start(PROGRAM, "export.cli", parse_options(given))

@@ -1,0 +1,84 @@
+"""A recording as CSV, for pandas, MATLAB and spreadsheets."""
+
+from __future__ import annotations
+
+import argparse
+from functools import cache
+from typing import Final
+
+import numpy as np
+
+from bota_clients.errors import RecordingError
+from bota_clients.export.cli import Advance
+from bota_clients.numbers import count
+from bota_clients.recording.reader import Recording
+from bota_ethercat.accounting import NOT_NEW
+from bota_ethercat.framing import DataFlag
+from bota_ethercat.pdo import Sample, SampleDecoder
+from bota_ethercat.program.new_file import NewFile
+
+_SECOND: Final = 1_000_000_000
+_VECTORS: Final = (("force", "N"), ("torque", "Nm"), ("acceleration", "m_s2"), ("angular_rate", "rad_s"))
+_FLAGS: Final = (DataFlag.GAP, DataFlag.REPEATED, DataFlag.INVALID)
+_REGISTERS: Final = (
+    "force_torque_saturated", "acceleration_saturated", "angular_rate_saturated", "warnings", "status",
+)  # fmt: skip
+COLUMNS: Final = (
+    "time_s", "stamp_utc", "sensor", "sequence",
+    *(f"{name}_{axis}_{unit}" for name, unit in _VECTORS for axis in "xyz"),
+    "temperature_degC",
+    *(f"orientation_{axis}" for axis in "xyzw"),
+    *(str(flag.name).lower() for flag in _FLAGS),
+    *_REGISTERS,
+)  # fmt: skip
+
+
+def write(options: argparse.Namespace, recording: Recording, advance: Advance) -> str:
+    """The names, then a line for each sample, into a file; says how many. PdoSizeError."""
+    there = {sensor.sensor for sensor in recording.sensors if sensor.frames}
+    if not there or options.sensor not in {None, *there}:
+        which = "" if options.sensor is None else f" of sensor {options.sensor}"
+        raise RecordingError(f"{recording.path} has no samples{which}")
+    decoder = cache(lambda size: SampleDecoder(size, options.imu_units))
+    written = left_out = last_ns = stamp_ns = 0
+    first_ns: int | None = None
+    gaps: dict[int, int] = {}
+    with NewFile(options.output, force=options.force) as file:
+        file.write(",".join(COLUMNS) + "\n")
+        for frame in recording.frames(options.sensor):
+            advance(1)
+            # A gap before a frame that is left out is before the next sample.
+            flags = frame.flags | gaps.pop(frame.sensor, 0)
+            if flags & NOT_NEW and not options.all:
+                left_out += 1
+                gaps[frame.sensor] = flags & DataFlag.GAP
+                continue
+            written += 1
+            first_ns = frame.monotonic_ns if first_ns is None else first_ns
+            if frame.monotonic_ns < last_ns - _SECOND:  # its machine was restarted: only the stamps go on
+                first_ns += frame.monotonic_ns - last_ns - max(0, frame.stamp_ns - stamp_ns)
+            last_ns, stamp_ns = frame.monotonic_ns, frame.stamp_ns
+            sample = decoder(len(frame.process_data)).decode(frame.process_data)
+            cells = [
+                _seconds(last_ns - first_ns),
+                f"{np.datetime64(stamp_ns, 'ns')}Z",
+                frame.sensor,
+                frame.sequence,
+            ]
+            file.write(f"{','.join(map(str, cells))},{_values(sample, flags)}\n")
+        file.finish()
+    left = f"; {count(left_out, 'frame')} without a new sample left out" if left_out else ""
+    return f"{count(written, 'sample')}{left}"
+
+
+def _values(sample: Sample, flags: int) -> str:
+    # Nine digits keep a REAL32 to the bit.
+    reals = ",".join([f"{value:.9g}" for value in (*sample.array, sample.temperature)])
+    orientation = ",".join([f"{value:.9g}" for value in sample.orientation or ()]) or ",,,"
+    whole = [int(bool(flags & flag)) for flag in _FLAGS] + [getattr(sample, name) for name in _REGISTERS]
+    return f"{reals},{orientation},{','.join(map(str, whole))}"
+
+
+def _seconds(ns: int) -> str:
+    whole, rest = divmod(abs(ns), _SECOND)
+    return f"{'-' if ns < 0 else ''}{whole}.{rest:09d}"

@@ -1,0 +1,215 @@
+"""The last samples that were measured before an instant: of a recording, or of a stream with the same result.
+
+    windows = Windows(32)
+    windows.configure(description["settings"], description["rate_hz"])  # again whenever they change
+    windows.take(frames)  # DATA messages of one sensor, in order
+    arrays = windows.at(np.array([windows.until_ns]))
+
+Samples are in slots, one for each period of the sensor; the slot of a lost sample stays empty. A sample was
+measured at its stamp less the delay of the filters, and each channel has filters of its own. Instants and
+stamps are ns of the server's CLOCK_MONOTONIC.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from bota_clients.errors import RecordingError
+from bota_clients.recording.columns import Columns, Ints, decode
+from bota_ethercat.accounting import NOT_NEW
+from bota_ethercat.client.reading import Delays
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.pdo import ImuUnits, Vector3
+from bota_ethercat.sensor.frames import IMU_HEIGHTS
+from bota_ethercat.sensor.response import delays_ms
+from bota_ethercat.settings import SettingValue, known_settings
+from ft_compensation.alignment import align
+from ft_compensation.compensator import Compensator
+from ft_compensation.quantities import EXACT, NO_WRENCH, STILL, ZERO, Accelerometer, Payload, Turning, Wrench
+from ft_compensation.specific_force import ImuSpecificForce
+from ft_compensation.stationary import BAD_WRENCH
+
+Array = npt.NDArray[Any]
+Arrays = dict[str, Array]
+_CHANNELS: Final = dict(zip(Delays._fields, (slice(0, 6), slice(6, 9), slice(9, 12)), strict=True))
+_UNKNOWN: Final = (math.nan,) * 3
+_SLOT: Final = np.dtype([
+    ("measured_ns", "i8", 3),  # by channel; of an empty slot by its place between two samples
+    ("values", "f4", 12),  # force, torque, acceleration, angular rate: N, Nm, m/s², rad/s; NaN: empty
+    ("valid", "?", 3),  # by channel
+    ("compensated", "f4", 6),  # N, Nm; NaN: not known
+])  # fmt: skip
+
+
+def read_tool(path: Path) -> Mapping[str, Any]:
+    """Parameters of the ROS 2 node, as `ethercat-identify --yaml` writes them; RecordingError."""
+    import yaml  # noqa: PLC0415 - of the extra `dataset`
+
+    try:
+        found: Mapping[str, Any] = yaml.safe_load(path.read_bytes())["/**"]["ros__parameters"]
+        Windows(1, tool=found)
+    except (OSError, yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError) as error:
+        why = " ".join(str(error).split())
+        raise RecordingError(
+            f"{path} does not have a tool's parameters, as ethercat-identify --yaml writes them: {why}"
+        ) from None
+    return found
+
+
+class Windows:
+    """The newest samples of one sensor, and windows of them, for instants that ascend.
+
+    Attributes:
+        begin_ns: stamp of the first sample; -1 before it.
+    """
+
+    def __init__(
+        self,
+        length: int,
+        *,
+        hold: bool = False,
+        tool: Mapping[str, Any] | None = None,
+        imu_units: ImuUnits = ImuUnits.G_DPS,
+    ) -> None:
+        """Of `length` samples. With a `tool`, parameters of the ROS 2 node, there is a compensated wrench.
+
+        `hold`: an empty slot has value and age of the last valid one of its window, instead of NaN.
+        """
+        self.begin_ns = -1
+        self._length, self._hold, self._units, self._compensator = length, hold, imu_units, None
+        self._slots = np.zeros(0, _SLOT)
+        self._newest = (0, 0)  # stamp and sequence of the newest sample
+        self._in_force: tuple[Mapping[str, object], float] | None = None
+        if tool is None:
+            return
+        center, inertia = tuple(tool["tool_center_of_gravity"]), tuple(tool.get("tool_inertia", (0.0,) * 6))
+        self._payload = Payload(float(tool["tool_mass"]), center, inertia)
+        self._compensator = Compensator(self._payload, Wrench.of(tool.get("bias", NO_WRENCH.values)))
+        rows = {name: tool.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
+        self._accelerometer = Accelerometer(**{name: tuple(row) for name, row in rows.items()})
+        self._imu_position: Vector3 = tuple(tool.get("imu_position", ZERO))
+
+    def configure(self, settings: Mapping[str, object], rate_hz: float, name: str = "") -> None:
+        """Settings and rate of what follows, as `describe` has them; the sensor's `name`; RecordingError."""
+        if (settings, rate_hz) == self._in_force:
+            return
+        if not rate_hz:
+            raise RecordingError("the sampling rate is not known, so lost samples have no place")
+        self._in_force, self._known, self._rate_hz = (settings, rate_hz), known_settings(settings), rate_hz
+        # Where a delay is unknown, a sample counts as measured only when it was stamped: never too early.
+        self._delay_ns = np.array([delay or 0 for delay in Delays.parse(delays_ms(self._known, rate_hz))])
+        if self._compensator is None:
+            return
+        (cx, cy, cz), position = self._payload.center, self._imu_position
+        x, y, z = position if any(position) else (0.0, 0.0, IMU_HEIGHTS.get(name[4:8], 0.0))
+        alignment = align(self._known, rate_hz)
+        self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), self._accelerometer, alignment)
+        wrong: dict[str, SettingValue] = {"calibration_matrix": False}
+        if self._payload.mass:
+            wrong |= {"inertia_compensation": True, "coordinate_system": True, "imu_active": 0}
+        if found := [setting for setting, value in wrong.items() if self._known.get(setting) == value]:
+            raise RecordingError(f"the wrench cannot be compensated by how {found[0]} was set: omit --tool")
+
+    @property
+    def until_ns(self) -> int:
+        """The last instant of which nothing that comes later can be a part; -1 before the first sample."""
+        return int(self._slots["measured_ns"].max(axis=0, initial=-1).min())
+
+    def take(self, frames: Sequence[DataMessage]) -> None:
+        """Take the next frames of the sensor, also REPEATED and INVALID ones; RecordingError."""
+        samples = decode((each for each in frames if not each.flags & NOT_NEW), self._units)
+        if not len(samples):
+            return
+        stamps, sequence = samples.monotonic_ns, samples.sequence
+        if self.begin_ns < 0:
+            self.begin_ns, self._newest = int(stamps[0]), (int(stamps[0]) - 1, int(sequence[0]) - 1)
+        passed = np.diff(stamps, prepend=self._newest[0])
+        if (passed <= 0).any():
+            raise RecordingError("the server's machine was restarted meanwhile: record again")
+        is_gap = (samples.flags & int(DataFlag.GAP) != 0) | (np.diff(sequence, prepend=self._newest[1]) != 1)
+        self._newest = int(stamps[-1]), int(sequence[-1])
+        lost = np.maximum(np.rint(passed * (self._rate_hz * 1e-9)).astype(np.int64) - 1, 0) * is_gap
+        # Of the slots of lost samples the first ones do: a window is not longer.
+        kept = np.minimum(lost, self._length)
+        end = np.cumsum(kept + 1) - 1  # where each sample is
+        of = np.repeat(np.arange(len(end)), kept + 1)
+        before = (lost - kept)[of] + end[of] - np.arange(len(of))  # periods until the next sample
+        before[end] = 0
+        slots = np.zeros(len(of), _SLOT)
+        until_ns = np.rint(passed[of] * (before / (lost[of] + 1))).astype(np.int64)
+        slots["measured_ns"] = (stamps[of] - until_ns)[:, np.newaxis] - self._delay_ns
+        values = np.hstack([samples.force, samples.torque, samples.acceleration, samples.angular_rate])
+        slots["values"] = math.nan
+        slots["values"][end] = np.where(np.isfinite(values), values, math.nan)
+        is_off = self._known.get("imu_active") == 0
+        wrong = (
+            samples.force_torque_saturated | samples.warnings & int(BAD_WRENCH),
+            samples.acceleration_saturated | is_off,
+            samples.angular_rate_saturated | is_off,
+        )
+        for channel, (part, bits) in enumerate(zip(_CHANNELS.values(), wrong, strict=True)):
+            slots["valid"][end, channel] = (bits == 0) & np.isfinite(values[:, part]).all(axis=1)
+        slots["compensated"][end] = self._compensated(samples)
+        self._slots = np.concatenate([self._slots, slots])
+
+    def _compensated(self, samples: Columns) -> Array | float:
+        """(n, 6) N, Nm, as the ROS 2 node has it; NaN without a tool."""
+        if self._compensator is None:
+            return math.nan
+        felt, turning = np.zeros((len(samples), 3)), cast(Any, STILL)
+        if self._payload.mass:
+            rows, turned = list[Vector3](), list[Turning]()
+            times = samples.monotonic_ns * 1e-9
+            each = (column.tolist() for column in (samples.acceleration, samples.angular_rate, times))
+            for acceleration, rate, time_s in zip(*each, strict=True):
+                rows.append((any(acceleration) and self._imu.follow(acceleration, rate, time_s)) or _UNKNOWN)
+                turned.append(self._imu.turning)
+            felt = np.array(rows)
+            if any(self._payload.inertia):
+                turning = np.moveaxis(np.array(turned), 0, 2)
+        compensate = cast(Any, self._compensator.compensate)  # of arrays as of numbers
+        return np.vstack(compensate(samples.force.T, samples.torque.T, felt.T, turning).final).T
+
+    def at(self, instants_ns: Ints) -> Arrays:
+        """Windows of these f instants; the last sample of each is the newest.
+
+        `force_torque`, `force_torque_compensated` (f, length, 6) N, Nm; `imu` (f, length, 6) m/s², rad/s;
+        of each channel `..._age` (f, length) s before the instant and `..._valid` (f, length). ValueError for
+        an instant after `until_ns`.
+        """
+        if (instants_ns > self.until_ns).any():
+            raise ValueError(f"after {self.until_ns} ns not all samples are here: take more")
+        slots, found = self._slots, Arrays()
+        for channel, (name, part) in enumerate(_CHANNELS.items()):
+            index = self._ends(instants_ns, channel)[:, np.newaxis] + np.arange(-self._length, 0)
+            is_there, index = index >= 0, np.maximum(index, 0)
+            filled = valid = slots["valid"][index, channel] & is_there
+            if self._hold:
+                held = np.maximum.accumulate(np.where(valid, np.arange(self._length), -1), axis=1)
+                index, filled = np.take_along_axis(index, held, 1), held >= 0
+            age_s = (instants_ns[:, np.newaxis] - slots["measured_ns"][index, channel]) * 1e-9
+            values, wrench = slots["values"][index, part], slots["compensated"][index]
+            age_s[~filled] = values[~filled] = wrench[~filled] = math.nan
+            found |= {name: values, f"{name}_age": age_s.astype(np.float32), f"{name}_valid": valid}
+            if self._compensator is not None and not channel:
+                found[f"{name}_compensated"] = wrench
+                found[f"{name}_compensated_valid"] = valid & np.isfinite(wrench).all(axis=2)
+        found["imu"] = np.concatenate([found.pop("acceleration"), found.pop("angular_rate")], axis=2)
+        return found
+
+    def forget(self, before_ns: int) -> None:
+        """What windows of this instant and later ones do not need; without this everything is kept."""
+        ends = [int(self._ends(np.array([before_ns]), channel)[0]) for channel in range(3)]
+        begin = max(min(ends) - self._length, 0)
+        self._slots = self._slots[begin:].copy()
+
+    def _ends(self, instants_ns: Ints, channel: int) -> Ints:
+        """The slot behind the newest one that was measured before or at each of these instants."""
+        measured = np.maximum.accumulate(self._slots["measured_ns"][:, channel])
+        return np.searchsorted(measured, instants_ns, "right")

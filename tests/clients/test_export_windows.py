@@ -1,0 +1,267 @@
+"""`ethercat-export --at`: each frame has what was measured before it, and nothing that was not measured."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import random
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bota_clients.export.cli import main
+from bota_clients.export.dataset import FrameTimes, clock_history, read_stamps, windows_of
+from bota_clients.export.windows import Array, Arrays, Windows
+from bota_clients.recording.reader import open_recording
+from bota_ethercat.framing import DataFlag, DataMessage
+from tests.clients.bags import imu, write_bag
+from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
+from tests.clients.simulated import Script, described, simulate
+from tests.ended import run_here
+
+SETTINGS: dict[str, Any] = {"fir": False, "acceleration_filter": 1, "angular_rate_filter": 3}
+RATE_HZ = 800.0
+NOT_FINITE: Any = {"torque.y": math.nan}
+TOOL: dict[str, Any] = {
+    "tool_mass": 0.8,
+    "tool_center_of_gravity": [0.004, -0.006, 0.055],
+    "tool_inertia": [1e-3, 2e-3, 3e-3, 1e-4, 0.0, 0.0],
+    "bias": [3.0, -1.5, 7.25, 0.2, -0.05, 0.125],
+    "accelerometer.offset": [0.1, -0.2, 0.3],
+}
+
+
+def windows(
+    path: Path, frames: Iterable[DataMessage], times: Array, length: int = 4, **options: Any
+) -> Arrays:
+    """Of a recording of these frames."""
+    record(path, frames, **SETTINGS)
+    with open_recording(path) as recording:
+        found = FrameTimes.of(times, clock_history(recording))
+        return joined(windows_of(recording, found, Windows(length, **options)))
+
+
+def joined(blocks: Iterable[Arrays]) -> Arrays:
+    made = [*blocks]
+    return {name: np.concatenate([block[name] for block in made]) for name in made[0]}
+
+
+def stamps(*samples: float) -> Array:
+    """Frames at these instants, in periods of the sensor."""
+    return np.array([START_NS + round(sample * PERIOD_NS) for sample in samples])
+
+
+def newest(made: Arrays) -> list[list[float]]:
+    """The numbers of the samples, which are their force x; -1: empty."""
+    found: list[list[float]] = np.nan_to_num(made["force_torque"][:, :, 0], nan=-1.0).tolist()
+    return found
+
+
+def test_a_window_ends_with_the_newest_sample_that_was_measured_before_the_frame(tmp_path: Path) -> None:
+    at = (50.0, 50.49, 50.5)
+    numbered: Any = ({"angular_rate.z": number, "acceleration.x": number} for number in range(100))
+    frames = (frame(number, **values) for number, values in enumerate(numbered))
+    made = windows(tmp_path / "run.mcap", frames, stamps(*at))
+    # Measured before the stamp: force 1.88 ms, acceleration 1.94 ms, rate 2.9 ms; a period is 1.25 ms.
+    assert newest(made) == [[48, 49, 50, 51], [48, 49, 50, 51], [49, 50, 51, 52]]
+    assert made["imu"][:, -1, 0] / 9.80665 == pytest.approx([51, 52, 52])
+    assert np.degrees(made["imu"][:, -1, 5]) == pytest.approx([52, 52, 52])
+    for name, delay_ms in (("force_torque", 1.88), ("acceleration", 1.94), ("angular_rate", 2.9)):
+        age_s = [(instant + delay_ms / 1.25) % 1 * 1.25e-3 for instant in at]
+        assert made[f"{name}_age"][:, -1] == pytest.approx(age_s, abs=1e-7)
+        assert np.diff(made[f"{name}_age"]) == pytest.approx(np.full((3, 3), -1.25e-3), abs=1e-7)
+        assert made[f"{name}_valid"].all()
+
+
+def test_a_lost_sample_stays_in_its_place_and_is_masked(tmp_path: Path) -> None:
+    """5 and 6 are lost, 8 is INVALID, 10 saturated, 12 not finite; then nothing for long."""
+    frames = [frame(number) for number in (0, 1, 2, 3, 4, 7, 8, 9, 10, 11, 12, 13, 2000)]
+    frames[5] = frames[5]._replace(flags=int(DataFlag.GAP))
+    frames[6] = frames[6]._replace(flags=int(DataFlag.INVALID))
+    frames[8], frames[10] = frame(10, warnings=1), frame(12, **NOT_FINITE)
+    frames[12] = frames[12]._replace(flags=int(DataFlag.GAP))
+    at = stamps(6.6, 12.4, 100, 1000, 1997)
+    made = windows(tmp_path / "run.mcap", frames, at, 8)
+    lost = [-1.0] * 8
+    assert newest(made) == [[1, 2, 3, 4, -1, -1, 7, -1], [-1, 7, -1, 9, -1, 11, -1, 13], lost, lost, lost]
+    assert (made["force_torque_valid"] == np.isfinite(made["force_torque"]).all(axis=2)).all()
+    assert (made["force_torque_valid"] == np.isfinite(made["force_torque_age"])).all()
+    assert made["acceleration_valid"][1].tolist() == [False, True, False, True, True, True, True, True]
+    held = windows(tmp_path / "held.mcap", frames, stamps(6.6, 12.4), 8, hold=True)
+    assert newest(held) == [[1, 2, 3, 4, 4, 4, 7, 7], [-1, 7, 7, 9, 9, 11, 11, 13]]
+    assert held["force_torque_valid"].tolist() == made["force_torque_valid"][:2].tolist()
+    assert held["force_torque_age"][0, 4:6] == pytest.approx(held["force_torque_age"][0, 3])
+
+
+@pytest.mark.parametrize("step_s", [-0.3, 0.3, -3600.0])
+def test_a_step_of_the_wall_clock_in_the_middle_bends_nothing(tmp_path: Path, step_s: float) -> None:
+    def stamp(instant: float) -> int:
+        return START_NS + round(instant) + (round(step_s * 1e9) if instant >= 1000.4 * PERIOD_NS else 0)
+
+    frames = [frame(number)._replace(stamp_ns=stamp(number * PERIOD_NS)) for number in range(2000)]
+    instants = np.arange(0.1e9, 2.4e9, 1e9 / 30)
+    times = np.array([stamp(instant) for instant in instants])
+    made = windows(tmp_path / "run.mcap", frames, times)
+    assert made["monotonic_ns"] == pytest.approx(instants, abs=PERIOD_NS if step_s > 0 else 1)
+    assert made["stamp_ns"].tolist() == times.tolist()
+
+
+def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> None:
+    """The stream is without REPEATED frames, comes in other batches, and is asked as it comes."""
+    frames = simulate(3.0, script=Script(((1.0, "stick"), (1.2, "unstick")), lost_frames=0.02))
+    path, row, chance = tmp_path / "run.mcap", described(), random.Random(1)
+    record(path, frames, sensors=(0,), **row["settings"])
+    with open_recording(path) as recording:
+        recorded = joined(
+            windows_of(recording, FrameTimes.at_rate(30.0, clock_history(recording)), Windows(32, tool=TOOL))
+        )
+    live = Windows(32, tool=TOOL)
+    live.configure(recording.sensors[0].settings, RATE_HZ, row["name"])
+    sent, asked, blocks = [each for each in frames if not each.flags & DataFlag.REPEATED], 0, []
+    while sent:
+        size = chance.randrange(1, 40)
+        live.take(sent[:size])
+        sent = sent[size:]
+        instants = recorded["monotonic_ns"][asked:]
+        ready = instants[: np.searchsorted(instants, live.until_ns, "right")]
+        if len(ready):
+            blocks.append(live.at(ready))
+            live.forget(int(ready[-1]))
+            asked += len(ready)
+    assert asked == len(recorded["monotonic_ns"]) > 80
+    assert not recorded["force_torque_valid"].all()
+    for name, array in joined(blocks).items():
+        assert array.tobytes() == recorded[name].tobytes(), name
+
+
+def test_the_compensated_wrench_is_the_nodes() -> None:
+    """The worked example of docs/compensation.md; unknown where it turns and what was before is not known."""
+    force: Any = {"force.x": 8.0, "force.y": -9.345, "force.z": 7.25, "acceleration.y": 1.0}
+    held = force | {"torque.x": 0.631, "torque.y": 0.55, "torque.z": 0.094}
+    frames = [frame(8, **held), *(frame(number) for number in range(9, 100))]
+    turning: dict[str, Any] = {"acceleration.y": 1.0, "angular_rate.z": 90.0}
+    frames[50:] = [frame(number, flags=4, **turning) for number in range(130, 136)]
+    parts = "tool_mass", "tool_center_of_gravity", "bias"
+    windows = Windows(1, tool={name: TOOL[name] for name in parts})
+    windows.configure({**described()["settings"], **SETTINGS}, RATE_HZ, "BFT-SENS-ECAT-M8")
+    windows.take(frames)
+    made = windows.at(np.array([8, 130, 131]) * PERIOD_NS - 1_880_000)
+    assert made["force_torque_compensated"][0, 0] == pytest.approx([5, 0, 0, 0, 0.6, 0], abs=1e-3)
+    assert made["force_torque_compensated_valid"].ravel().tolist() == [True, False, True]
+
+
+def test_every_format_has_the_same(tmp_path: Path) -> None:
+    zarr, parquet = pytest.importorskip("zarr"), pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "run.mcap"
+    record(path, (frame(number) for number in range(3000)), **SETTINGS)
+    for suffix in ("npz", "parquet", "zarr"):
+        given = path, tmp_path / f"run.{suffix}", "--fps", 30, "--window", 8
+        assert run_here(main, *given).code == 0
+        assert "exists" in run_here(main, *given).err
+        assert run_here(main, *given, "--force").code == 0
+    table = parquet.read_table(tmp_path / "run.parquet")
+    group = zarr.open_group(tmp_path / "run.zarr", mode="r")
+    npz = np.load(tmp_path / "run.npz")
+    texts = table.schema.metadata[b"bota_ethercat"], str(npz["attributes"])
+    for found in (group.attrs["bota_ethercat"], *map(json.loads, texts)):
+        first = found["settings"][0]
+        assert (first["identity"]["serial"], found["options"]["window"]) == (100, 8)
+        assert first["delay_ms"]["acceleration"] == 1.94
+    assert {*table.column_names, "attributes"} == {*group, "attributes"} == {*npz}
+    assert len(npz["stamp_ns"]) == 113
+    for name in group:
+        array, flat = npz[name], np.stack(table[name].to_numpy())
+        assert group[name][:].tobytes() == flat.tobytes() == array.tobytes(), name
+        assert (group[name].shape, group[name].dtype, flat.dtype) == (array.shape, array.dtype, array.dtype)
+        if array.ndim > 1:  # as in a data set of LeRobot v3
+            assert table.schema.field(name).type.list_size == array[0].size
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "datasets.md"
+
+
+@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL))
+def test_the_code_of_the_page_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in re.findall(r"^(?:import|from) (\w+)", code, re.MULTILINE):
+        pytest.importorskip(package)
+    monkeypatch.chdir(tmp_path)
+    record(Path("run.mcap"), (frame(number) for number in range(1000)), **SETTINGS)
+    for suffix in ("npz", "parquet"):
+        run_here(main, "run.mcap", f"run.{suffix}", "--fps", 30)
+    if "lerobot" in code:
+        lerobot, state = (
+            importlib.import_module("lerobot.datasets.lerobot_dataset"),
+            {"shape": (2,), "names": None},
+        )
+        features = {"state": {"dtype": "float32", **state}}
+        made = lerobot.LeRobotDataset.create("me/run", 30, features, "run", use_videos=False)
+        for number in range(38):
+            made.add_frame({"state": np.array([number, 0], np.float32), "task": "none"})
+        made.save_episode()
+        made.finalize()
+    found: dict[str, Any] = {}
+    exec(code, found)
+    assert np.shape(found.get("force_torque", np.zeros((38, 32, 6)))) == (38, 32, 6)
+    if "lerobot" in code:
+        merged = found["LeRobotDataset"]("me/with_force", root="with_force")[20]
+        assert merged["observation.force_torque"].reshape(32, 6)[-1, 0] == 20 * 800 // 30 + 1
+
+
+STAMPS = [START_NS + 123_456_789, START_NS + 223_456_000]
+
+
+def test_stamps_are_read_from_tables_and_bags(tmp_path: Path) -> None:
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "frames.csv"
+    for texts in (STAMPS, ["2023-11-14T22:13:20.123456789Z", "2023-11-14T22:13:20.223456000Z"]):
+        path.write_text("\n".join(["frame,timestamp", *(f"{n},{text}" for n, text in enumerate(texts))]))
+        assert read_stamps(path).tolist() == STAMPS
+    path, exact = tmp_path / "frames.parquet", pa.array(STAMPS, pa.timestamp("ns"))
+    seconds = pa.array([stamp * 1e-9 for stamp in STAMPS])
+    for column in (pa.array(STAMPS), exact, exact.cast(pa.timestamp("us"), safe=False), seconds):
+        parquet.write_table(pa.table({"exposed": column}), path)
+        assert abs(read_stamps(path, "exposed") - STAMPS).max() < 1000
+    bag = write_bag(tmp_path / "bag", "/camera", [imu(stamp) for stamp in STAMPS])
+    assert read_stamps(bag, "/camera").tolist() == STAMPS
+
+
+@pytest.mark.parametrize(
+    ("rows", "arguments", "said"),
+    [
+        ([1.0, 0.9], (), "row 1 of {} (counted from 0) is before the row above it"),
+        ([-0.5, 1.0], (), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:19.500"),
+        ([1.0, 2.0, 2.6, 2.7], (), "row 2 of {} (counted from 0) is of 2023-11-14T22:13:22.600"),
+        ([0.5], ("--latency", 1), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:20.500"),
+        ([-1.7e9], (), "is of 1970-01-01T00:00:00.000000000Z, and samples were measured from 2023-11-"),
+        (["0.1", "soon"], (), "{} has no times in a column timestamp (choose one with --column"),
+        ([], (), "{} has no times in a column timestamp "),
+        ([1.0], ("--column", "t"), "{} has no times in a column t (choose"),
+        ([1.0], ("--tool", "{}"), "{} does not have a tool's parameters"),
+        ([1.0], ("--clock", "{}"), "{} is not what 'ethercat-export align' prints"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_done_is_said_and_leaves_nothing(
+    tmp_path: Path, rows: Sequence[Any], arguments: tuple[Any, ...], said: str
+) -> None:
+    run, path = tmp_path / "run.mcap", tmp_path / "frames.csv"
+    record(run, (frame(number) for number in range(2000)), **SETTINGS)
+    texts = [row if isinstance(row, str) else f"{START_NS * 1e-9 + row:.3f}" for row in rows]
+    path.write_text("\n".join(["timestamp,exposure", *(f"{text},1" for text in texts)]))
+    given = [str(argument).format(path) for argument in arguments]
+    ended = run_here(main, run, tmp_path / "out.npz", "--at", path, *given)
+    assert ended.code == 1
+    assert ended.err.count("\n") == 1
+    assert said.format(path) in ended.err
+    assert sorted(tmp_path.iterdir()) == [path, run]
+
+
+@pytest.mark.parametrize(
+    "arguments", ["out.csv --fps 30", "out.npz", "out.npz --fps 30 --at x", "out.npz --fps 30 --window 0"]
+)
+def test_wrong_usage(arguments: str) -> None:
+    assert run_here(main, "run.mcap", *arguments.split()).code == 2
