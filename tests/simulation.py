@@ -60,7 +60,7 @@ from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
-from ethercat_server.virtual_sensor.world import ToldWorld, World
+from ethercat_server.virtual_sensor.world import ExternalWorld, World
 from scripts.benchmarks.records import ClockReading, decode_clock
 from tests.server.running import OLD, Commanded, FramedClient
 
@@ -215,13 +215,13 @@ class Simulation(SimulatedBus):
 
         The sensors feel `world`, which is asked once a millisecond, with the simulated time, s.
         """
-        told = ToldWorld()
+        external = ExternalWorld()
         if world is not None:
-            sensors = tuple(replace(each, world=told) for each in sensors or (SensorOptions(),))
+            sensors = tuple(replace(each, world=external) for each in sensors or (SensorOptions(),))
         super().__init__(backend or MemoryBackend(*sensors, machine=machine))
         self.started_ns = self.clock.now_ns
         if world is not None:
-            self._ask(world, told, 0)
+            self._ask(world, external, 0)
         self.transport = InMemoryTransport(self.clock)
         self.frames: list[DataMessage] = []
         self.published_ns: list[int] = []  # when each was handed out
@@ -238,11 +238,11 @@ class Simulation(SimulatedBus):
         self.clients: list[Client] = []
         self.hangs = False  # whether somebody has stopped it; time passes all the same
 
-    def _ask(self, world: World, told: ToldWorld, step: int) -> None:
+    def _ask(self, world: World, external: ExternalWorld, step: int) -> None:
         """Tell the sensors what they feel in this millisecond, and in the following."""
         due_ns = self.started_ns + step * 1_000_000
-        told.tell(due_ns * 1e-9, world(step * 1e-3), due_ns * 1e-9)
-        self.clock.at(due_ns + 1_000_000, functools.partial(self._ask, world, told, step + 1))
+        external.take(due_ns * 1e-9, world(step * 1e-3), due_ns * 1e-9)
+        self.clock.at(due_ns + 1_000_000, functools.partial(self._ask, world, external, step + 1))
 
     def listen(self) -> Transport:
         """Where its clients come from."""

@@ -118,14 +118,16 @@ _FINITE_SECONDS: Final = 10  # seconds with finite samples only after which it i
 
 
 class SampleHealth:
-    """What the samples of the sensor `number` show of it; call `check` once a second."""
+    """What the samples of the sensor `number` show of it; call `check` once a second.
 
-    def __init__(self, number: int) -> None:
+    `take` gets those that are finite, by field.
+    """
+
+    def __init__(self, number: int, take: Callable[[Sequence[Sequence[float]]], object]) -> None:
         self._number = number
         self.not_finite = 0  # new samples with a number that is NaN or infinite
         self.newest: list[bytes] = []  # process data that was handed out since `count`
-        # Gets those that are finite, by field.
-        self.take: Callable[[Sequence[Sequence[float]]], object] = lambda _: None
+        self._take = take
         self._checked = (0, 0, 0)  # the counts of the last check: fresh, repeated, not finite
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
@@ -141,7 +143,7 @@ class SampleHealth:
         columns = list(zip(*layout_for(len(newest[0])).struct.iter_unpack(b"".join(newest)), strict=True))
         # An infinity or a NaN survives the sum, so that one look is enough for all of them.
         if math.isfinite(sum(map(sum, columns))):
-            self.take(columns)
+            self._take(columns)
         else:
             self.not_finite += sum(not is_finite(each) for each in newest)
 

@@ -32,12 +32,11 @@ REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INV
 
 
 class SensorStream:
-    """Numbers, stamps and marks the frames of the sensor `number`, which samples every `period_ns`."""
+    """Numbers, stamps and marks the frames of a sensor."""
 
     def __init__(
         self,
-        number: int,
-        period_ns: float,
+        sensor: Sensor,
         timing: ExchangeTiming,
         clock: Clock = SYSTEM_CLOCK,
         latching: DistributedClock | None = None,
@@ -48,12 +47,12 @@ class SensorStream:
 
         Its process data passes the slave `passing_ns` after the frame has arrived there.
         """
-        self.number = number
+        self.number = sensor.number
         self._monotonic_ns = clock.monotonic_ns
         self.realtime_offset = realtime_offset or RealtimeOffset(clock)
         self._timing = timing
         self._passing_ns = passing_ns
-        self.clock = self._new_clock(period_ns, latching)
+        self.clock = self._new_clock(sensor.period_ns, latching)
         self.process_data = b""  # the newest valid process data
         self._handed_out = b""  # what the last frame carried: a REPEATED or INVALID one carries it again
         self.sequence = 0
@@ -63,8 +62,8 @@ class SensorStream:
         self.recoveries = 0
         # From the estimated instant of a sample to its hand-out, while locked.
         self.age = RecentDistribution()
-        self.health = SampleHealth(number)
-        self.drift: Drift | None = None
+        self.drift = Drift(sensor, clock)
+        self.health = SampleHealth(sensor.number, self.drift.add)
         self._discard = DISCARDED_AT_START
         self._gap = 0  # number of new samples to come that have GAP
         self._silent = False  # whether REPEATED or INVALID frames were sent since the newest sample
@@ -177,8 +176,7 @@ class SensorStream:
     def check(self) -> None:
         """To be called once a second: log what the samples show of the sensor."""
         self.health.check(self.fresh, self.repeated, self.clock)
-        if self.drift is not None:
-            self.drift.second()
+        self.drift.second()
         events = self.clock.events
         if events is not None and events.trust.is_final:
             self.clock.events = None
@@ -192,8 +190,7 @@ class SensorStream:
             before, self.clock = self.clock.events, self._new_clock(period_ns, latching)
             if before is not None and self.clock.events is not None:
                 self.clock.events.trust.was_trusted = before.trust.was_trusted
-            if self.drift is not None:
-                self.drift.begin("return")
+            self.drift.begin("return")
             self._discard = DISCARDED_AT_START
             self._gap = 1
             self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
@@ -217,7 +214,7 @@ class SensorStream:
                 "offset_ppm": round((1 / (1 + clock.estimate.pull) - 1) * 1e6, 1),
                 "uncertainty_us": round(clock.uncertainty_ns / 1000, 1) if clock.locked else None,
             },
-            **(self.drift.as_json() if self.drift is not None else {}),
+            **self.drift.as_json(),
         }
 
 
@@ -225,12 +222,7 @@ def make_streams(bus: Bus, sensors: Sequence[Sensor], timing: ExchangeTiming) ->
     """Those of the sensors on a bus in OP."""
     offset = RealtimeOffset(bus.clock)
     passing_ns = {at.number: at.start * BYTE_NS for inputs in bus.process_data.inputs for at in inputs}
-    streams = []
-    for number, each in enumerate(sensors):
-        stream = SensorStream(
-            number, each.period_ns, timing, bus.clock, bus.read_clock(number), offset, passing_ns[number]
-        )
-        stream.drift = Drift(each, bus.clock)
-        stream.health.take = stream.drift.add
-        streams.append(stream)
-    return streams
+    return [
+        SensorStream(each, timing, bus.clock, bus.read_clock(number), offset, passing_ns[number])
+        for number, each in enumerate(sensors)
+    ]

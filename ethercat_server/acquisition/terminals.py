@@ -19,16 +19,17 @@ from ethercat_server.acquisition.stream import INVALID, REPEATED, OutgoingFrame
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.exchange import Exchange
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.sensor.scan import Slave
 
-# Which slaves are meant: vendor and product, position on the wire.
-CHOICE: Final = re.compile(r"(?:(0x[0-9a-fA-F]+):(0x[0-9a-fA-F]+)(?:@|$))?([0-9]+)?")
+# A choice of slaves: vendor and product, position on the wire.
+CHOICE: Final = re.compile(r"(?!$)(?:(0x[0-9a-fA-F]+):(0x[0-9a-fA-F]+)(?:@(?=[0-9])|$))?([0-9]{1,5})?")
 _UNASSIGNED: Final = 0xFF  # sync manager of a PDO that is not assigned by default
 # By the number of a data type in the SII (ETG.1020); others are unsigned.
-_LETTERS: Final = {0x08: "f", 0x11: "f", **dict.fromkeys((0x02, 0x03, 0x04, *range(0x10, 0x16)), "i")}
+_LETTERS: Final = {**dict.fromkeys((0x02, 0x03, 0x04, 0x10, *range(0x12, 0x16)), "i"), 0x08: "f", 0x11: "f"}
 _BOOL: Final = 0x01
 _ASSIGNMENTS: Final = 0x1C10  # object with the PDOs of the first sync manager; those of the others follow
 _MOST_ENTRIES: Final = 256  # so that a reply with all of them is not too long
@@ -54,7 +55,7 @@ class Terminal:
         layout: list[dict[str, Any]] = []
         bits, content = 0, slave.sii or dict[str, Any](sync_managers=(), tx_pdos=(), rx_pdos=())
         outputs = [pdo for pdo in content["rx_pdos"] if pdo["sync_manager"] != _UNASSIGNED and pdo["entries"]]
-        for manager, row in enumerate(content["sync_managers"]):
+        for manager, row in enumerate(content["sync_managers"][: reg.MOST_SYNC_MANAGERS]):
             outputs += [row] if row["kind"] == "outputs" and row["size"] else []
             begin = bits
             for pdo in content["tx_pdos"]:
@@ -152,13 +153,13 @@ def _described(pdo: str, entry: dict[str, Any], at: int, others: Sequence[dict[s
 
 
 def find_terminals(slaves: Sequence[Slave], choices: Sequence[str]) -> list[Terminal]:
-    """Those that are meant among slaves that are no sensors; BusError if one is absent, or cannot be one."""
+    """The chosen ones of the slaves beside the sensors; BusError if one is absent, or cannot be one."""
     for choice in choices:
-        if not any(_is_meant(slave, choice) for slave in slaves):
+        if not any(_matches(slave, choice) for slave in slaves):
             there = ", ".join(map(str, slaves)) or "sensors only"
             raise BusError(f"no terminal {choice} is on the bus ({there}): connect it, or do not name it")
-    meant = [slave for slave in slaves if any(_is_meant(slave, choice) for choice in choices)]
-    found = [Terminal(number, slave) for number, slave in enumerate(meant)]
+    chosen = [slave for slave in slaves if any(_matches(slave, choice) for choice in choices)]
+    found = [Terminal(number, slave) for number, slave in enumerate(chosen)]
     if sum(len(terminal.row["layout"]) for terminal in found) > _MOST_ENTRIES:
         raise BusError(f"the terminals have more than {_MOST_ENTRIES} PDO entries together: name fewer")
     return found
@@ -166,10 +167,10 @@ def find_terminals(slaves: Sequence[Slave], choices: Sequence[str]) -> list[Term
 
 def named_positions(choices: Sequence[str]) -> list[int]:
     """The positions on the wire that are named."""
-    return [int(position) for choice in choices for *_, position in CHOICE.findall(choice)[:1] if position]
+    return [int(position) for choice in choices if (position := CHOICE.findall(choice)[0][-1])]
 
 
-def _is_meant(slave: Slave, choice: str) -> bool:
+def _matches(slave: Slave, choice: str) -> bool:
     (vendor, product, position), row = CHOICE.findall(choice)[0], slave.as_json()
     is_kind = not vendor or (int(vendor, 0), int(product, 0)) == (row["vendor"], row["product"])
     return is_kind and position in ("", str(slave.position))

@@ -33,6 +33,7 @@ def kept(drifts: Sequence[Drift]) -> Iterator[None]:
                 try:
                     state.write(path, drift.history.kept())
                 except OSError as error:
+                    drift.history.changed = True
                     log.warning("the history of sensor %d is not kept: %s", drift.sensor.number, error)
 
     def write_now_and_then() -> None:

@@ -61,7 +61,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         notifier.send("READY=1")
         notifier.update(server)
         try:
-            with kept([stream.drift for stream in server.streams if stream.drift is not None]):
+            with kept([stream.drift for stream in server.streams]):
                 server.run()
         finally:
             notifier.send("STOPPING=1")

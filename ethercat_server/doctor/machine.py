@@ -159,13 +159,6 @@ class Machine:
         """The online processors."""
         return processor_list(self.text("/sys/devices/system/cpu/online"))
 
-    def has_capability(self, bit: int) -> bool:
-        """Whether this process has a capability."""
-        found = re.search(r"^CapEff:\s*([0-9a-fA-F]+)$", self.text("/proc/self/status"), re.MULTILINE)
-        if found is None:
-            raise CannotLookError("/proc/self/status does not list capabilities")
-        return bool(int(found[1], 16) >> bit & 1)
-
     def commands_running(self) -> dict[int, str]:
         """The visible processes by PID, with their short names."""
         pids = [int(name) for name in self.names("/proc") if name.isdecimal()]

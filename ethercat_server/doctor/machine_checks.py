@@ -27,7 +27,13 @@ from ethercat_server.doctor.report import (
     skipped,
     warning,
 )
-from ethercat_server.ethercat.nic import ALLOW_IP, Routes, network_trouble
+from ethercat_server.ethercat.nic import (
+    ALLOW_IP,
+    NEEDED_CAPABILITIES,
+    Routes,
+    missing_capabilities,
+    network_trouble,
+)
 
 Look = Callable[[Machine], Finding | Iterable[Finding]]
 
@@ -79,16 +85,15 @@ def _preemption(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-_NEEDED: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
-_CAPABILITIES: Final = _NEEDED | {14: "CAP_IPC_LOCK", 23: "CAP_SYS_NICE"}
+_CAPABILITIES: Final = NEEDED_CAPABILITIES | {14: "CAP_IPC_LOCK", 23: "CAP_SYS_NICE"}
 
 
 def _capabilities(machine: Machine) -> Finding:
-    missing = [name for bit, name in _CAPABILITIES.items() if not machine.has_capability(bit)]
+    missing = missing_capabilities(machine.text("/proc/self/status"), _CAPABILITIES)
     held = [name for name in _CAPABILITIES.values() if name not in missing]
     without = (
         "could not open the interface"
-        if {*missing} & {*_NEEDED.values()}
+        if {*missing} & {*NEEDED_CAPABILITIES.values()}
         else "would have a less steady cycle"
     )
     return graded(

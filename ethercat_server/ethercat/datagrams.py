@@ -140,12 +140,6 @@ class Datagrams:
             count += self._receive(left_ns * 1e-9) is not None
         return count
 
-    def read_surely(self, number: int, address: int, size: int) -> bytes:
-        """Read ESC registers of a sensor; BusError if it does not answer."""
-        if data := repeat(_REGISTER_ATTEMPTS, self.read_register, number, address, size):
-            return data
-        raise BusError(f"sensor {number} does not answer: check cable and power")
-
     def read_surely_at(self, position: int, address: int, size: int) -> bytes:
         """Read ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
         if data := repeat(_REGISTER_ATTEMPTS, self.read_at, position, address, size):

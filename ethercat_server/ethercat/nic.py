@@ -18,7 +18,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -375,7 +375,7 @@ def _in_use(ifname: str, process: int = 0) -> InterfaceError:
 MAX_NAME_LENGTH: Final = 15  # Linux's limit; a longer name would overflow SOEM's buffer
 
 _CARRIER_TIMEOUT_S: Final = 5.0
-_CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
+NEEDED_CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
 
 
 @contextlib.contextmanager
@@ -430,10 +430,10 @@ def _wait_usable(ifname: str) -> None:
         raise InterfaceError(problem)
 
 
-def missing_capabilities() -> list[str]:
-    """Those of this process that a master needs and that it has not."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("CapEff:"):
-            effective = int(line.split()[1], 16)
-            return [name for bit, name in _CAPABILITIES.items() if not effective >> bit & 1]
-    return []
+def missing_capabilities(
+    status: str | None = None, needed: Mapping[int, str] = NEEDED_CAPABILITIES
+) -> list[str]:
+    """Those of the `needed` ones, by bit, that are not in a /proc/PID/status, by default this process's."""
+    lines = (Path("/proc/self/status").read_text() if status is None else status).splitlines()
+    effective = next((int(line.split()[1], 16) for line in lines if line.startswith("CapEff:")), 0)
+    return [name for bit, name in needed.items() if not effective >> bit & 1]

@@ -8,7 +8,6 @@ recognized by its sync managers.
 from __future__ import annotations
 
 import logging
-import struct
 from collections.abc import Collection, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -36,8 +35,6 @@ _PAUSE_S: Final = 0.002
 # Start and length of a Bota sensor's sync managers 0 to 2, and start of the last one.
 _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
 _INPUTS: Final = 0x1180
-_SYNC_MANAGER: Final = struct.Struct("<HH4x")
-_LENGTH_AND_CONTROL: Final = struct.Struct("<2xHB3x")  # of a sync manager
 _NAMELESS: Final = "nameless"
 _KNOWN: Final = ("vendor", "product", "revision", "name")  # what `describe` says of a slave from its SII
 _MOST_LISTED: Final = 64
@@ -113,7 +110,7 @@ def look_safely(
         )
     at_work = [
         slave for slave in slaves
-        if slave.at_work and (slave.position not in ours or _has_outputs(bus, slave.position))
+        if slave.at_work and not (slave.position in ours and _only_reads(bus, slave))
     ]  # fmt: skip
     if at_work and not force:
         where = ", ".join(f"{slave.position} in {slave.status.state.name}" for slave in at_work)
@@ -189,16 +186,21 @@ class OtherSlaves:
             log.warning("%s does not answer any more", slave)
 
 
-def _has_sensors_managers(bus: Bus, position: int) -> bool:
+def _sync_managers(bus: Bus, position: int) -> list[tuple[int, ...]]:
     data = bus.read_surely_at(position, reg.SYNC_MANAGER, 4 * reg.SYNC_MANAGER_SIZE)
-    *others, inputs = _SYNC_MANAGER.iter_unpack(data)
+    return list(reg.SYNC_MANAGER_LAYOUT.iter_unpack(data))
+
+
+def _has_sensors_managers(bus: Bus, position: int) -> bool:
+    *others, inputs = ((start, length) for start, length, *_ in _sync_managers(bus, position))
     return tuple(others) == _MAILBOXES_AND_OUTPUTS and inputs in [(_INPUTS, size) for size in LAYOUTS]
 
 
-def _has_outputs(bus: Bus, position: int) -> bool:
-    managers = bus.read_surely_at(position, reg.SYNC_MANAGER, 4 * reg.SYNC_MANAGER_SIZE)
-    kinds = [control for length, control in _LENGTH_AND_CONTROL.iter_unpack(managers) if length]
-    return any(control & reg.SM_WRITE and not control & reg.SM_MAILBOX for control in kinds)
+def _only_reads(bus: Bus, slave: Slave) -> bool:
+    """Whether it has no outputs; in BOOT nobody knows."""
+    kinds = [control for _, length, control, *_ in _sync_managers(bus, slave.position) if length]
+    has_outputs = any(control & reg.SM_WRITE and not control & reg.SM_MAILBOX for control in kinds)
+    return not has_outputs and slave.status.state is not AlState.BOOT
 
 
 def _stopped(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:

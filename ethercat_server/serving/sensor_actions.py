@@ -191,16 +191,12 @@ class SensorActions:
             self._announce_change(sensor)
         return (yield from self._finish_change(sensor, save_too))
 
-    def _begin_drift(self, sensor: Sensor, cause: str) -> None:
-        if (drift := self._streams[sensor.number].drift) is not None:
-            drift.begin(cause)
-
     def _announce_change(self, sensor: Sensor) -> None:
-        self._begin_drift(sensor, "change")
+        self._streams[sensor.number].drift.begin("change")
         self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, **sensor.in_force()))
 
     def _announce_offset(self, sensor: Sensor) -> None:
-        self._begin_drift(sensor, "tare")
+        self._streams[sensor.number].drift.begin("tare")
         self._hub.broadcast(event(Event.OFFSET_CHANGED, sensor=sensor.number, offset=sensor.reported_offset))
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:

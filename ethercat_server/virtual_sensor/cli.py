@@ -31,7 +31,7 @@ from ethercat_server.virtual_sensor.options import (
     whole,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
-from ethercat_server.virtual_sensor.world import FAULT, LOST, ToldWorld
+from ethercat_server.virtual_sensor.world import FAULT, LOST, ExternalWorld
 
 _PROGRAM: Final = "ethercat-virtual-sensor"
 _SERIAL_NUMBERS: Final = 100  # for each bus: more than it has slaves
@@ -142,7 +142,7 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
             ppm=of("ppm", position, 0.0),
             dc=of("dc", position, ""),
             signal=args.signal,
-            world=ToldWorld(args.world_lost) if args.world else None,
+            world=ExternalWorld(args.world_lost) if args.world else None,
             noise=args.noise == "on",
             seed=position,
         )
@@ -220,7 +220,8 @@ def _send(path: str, command: str) -> int:
     try:
         answer = link.send(path, command)
     except OSError as error:
-        _say(f"no virtual sensor of yours listens at {path} ({error.strerror}): start one, or give --control")
+        why = error.strerror or error
+        _say(f"no virtual sensor of yours answers at {path} ({why}): start one, or give --control")
         return 1
     print(answer)
     return int(not answer.startswith("ok"))

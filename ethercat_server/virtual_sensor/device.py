@@ -12,7 +12,12 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from ethercat_server.ethercat.slave import sii
-from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry, ObjectType
+from ethercat_server.sensor.objects.dictionary import (
+    Access,
+    ObjectEntry,
+    ObjectType,
+    with_highest_subindices,
+)
 from ethercat_server.virtual_sensor import registers as reg
 
 MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS = range(1, 5)  # kinds of sync managers, as in object 0x1C00
@@ -110,16 +115,7 @@ def _mapping_rows(device: Device) -> list[ObjectEntry]:
 
 def entries_of(device: Device, rows: Iterable[ObjectEntry]) -> dict[tuple[int, int], ObjectEntry]:
     """These and those of the PDO mapping, with the highest sub-index of each object, in order of address."""
-    rows = [*rows, *_mapping_rows(device)]
-    highest: dict[int, int] = {}
-    for row in rows:
-        if row.subindex:
-            highest[row.index] = max(row.subindex, highest.get(row.index, 0))
-    rows += [
-        ObjectEntry(index, 0, "Highest sub-index", ObjectType.U8, Access.RO, last)
-        for index, last in highest.items()
-    ]
-    return {row.address: row for row in sorted(rows, key=lambda row: row.address)}
+    return {row.address: row for row in with_highest_subindices([*rows, *_mapping_rows(device)])}
 
 
 def build_image(device: Device) -> bytes:

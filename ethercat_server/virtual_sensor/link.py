@@ -26,7 +26,7 @@ from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, QuitCommand, obey
 from ethercat_server.virtual_sensor.options import SlaveOptions
-from ethercat_server.virtual_sensor.world import ToldWorld
+from ethercat_server.virtual_sensor.world import ExternalWorld
 
 _BUFFER = 2048
 _SOL_PACKET, _PACKET_AUXDATA, _ETH_P_ALL = 263, 8, 3
@@ -137,8 +137,8 @@ def _hear(world: socket.socket, bus: Bus) -> None:
             content = decode(world.recv(DATAGRAM.size + 1))
             if content is not None and content[0] < len(bus.sensors):
                 sensor, time_s, felt = content
-                if isinstance(told := bus.sensors[sensor].options.world, ToldWorld):
-                    told.tell(time_s, felt, time.monotonic())
+                if isinstance(external := bus.sensors[sensor].options.world, ExternalWorld):
+                    external.take(time_s, felt, time.monotonic())
 
 
 class CommandChannel(contextlib.ExitStack):
@@ -254,7 +254,7 @@ def bound(path: str, kind: socket.SocketKind, poller: select.poll) -> Iterator[s
     """A Unix socket that this user's programs find at `path` until the end; LinkError if it cannot be."""
     with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, kind) as probe:
         # Remove a stale socket, left by a killed process; nothing else.
-        if stat.S_ISSOCK(Path(path).stat().st_mode) and probe.connect_ex(path) != 0:
+        if probe.connect_ex(path) == errno.ECONNREFUSED and stat.S_ISSOCK(Path(path).stat().st_mode):
             Path(path).unlink()
     with socket.socket(socket.AF_UNIX, kind) as made:
         try:

@@ -16,7 +16,7 @@ from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.signals import FORMULAS, SCENES, Formula, Reading, reading_of
-from ethercat_server.virtual_sensor.world import Measured, ToldWorld
+from ethercat_server.virtual_sensor.world import ExternalWorld, Measured
 
 _PPM_SCALE = 10**12  # ppm in steps of one millionth
 
@@ -127,8 +127,8 @@ class Sampler:
     def measure(self, options: SensorOptions) -> None:
         """Measure the signal in `options`, which begins with the next sample."""
         world = options.world or SCENES.get(options.signal)
-        self._told = world if isinstance(world, ToldWorld) else None
-        self._signal_start = self.clock.instant(self._number + 1) if self._told is None else 0
+        self._external = world if isinstance(world, ExternalWorld) else None
+        self._signal_start = self.clock.instant(self._number + 1) if self._external is None else 0
         self._signal: Measured | Formula = (
             FORMULAS[options.signal] if world is None else Measured(world, options.seed, options.noise)
         )
@@ -150,7 +150,7 @@ class Sampler:
         now = self._now() + later
         number = self.number_at(now)
         if number != self._number:
-            if self._data and self._told is not None and self._told.is_faulty(now * 1e-9):
+            if self._data and self._external is not None and self._external.is_faulty(now * 1e-9):
                 return self._data
             self._data = self._prepared if number == self._prepared_number else self._make(number)
             self._number = number
@@ -160,7 +160,7 @@ class Sampler:
         """Compute the next sample, or that which a frame at `expected` will read, while there is time."""
         number = self.number_at(expected)
         number += number == self._number
-        if number != self._prepared_number and not self.stuck and self._told is None:
+        if number != self._prepared_number and not self.stuck and self._external is None:
             self._prepared = self._make(number)
             self._prepared_number = number
 

@@ -17,7 +17,7 @@ from bota_ethercat.world import Felt
 from ethercat_server.virtual_sensor.filters import LoadFilter, filtered, imu_filter
 from ethercat_server.virtual_sensor.signals import Reading, quaternion, reading_of
 
-World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MONOTONIC if it is told
+World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MONOTONIC if it is external
 
 _HOLD, ZERO, FAULT = LOST = ("hold", "zero", "fault")  # what a world that has stopped is taken for
 LOST_AFTER_S: Final = 0.1  # also by how much a time stamp may differ from the time
@@ -32,29 +32,29 @@ _FILTERS: Final = ("fir", "acceleration_filter", "angular_rate_filter")
 _ACCELERATION_NOISE, _ANGULAR_RATE_NOISE = 0.002, 0.04  # g, °/s
 
 
-class ToldWorld:
-    """A world that is told moment by moment, each of which holds until the next; at rest before the first."""
+class ExternalWorld:
+    """A world outside, moment by moment; each holds until the next. At rest before the first."""
 
     def __init__(self, lost: str = FAULT) -> None:
         self._lost = lost
-        self._told = deque([(-math.inf, _REST)], maxlen=_REMEMBERED)
+        self._moments = deque([(-math.inf, _REST)], maxlen=_REMEMBERED)
         self.counts = {"taken": 0, "refused": 0}  # moments
 
-    def tell(self, time_s: float, felt: Felt, now_s: float) -> None:
+    def take(self, time_s: float, felt: Felt, now_s: float) -> None:
         """A moment later than the one before; any other, or one far from now, is refused."""
-        is_good = time_s > self._told[-1][0] and abs(time_s - now_s) <= LOST_AFTER_S
+        is_good = time_s > self._moments[-1][0] and abs(time_s - now_s) <= LOST_AFTER_S
         self.counts["taken" if is_good else "refused"] += 1
         if is_good:
-            self._told.append((time_s, felt))
+            self._moments.append((time_s, felt))
 
     def is_faulty(self, now_s: float) -> bool:
         """Whether it has stopped, and the sensor gives nothing new therefore."""
-        return self._lost == FAULT and LOST_AFTER_S < now_s - self._told[-1][0] < math.inf
+        return self._lost == FAULT and LOST_AFTER_S < now_s - self._moments[-1][0] < math.inf
 
     def __call__(self, seconds: float) -> Felt:
         """What the sensor feels."""
-        at = bisect.bisect_right(self._told, seconds, key=operator.itemgetter(0))
-        begin_s, felt = self._told[max(0, at - 1)]
+        at = bisect.bisect_right(self._moments, seconds, key=operator.itemgetter(0))
+        begin_s, felt = self._moments[max(0, at - 1)]
         return _REST if self._lost == ZERO and seconds - begin_s > LOST_AFTER_S else felt
 
 

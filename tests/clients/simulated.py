@@ -23,6 +23,7 @@ from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.clock import Clock
 from ethercat_server.ethercat.exchange import Exchange
+from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults import obey
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -61,7 +62,8 @@ def simulate(
     wire = list[bytes]()
     end = start + round(seconds * 1e9)
     timing = ExchangeTiming(now)
-    stream = SensorStream(0, life.sampler.clock.sinc_length * 1e9 / 51200, timing, cast(Clock, clock))
+    settings = {"sinc_length": life.sampler.clock.sinc_length}
+    stream = SensorStream(Sensor(0, Identity("", 1, "", ""), settings), timing, cast(Clock, clock))
     while now < end:
         while todo and now >= start + todo[0][0] * 1e9:
             answer = obey(bus, todo.pop(0)[1])

@@ -85,7 +85,6 @@ PROCESSORS = [
     Case("capabilities", FINE),
     Case("capabilities", NOTE, NO_RIGHTS, values={"missing": NAMES}, commands=["sudo ethercat-doctor ens5"]),
     Case("capabilities", NOTE, {"/proc/self/status": f"CapEff:\t{3 << 12:016x}\n"}, said="less steady cycle"),
-    Case("capabilities", SKIP, {"/proc/self/status": "Name: x\n"}),
     Case("governor", FINE),
     Case("governor", LOOK, {GOVERNOR.replace("*", "2"): "powersave"}, said="performance on 3, powersave on 1",
          commands=[f"echo performance | sudo tee {GOVERNOR}"]),

@@ -3,8 +3,10 @@ temperature, overload; and what it keeps of that in files."""
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +22,7 @@ from ethercat_server.acquisition.drift import Drift
 from ethercat_server.daemon.histories import kept
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.virtual_sensor.options import SensorOptions
+from tests.server.running import wait_until
 from tests.simulation import ManualClock, Simulation
 
 NAMES = [field.name for field in PDO_FIELDS[:18]]
@@ -177,16 +180,25 @@ def test_a_hostile_file_is_a_new_history(text: str, tmp_path: Path, monkeypatch:
         assert json.loads(json.dumps(history.kept(), allow_nan=False))["saturated_at"] is None
 
 
-def test_a_history_stays_small_and_a_folder_that_cannot_be_written_is_told(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_history_stays_small_and_is_written_once_a_full_disk_has_space(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setenv("STATE_DIRECTORY", "/proc/nowhere")
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    monkeypatch.setattr("ethercat_server.daemon.histories._EVERY_S", 0.01)
     arm = Arm()
-    with kept([arm.drift]):
-        for n in range(100):
-            arm.drift.history.add_run([n / 3] * 6)
-        assert len(json.dumps(arm.drift.history.kept())) < 10_000
-    assert "the history of sensor 0 is not kept" in caplog.text
+    for n in range(100):
+        arm.drift.history.add_run([n / 3] * 6)
+    assert len(json.dumps(arm.drift.history.kept())) < 10_000
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", full)
+        with kept([arm.drift]):
+            arm.drift.history.changed = True
+            wait_until(lambda: "the history of sensor 0 is not kept: [Errno 28]" in caplog.text, "said")
+            disk.undo()
+    assert [path.name for path in tmp_path.iterdir()] == ["sensor-7.json"]
 
 
 @pytest.mark.parametrize(

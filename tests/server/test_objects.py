@@ -273,8 +273,9 @@ def run_tare(
     sdo: ScriptedSdo, samples: int, target: list[float], force: Iterator[float], rate_dps: float = 0.0
 ) -> dict[str, Any]:
     """Tare a sensor whose Fx, without offset, is the next of `force` with every step; it turns about z."""
-    stream, layout = SensorStream(0, 1_250_000, ExchangeTiming()), LAYOUTS[61]
-    steps = tare(sdo, new_sensor(), stream, samples, target)
+    sensor, layout = new_sensor(), LAYOUTS[61]
+    stream = SensorStream(sensor, ExchangeTiming())
+    steps = tare(sdo, sensor, stream, samples, target)
     while True:
         values = list(layout.struct.unpack(bytes(layout.size)))
         values[2] = next(force) + struct.unpack("<f", sdo.held.get((0x8000, 1), bytes(4)))[0]

@@ -132,6 +132,16 @@ def test_what_is_no_terminal_ends_the_start_with_a_sentence(text: str, choice: s
     assert [image[reg.AL_STATUS] for image in registers(backend)] == before
 
 
+def test_a_terminal_whose_firmware_is_being_written_is_not_touched() -> None:
+    backend = chain("BOTA,EL3102:OP")
+    terminal: Any = backend.sensors.slaves[1]
+    terminal.life.esc.memory[reg.AL_STATUS] = AlState.BOOT
+    before = registers(backend)
+    with pytest.raises(BusError, match=r"slaves at work .*position 1 in BOOT"):
+        Simulation(backend=backend, wanted=Asked(terminals=["1"]))
+    assert registers(backend) == before
+
+
 def test_nothing_is_read_that_nobody_names() -> None:
     simulation = reading("BOTA,EL3102")
     assert type(simulation.cycle) is Cycle
@@ -219,20 +229,24 @@ def test_other_pdos_than_the_sii_has_are_not_decoded(caplog: pytest.LogCaptureFi
     check_frames(client.frames)
 
 
-def test_padding_optional_pdos_and_equal_names_in_the_sii() -> None:
-    bit, gap, value = (
+def test_padding_optional_pdos_types_and_equal_names_in_the_sii() -> None:
+    bit, gap, value, *more = (
         {"index": index, "subindex": 1, "name": name, "type": kind, "bits": bits}
-        for index, name, kind, bits in ((0x6000, "Input", 1, 1), (0, "", 0, 7), (0x6001, "Input", 8, 32))
-    )
+        for index, name, kind, bits in (
+            (0x6000, "Input", 1, 1), (0, "", 0, 7), (0x6001, "Input", 8, 32),
+            (0x6002, "LREAL", 0x11, 64), (0x6003, "LINT", 0x15, 64), (0x6004, "ULINT", 0x1B, 64),
+        )
+    )  # fmt: skip
     managers = [{"start": 0x1000, "size": 1, "control": 0, "enabled": True, "kind": "inputs"}] * 2
-    rows = (0, [bit, gap, value]), (0xFF, [bit]), (1, [bit])
+    rows = (0, [bit, gap, value]), (0xFF, [bit]), (1, [bit, gap, *more])
     pdos = [{"name": "A", "sync_manager": manager, "entries": entries} for manager, entries in rows]
     content = {"vendor": 2, "product": 3, "revision": 1, "name": "X", "rx_pdos": pdos[1:2], "tx_pdos": pdos}
     status = AlStatus(AlState.INIT, error=False, code=0)
     terminal = Terminal(0, Slave(1, status, {**content, "sync_managers": managers}))
-    assert terminal.size == 6
+    assert terminal.size == 30
     assert [(*row.values(),) for row in terminal.row["layout"]] == [
-        ("A Input", "bool", 0, 1), ("A Input 0x6001:1", "f32", 8, 32), ("A Input 0x6000:1", "bool", 40, 1)
+        ("A Input", "bool", 0, 1), ("A Input 0x6001:1", "f32", 8, 32), ("A Input 0x6000:1", "bool", 40, 1),
+        ("A LREAL", "f64", 48, 64), ("A LINT", "i64", 112, 64), ("A ULINT", "u64", 176, 64),
     ]  # fmt: skip
 
 

@@ -127,7 +127,7 @@ def test_the_control_socket(
     assert sensor.wait() == 0
     assert not path.exists(), "nothing is left behind"
     assert main(["--control", str(path), "--send", "help"]) == 1
-    assert f"no virtual sensor of yours listens at {path} (No such file" in capsys.readouterr().err
+    assert f"no virtual sensor of yours answers at {path} (No such file" in capsys.readouterr().err
 
 
 @pytest.mark.long

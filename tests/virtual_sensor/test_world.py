@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
+import select
 import socket
 import statistics
 import struct
@@ -21,8 +22,9 @@ from bota_ethercat.client import World, connect
 from bota_ethercat.pdo import SampleDecoder
 from bota_ethercat.world import Felt, decode, encode
 from ethercat_server.simulation.machine import Machine
+from ethercat_server.virtual_sensor.link import LinkError, bound
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.world import LOST_AFTER_S, ToldWorld
+from ethercat_server.virtual_sensor.world import LOST_AFTER_S, ExternalWorld
 from tests.server.running import needs_bus, server, wait_until
 from tests.simulation import Simulation, fresh
 from tests.virtual_sensor.conftest import Start
@@ -60,10 +62,10 @@ def test_what_is_no_datagram_is_dropped(data: bytes) -> None:
 
 
 def test_a_moment_holds_until_the_next_and_comes_in_order() -> None:
-    world = ToldWorld()
+    world = ExternalWorld()
     assert world(5.0) == push(0.0), "at rest before the first"
     for time_s, newtons in ((10.0, 1.0), (10.001, 2.0), (10.0005, 3.0), (math.nan, 3.0), (10.2, 3.0)):
-        world.tell(time_s, push(newtons), 10.001)
+        world.take(time_s, push(newtons), 10.001)
     assert world.counts == {"taken": 2, "refused": 3}
     assert [world(t).wrench[0] for t in (9.999, 10.0, 10.0009, 10.001, 11.0)] == [0.0, 1.0, 1.0, 2.0, 2.0]
 
@@ -71,12 +73,12 @@ def test_a_moment_holds_until_the_next_and_comes_in_order() -> None:
 @pytest.mark.parametrize(("lost", "newtons"), [("hold", 8.0), ("zero", 0.0), ("fault", None)])
 def test_a_world_that_stops(lost: str, newtons: float | None) -> None:
     """None: the sensor gives nothing new, until the world goes on."""
-    world = ToldWorld(lost)
+    world = ExternalWorld(lost)
     master = RawMaster(SensorOptions(world=world, noise=False)).go(OP)
 
     def go_on(count: int) -> bytes:
         for _ in range(count):
-            world.tell(master.now * 1e-9, push(8.0), master.now * 1e-9)
+            world.take(master.now * 1e-9, push(8.0), master.now * 1e-9)
             master.wait(MS)
         return master.inputs()
 
@@ -185,3 +187,16 @@ def test_the_example_in_real_time_runs(tmp_path: Path) -> None:
             forces.append(sample.force[2])
             if len(forces) == 400 and abs(statistics.mean(forces) + 10.0) < 0.2:
                 break
+
+
+def test_the_live_socket_of_another_program_is_not_taken_for_a_stale_one(tmp_path: Path) -> None:
+    path = str(tmp_path / "socket")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as theirs:
+        theirs.bind(path)
+        theirs.listen()
+        with (
+            pytest.raises(LinkError, match="Address already in use"),
+            bound(path, socket.SOCK_DGRAM, select.poll()),
+        ):
+            pass
+        assert Path(path).is_socket()

@@ -22,7 +22,6 @@ from ethercat_server.ethercat.slave.sii import OF_FIRMWARE
 _START_ATTEMPTS: Final = 20
 _MOST_BYTES: Final = 1486  # of process data in a frame
 _MAILBOXES_END: Final = 2 * reg.SYNC_MANAGER_SIZE
-_SYNC_MANAGER: Final = struct.Struct("<2xHBxBx")  # length, control, activation
 _HARDWARE: Final = struct.Struct("<BBxxH")  # numbers of FMMUs and of sync managers, features
 
 
@@ -64,6 +63,11 @@ class SlaveController:
         data = repeat(self.attempts, self._bus.read_register, self.number, reg.AL_STATUS, reg.AL_STATUS_SIZE)
         return AlStatus.parse(data) if data else None
 
+    def _read(self, address: int, size: int) -> bytes:
+        if data := repeat(self.attempts, self._bus.read_register, self.number, address, size):
+            return data
+        raise self._gone()
+
     def write(self, address: int, data: bytes) -> None:
         """Write registers; GoneError if it does not answer."""
         if not repeat(self.attempts, self._bus.write_register, self.number, address, data):
@@ -87,9 +91,7 @@ class SlaveController:
 
     def enter_preop(self) -> Steps[None]:
         """Through INIT, clearing what another master has set up (FMMUs, sync managers, SYNC0)."""
-        yield from self.go(AlState.INIT)
-        self._read_hardware()
-        self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
+        yield from self._enter_init()
         self._bus.write_register(self.number, reg.DC_ACTIVATION, b"\0\0")  # a controller without DC refuses
         yield
         self.write(reg.SYNC_MANAGER, self._mailboxes.ljust(self._count * reg.SYNC_MANAGER_SIZE, b"\0"))
@@ -109,13 +111,18 @@ class SlaveController:
     def leave(self, state: AlState) -> Steps[None]:
         """Go to INIT, or PREOP if it was found there, with nothing mapped and without a station address."""
         self.attempts = _START_ATTEMPTS
+        if state >= AlState.PREOP:
+            yield from self.enter_preop()
+        else:
+            yield from self._enter_init()
+            self.write(reg.SYNC_MANAGER, bytes(self._count * reg.SYNC_MANAGER_SIZE))
+        self.write(reg.STATION_ADDRESS, bytes(2))
+
+    def _enter_init(self) -> Steps[None]:
+        """Without FMMUs."""
         yield from self.go(AlState.INIT)
         self._read_hardware()
         self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
-        self.write(reg.SYNC_MANAGER, bytes(self._count * reg.SYNC_MANAGER_SIZE))
-        if state >= AlState.PREOP:
-            yield from self.enter_preop()
-        self.write(reg.STATION_ADDRESS, bytes(2))
 
     def mapped_size(self, assignment: int, in_sii: int) -> Steps[int]:
         """Bytes of process data by the PDOs that the object `assignment` lists; `in_sii` if there is none.
@@ -156,13 +163,13 @@ class SlaveController:
         SetUpError if something was not written: SOEM writes it once and does not verify it.
         """
         self._read_hardware()
-        self._fmmus = self._bus.read_surely(self.number, reg.FMMU, self._units * reg.FMMU_SIZE)
+        self._fmmus = self._read(reg.FMMU, self._units * reg.FMMU_SIZE)
         rows = reg.FMMU_LAYOUT.iter_unpack(self._fmmus)
         self.areas = [Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1]
-        data = self._bus.read_surely(self.number, reg.SYNC_MANAGER, self._count * reg.SYNC_MANAGER_SIZE)
+        data = self._read(reg.SYNC_MANAGER, self._count * reg.SYNC_MANAGER_SIZE)
         used = {
             reg.FMMU_WRITE if control & reg.SM_WRITE else reg.FMMU_READ: at * reg.SYNC_MANAGER_SIZE
-            for at, (length, control, active) in enumerate(_SYNC_MANAGER.iter_unpack(data))
+            for at, (_, length, control, _, active, _) in enumerate(reg.SYNC_MANAGER_LAYOUT.iter_unpack(data))
             if length and active & 1 and not control & reg.SM_MAILBOX
         }
         if {area.kind for area in self.areas} != used.keys():
@@ -213,6 +220,6 @@ class SlaveController:
 
     def _read_hardware(self) -> None:
         if not self._count:
-            data = self._bus.read_surely(self.number, reg.FMMU_AND_SM_COUNT, _HARDWARE.size)
+            data = self._read(reg.FMMU_AND_SM_COUNT, _HARDWARE.size)
             units, count, self.features = _HARDWARE.unpack(data)
             self._units, self._count = min(units, reg.MOST_FMMUS), min(count, reg.MOST_SYNC_MANAGERS)

@@ -82,9 +82,9 @@ MOST_FMMUS: Final = 16
 MOST_SYNC_MANAGERS: Final = 16
 SM_CONTROL_MAILBOX_OUT: Final = 0x26
 SM_CONTROL_MAILBOX_IN: Final = 0x22
-_SYNC_MANAGER: Final = struct.Struct("<HHBBBB")
+SYNC_MANAGER_LAYOUT: Final = struct.Struct("<HHBBBB")
 
 
 def pack_sync_manager(start: int, length: int, control: int) -> bytes:
     """The registers of a sync manager, activated; zeros without a length."""
-    return _SYNC_MANAGER.pack(start, length, control, 0, 1, 0) if length else bytes(SYNC_MANAGER_SIZE)
+    return SYNC_MANAGER_LAYOUT.pack(start, length, control, 0, 1, 0) if length else bytes(SYNC_MANAGER_SIZE)

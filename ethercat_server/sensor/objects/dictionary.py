@@ -10,7 +10,7 @@ import difflib
 import re
 import struct
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -245,26 +245,21 @@ def is_sensor(vendor: int, product: int) -> bool:
     return (vendor, product) == (VENDOR_ID, PRODUCT_CODE)
 
 
-def _highest_subindices() -> Iterator[ObjectEntry]:
-    """Sub-index 0 of each object that has parts, as Listing III.6 reads it."""
+def with_highest_subindices(rows: Sequence[ObjectEntry]) -> list[ObjectEntry]:
+    """By address, with sub-index 0 of each object that has parts, as Listing III.6 reads it."""
     highest: dict[int, int] = {}
-    for row in OBJECTS:
+    for row in rows:
         if row.subindex:
             highest[row.index] = max(row.subindex, highest.get(row.index, 0))
-    for index, last in highest.items():
-        yield ObjectEntry(index, 0, "Highest sub-index", ObjectType.U8, Access.RO, last)
+    added = (ObjectEntry(index, 0, "Highest sub-index", U8, RO, last) for index, last in highest.items())
+    return sorted((*rows, *added), key=lambda row: row.address)
 
 
 # Every object in Bota's manual, also those that the firmware seen does not have.
 KNOWN_OBJECTS: Final[tuple[ObjectEntry, ...]] = tuple(
-    sorted(
-        (
-            *OBJECTS,
-            *_highest_subindices(),
-            # Table III.1 has it, without a type; the firmware seen has none.
-            ObjectEntry(0x8003, 0, "Force/torque range", ObjectType.OCTETS, Access.RO, ""),
-        ),
-        key=lambda row: row.address,
+    with_highest_subindices(
+        # Table III.1 has the last one, without a type; the firmware seen has none.
+        (*OBJECTS, ObjectEntry(0x8003, 0, "Force/torque range", OCTETS, RO, ""))
     )
 )
 
