@@ -53,6 +53,11 @@ class VirtualBus:
         self._number = number
         self._process: subprocess.Popen[str] | None = None
 
+    @property
+    def pid(self) -> int:
+        """Process id of the sensor; 0 while the bus is down."""
+        return self._process.pid if self._process else 0
+
     def __enter__(self) -> VirtualBus:
         """Start the sensor's process and wait until it answers; ServerError if it does not."""
         command = [sys.executable, "-P", "-m", "ethercat_server.virtual_sensor.virtual_bus"]
