@@ -83,12 +83,12 @@ class VirtualBus:
                 + ": see its message above"
                 + ("" if code == _USAGE_EXIT_CODE else "; it needs root, or a kernel with user namespaces")
             )
-        self._enter_namespaces(Path(f"/proc/{self._process.pid}/ns"))
+        self._enter_namespaces()
         return self
 
-    def _enter_namespaces(self, theirs: Path) -> None:
+    def _enter_namespaces(self) -> None:
         """Those of the sensor, if it has a user namespace of its own."""
-        own = Path("/proc/self/ns")
+        own, theirs = Path("/proc/self/ns"), Path(f"/proc/{self.pid}/ns")
         if (own / "user").readlink() == (theirs / "user").readlink():
             return
         with (theirs / "user").open() as user, (theirs / "net").open() as network:
