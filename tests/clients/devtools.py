@@ -82,9 +82,9 @@ class Page:
         """Until a JavaScript expression is true."""
         wait_until(lambda: bool(self.value(expression)), expression)
 
-    def size(self, width: int, height: int, *, dark: bool = False, ratio: int = 1) -> None:
+    def size(self, width: int, height: int, *, dark: bool = False) -> None:
         self.ask(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=ratio,
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
             mobile=False,
         )  # fmt: skip
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}

@@ -8,13 +8,7 @@ import pytest
 
 from bota_ethercat.address import Address
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.clients.cpp_programs import (
-    Reading,
-    assert_no_faults,
-    driver,
-    needs_gxx,
-    patient,
-)
+from tests.clients.cpp_programs import Reading, assert_no_faults, driver, needs_gxx, patient
 from tests.served_simulation import ServedSimulation, served
 from tests.server.running import free_port, wait_until
 

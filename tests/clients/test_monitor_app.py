@@ -85,7 +85,7 @@ def test_a_recording_is_not_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not stopped
 
 
-def test_what_does_not_fit_is_scrolled_to() -> None:
+def test_what_does_not_fit_is_scrolled_to_and_another_size_is_drawn_anew() -> None:
     async def scene(stage: Stage) -> None:
         assert "Clients" not in stage.shown()
         await stage.press("end")
@@ -94,6 +94,10 @@ def test_what_does_not_fit_is_scrolled_to() -> None:
         assert "Clients" in text
         assert "localhost:12001" in text.splitlines()[0]
         assert "quit" in text.splitlines()[-1]
+        await stage.pilot.resize_terminal(60, 15)
+        await stage.pilot.pause()
+        rows = stage.shown().splitlines()
+        assert (len(rows), {len(row) for row in rows}) == (15, {60})
 
     play(scene)
 
@@ -137,14 +141,3 @@ def test_keys_that_end_it(key: str) -> None:
         assert not stage.app.is_running or stage.app._exit
 
     assert play(scene).app.return_code == 0
-
-
-def test_another_size_is_drawn_anew() -> None:
-    async def scene(stage: Stage) -> None:
-        await stage.pilot.resize_terminal(60, 15)
-        await stage.pilot.pause()
-        rows = stage.shown().splitlines()
-        assert len(rows) == 15
-        assert {len(row) for row in rows} == {60}
-
-    play(scene)

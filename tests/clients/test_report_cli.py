@@ -220,7 +220,6 @@ def test_sensors_are_chosen_by_place_serial_or_name(report: Report) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("localhost:12001", "is a server's address, no recording: write --server localhost:12001"),
         ("a.mcap --server localhost:1", "give a recording, or --server"),
         ("a.mcap --seconds 5", "--seconds is for listening"),
         ("--server localhost:x", "HOST:PORT"),
