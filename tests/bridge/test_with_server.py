@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import time
 from collections.abc import Callable
 from typing import Any
@@ -25,7 +26,12 @@ def test_both_as_processes(listener: Listener, start_process: StartProcess) -> N
         node = start_process(running.port)
         arrays = listener.subscribe(DiagnosticArray, "diagnostics")
         wrenches = listener.subscribe(WrenchStamped, "wrench", depth=20)
-        assert six(wrenches.get(timeout=PATIENCE_S)) == pytest.approx(CONSTANT)
+        try:
+            wrench = wrenches.get(timeout=PATIENCE_S)
+        except queue.Empty:
+            arrived = listener.messages.qsize()
+            pytest.fail(f"no wrench, and {arrived} arrays; node: {node.log}; server: {running.said()}")
+        assert six(wrench) == pytest.approx(CONSTANT)
         array: dict[str, Any] = {}
         while not array or {level(array["link"]), level(array["sensor"])} != {"ok"}:
             statuses = arrays.get(timeout=PATIENCE_S).status
