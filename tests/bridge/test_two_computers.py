@@ -18,6 +18,8 @@ from tests.served_simulation import served
 from tests.server.running import HERE, Program, Veth, another_machine, free_port, on_a_bus
 from tests.simulation import more_if_long
 
+# Shared memory does not know network namespaces: another computer has its own.
+ALONE = ["unshare", "--mount", "sh", "-c", 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', "sh"]
 ENVIRONMENT = ["env", "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST"]
 ASK = """
 import os, rclpy
@@ -59,7 +61,7 @@ def test_topics_and_services_cross_the_network_without_multicast(there: list[str
         node = Program("bridge.client", options.split(), under=[*ENVIRONMENT, *servers * by_server])
         try:
             asked = [*ENVIRONMENT, *(servers if by_server else [f"ROS_STATIC_PEERS={HERE}"])]
-            command = [*there, *asked, sys.executable, "-c", ASK]
+            command = [*there, *ALONE, *asked, sys.executable, "-c", ASK]
             told = subprocess.run(command, check=False, capture_output=True, text=True, timeout=PATIENCE_S)
             assert told.stdout.startswith("ft_sensor bias of"), (told, node.said())
         finally:
