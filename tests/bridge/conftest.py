@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from tests.bridge.scripted_server import ScriptedServer
+from tests.server.running import steady_addresses
 
 
 class _WithoutRos(pytest.Module):
@@ -48,9 +49,10 @@ def _ros() -> Iterator[None]:
 def listener() -> Iterator[Any]:
     from tests.bridge.real_node import Listener
 
-    opened = Listener()
-    yield opened
-    opened.close()
+    with steady_addresses():
+        opened = Listener()
+        yield opened
+        opened.close()
 
 
 @pytest.fixture

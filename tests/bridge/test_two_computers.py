@@ -5,6 +5,7 @@ Real processes in two network namespaces: who finds whom is for the middleware a
 
 from __future__ import annotations
 
+import fcntl
 import shutil
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.real_node import PATIENCE_S
 from tests.served_simulation import served
-from tests.server.running import HERE, Program, Veth, another_machine, free_port, on_a_bus
+from tests.server.running import HERE, Program, Veth, another_machine, free_port, on_a_bus, steady_addresses
 from tests.simulation import more_if_long
 
 # Shared memory does not know network namespaces: another computer has its own.
@@ -42,7 +43,7 @@ os._exit(0)
 
 @pytest.fixture
 def there() -> Iterator[list[str]]:
-    with Veth() as veth:
+    with steady_addresses(fcntl.LOCK_EX), Veth() as veth:
         veth.ip("address", "add", f"{HERE}/30", "dev", veth.near)
         with another_machine(veth) as command:
             yield command

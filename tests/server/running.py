@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import random
@@ -334,6 +335,17 @@ class Veth:
     @staticmethod
     def ip(*arguments: str) -> str:
         return subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True).stdout
+
+
+@contextlib.contextmanager
+def steady_addresses(lock_for: int = fcntl.LOCK_SH) -> Iterator[None]:
+    """No other worker changes the addresses of interfaces meanwhile; LOCK_EX: this one does.
+
+    Fast DDS reads the addresses when a participant begins: two that began with others do not find each other.
+    """
+    with Path(f"/dev/shm/test-addresses-{os.getuid()}").open("a") as lock:
+        fcntl.flock(lock, lock_for)
+        yield
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ Who a client is only the kernel knows, so these are real sockets.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import grp
 import itertools
 import json
@@ -37,6 +38,7 @@ from tests.server.running import (
     free_port,
     on_a_bus,
     server,
+    steady_addresses,
     wait_until,
 )
 
@@ -160,7 +162,7 @@ def with_server(test: Callable[..., None]) -> Callable[..., None]:
 @pytest.fixture(scope="module")
 def veth() -> Iterator[Veth]:
     """The cable to another machine."""
-    with Veth() as found:
+    with steady_addresses(fcntl.LOCK_EX), Veth() as found:
         found.ip("address", "add", f"{HERE}/30", "dev", found.near)
         yield found
 

@@ -6,6 +6,7 @@ What the kernel says of one, and whose lock it is, only the kernel knows.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import signal
 import socket
@@ -27,7 +28,7 @@ from ethercat_server.process.signals import Signals
 from tests import rights
 from tests.doctor.running import doctor_here
 from tests.rights import NOBODY, as_user, needs_another_user
-from tests.server.running import Veth, needs_bus, wait_until
+from tests.server.running import Veth, needs_bus, steady_addresses, wait_until
 from tests.tool.running import tool_here
 
 pytestmark = [pytest.mark.bus, needs_bus]
@@ -148,11 +149,12 @@ def test_the_default_route_is_refused_unless_it_is_allowed() -> None:
 
 @contextlib.contextmanager
 def address(veth: Veth, *options: str) -> Iterator[None]:
-    veth.ip("address", "add", "192.0.2.77/32", "dev", veth.near, *options)
-    try:
-        yield
-    finally:
-        veth.ip("address", "flush", "dev", veth.near)
+    with steady_addresses(fcntl.LOCK_EX):
+        veth.ip("address", "add", "192.0.2.77/32", "dev", veth.near, *options)
+        try:
+            yield
+        finally:
+            veth.ip("address", "flush", "dev", veth.near)
 
 
 def test_an_address_for_some_time_is_refused_by_server_tool_and_doctor_and_marked(veth: Veth) -> None:
