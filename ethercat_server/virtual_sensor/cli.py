@@ -151,17 +151,22 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
     return tuple(sensors) if chain is None else slaves_in(chain, sensors)
 
 
+def _get_priority() -> None:
+    """That of SCHED_FIFO above a master's: real sensors do not wait for a CPU."""
+    priority = DEFAULT_PRIORITY + 1
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        _say(f"not granted: real-time priority {priority} (CAP_SYS_NICE); samples may come late")
+
+
 def main(
-    argv: Sequence[str] | None = None,
-    on_open: Callable[[], None] = lambda: None,
-    number: int = 0,
-    priority: int = DEFAULT_PRIORITY + 1,
+    argv: Sequence[str] | None = None, on_open: Callable[[], None] = _get_priority, number: int = 0
 ) -> int:
     """Run the virtual sensor: 0 when ended, 1 on failure, 2 for wrong arguments.
 
     `on_open` is called once its interface is open, before it reads anything. The default serial numbers go by
-    `number`, or by the interface's MAC address. `priority` is that of SCHED_FIFO, above a master's: real
-    sensors do not wait for a CPU; 0 for ordinary scheduling.
+    `number`, or by the interface's MAC address.
     """
     parser = build_parser()
     args = parser.parse_args(argv)
@@ -183,14 +188,6 @@ def main(
         + (f", beside {', '.join(foreign)}" if foreign else "")
     )
 
-    def opened() -> None:
-        try:
-            if priority:
-                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        except PermissionError:
-            _say(f"not granted: real-time priority {priority} (CAP_SYS_NICE); samples may come late")
-        on_open()
-
     try:
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)  # reading from the terminal must not suspend it
         with signals_call(stopped.set):
@@ -202,7 +199,7 @@ def main(
                 world_path=args.world,
                 commands=sys.stdin,
                 exit_on_eof=args.exit_on_eof,
-                on_open=opened,
+                on_open=on_open,
                 on_ready=lambda: print(ready, flush=True),
             )
     except link.LinkError as error:

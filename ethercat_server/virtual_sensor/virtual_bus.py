@@ -166,13 +166,16 @@ def main(argv: Sequence[str]) -> int:
             sys.stderr.write(f"ethercat-virtual-sensor: cannot create a veth pair: {why}\n")
             return 1
 
-        def give_up_root() -> None:
+        def opened() -> None:
+            if int(priority):
+                with contextlib.suppress(PermissionError):  # the master says what it was not granted itself
+                    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(priority)))
             # Deleting an interface in the server's namespace takes rights.
             if far == _FAR_END and (found := user_to_become(user or None)):
                 become(found)
 
         try:
-            return cli.main([far, "--exit-on-eof", *arguments], give_up_root, int(number), int(priority))
+            return cli.main([far, "--exit-on-eof", *arguments], opened, int(number))
         except ServerError as error:
             sys.stderr.write(f"ethercat-virtual-sensor: {error}\n")
             return 1
