@@ -42,6 +42,7 @@ from bridge.stream.link import (
     offset_text,
 )
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
+from ft_compensation.identification.estimation import CONFIDENCE
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
 from ft_compensation.identification.poses import Pose, coverage, pose_of
@@ -246,7 +247,7 @@ class IdentifyServices:
         text = ". ".join([*parts, f"{self._write(result, parts)}; identify/apply puts it in force"])
         fields = {
             "poses": result.coverage.poses,
-            "confidence": result.confidence,
+            "confidence": CONFIDENCE,
             "mass": result.payload.mass,
             "mass_interval": result.mass_interval,
             "center": result.payload.center,

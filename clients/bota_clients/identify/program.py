@@ -19,6 +19,7 @@ from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
+from ft_compensation.identification.estimation import CONFIDENCE
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
@@ -52,7 +53,7 @@ def show_result(console: Console, result: Identified) -> None:
     table = Table(title="payload and bias", title_justify="left")
     table.add_column("")
     table.add_column("value", justify="right")
-    table.add_column(f"± ({100 * result.confidence:g} %)", justify="right")
+    table.add_column(f"± ({100 * CONFIDENCE:g} %)", justify="right")
     table.add_column("unit")
     table.add_row("mass", f"{result.payload.mass:.4f}", f"{result.mass_interval:.4f}", "kg")
     center, interval = ([1000 * x for x in each] for each in (result.payload.center, result.centre_interval))
@@ -106,7 +107,7 @@ def as_json(
         "tool_center_of_gravity_interval": result.centre_interval,
         "bias": result.bias.values,
         "bias_interval": result.bias_interval.values,
-        "confidence": result.confidence,
+        "confidence": CONFIDENCE,
         "force_rms": result.force_fit.rms,
         "torque_rms": result.torque_fit.rms,
         "force_fit": result.force_fit._asdict(),

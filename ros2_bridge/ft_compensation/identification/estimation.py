@@ -20,6 +20,7 @@ import numpy as np
 from ft_compensation.identification.weighted import Array, Known, Solution, solve, two_sided
 from ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
 
+CONFIDENCE: Final = 0.95  # of all intervals
 # m/s²: what is assumed of the length of a mean acceleration beyond offset and sensitivities, ...
 _LENGTH_DEVIATION: Final = 0.002
 _LENGTH_DEGREES: Final = 6.0  # ... as if it were estimated from so many residuals.
@@ -42,7 +43,7 @@ class Value(NamedTuple):
     """Some estimated quantities."""
 
     value: Array
-    half: Array  # half the width of the confidence interval
+    half: Array  # half the width of the interval, of `CONFIDENCE`
 
 
 class Estimate(NamedTuple):
@@ -62,7 +63,6 @@ class Estimate(NamedTuple):
 def estimate(
     wrench: Array,
     gravity: Array,
-    confidence: float = 0.95,
     acceleration: Array | None = None,
     acceleration_variance: Array | float = 0.0,
     regressor: Array | None = None,
@@ -95,7 +95,7 @@ def estimate(
     rows[..., 4:7, :] /= divisor[..., np.newaxis]
     rows[..., 4:7, 0] = -center / divisor
     deviation, degrees = solution.student(rows)
-    half = two_sided(confidence, degrees) * deviation
+    half = two_sided(CONFIDENCE, degrees) * deviation
     linear = 10
     if regressor is not None:
         linear = 16
@@ -121,7 +121,7 @@ def estimate(
     )
 
 
-def calibrate(acceleration: Array, gravity: Array, confidence: float) -> tuple[Value, Value, Value] | None:
+def calibrate(acceleration: Array, gravity: Array) -> tuple[Value, Value, Value] | None:
     """Offset, scale and cross-axis terms of an accelerometer that reads (n, 3) where gravity is known (n, 3).
 
     Each axis of the specific force, -gravity, is an affine function of the three that are read, by least
@@ -135,7 +135,7 @@ def calibrate(acceleration: Array, gravity: Array, confidence: float) -> tuple[V
         return None
     variance = ((gravity + rows @ answer) ** 2).sum(axis=0) / degrees
     spread = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))[:, np.newaxis] * variance)
-    half = two_sided(confidence, degrees) * spread
+    half = two_sided(CONFIDENCE, degrees) * spread
     scale = 1.0 / np.diag(straight)
     return (
         Value(-np.linalg.solve(straight, answer[3]), half[3]),

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from ft_compensation.identification.estimation import Estimate, Value, calibrate, estimate
+from ft_compensation.identification.estimation import CONFIDENCE, Estimate, Value, calibrate, estimate
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
 from ft_compensation.identification.weighted import Array
 from ft_compensation.quantities import (
@@ -74,7 +74,10 @@ class OffsetFit(NamedTuple):
 
 
 class Identified(NamedTuple):
-    """The answer. Every `..._interval` is half the width of the confidence interval."""
+    """The answer. Every `..._interval` is half the width of an interval of `CONFIDENCE`, by Student's t.
+
+    Each axis has the variance that its residuals show.
+    """
 
     payload: Payload
     bias: Wrench
@@ -82,8 +85,6 @@ class Identified(NamedTuple):
     mass_interval: float  # kg
     centre_interval: Vector3  # m
     bias_interval: Wrench  # N, Nm
-    # Of the intervals: 0.95 as a rule. Student's t; each axis has the variance that its residuals show.
-    confidence: float
     residuals: tuple[Wrench, ...]  # what the answer leaves of each pose, in order: measured minus modelled
     coverage: Coverage
     notes: tuple[str, ...]  # what a person should know, sentences: a pose that does not fit, a wide interval
@@ -95,7 +96,7 @@ class Identified(NamedTuple):
     touched: int | None = None  # index of the pose that does not fit the others
 
 
-def identify(poses: Sequence[Pose], *, confidence: float = 0.95) -> Identified:
+def identify(poses: Sequence[Pose]) -> Identified:
     """Mass, center of gravity and bias from `poses`.
 
     At least four, with gravity in directions that do not lie on one line; six with each axis of the sensor
@@ -114,7 +115,7 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95) -> Identified:
         raise IdentificationError(f"the poses do not suffice: {seen.missing}; {seen.next_pose}")
     equations = _Equations(poses)
     try:
-        found, drift, touched = _explained(equations, confidence)
+        found, drift, touched = _explained(equations)
     except np.linalg.LinAlgError:
         raise IdentificationError("the poses do not suffice: their equations leave an unknown open") from None
     mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
@@ -142,7 +143,7 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95) -> Identified:
             f"{_millimeters(payload.center, centre_interval)}; "
             f"{seen.next_pose if touched is None else touched}"
         )
-    accelerometer = _accelerometer(equations.calibrated(found, confidence))
+    accelerometer = _accelerometer(equations.calibrated(found))
     undetermined = accelerometer.undetermined if accelerometer else ""
     return Identified(
         payload,
@@ -151,7 +152,6 @@ def identify(poses: Sequence[Pose], *, confidence: float = 0.95) -> Identified:
         mass_interval,
         centre_interval,
         Wrench.of(found.bias.half.tolist()),
-        confidence,
         tuple(map(Wrench.of, found.residuals.tolist())),
         seen,
         (
@@ -188,15 +188,15 @@ class _Equations:
         if len(times) == len(poses) >= _FEWEST_IN_TIME and np.ptp(times) > 0.0:
             self.minutes = (np.array(times) - times[-1]) / _SECONDS_A_MINUTE
 
-    def solve(self, confidence: float, regressor: Array | None = None) -> Estimate:
+    def solve(self, regressor: Array | None = None) -> Estimate:
         """The estimate; of several regressors (k, n), each for itself."""
         read = None if self._known else self._acceleration
-        return estimate(self.wrench, self.gravity, confidence, read, self._noise, regressor)
+        return estimate(self.wrench, self.gravity, read, self._noise, regressor)
 
-    def calibrated(self, found: Estimate, confidence: float) -> tuple[Value, Value, Value] | None:
+    def calibrated(self, found: Estimate) -> tuple[Value, Value, Value] | None:
         """Offset, scale and cross-axis terms of the accelerometer."""
         if self._known and self._acceleration is not None:
-            return calibrate(self._acceleration, self.gravity, confidence)
+            return calibrate(self._acceleration, self.gravity)
         return found.calibration
 
 
@@ -215,17 +215,17 @@ class _Touched(NamedTuple):
         )
 
 
-def _explained(equations: _Equations, confidence: float) -> tuple[Estimate, Wrench | None, _Touched | None]:
+def _explained(equations: _Equations) -> tuple[Estimate, Wrench | None, _Touched | None]:
     """The answer, the drift of the bias a minute, and the pose that does not fit, if there are such."""
-    found, count = equations.solve(confidence), len(equations.wrench)
+    found, count = equations.solve(), len(equations.wrench)
     if count < _FEWEST_IN_TIME:
         return found, None, None
     suspects = np.argsort(np.abs(found.residuals / _rms(found.residuals)).max(axis=1))[-_SUSPECTS:]
-    without = equations.solve(confidence, np.eye(count)[suspects])
+    without = equations.solve(np.eye(count)[suspects])
     chances = _chance(found, without) * count
     which = int(chances.argmin())
     if equations.minutes is not None:
-        drifting = equations.solve(confidence, equations.minutes)
+        drifting = equations.solve(equations.minutes)
         assert drifting.shift is not None
         chance = float(_chance(found, drifting))
         if chance < min(_CHANCE, float(chances[which])):
@@ -364,7 +364,7 @@ def summary(result: Identified) -> str:
     """The answer in one sentence with its confidence interval, and the notes as further ones."""
     text = (
         f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity "
-        f"{_millimeters(result.payload.center, result.centre_interval)} ({100 * result.confidence:g} % "
+        f"{_millimeters(result.payload.center, result.centre_interval)} ({100 * CONFIDENCE:g} % "
         f"confidence) from {result.coverage.poses} poses; residual {result.force_fit.rms:.2g} N "
         f"({result.force_fit.verdict}), {result.torque_fit.rms:.2g} Nm ({result.torque_fit.verdict})"
     )
