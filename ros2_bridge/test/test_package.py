@@ -24,4 +24,5 @@ def test_the_program_says_how_it_is_used() -> None:
     run = subprocess.run(
         [sys.executable, "-m", "bridge.client", "--help"], check=True, capture_output=True, text=True
     )
-    assert "usage: ros2 run bridge client" in run.stdout
+    assert run.stdout.startswith("examples:\n  ros2 run bridge client")
+    assert "\nusage: ros2 run bridge client" in run.stdout

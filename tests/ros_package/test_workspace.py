@@ -82,6 +82,7 @@ def test_a_workspace_with_only_this_repository(colcon: Path, tmp_path: Path, how
             assert linked == (bool(how) and name in PACKAGES)  # CMake copies
     for name in ("bridge", "bota_ethercat_bridge"):  # For `ros2 run` to find.
         used = run("sh", "-c", sourced + f"{tmp_path}/install/{name}/lib/{name}/client --help")
+        assert used.startswith("examples:\n  ros2 run bridge client")
         assert "\nusage: ros2 run bridge client" in used
     run("colcon", "test", "--return-code-on-test-failure", "--packages-select", *names)
     assert "0 errors, 0 failures" in run("colcon", "test-result")
