@@ -1,26 +1,30 @@
-"""Draws the pictures in docs/ of monitor and report.
+"""The pictures in docs/ of monitor and report, each able to tell whether it is still of what it shows.
 
     python -m tests.clients.pictures report.png web.png
 
-makes those of the terminal again, and those named, or both; they need Chromium.
+makes those of the terminal again, and those named, or both; they need Chromium. A picture carries a digest of
+the page that it shows, for a report without what another version of Matplotlib may draw otherwise.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
+import re
 import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from PIL import Image
+from PIL import Image, PngImagePlugin
 from rich.console import Console
 from rich.text import Text
 
 from bota_clients.monitor.model import State
 from bota_clients.monitor.screen import Look
 from bota_clients.monitor.screen import render as render_screen
+from bota_clients.monitor.web.server import read_page
 from bota_clients.report.checks import Examination
 from bota_clients.report.page import render
 from tests.clients import monitor_states as made
@@ -31,16 +35,25 @@ from tests.clients.web_pages import Web
 
 DOCS: Final = Path(__file__).resolve().parents[2] / "docs"
 AGAIN: Final = "make it again: python -m tests.clients.pictures"
+_KEY: Final = "Source"
 _SECONDS: Final = 10.5  # of the web page's traces
 
 
-def _keep(drawn: Path, name: str, colors: int, said: object) -> None:
-    """Keep what was drawn, unless Chromium's console `said` something."""
+def digest_in(name: str) -> str:
+    """What the picture says it was made from."""
+    with Image.open(DOCS / name) as image:
+        return str(image.info.get(_KEY))
+
+
+def _keep(drawn: Path, name: str, source: str, colors: int, said: object) -> None:
+    """Keep what was drawn as the picture of `source`, unless Chromium's console `said` something."""
     if said:
         sys.exit(f"Chromium's console said: {said}")
+    notes = PngImagePlugin.PngInfo()
+    notes.add_text(_KEY, source)
     with Image.open(drawn) as image:
         few = image.convert("RGB").quantize(colors, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-        few.save(DOCS / name, optimize=True)
+        few.save(DOCS / name, optimize=True, pnginfo=notes)
 
 
 def report_page() -> str:
@@ -49,14 +62,31 @@ def report_page() -> str:
     return render([Examination(noisy)], made="2026-01-01 00:01 UTC", program="ethercat-report")
 
 
+def report_digest(page: str) -> str:
+    """Of everything but the lines of the plots: their texts count, and the style sheet."""
+
+    def texts(match: re.Match[str]) -> str:
+        return " ".join(re.findall(r"<(?:title|desc|text)\b[^>]*>([^<]*)<", match[0]))
+
+    return hashlib.sha256(re.sub(r"<svg.*?</svg>", texts, page, flags=re.DOTALL).encode()).hexdigest()
+
+
 def draw_report(name: str, scratch: Path) -> None:
-    source = scratch / "report.html"
-    source.write_text(report_page(), encoding="utf-8")
+    text, source = report_page(), scratch / "report.html"
+    source.write_text(text, encoding="utf-8")
     with browser(scratch) as page:
         page.size(960, 3480)
         page.open(source.as_uri())
         page.screenshot(scratch / "drawn.png")
-        _keep(scratch / "drawn.png", name, 160, page.complaints)
+        _keep(scratch / "drawn.png", name, report_digest(text), 160, page.complaints)
+
+
+def web_digest() -> str:
+    """Of all files of the page."""
+    found = hashlib.sha256()
+    for path, (body, _) in sorted(read_page().items()):
+        found.update(path.encode() + b"\0" + body)
+    return found.hexdigest()
 
 
 def _feed(web: Web) -> None:
@@ -83,7 +113,7 @@ def draw_web(name: str, scratch: Path) -> None:
         page.click("#pause")
         page.value("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
         page.screenshot(scratch / "drawn.png")
-        _keep(scratch / "drawn.png", name, 200, page.complaints)
+        _keep(scratch / "drawn.png", name, web_digest(), 200, page.complaints)
 
 
 def svg(state: State, look: Look, width: int, height: int) -> str:

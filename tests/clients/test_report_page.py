@@ -252,3 +252,8 @@ def test_chromium_draws_it_in_the_light_and_in_the_dark_and_prints_it(page: str,
         assert not light & dark_
         assert 4 <= len(re.findall(rb"/Type\s*/Page\b", shown.printed())) <= 12
         assert shown.complaints == []
+
+
+def test_the_picture_in_the_docs_is_of_this_page(page: str) -> None:
+    assert pictures.digest_in("report.png") == pictures.report_digest(page), pictures.AGAIN
+    assert (pictures.DOCS / "report.png").stat().st_size < 300_000

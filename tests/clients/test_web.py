@@ -23,6 +23,7 @@ from bota_clients.monitor.web.server import HEADERS, STREAM, answer, read_page
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.clients import monitor_states as made
+from tests.clients import pictures
 from tests.clients.monitor_states import START_S, frame, moving
 from tests.clients.web_pages import Web
 
@@ -361,6 +362,11 @@ def test_every_answer_has_the_headers_and_nothing_else_is_served() -> None:
         assert {name: found.headers[name] for name in HEADERS} == HEADERS
         assert found.headers["Content-Length"] == str(len(found.body))
         assert found.status_code == (200 if path in known else 404), path
+
+
+def test_the_picture_in_the_docs_is_of_this_page() -> None:
+    assert pictures.digest_in("web.png") == pictures.web_digest(), pictures.AGAIN
+    assert (pictures.DOCS / "web.png").stat().st_size < 60_000
 
 
 # What it says.
