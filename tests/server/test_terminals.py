@@ -13,7 +13,7 @@ from bota_ethercat.errors import RefusedError
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.terminals import Terminal
-from ethercat_server.errors import BusError
+from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.exchange import Area, make_frames
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState, AlStatus
@@ -227,6 +227,14 @@ def test_other_pdos_than_the_sii_has_are_not_decoded(caplog: pytest.LogCaptureFi
     wait_for(simulation, "LOST")
     assert not client.terminal_frames
     check_frames(client.frames)
+
+
+def test_more_inputs_than_fmmus_are_refused() -> None:
+    simulation = reading("BOTA,EL3102", "1")
+    wait_for(simulation, "OP")
+    (controller, _), inputs = simulation.bus.terminals[0], [(3, 0x1180, 1, 0)] * 17
+    with pytest.raises(SetUpError, match="FMMUs for 17 inputs: do not name it"):
+        controller.map_inputs(0, inputs)
 
 
 def test_padding_optional_pdos_types_and_equal_names_in_the_sii() -> None:

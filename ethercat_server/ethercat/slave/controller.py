@@ -99,7 +99,12 @@ class SlaveController:
         yield from self.go(AlState.PREOP)
 
     def map_inputs(self, logical: int, inputs: Sequence[tuple[int, int, int, int]]) -> None:
-        """Map inputs from a logical address on, and nothing else: sync manager, its start, bytes, control."""
+        """Map inputs from a logical address on, and nothing else: sync manager, its start, bytes, control.
+
+        SetUpError if there are more of them than FMMUs.
+        """
+        if len(inputs) > self._units:
+            raise SetUpError(f"{self._name} has {self._units} FMMUs for {len(inputs)} inputs: do not name it")
         units = b""
         for manager, start, size, control in inputs:
             at = reg.SYNC_MANAGER + manager * reg.SYNC_MANAGER_SIZE
