@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bota_clients.errors import RecordingError
 from bota_clients.export.align import find_offset
 from bota_clients.export.cli import main
-from bota_clients.export.dataset import Clock, FrameTimes
+from bota_clients.export.dataset import Clock
 from tests.clients.bags import imu, joint_states, write_bag
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
 from tests.ended import run_here
@@ -88,7 +88,7 @@ def test_the_offset_and_drift_of_a_robots_clock(tmp_path: Path, topic: str) -> N
     assert not problems("export-align", ended.json)
     found = Clock(ended.json["stamp_ns"], ended.json["monotonic_ns"], ended.json["drift_ppm"])
     exact_ns = START_NS + np.rint(1e9 * stamps).astype(np.int64)
-    error_ms = FrameTimes.of(exact_ns, found.history()).instants_ns * 1e-6 - instants * 1e3
+    error_ms = found.instants(exact_ns) * 1e-6 - instants * 1e3
     assert abs(error_ms).max() < 0.5
     assert abs(error_ms[len(error_ms) // 2]) < 2 * ended.json["interval_ms"] < 0.5
     assert ended.json["offset_ms"] == pytest.approx(OFFSET_S * 1e3, abs=5)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from bota_clients.export.cli import main
-from bota_clients.export.dataset import FrameTimes, clock_history, read_stamps, windows_of
+from bota_clients.export.dataset import Periodic, Stamped, read_stamps, windows_of
 from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
@@ -42,8 +42,7 @@ def windows(
     """Of a recording of these frames."""
     record(path, frames, **SETTINGS)
     with open_recording(path) as recording:
-        found = FrameTimes.of(times, clock_history(recording))
-        return joined(windows_of(recording, found, Windows(length, **options)))
+        return joined(windows_of(recording, Stamped(times), Windows(length, **options)))
 
 
 def joined(blocks: Iterable[Arrays]) -> Arrays:
@@ -117,9 +116,7 @@ def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> N
     path, row, chance = tmp_path / "run.mcap", described(), random.Random(1)
     record(path, frames, sensors=(0,), **row["settings"])
     with open_recording(path) as recording:
-        recorded = joined(
-            windows_of(recording, FrameTimes.at_rate(30.0, clock_history(recording)), Windows(32, tool=TOOL))
-        )
+        recorded = joined(windows_of(recording, Periodic(30.0), Windows(32, tool=TOOL)))
     live = Windows(32, tool=TOOL)
     live.configure(recording.sensors[0].settings, RATE_HZ, row["name"])
     sent, asked, blocks = [each for each in frames if not each.flags & DataFlag.REPEATED], 0, []
@@ -237,7 +234,7 @@ def test_stamps_are_read_from_tables_and_bags(tmp_path: Path) -> None:
         ([-0.5, 1.0], (), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:19.500"),
         ([1.0, 2.0, 2.6, 2.7], (), "row 2 of {} (counted from 0) is of 2023-11-14T22:13:22.600"),
         ([0.5], ("--latency", 1), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:20.500"),
-        ([-1.7e9], (), "is of 1970-01-01T00:00:00.000000000Z, and samples were measured from 2023-11-"),
+        ([-1.7e9], (), "is of 1970-01-01T00:00:00.000000000Z, and the first sample was measured at 2023-11-"),
         (["0.1", "soon"], (), "{} has no times in a column timestamp (choose one with --column"),
         ([], (), "{} has no times in a column timestamp "),
         ([1.0], ("--column", "t"), "{} has no times in a column t (choose"),

@@ -5,17 +5,19 @@ of the server, so a recording has the history of their offset: by this the frame
 CLOCK_MONOTONIC, which is never set.
 
 with open_recording(Path("run.mcap")) as recording:
-    for block in windows_of(recording, times, Windows(32)):
+    for block in windows_of(recording, Stamped(stamps_ns), Windows(32)):
         print(block["force_torque"].shape)
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import math
 import shutil
 import tempfile
-from collections import defaultdict
+import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -24,12 +26,11 @@ import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import DATASETS, PROGRAM, Advance
-from bota_clients.export.windows import Arrays, Windows, read_tool
+from bota_clients.export.windows import Array, Arrays, Windows, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
 from bota_clients.recording.reader import Recording
-from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
@@ -41,8 +42,6 @@ _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
 _ZARR_FRAMES: Final = 1024  # in a chunk
 _UNITS: Final = {"force": "N", "torque": "Nm", "acceleration": "m/s^2", "angular_rate": "rad/s", "age": "s"}
 _SECOND: Final = 1_000_000_000
-_YEAR_NS: Final = 31_536_000 * _SECOND
-Clocks = tuple[Ints, Ints]  # stamps (n,), ns, and the server's CLOCK_MONOTONIC at these
 
 
 class Clock(NamedTuple):
@@ -61,46 +60,49 @@ class Clock(NamedTuple):
         except (OSError, BadMessageError, LookupError, TypeError, ValueError):
             raise RecordingError(f"{path} is not what 'ethercat-export align' prints") from None
 
-    def history(self) -> Clocks:
-        """Both clocks from a year before to a year after."""
-        passed = np.array([-_YEAR_NS, _YEAR_NS])
-        drifted = np.rint(passed * (self.drift_ppm * 1e-6)).astype(np.int64)
-        return self.stamp_ns + passed, self.monotonic_ns + passed + drifted
+    def instants(self, stamps_ns: Ints) -> Ints:
+        """Of the server's CLOCK_MONOTONIC."""
+        passed = stamps_ns - self.stamp_ns
+        return np.asarray(
+            self.monotonic_ns + passed + np.rint(passed * (self.drift_ppm * 1e-6)).astype(np.int64)
+        )
 
 
-def clock_history(recording: Recording, sensor: int = 0) -> Clocks:
-    """Both stamps of every sample; RecordingError."""
-    samples = (each for each in recording.frames(sensor) if not each.flags & NOT_NEW)
-    rows = ((each.stamp_ns, each.monotonic_ns) for each in samples)
-    stamps = np.fromiter(rows, np.dtype((np.uint64, 2))).view(np.int64)
-    if not len(stamps):
-        raise RecordingError(f"{recording.path} has no new and valid samples")
-    return stamps[:, 0], stamps[:, 1]
+class Periodic:
+    """Frames at a rate, from the first sample on until the last."""
+
+    count = 0  # of those that there must be
+
+    def __init__(self, fps: float) -> None:
+        self._period_ns, self._made, self._begin_ns = _SECOND / fps, 0, -1
+
+    def exposed(self, stamps: Ints, instants: Ints) -> Ints:
+        """As `Stamped.exposed`; the stamps are by CLOCK_REALTIME."""
+        if self._begin_ns < 0:
+            self._begin_ns = int(instants[0])
+        begin, self._made = self._made, math.ceil((instants[-1] - self._begin_ns) / self._period_ns)
+        made = self._begin_ns + np.rint(np.arange(begin, self._made) * self._period_ns).astype(np.int64)
+        return np.stack([_interpolated(made, instants, stamps), made])
 
 
-class FrameTimes(NamedTuple):
-    """Frames in the order of their instants."""
+class Stamped:
+    """Frames in the order of their instants, stamped so long after the exposure."""
 
-    stamps_ns: Ints  # (f,) as given; of a rate by CLOCK_REALTIME
-    instants_ns: Ints  # (f,) of the exposure, by the server's CLOCK_MONOTONIC
-    source: str = ""  # of the rows, for errors; none: a rate, which ends with the recording
+    def __init__(
+        self, stamps_ns: Ints, source: str = "the frames", latency_s: float = 0.0, clock: Clock | None = None
+    ) -> None:
+        """`source` is for errors; `clock` made the stamps, if not the server's CLOCK_REALTIME."""
+        self.count, self._stamps, self._source, self._clock = len(stamps_ns), stamps_ns, source, clock
+        self._left, self._latency_ns = stamps_ns, round(latency_s * _SECOND)
 
-    @classmethod
-    def at_rate(cls, fps: float, clocks: Clocks) -> FrameTimes:
-        """From the first sample on."""
-        stamps, instants = clocks
-        passed = np.arange(0, instants[-1] - instants[0], _SECOND / fps)
-        made = instants[0] + np.rint(passed).astype(np.int64)
-        return cls(_interpolated(made, instants, stamps), made)
+    def exposed(self, stamps: Ints, instants: Ints) -> Ints:
+        """(2, f) ns: stamps of the frames up to the last of these samples, and instants of their exposure.
 
-    @classmethod
-    def of(
-        cls, stamps_ns: Ints, clocks: Clocks, source: str = "the frames", latency_s: float = 0.0
-    ) -> FrameTimes:
-        """By the clock that stamped them, so long after the exposure; RecordingError."""
-        stamps, instants = clocks
-        found, begin = np.zeros(0, np.int64), 0
-        for end in [*(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), len(stamps)]:
+        From both stamps (n,) of the samples, the last of the call before first.
+        """
+        found = np.zeros(0, np.int64) if self._clock is None else self._clock.instants(self._left)
+        ends = [0, *(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), len(stamps)]
+        for begin, end in itertools.pairwise(ends):
             here, there = stamps[begin:end], instants[begin:end]
             # The clock was set back between two samples, and frames of this time may be by either.
             if begin:
@@ -109,26 +111,25 @@ class FrameTimes(NamedTuple):
             if end < len(stamps):
                 there = np.append(there, instants[end])
                 here = np.append(here, here[-1] + there[-1] - there[-2])
-            rest = stamps_ns[len(found) :]
+            rest = self._left[len(found) :]
             rest = rest[: int(np.append(np.flatnonzero(np.diff(rest) < 0), len(rest))[0]) + 1]
             if len(rest) and rest[0] >= here[0]:
                 reached = rest[: np.searchsorted(rest, here[-1], "right")]
                 found = np.append(found, _interpolated(reached, here, there))
-            begin = end
-        if len(found) < len(stamps_ns):
-            raise cls(stamps_ns, found, source).refusal(len(found), int(stamps[0]), int(stamps[-1]))
-        return cls(stamps_ns, found - round(latency_s * _SECOND), source)
+        made, self._left = self._left[: len(found)], self._left[len(found) :]
+        return np.stack([made, found - self._latency_ns])
 
     def refusal(self, row: int, begin_ns: int, end_ns: int) -> RecordingError:
-        """Of this row, which was not taken between these two stamps, or is not in its place."""
-        source, stamps = f"row {row} of {self.source} (counted from 0)", self.stamps_ns
+        """Of this row, which was not exposed between these two stamps, or is not in its place."""
+        source, stamps = f"row {row} of {self._source} (counted from 0)", self._stamps
         if row and stamps[row] < stamps[row - 1]:
             return RecordingError(
                 f"{source} is before the row above it, and the server's clock was not set then: sort the rows"
             )
-        taken, begin, end = np.array([stamps[row], begin_ns, end_ns]).astype("datetime64[ns]")
+        which, bound = ("first", begin_ns) if stamps[row] < begin_ns else ("last", end_ns)
+        taken, limit = np.array([stamps[row], bound]).astype("datetime64[ns]")
         return RecordingError(
-            f"{source} is of {taken}Z, and samples were measured from {begin}Z to {end}Z: leave the row out, "
+            f"{source} is of {taken}Z, and the {which} sample was measured at {limit}Z: leave the row out, "
             "or find the offset of its clock with 'ethercat-export align'"
         )
 
@@ -197,7 +198,7 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
 
 def windows_of(
     recording: Recording,
-    times: FrameTimes,
+    frames: Periodic | Stamped,
     windows: Windows,
     sensor: int = 0,
     advance: Advance = lambda _: None,
@@ -206,24 +207,29 @@ def windows_of(
 
     RecordingError for the first frame without a window.
     """
-    done = 0
-    for settings, frames in recording.batches(sensor):
+    done, clocks, waiting = 0, np.zeros((2, 0), np.int64), np.zeros((2, 0), np.int64)
+    for settings, batch in recording.batches(sensor):
         windows.configure(settings.values, settings.rate_hz, settings.identity.name)
-        windows.take(frames)
-        end = int(np.searchsorted(times.instants_ns, windows.until_ns, "right"))
-        ready = times.instants_ns[done:end]
-        if len(ready) and ready[0] < windows.begin_ns:
+        samples = windows.take(batch)
+        clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
+        if clocks.size:
+            waiting = np.hstack([waiting, frames.exposed(*clocks)])
+        ready = waiting[:, : np.searchsorted(waiting[1], windows.until_ns, "right")]
+        if (ready[1, :1] < windows.begin_ns).any():
             break
-        if len(ready):
-            yield {"stamp_ns": times.stamps_ns[done:end], "monotonic_ns": ready, **windows.at(ready)}
-        done = max(done, end)
-        windows.forget(min([windows.until_ns, *times.instants_ns[done : done + 1].tolist()]))
-        advance(len(frames))
-    if not done and not times.source:
+        if ready.size:
+            yield {"stamp_ns": ready[0], "monotonic_ns": ready[1], **windows.at(ready[1])}
+        done, waiting = done + len(ready[0]), waiting[:, len(ready[0]) :]
+        windows.forget(min([windows.until_ns, *waiting[1, :1].tolist()]))
+        advance(len(batch))
+    if not clocks.size:
+        raise RecordingError(f"{recording.path} has no new and valid samples")
+    if isinstance(frames, Stamped) and done < frames.count:
+        stamp_ns, instant_ns = np.hstack([waiting, clocks[:, -1:]])[:, 0].tolist()
+        bounds = (bound + stamp_ns - instant_ns for bound in (windows.begin_ns, windows.until_ns))
+        raise frames.refusal(done, *bounds)
+    if not done:
         raise RecordingError("the recording is too short for a frame")
-    if done < len(times.stamps_ns) and times.source:
-        here_ns = int(times.stamps_ns[done] - times.instants_ns[done])
-        raise times.refusal(done, windows.begin_ns + here_ns, windows.until_ns + here_ns)
 
 
 def write(options: argparse.Namespace, recording: Recording, advance: Advance) -> str:
@@ -231,16 +237,11 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
     clock = options.clock and Clock.read(options.clock)
     tool = options.tool and read_tool(options.tool)
     length, sensor, path = int(options.window), choose(recording, options.sensor), options.output
+    frames: Periodic | Stamped
     if options.at is None:
-        times = FrameTimes.at_rate(options.fps, clock_history(recording, sensor.sensor))
+        frames = Periodic(options.fps)
     else:
-        stamps = read_stamps(options.at, options.column)
-        times = FrameTimes.of(
-            stamps,
-            clock.history() if clock else clock_history(recording, sensor.sensor),
-            str(options.at),
-            options.latency,
-        )
+        frames = Stamped(read_stamps(options.at, options.column), str(options.at), options.latency, clock)
     windows = Windows(length, hold=options.hold, tool=tool, imu_units=options.imu_units)
     about = {
         "program": f"{PROGRAM} {VERSION}",
@@ -262,7 +263,7 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
     if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
         raise FileError(f"{path} {EXISTS}")
     with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
-        made, blocks = Path(folder, path.name), windows_of(recording, times, windows, sensor.sensor, advance)
+        made, blocks = Path(folder, path.name), windows_of(recording, frames, windows, sensor.sensor, advance)
         _WRITERS[path.suffix](made, json.dumps(about, default=str), blocks)
         if path.is_dir():
             shutil.rmtree(path)
@@ -288,16 +289,19 @@ def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
 
 
 def _npz(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
-    """An array for each name, and `attributes`, text."""
-    flat, like = defaultdict[str, bytearray](bytearray), Arrays()
+    """An array for each name, and `attributes`, text; on disk until their length is known."""
+    like = Arrays()
     for like in blocks:
         for name, array in like.items():
-            flat[name] += array.tobytes()
-    arrays = {
-        name: np.frombuffer(flat[name], array.dtype).reshape(-1, *array.shape[1:])
-        for name, array in like.items()
-    }
-    np.savez(path, attributes=np.array(about), allow_pickle=False, **arrays)
+            with (path.parent / name).open("ab") as file:
+                array.tofile(file)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in (like | {"attributes": np.array(about)}).items():
+            whole: Array = array
+            if name in like:
+                whole = np.memmap(path.parent / name, array.dtype, "r").reshape(-1, *array.shape[1:])
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, whole, allow_pickle=False)
 
 
 def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:

@@ -59,13 +59,8 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
                 first_ns += frame.monotonic_ns - last_ns - max(0, frame.stamp_ns - stamp_ns)
             last_ns, stamp_ns = frame.monotonic_ns, frame.stamp_ns
             sample = decoder(len(frame.process_data)).decode(frame.process_data)
-            cells = [
-                _seconds(last_ns - first_ns),
-                f"{np.datetime64(stamp_ns, 'ns')}Z",
-                frame.sensor,
-                frame.sequence,
-            ]
-            file.write(f"{','.join(map(str, cells))},{_values(sample, flags)}\n")
+            when = f"{(last_ns - first_ns) / _SECOND:.9f},{np.datetime64(stamp_ns, 'ns')}Z"
+            file.write(f"{when},{frame.sensor},{frame.sequence},{_values(sample, flags)}\n")
         file.finish()
     left = f"; {count(left_out, 'frame')} without a new sample left out" if left_out else ""
     return f"{count(written, 'sample')}{left}"
@@ -77,8 +72,3 @@ def _values(sample: Sample, flags: int) -> str:
     orientation = ",".join([f"{value:.9g}" for value in sample.orientation or ()]) or ",,,"
     whole = [int(bool(flags & flag)) for flag in _FLAGS] + [getattr(sample, name) for name in _REGISTERS]
     return f"{reals},{orientation},{','.join(map(str, whole))}"
-
-
-def _seconds(ns: int) -> str:
-    whole, rest = divmod(abs(ns), _SECOND)
-    return f"{'-' if ns < 0 else ''}{whole}.{rest:09d}"

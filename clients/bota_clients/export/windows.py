@@ -121,11 +121,11 @@ class Windows:
         """The last instant of which nothing that comes later can be a part; -1 before the first sample."""
         return int(self._slots["measured_ns"].max(axis=0, initial=-1).min())
 
-    def take(self, frames: Sequence[DataMessage]) -> None:
-        """Take the next frames of the sensor, also REPEATED and INVALID ones; RecordingError."""
+    def take(self, frames: Sequence[DataMessage]) -> Columns:
+        """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
         samples = columns((each for each in frames if not each.flags & NOT_NEW), self._units)
         if not len(samples):
-            return
+            return samples
         stamps, sequence = samples.monotonic_ns, samples.sequence
         if self.begin_ns < 0:
             self.begin_ns, self._newest = int(stamps[0]), (int(stamps[0]) - 1, int(sequence[0]) - 1)
@@ -139,11 +139,11 @@ class Windows:
         kept = np.minimum(lost, self._length)
         end = np.cumsum(kept + 1) - 1  # where each sample is
         of = np.repeat(np.arange(len(end)), kept + 1)
-        before = (lost - kept)[of] + end[of] - np.arange(len(of))  # periods until the next sample
-        before[end] = 0
+        after = np.arange(len(of)) - (end - kept)[of] + 1  # periods since the sample before
+        since_ns = np.rint(passed[of] * (after / (lost[of] + 1))).astype(np.int64)
+        since_ns[end] = passed
         slots = np.zeros(len(of), _SLOT)
-        until_ns = np.rint(passed[of] * (before / (lost[of] + 1))).astype(np.int64)
-        slots["measured_ns"] = (stamps[of] - until_ns)[:, np.newaxis] - self._delay_ns
+        slots["measured_ns"] = ((stamps - passed)[of] + since_ns)[:, np.newaxis] - self._delay_ns
         values = np.hstack([samples.force, samples.torque, samples.acceleration, samples.angular_rate])
         slots["values"] = math.nan
         slots["values"][end] = np.where(np.isfinite(values), values, math.nan)
@@ -157,6 +157,7 @@ class Windows:
             slots["valid"][end, channel] = (bits == 0) & np.isfinite(values[:, part]).all(axis=1)
         slots["compensated"][end] = self._compensated(samples)
         self._slots = np.concatenate([self._slots, slots])
+        return samples
 
     def _compensated(self, samples: Columns) -> Array | float:
         """(n, 6) N, Nm, as the ROS 2 node has it; NaN without a tool."""
