@@ -31,7 +31,6 @@ from bota_ethercat.client import Client
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.running import frames_in
-from tests.rights import NO_OTHER_USER
 from tests.served_simulation import ServedSimulation, served
 from tests.server.running import PATIENCE_S, free_port, wait_until
 from tests.simulation import simulated_bus, simulated_server
@@ -308,21 +307,6 @@ def test_a_tare_without_an_answer_is_not_known(way: str, monkeypatch: pytest.Mon
         text, bad = tare(Address("localhost", server.port), 0)
     assert bad
     assert text.startswith("It is unknown whether sensor 0 was tared: ")
-
-
-def test_tare_of_another_user_says_the_servers_sentence(shared: ServedSimulation) -> None:
-    if NO_OTHER_USER is not None:
-        pytest.skip(NO_OTHER_USER)
-    code = (
-        "from bota_ethercat.address import Address; from bota_clients.monitor.tare import tare;"
-        "from tests.rights import become_nobody; become_nobody();"
-        f"print(*tare(Address('localhost', {shared.port}), 0))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=PATIENCE_S
-    )
-    assert done.stdout.startswith("Sensor 0 was not tared: tare is denied to uid 65534"), done.stderr
-    assert done.stdout.endswith("True\n")
 
 
 def test_a_stopped_server_is_said_to_be_silent(shared: ServedSimulation) -> None:

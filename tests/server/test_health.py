@@ -147,15 +147,6 @@ def test_an_emergency_is_told_logged_and_kept(log: pytest.LogCaptureFixture) -> 
     assert [stream.lost_samples for stream in simulation.streams] == [0, 0]
 
 
-def test_what_waits_in_the_mailbox_is_read_within_a_tenth_of_a_second() -> None:
-    simulation = Simulation()
-    simulation.run(1.0)
-    for _ in range(10):
-        simulation.command(HOT)
-        simulation.run(0.11)
-    assert simulation.status()["sensors"][0]["emergencies"] == 10
-
-
 def test_a_flood_floods_neither_log_nor_clients_nor_the_bus(log: pytest.LogCaptureFixture) -> None:
     simulation = Simulation(CLOCK, settings=SLOW)
     flood(simulation, 61.0, 0.02)
