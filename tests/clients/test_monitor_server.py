@@ -309,17 +309,6 @@ def test_a_tare_without_an_answer_is_not_known(way: str, monkeypatch: pytest.Mon
     assert text.startswith("It is unknown whether sensor 0 was tared: ")
 
 
-def test_a_stopped_server_is_said_to_be_silent(shared: ServedSimulation) -> None:
-    with reading(shared.port) as model:
-        wait_until(lambda: samples(model) > 20, "samples")
-        with shared.stopped():
-            wait_until(lambda: state(model).server.silent, "silence")
-            alerts = [alert for sensor in state(model).sensors for alert in sensor.alerts]
-            assert not [alert for alert in alerts if alert.ago_s is None], "they are about what is now"
-        wait_until(lambda: not state(model).server.silent, "the server's voice")
-        assert state(model).server.connected
-
-
 def test_a_restart_of_the_server_is_seen_and_survived() -> None:
     with served(*SENSORS, sinc_length=512) as first, reading(first.port) as model:
         wait_until(lambda: samples(model) > 20, "samples")

@@ -591,13 +591,3 @@ def test_a_single_late_answer_makes_the_loop_wait_longer_for_some_exchanges_only
         simulation.command("lose 1")
         client.fresh(20)
     assert simulation.status()["sensors"][0]["lost_samples"] - before <= 1
-
-
-def test_settings_are_changed_on_a_slow_machine() -> None:
-    simulation = Simulation(SensorOptions(signal="rest"))
-    client = simulation.subscribe()
-    simulation.backend.become(Machine(frame_ns=10e6, frame_jitter_ns=1e6, wake_ns=5e6))
-    simulation.run(3.0)
-    changed = client.ask("configure", settings={"chop": True})
-    assert changed["ok"], changed
-    assert client.ask("sdo_read", name="Sampling rate")["value"] == 800

@@ -543,14 +543,6 @@ def test_a_sensor_settles_after_each_entry_into_op(bench: Bench) -> None:
     assert not settling(bench), "it did not leave OP either"
 
 
-def test_one_of_a_chain_settles() -> None:
-    bench = Bench(AT_REST, SensorOptions(signal="rest", serial=2))
-    bench.run(0.6)
-    bench.command("power cycle 0.2 @1")
-    bench.listener.wait_event("sensor_back", 1)
-    assert (settling(bench, 0), settling(bench, 1)) == (False, True)
-
-
 @pytest.mark.parametrize("change", ["start", "recovery", "configure"])
 def test_a_tare_waits_for_settled_data(bench: Bench, change: str) -> None:
     if change != "start":
