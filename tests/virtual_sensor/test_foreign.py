@@ -18,10 +18,6 @@ ERROR = 0x10
 OUTPUTS, INPUTS = 0x1100, 0x1180
 
 
-def no_check() -> None:
-    pass
-
-
 def master_of(text: str) -> RawMaster:
     return RawMaster(*slaves_in(parse_chain(text)))
 
