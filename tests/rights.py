@@ -41,19 +41,6 @@ NO_OTHER_USER = _why_no_other_user()
 needs_another_user: Final = pytest.mark.skipif(NO_OTHER_USER is not None, reason=NO_OTHER_USER or "")
 
 
-def become_nobody() -> None:
-    """For good; for a helper process that was started with `python -m`.
-
-    What it needs of the library must be loaded before: the interpreter may be one that only root can read.
-    Does nothing where this process is not root's and so is a stranger to nobody.
-    """
-    "x".encode("idna")  # what connecting by name loads
-    if NO_OTHER_USER is None:
-        os.setgroups([])
-        os.setgid(NOBODY.pw_gid)
-        os.setuid(NOBODY.pw_uid)
-
-
 @contextlib.contextmanager
 def as_user(uid: int) -> Iterator[None]:
     """What is done within, root's process does as this user."""

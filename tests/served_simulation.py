@@ -60,10 +60,9 @@ class ServedSimulation(Simulation):
 
     def __init__(self, *sensors: SensorOptions, settings: Mapping[str, SettingValue], port: int = 0) -> None:
         self.port = port or free_port()
-        self._goes_on, self._todo = threading.Event(), queue.SimpleQueue[Callable[[], None]]()
+        self._todo = queue.SimpleQueue[Callable[[], None]]()
         super().__init__(*sensors, settings=settings, backend=_Backend(*sensors))
         self._thread = threading.Thread(target=self.cycle.run, name="server")
-        self._goes_on.set()
         self._thread.start()
 
     def listen(self) -> Transport:
@@ -73,7 +72,6 @@ class ServedSimulation(Simulation):
         """Nothing is kept: it may run for long."""
 
     def serves(self, until_ns: int, serve: Callable[[int], None]) -> None:
-        self._goes_on.wait()
         while not self._todo.empty():
             self._todo.get()()
         super().serves(until_ns, serve)
@@ -85,15 +83,6 @@ class ServedSimulation(Simulation):
         said = answer.result(PATIENCE_S)
         assert said.startswith("ok"), said
         return said[3:]
-
-    @contextlib.contextmanager
-    def stopped(self) -> Iterator[None]:
-        """As by SIGSTOP."""
-        self._goes_on.clear()
-        try:
-            yield
-        finally:
-            self._goes_on.set()
 
     def close(self) -> None:
         """As by SIGTERM; nothing more once it has ended."""

@@ -17,7 +17,7 @@ import pytest
 
 from scripts.benchmarks import contact, modes, statistics
 from scripts.benchmarks import program as benchmark
-from scripts.benchmarks.chain import ScriptError, Setup, Turn
+from scripts.benchmarks.chain import ScriptError, Turn
 from scripts.benchmarks.records import Recording, began
 from scripts.benchmarks.statistics import Arrivals
 from tests.server.running import needs_bus
@@ -61,15 +61,6 @@ def test_what_wraps_in_the_signal_is_made_continuous() -> None:
     (stream,) = statistics.split(np.array(records, dtype=np.int64))
     assert stream.number.tolist() == [top - 2 + k for k in range(5)]
     assert stream.ages.tolist() == [90_000] * 5
-
-
-def test_summary_of_two_sensors() -> None:
-    streams = [arrivals((1, 2, 3), age=100_000), arrivals((7, 9), age=200_000)]
-    figures, ages = statistics.summary(streams)
-    assert (figures["made"], figures["arrivals"], figures["lost"]) == (6, 5, 1)
-    assert (figures["age_us"]["p50"], figures["age_us"]["min"], figures["age_us"]["max"]) == (100, 100, 200)
-    assert figures["stamp_error_us"] == {"p99_absolute": 0.0}
-    assert len(ages) == 5
 
 
 def turn(median_us: float, lost: int, cpu: float) -> Turn:
@@ -186,25 +177,6 @@ def test_recording_begins_after_the_warm_up(tmp_path: Path) -> None:
 
 
 # -- runs
-
-
-@pytest.mark.long
-def test_the_contact_is_by_the_ages_of_the_same_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    turns = {modes.THIS: 100_000, modes.BARE_C: 90_000, modes.DRIVER: 2_000_000}
-    monkeypatch.setattr(
-        modes, "turn", lambda _, name: statistics.summary([arrivals(range(100), turns[name])])
-    )
-    monkeypatch.setattr(modes, "build", lambda _: tmp_path)
-    monkeypatch.setattr(modes, "VENDOR", tmp_path)
-    (tmp_path / "has-bota-driver==1").touch()
-    monkeypatch.setenv("DEMO_DIRECTORY", str(tmp_path))
-    rows = contact.measure(Setup(800, 1, 1.0, 0), True, tmp_path / "contact.png")
-    walls = {row["program"]: row["filters"]["SINC 64"]["stiffest_wall"] for row in rows}
-    assert [*walls] == ["this", "bare C", "Bota's driver", contact.IDEAL, contact.POLLING]
-    assert walls[contact.IDEAL] > walls["bare C"] >= walls["this"] > 1.3 * walls["Bota's driver"]
-    above = {row["program"]: row["filters"]["SINC 64"]["overshoot"] for row in rows}
-    assert above[contact.IDEAL] < above["this"] < above["Bota's driver"]
-    assert (tmp_path / "contact.png").exists()
 
 
 def numbers(content: Any) -> Iterator[float]:

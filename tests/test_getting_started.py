@@ -29,7 +29,6 @@ ELSEWHERE = (
 """Commands that change the machine, need systemd, or ROS 2 from apt."""
 JUDGES = ("ethercat-doctor", "ethercat-monitor")
 """Their exit code is a verdict, here on a machine that runs tests."""
-SLOWEST_S = 240.0
 NUMBER = re.compile(r"[-+±]?\d+(?:\.\d+)?")
 
 
@@ -98,9 +97,10 @@ class Desk:
         """What a command that ends has said, and its exit code."""
         self._count += 1
         name, code = str(self._count), self.folder / f"{self._count}.code"
+        os.mkfifo(code)
         self._send(f"{{ {command}\n}} >{self.folder}/{name}.out 2>&1; echo $? >{code}")
-        wait_until(lambda: code.exists() and code.read_text(), command, SLOWEST_S)
-        return self.said(name), int(code.read_text())
+        ended = int(code.read_text())  # when it ends: installing takes minutes on a busy machine
+        return self.said(name), ended
 
     def start(self, terminal: str, command: str) -> None:
         """One that goes on; again where a busy machine starved the virtual sensor."""

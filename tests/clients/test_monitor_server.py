@@ -31,7 +31,6 @@ from bota_ethercat.client import Client
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.running import frames_in
-from tests.rights import NO_OTHER_USER
 from tests.served_simulation import ServedSimulation, served
 from tests.server.running import PATIENCE_S, free_port, wait_until
 from tests.simulation import simulated_bus, simulated_server
@@ -308,32 +307,6 @@ def test_a_tare_without_an_answer_is_not_known(way: str, monkeypatch: pytest.Mon
         text, bad = tare(Address("localhost", server.port), 0)
     assert bad
     assert text.startswith("It is unknown whether sensor 0 was tared: ")
-
-
-def test_tare_of_another_user_says_the_servers_sentence(shared: ServedSimulation) -> None:
-    if NO_OTHER_USER is not None:
-        pytest.skip(NO_OTHER_USER)
-    code = (
-        "from bota_ethercat.address import Address; from bota_clients.monitor.tare import tare;"
-        "from tests.rights import become_nobody; become_nobody();"
-        f"print(*tare(Address('localhost', {shared.port}), 0))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=PATIENCE_S
-    )
-    assert done.stdout.startswith("Sensor 0 was not tared: tare is denied to uid 65534"), done.stderr
-    assert done.stdout.endswith("True\n")
-
-
-def test_a_stopped_server_is_said_to_be_silent(shared: ServedSimulation) -> None:
-    with reading(shared.port) as model:
-        wait_until(lambda: samples(model) > 20, "samples")
-        with shared.stopped():
-            wait_until(lambda: state(model).server.silent, "silence")
-            alerts = [alert for sensor in state(model).sensors for alert in sensor.alerts]
-            assert not [alert for alert in alerts if alert.ago_s is None], "they are about what is now"
-        wait_until(lambda: not state(model).server.silent, "the server's voice")
-        assert state(model).server.connected
 
 
 def test_a_restart_of_the_server_is_seen_and_survived() -> None:

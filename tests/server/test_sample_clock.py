@@ -352,23 +352,65 @@ def test_pauses_between_trials_double_until_event_times_have_proved_right_for_lo
     assert pause_s() == pytest.approx(10, abs=0.5)
 
 
-@pytest.mark.parametrize("seconds", [0.8, 3.0], ids=["on trial", "trusted"])
-def test_what_does_not_fit_while_the_machine_is_busy_is_not_held_against_event_times(seconds: float) -> None:
+def show(
+    simulation: ClockSimulation, took_ns: float, ago_ns: float, off_ns: float, count: int
+) -> list[float | None]:
+    """Exchanges that took so long, each with a sample of `ago_ns` before that is `off_ns` from the expected.
+
+    What `date` makes of them while event times are trusted.
+    """
+    events, period_ns, dated = simulation.clock.events, simulation.clock.period_ns, []
+    assert events is not None
+    for _ in range(count):
+        simulation.now_ns += 30e6
+        sent = int(simulation.now_ns)
+        back = sent + int(took_ns)
+        latched = HONEST.local(sent), 1, HONEST.local(sent - ago_ns), 1
+        events.take(latched, sent, back, True, period_ns)
+        if events.are_trusted:
+            dated.append(events.date(sent - ago_ns - off_ns, period_ns, 1e6, sent, back))
+        else:
+            events.compare(0.0, 1e6, back)
+    return dated
+
+
+@pytest.mark.parametrize(("took_ns", "counts"), [(20e6, False), (100e3, True)])
+def test_exchanges_of_a_busy_machine_are_not_held_against_event_times_on_trial(
+    took_ns: float, counts: bool
+) -> None:
     """An exchange was away for long then: who knows what has held up what."""
-    for took_ns, counts in ((20e6, False), (100e3, True)):
-        simulation = run(HONEST, seconds=seconds)
-        events = simulation.clock.events
-        assert events is not None
-        for number in range(300):
-            sent = int(simulation.now_ns + number * 30e6)
-            back = sent + int(took_ns)
-            long_ago = HONEST.local(sent - 1e9)
-            events.take((HONEST.local(sent), 1, long_ago, 1), sent, back, True, simulation.clock.period_ns)
-            if events.are_trusted:
-                events.date(sent, simulation.clock.period_ns, 1e6, sent, back)
-            else:
-                events.compare(0.0, 1e6, back)
-        assert bool(trust(simulation).why) is counts
+    simulation = run(HONEST, seconds=0.8)
+    show(simulation, took_ns, ago_ns=1e9, off_ns=0, count=300)
+    assert bool(trust(simulation).why) is counts
+
+
+@pytest.mark.parametrize(
+    ("took_ns", "ago_ns", "off_ns", "dates", "counts"),
+    [
+        pytest.param(100e3, 1e6, 0, True, False, id="right"),
+        pytest.param(100e3, 1e6, 40e3, False, True, id="not as expected"),
+        pytest.param(20e6, 1e6, 40e3, False, False, id="not as expected, but the machine is busy"),
+        pytest.param(100e3, 1e6, 300e3, True, False, id="the sensor's own clock is another"),
+        pytest.param(100e3, 5e6, 0, False, False, id="older than the newest sample can be"),
+        pytest.param(100e3, 1e9, 0, False, True, id="not between the frames"),
+        pytest.param(20e6, 1e9, 0, False, False, id="not between the frames, but the machine is busy"),
+    ],
+)
+def test_which_samples_trusted_event_times_date_and_which_count_against_them(
+    took_ns: float, ago_ns: float, off_ns: float, dates: bool, counts: bool
+) -> None:
+    simulation = run(HONEST, seconds=3.0)
+    dated = show(simulation, took_ns, ago_ns, off_ns, count=6)
+    assert [late is not None for late in dated] == [dates] * (5 if counts else 6), "the fifth is too much"
+    assert bool(trust(simulation).why) is counts
+
+
+def test_samples_that_fit_make_up_for_those_that_do_not() -> None:
+    simulation = run(HONEST, seconds=3.0)
+    for _ in range(6):
+        show(simulation, 100e3, 1e6, 40e3, count=1)
+        show(simulation, 100e3, 1e6, 0, count=100)
+    assert not trust(simulation).why
 
 
 @pytest.mark.parametrize(

@@ -273,12 +273,6 @@ def test_every_choice_of_every_setting_takes(shared: Bench) -> None:
     assert shared.ask("configure", settings={"fir": False})["ok"]
 
 
-def test_saved_settings_are_in_the_flash(bench: Bench) -> None:
-    assert bench.ask("configure", settings={"acceleration_range_g": 8}, save=True)["saved"] is True
-    assert bench.ask("configure", settings={"acceleration_range_g": 8})["saved"] is False
-    assert bench.written().index(("0x8004", 0, "02")) < bench.written().index(("0x8030", 1, "01"))
-
-
 def test_what_was_configured_and_tared_outlives_server_and_power_cut(bench: Bench) -> None:
     assert bench.ask("configure", settings={"sinc_length": 128})["ok"]
     tared = tare_at_rest(bench)["new_offset"]
@@ -549,14 +543,6 @@ def test_a_sensor_settles_after_each_entry_into_op(bench: Bench) -> None:
     assert not settling(bench), "it did not leave OP either"
 
 
-def test_one_of_a_chain_settles() -> None:
-    bench = Bench(AT_REST, SensorOptions(signal="rest", serial=2))
-    bench.run(0.6)
-    bench.command("power cycle 0.2 @1")
-    bench.listener.wait_event("sensor_back", 1)
-    assert (settling(bench, 0), settling(bench, 1)) == (False, True)
-
-
 @pytest.mark.parametrize("change", ["start", "recovery", "configure"])
 def test_a_tare_waits_for_settled_data(bench: Bench, change: str) -> None:
     if change != "start":
@@ -639,17 +625,6 @@ def test_a_sensor_lost_half_way_comes_back_with_its_former_settings(
     assert bench.listener.wait_event("sensor_back")["settings"] == before["settings"]
     check_former(bench, before)
     assert bench.ask("configure", settings=settings)["ok"], "the next one takes"
-
-
-def test_whoever_asked_is_told_at_once_that_the_sensor_is_lost(bench: Bench) -> None:
-    before = bench.described()
-    bench.command("on-write 0x8006 4 power off")
-    assert bench.refused("configure", settings=BY_PREOP)["code"] == "not_ready"
-    assert bench.described()["state"] == "LOST"
-    assert bench.refused("configure", settings=BY_PREOP)["code"] == "not_ready"
-    bench.command("power on")
-    bench.listener.wait_event("sensor_back")
-    check_former(bench, before)
 
 
 @pytest.mark.parametrize("comes_back", [False, True])

@@ -448,13 +448,6 @@ def test_a_slave_that_stops_answering_is_said(monkeypatch: pytest.MonkeyPatch) -
         look_safely(Bus(backend), lambda: None)
 
 
-def test_a_bus_that_loses_frames_is_looked_at_all_the_same() -> None:
-    backend = chain("BOTA:OP,DRIVE:OP")
-    backend.command("lose 2")
-    with pytest.raises(BusError, match="position 1 in OP"):
-        look_safely(Bus(backend), lambda: None)
-
-
 # -- a start that is given up at any moment: the sensors go to INIT, the other devices are as they were
 
 

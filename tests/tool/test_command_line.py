@@ -117,14 +117,6 @@ def test_a_snapshot_that_cannot_be_written_is_said_before_the_sensor_is_read(fil
     assert said in refused("snapshot", "ens5", file)
 
 
-def test_help_names_every_command_and_the_exit_codes() -> None:
-    shown = tool_here("--help").out
-    assert len(COMMANDS) == 13
-    assert not [name for name in COMMANDS if f"\n  {name} " not in shown]
-    assert "3 plan: there are changes" in shown
-    assert "--set NAME=VALUE" in tool_here("plan", "--help").out
-
-
 @needs_bus
 @pytest.mark.parametrize("command", ["eeprom", "watch", "objects", "save", "tare"])
 def test_no_such_interface(command: str) -> None:

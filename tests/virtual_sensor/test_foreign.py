@@ -6,24 +6,16 @@ import struct
 
 import pytest
 
-from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.slave import sii
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.wire import Command
-from ethercat_server.sensor.scan import look_safely
 from ethercat_server.virtual_sensor.faults import obey
 from ethercat_server.virtual_sensor.foreign import KINDS, ForeignSlave, parse_chain, slaves_in
-from tests.simulation import chain
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, do, fmmu, sync_manager
 
 MS = 1_000_000
 ERROR = 0x10
 OUTPUTS, INPUTS = 0x1100, 0x1180
-
-
-def no_check() -> None:
-    pass
 
 
 def master_of(text: str) -> RawMaster:
@@ -184,19 +176,3 @@ def test_power_and_cable_of_a_place() -> None:
     assert obey(master.bus, "power off #3").startswith("error: ")
     do(master, "error 0x1E #1")
     assert master.read16(0x0134, 1) == 0x001E
-
-
-@pytest.mark.parametrize("state", ["", ":SAFEOP", ":OP"])
-def test_the_backend_in_memory_takes_a_mixed_chain_to_safeop(state: str) -> None:
-    """Also one that another master has left."""
-    backend = chain(f"EK1100{state},BOTA{state},EL3102{state},DRIVE{state}")
-    bus = Bus(backend)
-    found = look_safely(bus, no_check, force=True)
-    assert [slave.name for slave in found] == ["EK1100", "BFT-SENS-ECAT-M8", "EL3102", "DRIVE"]
-    bus.scan(range(1, 4), [slave.sii for slave in found], no_check)  # the coupler has no mailbox
-    assert finish(bus.slaves[1].sdo.read(0x1008, 0), clock=bus.clock) == b"EL3102"
-    assert bus.map_process_data(no_check) == [61, 6, 2]
-    for slave in bus.slaves:
-        finish(slave.go(AlState.SAFEOP), clock=bus.clock)
-    states = [slave.life.state for slave in backend.sensors.slaves[1:] if slave.life]
-    assert states == [SAFEOP] * 3

@@ -33,6 +33,8 @@ def test_identity_and_mapping() -> None:
     assert master.upload(0x1018, 4) == struct.pack("<I", 77)
     count = master.upload(0x1A00, 0)[0]
     assert sum(master.upload(0x1A00, n)[0] for n in range(1, count + 1)) == 77 * 8
+    assigned = [[master.upload(index, n) for n in (0, 1)] for index in (0x1C12, 0x1C13, 0x1600)]
+    assert assigned == [[b"\1", b"\x00\x16"], [b"\1", b"\x00\x1a"], [b"\1", b"\x08\x00\x00\x70"]]
     assert [master.upload(0x1C00, n)[0] for n in range(5)] == [4, 1, 2, 3, 4]
     sizes = [len(master.upload(0x2000, n)) for n in range(1, master.upload(0x2000, 0)[0] + 1)]
     assert len(sizes) == 0x57
@@ -133,12 +135,13 @@ def test_object_lists() -> None:
     found = b"".join(f[4:] for f in fragments)
     assert found[:2] == b"\1\0"
     assert list(struct.unpack(f"<{len(found) // 2}H", found)[1:]) == expected
-    [lengths] = master.information(1, struct.pack("<H", 0))
-    counts = struct.unpack("<6H", lengths[4:])
-    assert counts[:2] == (0, len(expected))
-    for kind in range(2, 6):
+    settings = [*range(0x8004, 0x8009)]
+    listed = ([0x7000], [0x6000], [*range(0x8000, 0x8003), *settings, 0x8010, 0x8030], settings)
+    for kind, indices in enumerate(listed, 2):
         [one] = master.information(1, struct.pack("<H", kind))
-        assert (len(one) - 6) // 2 == counts[kind]
+        assert one[4:] == struct.pack(f"<{1 + len(indices)}H", kind, *indices)
+    [lengths] = master.information(1, struct.pack("<H", 0))
+    assert struct.unpack("<6H", lengths[4:]) == (0, len(expected), *map(len, listed))
     [error] = master.information(1, struct.pack("<H", 9))
     assert error[0] == 7
 
@@ -157,8 +160,9 @@ def test_descriptions() -> None:
     for index, subindex in [(0x8004, 0), (0x8005, 0), (0x8007, 0), (0x8008, 0), (0x8010, 1), (0x8010, 6)]:
         [reply] = master.information(5, struct.pack("<HBB", index, subindex, 0))
         assert struct.unpack_from("<HH", reply, 8) == (0x0037, 8), "one-byte settings are BIT8"
-    [reply] = master.information(5, struct.pack("<HBB", 0x6000, 4, 0))
-    assert struct.unpack_from("<H", reply, 12)[0] == 0x87
+    for index, subindex, access in ((0x6000, 4, 0x87), (0x7000, 0, 0x47)):
+        [reply] = master.information(5, struct.pack("<HBB", index, subindex, 0))
+        assert struct.unpack_from("<H", reply, 12)[0] == access, "read always, mapped to TxPDO or RxPDO"
     for request in ((3, struct.pack("<H", 0x5555)), (5, struct.pack("<HBB", 0x1018, 9, 0)), (9, b"")):
         [reply] = master.information(*request)
         assert reply[0] == 7

@@ -5,7 +5,7 @@ import struct
 import pytest
 
 from bota_ethercat.pdo import LAYOUTS
-from ethercat_server.ethercat.slave.sii import checksum
+from ethercat_server.ethercat.slave.sii import checksum, decode
 from ethercat_server.virtual_sensor.device import build_image
 from ethercat_server.virtual_sensor.dictionary import sensor_device
 from ethercat_server.virtual_sensor.options import EEPROM_MS, SensorOptions
@@ -51,7 +51,8 @@ def test_identity_and_mailbox_words() -> None:
 
 @pytest.mark.parametrize("size", list(LAYOUTS))
 def test_categories(size: int) -> None:
-    found = categories(build_image(sensor_device("BFT-ROKS-ECAT-M8", 7, size)))
+    image = build_image(sensor_device("BFT-ROKS-ECAT-M8", 7, size))
+    found = categories(image)
     assert set(found) == {10, 30, 40, 41, 50, 51}
     assert found[10][1:18] == b"\x10BFT-ROKS-ECAT-M8"
     assert found[30][5] == 0x03, "SDO and SDO information, nothing else"
@@ -64,6 +65,9 @@ def test_categories(size: int) -> None:
     assert (index, count, manager) == (0x1A00, len(LAYOUTS[size].fields), 3)
     bits = sum(found[50][8 + 8 * n + 5] for n in range(count))
     assert bits == size * 8
+    output = {"index": 0x7000, "subindex": 0, "name": "Digital output", "type": 0x0002, "bits": 8}
+    (outputs,) = decode(image)["rx_pdos"]
+    assert outputs == {"index": 0x1600, "name": "Outputs", "sync_manager": 2, "entries": [output]}
     strings = found[10][0]
     assert all(1 <= found[50][8 + 8 * n + 3] <= strings for n in range(count))
 
