@@ -1,8 +1,8 @@
 """Which slaves are on a bus, which of them are sensors or operational, and whether a master is active.
 
 Nothing is disturbed: frames of other masters are counted, registers and SIIs (EEPROMs) are read. The SII of a
-slave in SAFEOP, OP or BOOT is not read, because that takes writes to its controller; a Bota sensor is then
-recognized by its sync managers.
+slave in SAFEOP, OP or BOOT is not read, because that takes writes to its controller, unless it may be stopped
+and must be what its name says; a Bota sensor is then recognized by its sync managers.
 """
 
 from __future__ import annotations
