@@ -19,7 +19,6 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.errors import ProtocolError, UnreachableError
-from bota_ethercat.health.sentences import no_server
 from bota_ethercat.program.server_choice import default_server
 from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.nic import Routes, find_routes, master_sockets, table, users_of
@@ -164,7 +163,7 @@ def server_here() -> tuple[Address, str]:
                 raise ServerError(f"the server at {address} has no interface on this computer")
             return address, ifname
     except UnreachableError as error:
-        raise ServerError(no_server(address, error)) from None
+        raise ServerError(f"no server at {address} ({error})") from None
     except (ValueError, ProtocolError) as error:
         raise ServerError(str(error)) from None
 

@@ -23,7 +23,7 @@ from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.controller import SlaveController
-from ethercat_server.sensor.scan import Slave
+from ethercat_server.sensor.scan import Kind, Slave
 
 # A choice of slaves: vendor and product, position on the wire.
 CHOICE: Final = re.compile(r"(?!$)(?:(0x[0-9a-fA-F]+):(0x[0-9a-fA-F]+)(?:@(?=[0-9])|$))?([0-9]{1,5})?")
@@ -165,15 +165,19 @@ def find_terminals(slaves: Sequence[Slave], choices: Sequence[str]) -> list[Term
     return found
 
 
-def named_positions(choices: Sequence[str]) -> list[int]:
-    """The positions on the wire that are named."""
-    return [int(position) for choice in choices if (position := CHOICE.findall(choice)[0][-1])]
+def named_positions(choices: Sequence[str]) -> dict[int, Kind | None]:
+    """The positions on the wire that are named, and the vendor and product that each must have, if any."""
+    return {int(position): kind for kind, position in map(_parsed, choices) if position}
 
 
 def _matches(slave: Slave, choice: str) -> bool:
-    (vendor, product, position), row = CHOICE.findall(choice)[0], slave.as_json()
-    is_kind = not vendor or (int(vendor, 0), int(product, 0)) == (row["vendor"], row["product"])
-    return is_kind and position in ("", str(slave.position))
+    (kind, position), row = _parsed(choice), slave.as_json()
+    return kind in (None, (row["vendor"], row["product"])) and position in ("", str(slave.position))
+
+
+def _parsed(choice: str) -> tuple[Kind | None, str]:
+    vendor, product, position = CHOICE.findall(choice)[0]
+    return (int(vendor, 0), int(product, 0)) if vendor else None, position
 
 
 class CycleWithTerminals(Cycle):

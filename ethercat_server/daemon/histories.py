@@ -1,4 +1,7 @@
-"""The histories of the sensors in files, one by serial number, which a thread writes now and then."""
+"""The histories of the sensors in files, one by serial number, which a thread writes now and then.
+
+Sensors that share a serial number have none: after a change of cables each would have the other's.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +24,14 @@ log = logging.getLogger(__name__)
 @contextlib.contextmanager
 def kept(drifts: Sequence[Drift]) -> Iterator[None]:
     """Within it the histories are those of the files, and are written there; at the end, too."""
-    by_path = {state.folder() / f"sensor-{drift.sensor.identity.serial}.json": drift for drift in drifts}
-    for path, drift in by_path.items():
-        drift.history = History(state.read(path))
+    by_path, serials = {}, [drift.sensor.identity.serial for drift in drifts]
+    for drift, serial in zip(drifts, serials, strict=True):
+        if serials.count(serial) > 1:
+            text = "no history is kept of sensor %d: another one has its serial number %d, too"
+            log.warning(text, drift.sensor.number, serial)
+            continue
+        path = state.folder() / f"sensor-{serial}.json"
+        by_path[path], drift.history = drift, History(state.read(path))
     ended = threading.Event()
 
     def write() -> None:

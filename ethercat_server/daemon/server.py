@@ -13,7 +13,7 @@ from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, par
 from ethercat_server.daemon.service import Notifier
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
-from ethercat_server.process.privileges import User, become, user_to_become
+from ethercat_server.process.privileges import User, become, forbid_new_privileges, user_to_become
 from ethercat_server.process.signals import Signals
 from ethercat_server.server import Server
 from ethercat_server.serving.connection import Limits
@@ -29,6 +29,8 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
     """Start up, stream until asked to stop, shut down; ServerError says what failed."""
     options = parse_options(argv)
     user = user_to_become(options.server["user"])
+    if user is not None:
+        forbid_new_privileges()  # before the log's thread starts
     control_uids = controlling_uids(options.server["control_users"], options.server["control_groups"])
     names, notifier = local_names(), Notifier()
     with contextlib.ExitStack() as cleanup:

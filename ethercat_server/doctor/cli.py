@@ -74,7 +74,7 @@ def _run(args: argparse.Namespace) -> int:
         try:
             _, args.iface = server_here()
         except ServerError as error:
-            raise UsageError(f"name an interface, or a server: {error}") from None
+            raise UsageError(f"{error}: name the interface, or start ethercat-server on it") from None
     if not 0 < len(os.fsencode(args.iface)) <= MAX_NAME_LENGTH or "/" in args.iface:
         raise UsageError(
             f"{args.iface!r} is not an interface name: it must have 1 to {MAX_NAME_LENGTH} characters; "

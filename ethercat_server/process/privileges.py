@@ -55,6 +55,11 @@ def _who_ran_sudo() -> User | None:
     return User(int(uid), int(gid), name)
 
 
+def forbid_new_privileges() -> None:
+    """This thread, and those and the processes that it starts from now on, gain none by executing a file."""
+    ctypes.CDLL(None).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+
+
 def become(user: User) -> None:
     """Become `user`, with its groups and no capability, in all threads; ServerError if that is refused.
 
@@ -72,7 +77,7 @@ def become(user: User) -> None:
     except (OSError, OverflowError) as error:
         why = error.strerror if isinstance(error, OSError) else "there is no such user"
         raise ServerError(f"cannot become user {user}: {why}; '--user root' stays root") from None
-    ctypes.CDLL(None).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+    forbid_new_privileges()
     if kept := _capabilities():
         raise ServerError(f"cannot give up the capabilities {kept:#x}: '--user root' keeps them all")
 

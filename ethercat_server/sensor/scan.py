@@ -1,14 +1,14 @@
 """Which slaves are on a bus, which of them are sensors or operational, and whether a master is active.
 
 Nothing is disturbed: frames of other masters are counted, registers and SIIs (EEPROMs) are read. The SII of a
-slave in SAFEOP, OP or BOOT is not read, because that takes writes to its controller; a Bota sensor is then
-recognized by its sync managers.
+slave in SAFEOP, OP or BOOT is not read, because that takes writes to its controller, unless it may be stopped
+and must be what its name says; a Bota sensor is then recognized by its sync managers.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.pdo import LAYOUTS
@@ -40,6 +40,7 @@ _KNOWN: Final = ("vendor", "product", "revision", "name")  # what `describe` say
 _MOST_LISTED: Final = 64
 _ABSENT_AFTER: Final = 3  # unanswered reads in a row; a single lost datagram says nothing
 _ABSENT: Final = "ABSENT"
+Kind = tuple[int, int]  # vendor and product
 
 log = logging.getLogger(__name__)
 
@@ -85,13 +86,14 @@ class Slave(NamedTuple):
 
 
 def look_safely(
-    bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False, ours: Collection[int] = ()
+    bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False, ours: Mapping[int, Kind | None] = {}
 ) -> list[Slave]:
     """All slaves, in their order on the wire, with their SIIs; NoSlaveError if there are none.
 
     BusError if using the bus would stop another machine: if another master is sending, or a slave that is
     not Bota's is in SAFEOP, OP or BOOT. With `force`, such slaves are taken to PREOP instead, and
-    those without outputs at the positions `ours`, where a server that was killed has left them.
+    those without outputs at the positions `ours`, where a server that was killed has left them: what is there
+    by its SII must be what is named.
     """
     if not force and (count := bus.listen(_LISTEN_S)) >= _MASTER_FRAMES:
         raise BusError(
@@ -110,7 +112,7 @@ def look_safely(
         )
     at_work = [
         slave for slave in slaves
-        if slave.at_work and not (slave.position in ours and _only_reads(bus, slave))
+        if slave.at_work and not (slave.position in ours and _is_ours(bus, slave, ours[slave.position]))
     ]  # fmt: skip
     if at_work and not force:
         where = ", ".join(f"{slave.position} in {slave.status.state.name}" for slave in at_work)
@@ -196,11 +198,14 @@ def _has_sensors_managers(bus: Bus, position: int) -> bool:
     return tuple(others) == _MAILBOXES_AND_OUTPUTS and inputs in [(_INPUTS, size) for size in LAYOUTS]
 
 
-def _only_reads(bus: Bus, slave: Slave) -> bool:
-    """Whether it has no outputs; in BOOT nobody knows."""
+def _is_ours(bus: Bus, slave: Slave, kind: Kind | None) -> bool:
+    """Whether it is of this kind, if any, and has no outputs; in BOOT nobody knows."""
     kinds = [control for _, length, control, *_ in _sync_managers(bus, slave.position) if length]
     has_outputs = any(control & reg.SM_WRITE and not control & reg.SM_MAILBOX for control in kinds)
-    return not has_outputs and slave.status.state is not AlState.BOOT
+    if has_outputs or slave.status.state is AlState.BOOT:
+        return False
+    content = kind and with_sii(bus, slave).sii
+    return kind is None or (content is not None and (content["vendor"], content["product"]) == kind)
 
 
 def _stopped(bus: Bus, slave: Slave, check_interrupt: CheckInterrupt) -> Slave:

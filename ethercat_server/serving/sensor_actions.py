@@ -161,10 +161,7 @@ class SensorActions:
 
     def _configure(self, connection: Connection, request: Request) -> None:
         number, save_too = request.values["sensor"], request.values["save"]
-        done = self._answering(connection, request)
-        self._check_unchanging(number)
-        self._jobs.check_present(number)
-        sensor = self.sensors[number]
+        done, sensor = self._answering(connection, request), self.sensors[number]
         try:
             change = Change(sensor, request.values["settings"])
         except SettingError as error:

@@ -36,7 +36,7 @@ from tests.server.running import PATIENCE_S
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ([], "name an interface, or a server: no server at localhost:12001 (Connection refused)"),
+        ([], "12001 (Connection refused): name the interface, or start ethercat-server on it\n"),
         (["ens5", "--colour"], "usage: ethercat-doctor"),
         (["ens5", "--seconds", "soon"], "must be from 0 to 3600"),
         (["ens5", "--seconds", "-1"], "from 0 to 3600"),

@@ -201,6 +201,21 @@ def test_a_history_stays_small_and_is_written_once_a_full_disk_has_space(
     assert [path.name for path in tmp_path.iterdir()] == ["sensor-7.json"]
 
 
+def test_sensors_with_the_same_serial_number_have_no_history(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    (tmp_path / "sensor-7.json").write_text('{"saturations": 3}')
+    arms = [Arm(7), Arm(7), Arm(8)]
+    with kept([arm.drift for arm in arms]):
+        for arm in arms:
+            assert arm.drift.history.saturations == 0
+            arm.drift.history.add_run([0.1] * 6)
+    assert caplog.text.count("another one has its serial number 7, too") == 2
+    assert (tmp_path / "sensor-7.json").read_text() == '{"saturations": 3}'
+    assert json.loads((tmp_path / "sensor-8.json").read_text())["runs"] == [[0.1] * 6]
+
+
 @pytest.mark.parametrize(
     "row",
     [

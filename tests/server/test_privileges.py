@@ -102,6 +102,7 @@ def test_what_needs_root_is_done_before_a_frame_is_read(monkeypatch: pytest.Monk
     monkeypatch.setattr(daemon, "open_bus", open_bus)
     monkeypatch.setattr(assembly, "bring_up", bring_up)
     monkeypatch.setattr(realtime, "prepare", prepare)
+    monkeypatch.setattr(daemon, "forbid_new_privileges", lambda: done.append("forbade new ones"))
     monkeypatch.setattr(daemon, "become", lambda user: done.append(f"became {user}"))
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
@@ -110,7 +111,8 @@ def test_what_needs_root_is_done_before_a_frame_is_read(monkeypatch: pytest.Monk
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-    assert done == ["opened ens5", "prepared, becomes user: True", "became nobody", "brought up"]
+    prepared = "prepared, becomes user: True"
+    assert done == ["forbade new ones", "opened ens5", prepared, "became nobody", "brought up"]
 
 
 # -- the server
@@ -131,7 +133,7 @@ def check_unprivileged(process: int) -> None:
         assert rows["Gid"].split() == [str(NOBODY.pw_gid)] * 4
         assert sorted(map(int, rows["Groups"].split())) == sorted(groups)
         assert not int(rows["CapEff"], 16) | int(rows["CapPrm"], 16) | int(rows["CapAmb"], 16)
-    assert rows_of(process)["NoNewPrivs"] == "1"
+        assert rows["NoNewPrivs"] == "1"
 
 
 @pytest.fixture(scope="module")

@@ -121,6 +121,7 @@ def test_terminals_are_named_by_what_and_where_they_are(choice: str) -> None:
         ("BOTA,DRIVE", "1", "'DRIVE' at position 1 .* has outputs, which nobody would write"),
         ("EK1100,BOTA", "0", "'EK1100' at position 0 .* has no inputs"),
         ("BOTA,EL3102:OP", ANALOG, "slaves at work"),
+        ("BOTA,EL3102:OP", f"{DIGITAL}@1", "slaves at work"),
         ("BOTA,DRIVE:OP", "1", "slaves at work"),
     ],
 )
@@ -209,11 +210,12 @@ def test_only_inputs_are_mapped_and_no_memory_but_the_mailbox_is_written() -> No
     assert max(address for address, _ in slave.writes) == 0x1000  # type: ignore[union-attr]
 
 
-def test_a_server_that_was_killed_finds_its_terminal_by_its_position() -> None:
+@pytest.mark.parametrize("choice", ["1", f"{ANALOG}@1"])
+def test_a_server_that_was_killed_finds_its_terminal_by_its_position(choice: str) -> None:
     """Nobody has taken it out of OP."""
     simulation = reading("BOTA,EL3102", f"{ANALOG}@1")
     wait_for(simulation, "OP")
-    wait_for(Simulation(backend=simulation.backend, wanted=Asked(terminals=["1"])), "OP")
+    wait_for(Simulation(backend=simulation.backend, wanted=Asked(terminals=[choice])), "OP")
 
 
 def test_other_pdos_than_the_sii_has_are_not_decoded(caplog: pytest.LogCaptureFixture) -> None:
