@@ -62,6 +62,7 @@ class Bus:
         self.disconnected: set[Slave] = set()  # those whose cable at port 0 is unplugged
         self.due: list[Callable[[], object]] = []  # for the end of the frame that is being processed
         self.frames = self.frames_lost = 0
+        self.quit = False  # the program is to end
         self.repair()
         self._power_events: list[tuple[int, Slave]] = []
         self._alive: list[Application] = []

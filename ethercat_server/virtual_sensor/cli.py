@@ -76,7 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
         _PROGRAM,
         "Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
         "and other slaves beside them.",
-        f"commands, one per line on stdin or on the --control socket, or with --send:\n{commands}\n\n"
+        f"commands, by --send, or one per line on stdin:\n{commands}\n\n"
         f"of a distributed clock, in --dc or as a command:\n{words}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -29,10 +29,6 @@ LONGEST_LINE: Final = 1000
 PPM_LIMIT: Final = 100_000.0
 
 
-class QuitCommand(Exception):  # noqa: N818
-    """The command `quit`."""
-
-
 @dataclass(frozen=True, slots=True)
 class Call:
     """A command for a slave of a bus."""
@@ -137,10 +133,6 @@ def _one_of(what: str, known: Sequence[str]) -> Callable[[str], str]:
 _CHANNEL = _one_of("channel", CHANNELS)
 
 
-def _quit(_call: Call) -> None:
-    raise QuitCommand
-
-
 COMMANDS: Final[tuple[Command, ...]] = (
     Command("lose N", "lose the next N frames", lambda c, n: setattr(c.bus, "lose", n), (_COUNT,)),
     Command("deaf [SECONDS]", "lose every frame, until `hear` or for a time",
@@ -206,14 +198,14 @@ COMMANDS: Final[tuple[Command, ...]] = (
     Command("stats", "counters and states, as JSON",
             lambda c: json.dumps(c.bus.statistics(), separators=(",", ":"))),
     Command("help", "this list", lambda _: " | ".join(f"{c.usage}: {c.meaning}" for c in COMMANDS)),
-    Command("quit", "end the program", _quit),
+    Command("quit", "end the program", lambda c: setattr(c.bus, "quit", True)),
 )  # fmt: skip
 
 BY_NAME: Final = {command.name: command for command in COMMANDS}
 
 
 def obey(bus: Bus, line: str) -> str:
-    """Execute one command; returns the answer without a line end. QuitCommand for `quit`."""
+    """Execute one command; returns the answer without a line end."""
     try:
         result = _parse(bus, line.split(), None)()
     except UsageError as error:
