@@ -15,12 +15,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor.application import Application
 from ethercat_server.virtual_sensor.bus import Bus, Damage, Slave
 from ethercat_server.virtual_sensor.distributed_clock import parse_word
 from ethercat_server.virtual_sensor.esc import SiiInterface
-from ethercat_server.virtual_sensor.options import Command, UsageError, real, whole
+from ethercat_server.virtual_sensor.options import Command, UsageError, model_name, real, whole
 from ethercat_server.virtual_sensor.sampler import CHANNELS, MOST_SKIPPED
 from ethercat_server.virtual_sensor.sensor import Firmware, VirtualSensor
 from ethercat_server.virtual_sensor.signals import SIGNALS
@@ -71,8 +70,6 @@ class Call:
         self.bus.power(self.slave, how == "on", seconds)
 
     def _swap(self, model: str, serial: int) -> None:
-        if not model.isascii() or not 1 <= len(model) <= 20:
-            raise UsageError(f"model {model!r} must have 1 to 20 ASCII characters, such as {MODELS[0]}")
         self.sensor.swap(model, serial)
         self.bus.power(self.sensor, True)
 
@@ -149,7 +146,7 @@ COMMANDS: Final[tuple[Command, ...]] = (
             Call._power, (str, _AMOUNT)),
     Command("disconnect [@N]", "unplug the cable at port 0", lambda c: c.bus.connect(c.slave, False)),
     Command("connect [@N]", "end `disconnect`", lambda c: c.bus.connect(c.slave, True)),
-    Command("swap MODEL SERIAL [@N]", "replace the sensor by another one", Call._swap, (str, _LONG)),
+    Command("swap MODEL SERIAL [@N]", "replace the sensor by another one", Call._swap, (model_name, _LONG)),
     Command("safeop CODE [@N]", "fall to SAFEOP with this AL status code",
             lambda c, code: c.application.fail(AlState.SAFEOP, code), (_WORD,)),
     Command("error CODE [@N]", "set the error bit and this AL status code",

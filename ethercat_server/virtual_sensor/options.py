@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import math
 from collections.abc import Callable, Sequence
@@ -15,7 +16,7 @@ from ethercat_server.virtual_sensor.world import World
 EEPROM_MS: Final = 2.0  # about what a real EEPROM needs for the eight bytes of a read command
 
 
-class UsageError(Exception):
+class UsageError(argparse.ArgumentTypeError):
     """Wrong or contradictory options, or a command that is wrong or cannot be executed: a sentence."""
 
 
@@ -74,6 +75,13 @@ def real(lowest: float, highest: float) -> Callable[[str], float]:
         raise UsageError(f"{text!r} must be a number from {lowest:g} to {highest:g}")
 
     return parse
+
+
+def model_name(text: str) -> str:
+    """Parses the name of a model; UsageError if a sensor cannot have it."""
+    if not text.isascii() or len(text) > 20:
+        raise UsageError(f"model {text!r} must have at most 20 ASCII characters, such as {MODELS[0]}")
+    return text
 
 
 @dataclass(frozen=True, slots=True)
