@@ -45,7 +45,7 @@ _NEEDED: Final = (
 
 
 class Application:
-    """What the EtherCAT controller calls, and what SDOs access: a slave that does nothing with its objects.
+    """What the EtherCAT controller calls: a slave that does nothing with its objects.
 
     `clock` gives the time in ns; reading its EEPROM takes `eeprom_ms`.
     """
@@ -64,7 +64,7 @@ class Application:
         self.state = AlState.INIT
         self.error = False  # the error bit of AL status
         self.code = 0  # the AL status code
-        coe = CoeServer(self, SdoInformation(objects, device).answer)
+        coe = CoeServer(objects, lambda: self.state, SdoInformation(objects, device).answer)
         managers = self.esc.sync_managers
         self.mailbox = Mailbox(managers[0], managers[1], coe.answer, device.protocols)
         self._outputs = [(entry.address, entry.type.size) for entry in device.output_entries]
@@ -73,7 +73,7 @@ class Application:
 
     def inputs(self) -> bytes:
         """The newest process data."""
-        return b"".join(self.read(*entry.address) for entry in self.device.input_entries)
+        return b"".join(self.objects.read(*entry.address) for entry in self.device.input_entries)
 
     def outputs(self, data: bytes) -> None:
         """The master wrote the outputs; they count in OP only."""
@@ -187,22 +187,6 @@ class Application:
     def repeat_requested(self) -> None:
         """The last reply was lost on the way."""
         self.mailbox.repeat()
-
-    def read(self, index: int, subindex: int) -> bytes:
-        """An SDO upload."""
-        return self.objects.read(index, subindex)
-
-    def length(self, index: int, subindex: int) -> int:
-        """Bytes of an entry."""
-        return self.objects.size(self.objects.entry(index, subindex))
-
-    def check_download(self, index: int, subindex: int, length: int) -> None:
-        """Refuse a download of the wrong length before its data has come."""
-        self.objects.check_write(self.objects.entry(index, subindex), length, self.state)
-
-    def write(self, index: int, subindex: int, data: bytes) -> None:
-        """An SDO download."""
-        self.objects.write(index, subindex, data, self.state)
 
 
 def al_statistics(life: Application | None) -> dict[str, Any]:

@@ -131,10 +131,10 @@ _CHANNEL = _one_of("channel", CHANNELS)
 
 
 COMMANDS: Final[tuple[Command, ...]] = (
-    Command("lose N", "lose the next N frames", lambda c, n: setattr(c.bus, "lose", n), (_COUNT,)),
+    Command("lose N", "lose the next N frames", lambda c, n: c.bus.lose(n), (_COUNT,)),
     Command("deaf [SECONDS]", "lose every frame, until `hear` or for a time",
             lambda c, seconds=math.inf: setattr(c.bus, "deaf_until", c.bus.now + seconds * 1e9), (_AMOUNT,)),
-    Command("deaf-after N", "lose every frame after the next N", lambda c, n: setattr(c.bus, "deaf_after", n),
+    Command("deaf-after N", "lose every frame after the next N", lambda c, n: c.bus.lose(math.inf, n),
             (_COUNT,)),
     Command("hear", "end `deaf`, `deaf-after`, `lose` and `damage`", lambda c: c.bus.repair()),
     Command("damage N [PORT] [@N]", "corrupt the next N frames on the cable at port 0 or 1 of this slave",
@@ -152,7 +152,7 @@ COMMANDS: Final[tuple[Command, ...]] = (
     Command("error CODE [@N]", "set the error bit and this AL status code",
             lambda c, code: c.application.fail(c.application.state, code), (_WORD,)),
     Command("abort INDEX SUBINDEX CODE [@N]", "abort the next SDO on that entry",
-            lambda c, index, sub, code: c.firmware.aborts.update({(index, sub): code}),
+            lambda c, index, sub, code: c.firmware.dictionary.aborts.update({(index, sub): code}),
             (_WORD, _BYTE, _LONG)),
     Command("on-write INDEX SUBINDEX COMMAND ...", "execute a command after the next SDO write to that entry",
             Call._on_write, (_WORD, _BYTE, str)),

@@ -69,6 +69,22 @@ _DEVICES: Final = (
 KINDS: Final = {device.name: device for device in _DEVICES}  # by the name in `--chain`
 
 
+_ENABLE: Final = 0x000F  # controlword in normal operation
+# Statuswords: remote, with switch-on disabled and with operation enabled.
+_DISABLED, _ENABLED = 0x0240, 0x0237
+
+
+class _DriveObjects(ObjectTable):
+    @property
+    def enabled(self) -> bool:
+        return int(self.number(_CONTROLWORD.address)) & _ENABLE == _ENABLE
+
+    def read(self, index: int, subindex: int) -> bytes:
+        if (index, subindex) == _STATUSWORD.address:
+            return _STATUSWORD.type.pack(_ENABLED if self.enabled else _DISABLED)
+        return super().read(index, subindex)
+
+
 def _objects_of(device: Device) -> ObjectTable:
     u32 = ObjectType.U32
     rows = [
@@ -82,44 +98,23 @@ def _objects_of(device: Device) -> ObjectTable:
         *device.input_entries,
     ]
     entries = entries_of(device, rows)
-    return ObjectTable(entries, {a: row.type.pack(row.default) for a, row in entries.items()})
-
-
-_ENABLE: Final = 0x000F  # controlword in normal operation
-# Statuswords: remote, with switch-on disabled and with operation enabled.
-_DISABLED, _ENABLED = 0x0240, 0x0237
+    kind = _DriveObjects if device is _DRIVE else ObjectTable
+    return kind(entries, {a: row.type.pack(row.default) for a, row in entries.items()})
 
 
 class Drive(Application):
     """A servo drive, which the controlword enables in one step, and the end of process data disables."""
 
-    def __init__(self, clock: Callable[[], int]) -> None:
-        super().__init__(_DRIVE, clock, _objects_of(_DRIVE), EEPROM_MS)
-
-    @property
-    def enabled(self) -> bool:
-        """Whether the controlword has enabled it."""
-        return int(self.objects.number(_CONTROLWORD.address)) & _ENABLE == _ENABLE
-
     @property
     def turning(self) -> bool:
         """Whether the motor moves."""
-        return self.enabled and self.objects.number(_VELOCITY.address) != 0
+        assert isinstance(self.objects, _DriveObjects)
+        return self.objects.enabled and self.objects.number(_VELOCITY.address) != 0
 
     def state_changed(self) -> None:
         """See `Application`."""
         if self.state is not AlState.OP:
             self.objects.values[_CONTROLWORD.address] = bytes(2)
-
-    def work(self) -> None:
-        """Be at work in OP: the other master has enabled it, and it turns."""
-        self.take_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
-
-    def read(self, index: int, subindex: int) -> bytes:
-        """See `Application`."""
-        if (index, subindex) == _STATUSWORD.address:
-            return _STATUSWORD.type.pack(_ENABLED if self.enabled else _DISABLED)
-        return super().read(index, subindex)
 
 
 class InputTerminal(Application):
@@ -157,12 +152,8 @@ class ForeignSlave:
             self.life = None
         elif self.life is None:
             device = KINDS[self.options.kind]
-            kind = InputTerminal if device.inputs else Application
-            self.life = (
-                Drive(self._clock)
-                if device is _DRIVE
-                else kind(device, self._clock, _objects_of(device), EEPROM_MS)
-            )
+            kind = Drive if device is _DRIVE else InputTerminal if device.inputs else Application
+            self.life = kind(device, self._clock, _objects_of(device), EEPROM_MS)
             self.life.esc.record = self._remember
 
     def _remember(self, address: int, data: bytes) -> None:
@@ -172,7 +163,7 @@ class ForeignSlave:
     def left_at_work(self) -> None:
         """Another master has left it in the AL state it is in: record from now on."""
         if isinstance(self.life, Drive) and self.life.state is AlState.OP:
-            self.life.work()
+            self.life.take_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
         self.writes.clear()
         self.write_count = 0
 
