@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, number
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import look_up
@@ -28,7 +28,6 @@ from ethercat_server.virtual_sensor.options import (
     SlaveOptions,
     UsageError,
     model_name,
-    real,
     whole,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
@@ -51,7 +50,7 @@ _SEVERAL: Final = "; several, comma separated or repeated, for a chain"
 _ALONG_THE_CHAIN: Final[tuple[tuple[str, str, Callable[[str], Any], str], ...]] = (
     ("model", "NAME", model_name, f"default {MODELS[0]}"),
     ("serial", "N", whole(0, 2**32 - 1), "default: by the interface's MAC address"),
-    ("ppm", "X", real(-PPM_LIMIT, PPM_LIMIT), "clock error"),
+    ("ppm", "X", number(-PPM_LIMIT, PPM_LIMIT), "clock error"),
     ("dc", "WORD[=VALUE][+...]", _clock, "distributed clock, see below"),
 )
 

@@ -14,12 +14,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from bota_ethercat.program.arguments import number
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor.application import Application
 from ethercat_server.virtual_sensor.bus import Bus, Damage, Slave
 from ethercat_server.virtual_sensor.distributed_clock import parse_word
 from ethercat_server.virtual_sensor.esc import SiiInterface
-from ethercat_server.virtual_sensor.options import Command, UsageError, model_name, real, whole
+from ethercat_server.virtual_sensor.options import Command, UsageError, model_name, whole
 from ethercat_server.virtual_sensor.sampler import CHANNELS, MOST_SKIPPED
 from ethercat_server.virtual_sensor.sensor import Firmware, VirtualSensor
 from ethercat_server.virtual_sensor.signals import SIGNALS
@@ -91,8 +92,6 @@ class Call:
 
     def _channel_fault(self, kind: str, channel: str, value: float | None, on: bool) -> None:
         sampler, position = self.firmware.sampler, CHANNELS.index(channel)
-        if sampler.exact:
-            raise UsageError("the signal `clock` has no channel faults: use another one")
         faults: dict[int, float | None] = getattr(sampler, kind)
         if not on:
             faults.pop(position, None)
@@ -108,7 +107,7 @@ class Call:
 
 
 _COUNT, _LONG, _WORD, _BYTE, _PORT = (whole(0, most) for most in (2**31, 2**32 - 1, 0xFFFF, 0xFF, 1))
-_AMOUNT = real(0, 1e6)
+_AMOUNT = number(0, 1e6)
 
 
 def _hex(text: str) -> bytes:
@@ -185,9 +184,9 @@ COMMANDS: Final[tuple[Command, ...]] = (
             lambda c, channel: c._channel_fault("frozen", channel, None, False), (_CHANNEL,)),
     Command("skip PERCENT [@N]", "skip this percentage of the samples at random; 0 ends it",
             lambda c, percent: c.firmware.sampler.set_skip(percent),
-            (real(0, MOST_SKIPPED),)),
+            (number(0, MOST_SKIPPED),)),
     Command("ppm X [@N]", "set the error of the sensor's clock", lambda c, ppm: c.sensor.set_ppm(ppm),
-            (real(-PPM_LIMIT, PPM_LIMIT),)),
+            (number(-PPM_LIMIT, PPM_LIMIT),)),
     Command("signal NAME [@N]", "measure another signal, from its beginning",
             lambda c, name: c.sensor.set_signal(name), (_one_of("signal", SIGNALS),)),
     Command("dc WORD [VALUE] ... [@N]", "a fault of the distributed clock, as in --dc; `dc ok` ends it",

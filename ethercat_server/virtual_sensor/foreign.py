@@ -105,12 +105,6 @@ def _objects_of(device: Device) -> ObjectTable:
 class Drive(Application):
     """A servo drive, which the controlword enables in one step, and the end of process data disables."""
 
-    @property
-    def turning(self) -> bool:
-        """Whether the motor moves."""
-        assert isinstance(self.objects, _DriveObjects)
-        return self.objects.enabled and self.objects.number(_VELOCITY.address) != 0
-
     def state_changed(self) -> None:
         """See `Application`."""
         if self.state is not AlState.OP:
@@ -170,7 +164,10 @@ class ForeignSlave:
     @property
     def turning(self) -> bool:
         """Whether it is a drive whose motor moves."""
-        return isinstance(self.life, Drive) and self.life.turning
+        objects = self.life.objects if self.life else None
+        return (
+            isinstance(objects, _DriveObjects) and objects.enabled and objects.number(_VELOCITY.address) != 0
+        )
 
     def statistics(self) -> dict[str, Any]:
         """Its part of what the command `stats` reports."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from bota_ethercat.program.arguments import typed
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor.world import World
@@ -16,8 +16,8 @@ from ethercat_server.virtual_sensor.world import World
 EEPROM_MS: Final = 2.0  # about what a real EEPROM needs for the eight bytes of a read command
 
 
-class UsageError(argparse.ArgumentTypeError):
-    """Wrong or contradictory options, or a command that is wrong or cannot be executed: a sentence."""
+# Wrong or contradictory options, or a command that is wrong or cannot be executed: a sentence.
+UsageError = argparse.ArgumentTypeError
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,28 +53,12 @@ SlaveOptions = SensorOptions | ForeignOptions
 def whole(lowest: int, highest: int) -> Callable[[str], int]:
     """Parses a whole number, decimal or 0x...; UsageError if it is invalid or out of range."""
 
-    def parse(text: str) -> int:
-        try:
-            value = int(text, 0)
-        except ValueError:
-            raise UsageError(f"{text!r} is not a whole number such as 27 or 0x1B") from None
-        if not lowest <= value <= highest:
-            raise UsageError(f"{text} is out of range: it must be from {lowest} to {highest}")
-        return value
+    def within(text: str) -> int:
+        if lowest <= (value := int(text, 0)) <= highest:
+            return value
+        raise ValueError
 
-    return parse
-
-
-def real(lowest: float, highest: float) -> Callable[[str], float]:
-    """Parses a finite number; UsageError if it is invalid or out of range."""
-
-    def parse(text: str) -> float:
-        with contextlib.suppress(ValueError):
-            if lowest <= (value := float(text)) <= highest:
-                return value
-        raise UsageError(f"{text!r} must be a number from {lowest:g} to {highest:g}")
-
-    return parse
+    return typed(within, f"a whole number from {lowest} to {highest}")
 
 
 def model_name(text: str) -> str:

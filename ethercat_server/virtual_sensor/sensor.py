@@ -20,21 +20,17 @@ _REPETITION_NS: Final = 300_000_000
 _WRITES_REMEMBERED: Final = 200
 
 
+OnWrite = Callable[[int, int, bytes, AlState, int], None]
+
+
 class WatchedDictionary(Dictionary):
     """Has `on_write` called for every SDO write: index, sub-index, data, AL state, abort code or 0.
 
     The next transfer of an entry in `aborts` is aborted with the code there.
     """
 
-    def __init__(
-        self,
-        options: SensorOptions,
-        flash: Flash,
-        process_data: Callable[[], bytes],
-        now: Callable[[], int],
-        on_write: Callable[[int, int, bytes, AlState, int], None],
-    ) -> None:
-        super().__init__(options, flash, process_data, now)
+    def __init__(self, on_write: OnWrite, *of_dictionary: Any) -> None:
+        super().__init__(*of_dictionary)
         self._on_write = on_write
         self.aborts: dict[Address, int] = {}
         # Code and until when, by write.
@@ -83,9 +79,9 @@ class Firmware(Application):
         options: SensorOptions,
         flash: Flash,
         clock: Callable[[], int],
-        on_write: Callable[[int, int, bytes, AlState, int], None],
+        on_write: OnWrite,
     ) -> None:
-        self.dictionary = WatchedDictionary(options, flash, self.inputs, clock, on_write)
+        self.dictionary = WatchedDictionary(on_write, options, flash, self.inputs, clock)
         self.sampler = Sampler(options, self.dictionary, clock)
         self.dictionary.changed = self.sampler.settings_changed
         device = sensor_device(options.model, options.serial, options.pdo_size)
