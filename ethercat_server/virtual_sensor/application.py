@@ -16,6 +16,7 @@ from ethercat_server.virtual_sensor.coe import CoeServer, ObjectTable, SdoInform
 from ethercat_server.virtual_sensor.device import Device, build_image
 from ethercat_server.virtual_sensor.esc import Esc
 from ethercat_server.virtual_sensor.mailbox import Mailbox
+from ethercat_server.virtual_sensor.options import EEPROM_MS
 
 _ERROR: Final = 0x10  # error bit of AL status, acknowledge bit of AL control
 _ORDER: Final = (AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP)
@@ -55,7 +56,7 @@ class Application:
         device: Device,
         clock: Callable[[], int],
         objects: ObjectTable,
-        eeprom_ms: float,
+        eeprom_ms: float = EEPROM_MS,
     ) -> None:
         self.device = device
         self.clock = clock

@@ -20,13 +20,7 @@ from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.application import Application, al_statistics
 from ethercat_server.virtual_sensor.coe import ObjectTable
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
-from ethercat_server.virtual_sensor.options import (
-    EEPROM_MS,
-    ForeignOptions,
-    SensorOptions,
-    SlaveOptions,
-    UsageError,
-)
+from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions, SlaveOptions, UsageError
 
 _RO, _RW = Access.RO, Access.RW
 _CONTROLWORD = ObjectEntry(0x6040, 0, "Controlword", ObjectType.U16, _RW)
@@ -147,7 +141,7 @@ class ForeignSlave:
         elif self.life is None:
             device = KINDS[self.options.kind]
             kind = Drive if device is _DRIVE else InputTerminal if device.inputs else Application
-            self.life = kind(device, self._clock, _objects_of(device), EEPROM_MS)
+            self.life = kind(device, self._clock, _objects_of(device))
             self.life.esc.record = self._remember
 
     def _remember(self, address: int, data: bytes) -> None:
