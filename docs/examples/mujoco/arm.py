@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
-import os
+import signal
+import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -82,13 +84,22 @@ class Arm:
     @contextlib.contextmanager
     def shown(self) -> Iterator[Any]:
         """A window, where there is a screen: `sync` renews it; None where there is none."""
-        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        import glfw  # noqa: PLC0415 - slow, and the tests do without
+        from mujoco import viewer  # noqa: PLC0415 - as above
+
+        glfw.ERROR_REPORTING = "ignore"
+        # Tried first, for where the viewer finds no screen it ends the process.
+        if not (glfw.init() and glfw.create_window(640, 480, "arm", None, None)):
+            print(f"no window: {glfw.get_error()[1].decode()}", flush=True)
             yield None
             return
-        from mujoco import viewer  # noqa: PLC0415 - it needs a screen
-
-        with viewer.launch_passive(self.model, self.data) as window:
+        glfw.terminate()
+        with viewer.launch_passive(self.model, self.data, show_left_ui=False, show_right_ui=False) as window:
+            mujoco.mjv_defaultFreeCamera(self.model, window.cam)
             yield window
+        for thread in threading.enumerate():  # of the viewer, which must not draw when Python ends GLFW
+            if thread.daemon:
+                thread.join()
 
 
 def arguments(description: str) -> argparse.ArgumentParser:
@@ -101,6 +112,10 @@ def arguments(description: str) -> argparse.ArgumentParser:
 
 def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace) -> None:
     """In real time, a cycle a millisecond, until the task is done; prints each change of condition."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it at once, for MuJoCo's threads cannot be ended
+    while not Path(options.world).is_socket():
+        print(f"waiting for a virtual sensor with --world {options.world}", flush=True)
+        time.sleep(1.0)
     with World(options.world) as world, Client(options.port) as sensor, arm.shown() as window:
         condition, due = None, time.monotonic()
         for number in itertools.count():
@@ -112,8 +127,10 @@ def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace)
                 return
             if reading.condition is not condition:
                 condition = reading.condition
-                print(f"{number * STEP_S:7.3f} s: {condition}")
+                print(f"{number * STEP_S:7.3f} s: {condition}", flush=True)
             if window is not None and number % _SHOWN_EVERY == 0:
+                if not window.is_running():
+                    sys.exit("the window was closed")
                 window.sync()
             due = max(due + STEP_S, time.monotonic() - _LARGEST_LAG_S)
             time.sleep(max(0.0, due - time.monotonic()))
