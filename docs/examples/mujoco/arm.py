@@ -85,6 +85,7 @@ class Arm:
     def shown(self) -> Iterator[Any]:
         """A window, where there is a screen: `sync` renews it; None where there is none."""
         import glfw  # noqa: PLC0415 - slow, and the tests do without
+
         from mujoco import viewer  # noqa: PLC0415 - as above
 
         glfw.ERROR_REPORTING = "ignore"
@@ -112,7 +113,7 @@ def arguments(description: str) -> argparse.ArgumentParser:
 
 def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace) -> None:
     """In real time, a cycle a millisecond, until the task is done; prints each change of condition."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it at once, for MuJoCo's threads cannot be ended
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # at once: Python would wait for the window
     while not Path(options.world).is_socket():
         print(f"waiting for a virtual sensor with --world {options.world}", flush=True)
         time.sleep(1.0)
