@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import itertools
 import signal
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
 STEP_S: Final = 0.001
 READY: Final = (0.0, 20.0, 100.0, 0.0, -30.0, 0.0)  # degrees: the tool before the wall, level
-_DAMPING: Final = 1e-4  # of the inverse of the Jacobian
 _SHOWN_EVERY: Final = 20  # steps
 _LARGEST_LAG_S: Final = 0.05  # behind which no step is made up for
 
@@ -49,14 +47,12 @@ class Arm:
     @property
     def tip(self) -> NDArray[np.float64]:
         """Position of the tip, (3,) m, in the base's frame."""
-        position: NDArray[np.float64] = self.data.site_xpos[self._tip].copy()
-        return position
+        return np.array(self.data.site_xpos[self._tip])
 
     @property
     def rotation(self) -> NDArray[np.float64]:
         """Turns the sensor's vectors into the base's, (3, 3)."""
-        rotation: NDArray[np.float64] = self.data.site_xmat[self._sensor].reshape(3, 3).copy()
-        return rotation
+        return np.array(self.data.site_xmat[self._sensor]).reshape(3, 3)
 
     @property
     def joints(self) -> NDArray[np.float64]:
@@ -72,10 +68,7 @@ class Arm:
         if self.velocity.any():
             mujoco.mj_jacSite(self.model, self.data, self._jacobian[:3], self._jacobian[3:], self._tip)
             twist = np.append(self.velocity, np.zeros(3)) * STEP_S
-            jacobian = self._jacobian
-            self.data.ctrl += jacobian.T @ np.linalg.solve(
-                jacobian @ jacobian.T + _DAMPING * np.eye(6), twist
-            )
+            self.data.ctrl += np.linalg.pinv(self._jacobian) @ twist
         mujoco.mj_step(self.model, self.data)
         values = self.data.sensordata.tolist()
         # MuJoCo gives what the arm does to the tool; the sensor feels the opposite.
@@ -114,9 +107,10 @@ def arguments(description: str) -> argparse.ArgumentParser:
 def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace) -> None:
     """In real time, a cycle a millisecond, until the task is done; prints each change of condition."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # at once: Python would wait for the window
-    while not Path(options.world).is_socket():
+    if not Path(options.world).is_socket():
         print(f"waiting for a virtual sensor with --world {options.world}", flush=True)
-        time.sleep(1.0)
+        while not Path(options.world).is_socket():
+            time.sleep(0.1)
     with World(options.world) as world, Client(options.port) as sensor, arm.shown() as window:
         condition, due = None, time.monotonic()
         for number in itertools.count():
@@ -131,7 +125,7 @@ def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace)
                 print(f"{number * STEP_S:7.3f} s: {condition}", flush=True)
             if window is not None and number % _SHOWN_EVERY == 0:
                 if not window.is_running():
-                    sys.exit("the window was closed")
+                    raise SystemExit("the window was closed")
                 window.sync()
             due = max(due + STEP_S, time.monotonic() - _LARGEST_LAG_S)
             time.sleep(max(0.0, due - time.monotonic()))
