@@ -106,7 +106,7 @@ def arguments(description: str) -> argparse.ArgumentParser:
 
 def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace) -> None:
     """In real time, a cycle a millisecond, until the task is done; prints each change of condition."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # at once: Python would wait for the window
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends it at once, with the window's threads
     if not Path(options.world).is_socket():
         print(f"waiting for a virtual sensor with --world {options.world}", flush=True)
         while not Path(options.world).is_socket():
