@@ -25,10 +25,11 @@ CPP: Final = ROOT / "clients/cpp/include/bota_ethercat"
 HARDWARE: Final = ROOT / "clients/ros2_control/include/bota_ethercat_hardware"
 CPP_FUNCTIONS: Final = {"choose_server", "make_real_time", "monotonic_now_ns", "parse_server", "to_string"}
 CPP_TYPES: Final = {
-    "Channel", "Client", "Condition", "Control", "Counters", "Description", "Frame", "ImuUnits", "Options",
-    "Reading", "Reconnect", "Sample", "Scheduling", "SensorInfo", "StreamCounts", "TareResult",
+    "Channel", "Client", "Condition", "Control", "Counters", "Description", "Felt", "Frame",
+    "ImuUnits", "Options", "Reading", "Reconnect", "Sample", "Scheduling", "SensorInfo", "StreamCounts",
+    "TareResult", "World",
 }  # fmt: skip
-"""What docs/cpp.md tells of; the headers have further names."""
+"""What docs/cpp.md and docs/world.md tell of; the headers have further names."""
 
 
 def python() -> set[str]:
@@ -57,7 +58,7 @@ def cpp() -> set[str]:
             public = shorter
         parts = re.split("," if kind == "enum class" else ";", public.replace("public:", ""))
         members = {found[1] for part in parts if (found := re.search(r"(\w+)\s*(?=[(=\[]|$)", part.strip()))}
-        names |= {name, *(f"{name}::{member}" for member in members - {name})}
+        names |= {name, *(f"{name}::{member}" for member in members - {name, "operator"})}
     return names
 
 

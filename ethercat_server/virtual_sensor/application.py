@@ -16,6 +16,7 @@ from ethercat_server.virtual_sensor.coe import CoeServer, ObjectTable, SdoInform
 from ethercat_server.virtual_sensor.device import Device, build_image
 from ethercat_server.virtual_sensor.esc import Esc
 from ethercat_server.virtual_sensor.mailbox import Mailbox
+from ethercat_server.virtual_sensor.options import EEPROM_MS
 
 _ERROR: Final = 0x10  # error bit of AL status, acknowledge bit of AL control
 _ORDER: Final = (AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP)
@@ -45,7 +46,7 @@ _NEEDED: Final = (
 
 
 class Application:
-    """What the EtherCAT controller calls, and what SDOs access: a slave that does nothing with its objects.
+    """What the EtherCAT controller calls: a slave that does nothing with its objects.
 
     `clock` gives the time in ns; reading its EEPROM takes `eeprom_ms`.
     """
@@ -55,7 +56,7 @@ class Application:
         device: Device,
         clock: Callable[[], int],
         objects: ObjectTable,
-        eeprom_ms: float,
+        eeprom_ms: float = EEPROM_MS,
     ) -> None:
         self.device = device
         self.clock = clock
@@ -64,7 +65,7 @@ class Application:
         self.state = AlState.INIT
         self.error = False  # the error bit of AL status
         self.code = 0  # the AL status code
-        coe = CoeServer(self, SdoInformation(objects, device).answer)
+        coe = CoeServer(objects, lambda: self.state, SdoInformation(objects, device).answer)
         managers = self.esc.sync_managers
         self.mailbox = Mailbox(managers[0], managers[1], coe.answer, device.protocols)
         self._outputs = [(entry.address, entry.type.size) for entry in device.output_entries]
@@ -73,7 +74,7 @@ class Application:
 
     def inputs(self) -> bytes:
         """The newest process data."""
-        return b"".join(self.read(*entry.address) for entry in self.device.input_entries)
+        return b"".join(self.objects.read(*entry.address) for entry in self.device.input_entries)
 
     def outputs(self, data: bytes) -> None:
         """The master wrote the outputs; they count in OP only."""
@@ -187,22 +188,6 @@ class Application:
     def repeat_requested(self) -> None:
         """The last reply was lost on the way."""
         self.mailbox.repeat()
-
-    def read(self, index: int, subindex: int) -> bytes:
-        """An SDO upload."""
-        return self.objects.read(index, subindex)
-
-    def length(self, index: int, subindex: int) -> int:
-        """Bytes of an entry."""
-        return self.objects.size(self.objects.entry(index, subindex))
-
-    def check_download(self, index: int, subindex: int, length: int) -> None:
-        """Refuse a download of the wrong length before its data has come."""
-        self.objects.check_write(self.objects.entry(index, subindex), length, self.state)
-
-    def write(self, index: int, subindex: int, data: bytes) -> None:
-        """An SDO download."""
-        self.objects.write(index, subindex, data, self.state)
 
 
 def al_statistics(life: Application | None) -> dict[str, Any]:

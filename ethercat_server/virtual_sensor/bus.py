@@ -15,7 +15,6 @@ wire order; the sensors among them, with their settings and their flash, are in 
 from __future__ import annotations
 
 import contextlib
-import math
 import operator
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -62,6 +61,7 @@ class Bus:
         self.disconnected: set[Slave] = set()  # those whose cable at port 0 is unplugged
         self.due: list[Callable[[], object]] = []  # for the end of the frame that is being processed
         self.frames = self.frames_lost = 0
+        self.quit = False  # the program is to end
         self.repair()
         self._power_events: list[tuple[int, Slave]] = []
         self._alive: list[Application] = []
@@ -72,9 +72,8 @@ class Bus:
 
     def repair(self) -> None:
         """End what loses or damages frames."""
-        self.lose = 0  # number of the next frames that are lost
-        self.deaf_until: float | None = None  # no frame comes back before this time
-        self.deaf_after: int | None = None  # number of frames after which the bus stops answering
+        self.lost: tuple[float, float] = (0, 0)  # the numbers of the frames that are: from this, before that
+        self.deaf_until: float = 0  # no frame comes back before this time
         self.damage: Damage | None = None  # of the next frames on the cable
 
     def _leave_behind(self) -> None:
@@ -103,6 +102,10 @@ class Bus:
         for position, life in enumerate(self._alive):
             life.esc.set_line(position, len(self._alive) - 1 - position)
 
+    def lose(self, frames: float, after: int = 0) -> None:
+        """Lose so many frames, after so many that come back."""
+        self.lost = self.frames + after, self.frames + after + frames
+
     def set_time(self, now: int) -> None:
         """Let time pass up to `now`, with what is due meanwhile but the watchdogs: frames may be waiting."""
         now = max(now, self.now)  # a frame lasts some µs
@@ -111,8 +114,6 @@ class Bus:
             slave.power(True)
             self.rewire()
         self.now = now
-        if self.deaf_until is not None and now >= self.deaf_until:
-            self.deaf_until = None
 
     def power(self, slave: Slave, on: bool, seconds: float | None = None) -> None:
         """Switch a slave on or off; on again after `seconds` unless None."""
@@ -142,14 +143,11 @@ class Bus:
         if not datagrams:
             return False
         self.set_time(now)
+        begin, end = self.lost
+        lost = begin <= self.frames < end or self.now < self.deaf_until or not self._alive
         self.frames += 1
-        if self.deaf_after is not None:
-            self.deaf_after -= 1
-            if self.deaf_after < 0:
-                self.deaf_after, self.deaf_until = None, math.inf
-        if self.deaf_until is not None or self.lose or not self._alive:
-            self.lose = max(self.lose - 1, 0)
-            self.frames_lost += 1
+        self.frames_lost += lost
+        if lost:
             return False
         position = self._damaged_at()
         intact = self._escs[:position]

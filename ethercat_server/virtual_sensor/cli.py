@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, number
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import look_up
@@ -27,7 +27,7 @@ from ethercat_server.virtual_sensor.options import (
     SensorOptions,
     SlaveOptions,
     UsageError,
-    real,
+    model_name,
     whole,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
@@ -37,35 +37,22 @@ _PROGRAM: Final = "ethercat-virtual-sensor"
 _SERIAL_NUMBERS: Final = 100  # for each bus: more than it has slaves
 
 
-def _model(text: str) -> str:
-    if not text.isascii() or len(text) > 20:
-        raise UsageError(f"model {text!r} must have at most 20 ASCII characters, such as {MODELS[0]}")
-    return text
-
-
 def _clock(text: str) -> str:
     parse_clock(text)
     return text
 
 
-def _sinc_length(text: str) -> int:
-    lengths = SETTINGS["sinc_length"].choices or ()
-    return whole(int(min(lengths)), int(max(lengths)))(text)
+def _each(parse: Callable[[str], Any]) -> Callable[[str], list[Any]]:
+    return lambda text: [parse(word) for word in text.split(",") if word]
 
 
-_ALONG_THE_CHAIN: Final = ("model", "serial", "ppm", "dc")
-_SEVERAL = "; several, comma separated or repeated, for a chain"
-# Name, metavar, parser, help.
-_OPTIONS: Final[tuple[tuple[str, str, Callable[[str], Any], str], ...]] = (
-    ("chain", "SLAVES", parse_chain, f"all slaves in wire order: {SENSOR}, {', '.join(KINDS)}; "
-     "KIND:STATE if another master has left one in this AL state"),
-    ("sensors", "N", whole(1, MOST_SLAVES), "sensors on the bus (default: as many as named, or 1)"),
-    ("model", "NAME", _model, f"default {MODELS[0]}{_SEVERAL}"),
-    ("serial", "N", whole(0, 2**32 - 1), f"default: by the interface's MAC address{_SEVERAL}"),
-    ("sinc", "N", _sinc_length, "SINC length after power-on (default 64)"),
-    ("ppm", "X", real(-PPM_LIMIT, PPM_LIMIT), f"clock error{_SEVERAL}"),
-    ("dc", "WORD[=VALUE][+...]", _clock, f"distributed clock, see below{_SEVERAL}"),
-)  # fmt: skip
+_SEVERAL: Final = "; several, comma separated or repeated, for a chain"
+_ALONG_THE_CHAIN: Final[tuple[tuple[str, str, Callable[[str], Any], str], ...]] = (
+    ("model", "NAME", model_name, f"default {MODELS[0]}"),
+    ("serial", "N", whole(0, 2**32 - 1), "default: by the interface's MAC address"),
+    ("ppm", "X", number(-PPM_LIMIT, PPM_LIMIT), "clock error"),
+    ("dc", "WORD[=VALUE][+...]", _clock, "distributed clock, see below"),
+)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -76,14 +63,30 @@ def build_parser() -> argparse.ArgumentParser:
         _PROGRAM,
         "Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
         "and other slaves beside them.",
-        f"commands, one per line on stdin or on the --control socket, or with --send:\n{commands}\n\n"
+        f"commands, by --send, or one per line on stdin:\n{commands}\n\n"
         f"of a distributed clock, in --dc or as a command:\n{words}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("iface", metavar="IFACE", nargs="?", help="interface, one end of a veth pair")
-    for name, metavar, _, meaning in _OPTIONS:
-        action = "append" if name in _ALONG_THE_CHAIN else "store"
-        parser.add_argument(f"--{name}", metavar=metavar, action=action, help=meaning)
+    parser.add_argument(
+        "--chain", metavar="SLAVES", type=parse_chain,
+        help=f"all slaves in wire order: {SENSOR}, {', '.join(KINDS)}; "
+        "KIND:STATE if another master has left one in this AL state",
+    )  # fmt: skip
+    parser.add_argument(
+        "--sensors", metavar="N", type=whole(1, MOST_SLAVES),
+        help="sensors on the bus (default: as many as named, or 1)",
+    )  # fmt: skip
+    for name, metavar, parse, meaning in _ALONG_THE_CHAIN:
+        parser.add_argument(
+            f"--{name}", metavar=metavar, type=_each(parse), action="extend", default=[],
+            help=f"{meaning}{_SEVERAL}",
+        )  # fmt: skip
+    lengths = SETTINGS["sinc_length"].choices or ()
+    sinc_length = whole(int(min(lengths)), int(max(lengths)))
+    parser.add_argument(
+        "--sinc", metavar="N", type=sinc_length, help="SINC length after power-on (default 64)"
+    )
     parser.add_argument("--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data")
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
     parser.add_argument("--world", metavar="PATH", help="measure what datagrams to this Unix socket say")
@@ -107,20 +110,10 @@ def _number_of(ifname: str) -> int:
 
 def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[SlaveOptions, ...]:
     """The slaves that parsed arguments ask for; UsageError if they are contradictory."""
-    given: dict[str, Any] = {}
-    for name, _, parse, _ in _OPTIONS:
-        text = getattr(args, name.replace("-", "_"))
-        try:
-            if name in _ALONG_THE_CHAIN:
-                given[name] = [parse(word) for each in text or () for word in each.split(",") if word]
-            else:
-                given[name] = None if text is None else parse(text)
-        except UsageError as error:
-            raise UsageError(f"--{name}: {error}") from None
-    chain, count = given["chain"], given["sensors"]
+    chain, count = args.chain, args.sensors
     if chain is not None and count is not None:
         raise UsageError("--chain names the sensors too: leave --sensors out")
-    named = max(len(given[name]) for name in _ALONG_THE_CHAIN)
+    named = max(map(len, (args.model, args.serial, args.ppm, args.dc)))
     if chain is not None:
         count = sum(kind == SENSOR for kind, _ in chain)
     elif count is None:
@@ -128,19 +121,19 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
     if named > count:
         raise UsageError(f"{named} sensors are named but there are to be {count}: name no more than that")
 
-    def of(name: str, position: int, default: Any) -> Any:
+    def of(given: list[Any], position: int, default: Any) -> Any:
         """The last one applies to the rest."""
-        return given[name][min(position, len(given[name]) - 1)] if given[name] else default
+        return given[min(position, len(given) - 1)] if given else default
 
-    serials = given["serial"] or [default_serial]
+    serials = args.serial or [default_serial]
     sensors = [
         SensorOptions(
-            model=of("model", position, MODELS[0]),
+            model=of(args.model, position, MODELS[0]),
             serial=(serials + [serials[-1] + n for n in range(1, count)])[position],
             pdo_size=int(args.pdo),
-            sinc_length=given["sinc"],
-            ppm=of("ppm", position, 0.0),
-            dc=of("dc", position, ""),
+            sinc_length=args.sinc,
+            ppm=of(args.ppm, position, 0.0),
+            dc=of(args.dc, position, ""),
             signal=args.signal,
             world=ExternalWorld(args.world_lost) if args.world else None,
             noise=args.noise == "on",
@@ -177,8 +170,7 @@ def main(
     try:
         slaves = options_from(args, _SERIAL_NUMBERS * (number or _number_of(args.iface)) or 1)
     except UsageError as error:
-        _say(error)
-        return 2
+        parser.error(str(error))
     stopped = threading.Event()
     models = [slave.model for slave in slaves if isinstance(slave, SensorOptions)]
     foreign = [slave.kind for slave in slaves if isinstance(slave, ForeignOptions)]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import AbortCode, abort_meaning
@@ -60,6 +60,10 @@ class ObjectTable:
         self.check_write(self.entry(index, subindex), len(data), state)
         self.values[index, subindex] = data
 
+    def check_download(self, index: int, subindex: int, length: int, state: AlState) -> None:
+        """Refuse a download before its data has come."""
+        self.check_write(self.entry(index, subindex), length, state)
+
     def check_write(self, row: ObjectEntry, length: int, state: AlState) -> None:
         """SdoAbortError if `length` bytes cannot be written to `row` in `state`, whatever they are."""
         if row.access is Access.RO:
@@ -78,24 +82,21 @@ _DOWNLOAD, _UPLOAD, _DOWNLOADED, _ABORT = 1, 2, 3, 4
 _SIZE_INDICATED, _EXPEDITED, _COMPLETE = 0x01, 0x02, 0x10
 
 
-class _Objects(Protocol):
-    """What the server reads and writes: see `Application`."""
-
-    def read(self, index: int, subindex: int) -> bytes: ...
-    def length(self, index: int, subindex: int) -> int: ...
-    def check_download(self, index: int, subindex: int, length: int) -> None: ...
-    def write(self, index: int, subindex: int, data: bytes) -> None: ...
-
-
 class CoeServer:
     """Answers CoE requests one at a time: SDO upload and download, expedited and normal.
 
-    No object is too long for the mailbox, so there are no segments. `information` answers requests to the SDO
-    Information service.
+    No object is too long for the mailbox, so there are no segments. `state` gives the AL state; `information`
+    answers requests to the SDO Information service.
     """
 
-    def __init__(self, objects: _Objects, information: Callable[[bytes, int], list[bytes]]) -> None:
+    def __init__(
+        self,
+        objects: ObjectTable,
+        state: Callable[[], AlState],
+        information: Callable[[bytes, int], list[bytes]],
+    ) -> None:
         self._objects = objects
+        self._state = state
         self._information = information
 
     def answer(self, message: bytes, room: int) -> list[bytes]:
@@ -145,13 +146,13 @@ class CoeServer:
             if command & _SIZE_INDICATED:
                 size = 4 - (command >> 2 & 3)
             else:  # the client leaves it to the server
-                size = min(self._objects.length(index, subindex), 4)
+                size = min(self._objects.size(self._objects.entry(index, subindex)), 4)
             data = request[4 : 4 + size]
         else:
             (size,) = struct.unpack_from("<I", request, 4)
             data = request[_SDO_HEADER_SIZE : _SDO_HEADER_SIZE + size]
-            self._objects.check_download(index, subindex, size)
-        self._objects.write(index, subindex, data)
+            self._objects.check_download(index, subindex, size, self._state())
+        self._objects.write(index, subindex, data, self._state())
         return struct.pack("<BHBI", _DOWNLOADED << 5, index, subindex, 0)
 
 

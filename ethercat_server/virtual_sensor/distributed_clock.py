@@ -11,8 +11,9 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from bota_ethercat.program.arguments import number
 from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.options import Command, UsageError, real
+from ethercat_server.virtual_sensor.options import Command, UsageError
 
 RATE_SCALE: Final = 10**12  # rates are in parts of this
 HOP_NS: Final = 700  # from slave to slave, cable included
@@ -259,11 +260,11 @@ CLOCK_WORDS: Final = (
     Command("no-events", "no 0x09F0, 0x09F8, 0x09FC: they read zero", lambda c, _: c.events.take_away()),
     Command("stuck", "0x09FC stands still", lambda c, _: setattr(c.events, "stuck", True)),
     Command("late US", "0x09F8 and 0x09FC are too late by this, too early if negative",
-            lambda c, _, us: setattr(c.events, "shift", round(us * 1000)), (real(-1e6, 1e6),)),
+            lambda c, _, us: setattr(c.events, "shift", round(us * 1000)), (number(-1e6, 1e6),)),
     Command("at NS", "the local clock jumps to this time",
-            lambda c, now, ns: c.local.set(now, round(ns)), (real(0, 2.0**62),)),
+            lambda c, now, ns: c.local.set(now, round(ns)), (number(0, 2.0**62),)),
     Command("ppm X", "rate of the local clock, without a jump of the time",
-            lambda c, now, ppm: c.local.set_ppm(now, ppm), (real(-100_000, 100_000),)),
+            lambda c, now, ppm: c.local.set_ppm(now, ppm), (number(-100_000, 100_000),)),
 )  # fmt: skip
 _FROM_POWER_ON: Final = ("none", "32-bit")  # which cannot come about while the controller runs
 

@@ -14,23 +14,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from bota_ethercat.program.arguments import number
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor.application import Application
 from ethercat_server.virtual_sensor.bus import Bus, Damage, Slave
 from ethercat_server.virtual_sensor.distributed_clock import parse_word
 from ethercat_server.virtual_sensor.esc import SiiInterface
-from ethercat_server.virtual_sensor.options import Command, UsageError, real, whole
+from ethercat_server.virtual_sensor.options import Command, UsageError, model_name, whole
 from ethercat_server.virtual_sensor.sampler import CHANNELS, MOST_SKIPPED
 from ethercat_server.virtual_sensor.sensor import Firmware, VirtualSensor
 from ethercat_server.virtual_sensor.signals import SIGNALS
 
 LONGEST_LINE: Final = 1000
 PPM_LIMIT: Final = 100_000.0
-
-
-class QuitCommand(Exception):  # noqa: N818
-    """The command `quit`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +71,6 @@ class Call:
         self.bus.power(self.slave, how == "on", seconds)
 
     def _swap(self, model: str, serial: int) -> None:
-        if not model.isascii() or not 1 <= len(model) <= 20:
-            raise UsageError(f"model {model!r} must have 1 to 20 ASCII characters, such as {MODELS[0]}")
         self.sensor.swap(model, serial)
         self.bus.power(self.sensor, True)
 
@@ -98,8 +92,6 @@ class Call:
 
     def _channel_fault(self, kind: str, channel: str, value: float | None, on: bool) -> None:
         sampler, position = self.firmware.sampler, CHANNELS.index(channel)
-        if sampler.exact:
-            raise UsageError("the signal `clock` has no channel faults: use another one")
         faults: dict[int, float | None] = getattr(sampler, kind)
         if not on:
             faults.pop(position, None)
@@ -115,7 +107,7 @@ class Call:
 
 
 _COUNT, _LONG, _WORD, _BYTE, _PORT = (whole(0, most) for most in (2**31, 2**32 - 1, 0xFFFF, 0xFF, 1))
-_AMOUNT = real(0, 1e6)
+_AMOUNT = number(0, 1e6)
 
 
 def _hex(text: str) -> bytes:
@@ -137,15 +129,11 @@ def _one_of(what: str, known: Sequence[str]) -> Callable[[str], str]:
 _CHANNEL = _one_of("channel", CHANNELS)
 
 
-def _quit(_call: Call) -> None:
-    raise QuitCommand
-
-
 COMMANDS: Final[tuple[Command, ...]] = (
-    Command("lose N", "lose the next N frames", lambda c, n: setattr(c.bus, "lose", n), (_COUNT,)),
+    Command("lose N", "lose the next N frames", lambda c, n: c.bus.lose(n), (_COUNT,)),
     Command("deaf [SECONDS]", "lose every frame, until `hear` or for a time",
             lambda c, seconds=math.inf: setattr(c.bus, "deaf_until", c.bus.now + seconds * 1e9), (_AMOUNT,)),
-    Command("deaf-after N", "lose every frame after the next N", lambda c, n: setattr(c.bus, "deaf_after", n),
+    Command("deaf-after N", "lose every frame after the next N", lambda c, n: c.bus.lose(math.inf, n),
             (_COUNT,)),
     Command("hear", "end `deaf`, `deaf-after`, `lose` and `damage`", lambda c: c.bus.repair()),
     Command("damage N [PORT] [@N]", "corrupt the next N frames on the cable at port 0 or 1 of this slave",
@@ -157,13 +145,13 @@ COMMANDS: Final[tuple[Command, ...]] = (
             Call._power, (str, _AMOUNT)),
     Command("disconnect [@N]", "unplug the cable at port 0", lambda c: c.bus.connect(c.slave, False)),
     Command("connect [@N]", "end `disconnect`", lambda c: c.bus.connect(c.slave, True)),
-    Command("swap MODEL SERIAL [@N]", "replace the sensor by another one", Call._swap, (str, _LONG)),
+    Command("swap MODEL SERIAL [@N]", "replace the sensor by another one", Call._swap, (model_name, _LONG)),
     Command("safeop CODE [@N]", "fall to SAFEOP with this AL status code",
             lambda c, code: c.application.fail(AlState.SAFEOP, code), (_WORD,)),
     Command("error CODE [@N]", "set the error bit and this AL status code",
             lambda c, code: c.application.fail(c.application.state, code), (_WORD,)),
     Command("abort INDEX SUBINDEX CODE [@N]", "abort the next SDO on that entry",
-            lambda c, index, sub, code: c.firmware.aborts.update({(index, sub): code}),
+            lambda c, index, sub, code: c.firmware.dictionary.aborts.update({(index, sub): code}),
             (_WORD, _BYTE, _LONG)),
     Command("on-write INDEX SUBINDEX COMMAND ...", "execute a command after the next SDO write to that entry",
             Call._on_write, (_WORD, _BYTE, str)),
@@ -196,9 +184,9 @@ COMMANDS: Final[tuple[Command, ...]] = (
             lambda c, channel: c._channel_fault("frozen", channel, None, False), (_CHANNEL,)),
     Command("skip PERCENT [@N]", "skip this percentage of the samples at random; 0 ends it",
             lambda c, percent: c.firmware.sampler.set_skip(percent),
-            (real(0, MOST_SKIPPED),)),
+            (number(0, MOST_SKIPPED),)),
     Command("ppm X [@N]", "set the error of the sensor's clock", lambda c, ppm: c.sensor.set_ppm(ppm),
-            (real(-PPM_LIMIT, PPM_LIMIT),)),
+            (number(-PPM_LIMIT, PPM_LIMIT),)),
     Command("signal NAME [@N]", "measure another signal, from its beginning",
             lambda c, name: c.sensor.set_signal(name), (_one_of("signal", SIGNALS),)),
     Command("dc WORD [VALUE] ... [@N]", "a fault of the distributed clock, as in --dc; `dc ok` ends it",
@@ -206,14 +194,14 @@ COMMANDS: Final[tuple[Command, ...]] = (
     Command("stats", "counters and states, as JSON",
             lambda c: json.dumps(c.bus.statistics(), separators=(",", ":"))),
     Command("help", "this list", lambda _: " | ".join(f"{c.usage}: {c.meaning}" for c in COMMANDS)),
-    Command("quit", "end the program", _quit),
+    Command("quit", "end the program", lambda c: setattr(c.bus, "quit", True)),
 )  # fmt: skip
 
 BY_NAME: Final = {command.name: command for command in COMMANDS}
 
 
 def obey(bus: Bus, line: str) -> str:
-    """Execute one command; returns the answer without a line end. QuitCommand for `quit`."""
+    """Execute one command; returns the answer without a line end."""
     try:
         result = _parse(bus, line.split(), None)()
     except UsageError as error:

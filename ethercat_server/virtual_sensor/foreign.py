@@ -20,13 +20,7 @@ from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.application import Application, al_statistics
 from ethercat_server.virtual_sensor.coe import ObjectTable
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
-from ethercat_server.virtual_sensor.options import (
-    EEPROM_MS,
-    ForeignOptions,
-    SensorOptions,
-    SlaveOptions,
-    UsageError,
-)
+from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions, SlaveOptions, UsageError
 
 _RO, _RW = Access.RO, Access.RW
 _CONTROLWORD = ObjectEntry(0x6040, 0, "Controlword", ObjectType.U16, _RW)
@@ -69,6 +63,22 @@ _DEVICES: Final = (
 KINDS: Final = {device.name: device for device in _DEVICES}  # by the name in `--chain`
 
 
+_ENABLE: Final = 0x000F  # controlword in normal operation
+# Statuswords: remote, with switch-on disabled and with operation enabled.
+_DISABLED, _ENABLED = 0x0240, 0x0237
+
+
+class _DriveObjects(ObjectTable):
+    @property
+    def enabled(self) -> bool:
+        return int(self.number(_CONTROLWORD.address)) & _ENABLE == _ENABLE
+
+    def read(self, index: int, subindex: int) -> bytes:
+        if (index, subindex) == _STATUSWORD.address:
+            return _STATUSWORD.type.pack(_ENABLED if self.enabled else _DISABLED)
+        return super().read(index, subindex)
+
+
 def _objects_of(device: Device) -> ObjectTable:
     u32 = ObjectType.U32
     rows = [
@@ -82,44 +92,17 @@ def _objects_of(device: Device) -> ObjectTable:
         *device.input_entries,
     ]
     entries = entries_of(device, rows)
-    return ObjectTable(entries, {a: row.type.pack(row.default) for a, row in entries.items()})
-
-
-_ENABLE: Final = 0x000F  # controlword in normal operation
-# Statuswords: remote, with switch-on disabled and with operation enabled.
-_DISABLED, _ENABLED = 0x0240, 0x0237
+    kind = _DriveObjects if device is _DRIVE else ObjectTable
+    return kind(entries, {a: row.type.pack(row.default) for a, row in entries.items()})
 
 
 class Drive(Application):
     """A servo drive, which the controlword enables in one step, and the end of process data disables."""
 
-    def __init__(self, clock: Callable[[], int]) -> None:
-        super().__init__(_DRIVE, clock, _objects_of(_DRIVE), EEPROM_MS)
-
-    @property
-    def enabled(self) -> bool:
-        """Whether the controlword has enabled it."""
-        return int(self.objects.number(_CONTROLWORD.address)) & _ENABLE == _ENABLE
-
-    @property
-    def turning(self) -> bool:
-        """Whether the motor moves."""
-        return self.enabled and self.objects.number(_VELOCITY.address) != 0
-
     def state_changed(self) -> None:
         """See `Application`."""
         if self.state is not AlState.OP:
             self.objects.values[_CONTROLWORD.address] = bytes(2)
-
-    def work(self) -> None:
-        """Be at work in OP: the other master has enabled it, and it turns."""
-        self.take_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
-
-    def read(self, index: int, subindex: int) -> bytes:
-        """See `Application`."""
-        if (index, subindex) == _STATUSWORD.address:
-            return _STATUSWORD.type.pack(_ENABLED if self.enabled else _DISABLED)
-        return super().read(index, subindex)
 
 
 class InputTerminal(Application):
@@ -157,12 +140,8 @@ class ForeignSlave:
             self.life = None
         elif self.life is None:
             device = KINDS[self.options.kind]
-            kind = InputTerminal if device.inputs else Application
-            self.life = (
-                Drive(self._clock)
-                if device is _DRIVE
-                else kind(device, self._clock, _objects_of(device), EEPROM_MS)
-            )
+            kind = Drive if device is _DRIVE else InputTerminal if device.inputs else Application
+            self.life = kind(device, self._clock, _objects_of(device))
             self.life.esc.record = self._remember
 
     def _remember(self, address: int, data: bytes) -> None:
@@ -172,14 +151,17 @@ class ForeignSlave:
     def left_at_work(self) -> None:
         """Another master has left it in the AL state it is in: record from now on."""
         if isinstance(self.life, Drive) and self.life.state is AlState.OP:
-            self.life.work()
+            self.life.take_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
         self.writes.clear()
         self.write_count = 0
 
     @property
     def turning(self) -> bool:
         """Whether it is a drive whose motor moves."""
-        return isinstance(self.life, Drive) and self.life.turning
+        objects = self.life.objects if self.life else None
+        return (
+            isinstance(objects, _DriveObjects) and objects.enabled and objects.number(_VELOCITY.address) != 0
+        )
 
     def statistics(self) -> dict[str, Any]:
         """Its part of what the command `stats` reports."""

@@ -24,7 +24,7 @@ from bota_ethercat.world import DATAGRAM, decode
 from ethercat_server.ethercat.nic import arrived_ns, look_up
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
-from ethercat_server.virtual_sensor.faults import LONGEST_LINE, QuitCommand, obey
+from ethercat_server.virtual_sensor.faults import LONGEST_LINE, obey
 from ethercat_server.virtual_sensor.options import SlaveOptions
 from ethercat_server.virtual_sensor.world import ExternalWorld
 
@@ -43,9 +43,9 @@ _STEP: Final = 0.001
 # Quantile of half the time that an answer takes, followed in steps of `_STEP`: a master estimates the round
 # trip from its quickest frames.
 _QUICK: Final = 1 / 16
-_MOST_CONNECTIONS: Final = 16
-_CHUNK: Final = 4096
+_CHUNK: Final = 1 << 16
 _ANSWER_S: Final = 5.0
+_LONGEST_ANSWER: Final = 1 << 20
 
 
 class LinkError(Exception):
@@ -82,12 +82,12 @@ def run(
     ifname: str,
     slaves: Iterable[SlaveOptions],
     *,
-    control_path: str | None = None,
-    world_path: str | None = None,
-    commands: TextIO | None = None,
-    exit_on_eof: bool = False,
-    on_open: Callable[[], None] = lambda: None,
-    on_ready: Callable[[], None] = lambda: None,
+    control_path: str | None,
+    world_path: str | None,
+    commands: TextIO | None,
+    exit_on_eof: bool,
+    on_open: Callable[[], None],
+    on_ready: Callable[[], None],
     stop: threading.Event,
 ) -> None:
     """Answer EtherCAT frames on `ifname` until stopped.
@@ -105,22 +105,29 @@ def run(
         bus = Bus(slaves, time.monotonic_ns())
         poller = select.poll()
         poller.register(raw, select.POLLIN)
-        channel = stack.enter_context(CommandChannel(bus, poller, control_path, commands))
-        world = stack.enter_context(bound(world_path, socket.SOCK_DGRAM, poller)) if world_path else None
+        heard: dict[int, Callable[[], object]] = {}  # besides the frames: what to do, by descriptor
+        with contextlib.suppress(LinkError) if control_path is None else contextlib.nullcontext():
+            control = stack.enter_context(bound(control_path or own_socket()))
+            heard[control.fileno()] = lambda: _obey(control, bus)
+        if world_path:
+            world = stack.enter_context(bound(world_path))
+            heard[world.fileno()] = lambda: _hear(world, bus)
+        if commands is not None:
+            with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
+                typed = commands.fileno()
+                heard[typed] = lambda: _obey_lines(typed, bus, poller, exit_on_eof)
+        for descriptor in heard:
+            poller.register(descriptor, select.POLLIN)
         # All that is loaded need never be looked through again, which takes some 20 ms.
         gc.collect()
         gc.freeze()
         on_ready()
         answers, index, up = _Answers(raw, bus, ifname), socket.if_nametoindex(ifname), True
-        stack.enter_context(contextlib.suppress(QuitCommand))
-        while not stop.is_set() and not (exit_on_eof and channel.ended):
+        while not stop.is_set() and not bus.quit:
             ready = [descriptor for descriptor, _ in poller.poll(_IDLE_MS)]
             for descriptor in ready:
-                if world is not None and descriptor == world.fileno():
-                    _hear(world, bus)
-                elif descriptor != raw.fileno():
-                    bus.set_time(time.monotonic_ns())
-                    channel.handle(descriptor)
+                if descriptor in heard:
+                    heard[descriptor]()
             if raw.fileno() in ready:
                 up = answers.waiting()
                 continue
@@ -128,6 +135,32 @@ def run(
             # Down is like an unplugged cable: it may come back, unless the interface was deleted.
             if not up and index not in dict(socket.if_nameindex()):
                 raise LinkError(f"interface {ifname} has disappeared: create it again, and restart")
+
+
+def _obey(control: socket.socket, bus: Bus) -> None:
+    """Execute the command in the next datagram; who sent it gets the answer, if it has an address."""
+    bus.set_time(time.monotonic_ns())
+    with contextlib.suppress(OSError):
+        line, sender = control.recvfrom(LONGEST_LINE)
+        answer = obey(bus, line.decode(errors="replace"))
+        if sender:
+            control.sendto(answer.encode(), sender)
+
+
+def _obey_lines(descriptor: int, bus: Bus, poller: select.poll, exit_on_eof: bool) -> None:
+    """Execute the commands that were typed."""
+    bus.set_time(time.monotonic_ns())
+    try:
+        lines = os.read(descriptor, _CHUNK)
+    except OSError:  # of a terminal, to a job in the background
+        lines = b""
+    for line in lines.decode(errors="replace").splitlines():
+        answer = obey(bus, line)
+        with contextlib.suppress(OSError):  # nobody reads the answers
+            os.write(1, answer.encode() + b"\n")
+    if not lines:
+        poller.unregister(descriptor)
+        bus.quit |= exit_on_eof
 
 
 def _hear(world: socket.socket, bus: Bus) -> None:
@@ -141,96 +174,6 @@ def _hear(world: socket.socket, bus: Bus) -> None:
                     external.take(time_s, felt, time.monotonic())
 
 
-class CommandChannel(contextlib.ExitStack):
-    """Reads commands and writes one line of answer to each."""
-
-    def __init__(
-        self, bus: Bus, poller: select.poll, control_path: str | None, commands: TextIO | None
-    ) -> None:
-        """LinkError if `control_path` cannot be used."""
-        super().__init__()
-        self._bus = bus
-        self._poller = poller
-        self._listener: socket.socket | None = None
-        self._connections: dict[int, socket.socket] = {}
-        self.callback(self._hang_up)
-        self._pending: dict[int, bytes] = {}  # the beginning of a line, by descriptor
-        self.ended = False  # the text stream has
-        with contextlib.suppress(LinkError) if control_path is None else contextlib.nullcontext():
-            listener = bound(control_path or own_socket(), socket.SOCK_STREAM, poller)
-            self._listener = self.enter_context(listener)
-            self._listener.listen()
-        if commands is not None:
-            with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
-                self._pending[commands.fileno()] = b""
-                poller.register(commands, select.POLLIN)
-
-    def _hang_up(self) -> None:
-        for connection in self._connections.values():
-            connection.close()
-
-    def handle(self, descriptor: int) -> None:
-        """Handle what has come on `descriptor`. QuitCommand if the command was `quit`."""
-        if descriptor in self._pending:
-            self._read(descriptor)
-        elif self._listener is not None and descriptor == self._listener.fileno():
-            with contextlib.suppress(OSError):
-                self._add(self._listener.accept()[0])
-
-    def _add(self, connection: socket.socket) -> None:
-        if len(self._connections) >= _MOST_CONNECTIONS:
-            connection.close()
-            return
-        connection.setblocking(False)
-        self._connections[connection.fileno()] = connection
-        self._pending[connection.fileno()] = b""
-        self._poller.register(connection, select.POLLIN)
-
-    def _read(self, descriptor: int) -> None:
-        try:
-            data = os.read(descriptor, _CHUNK)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        ended = not data
-        for line in self._lines(descriptor, data or (b"\n" if self._pending[descriptor] else b"")):
-            try:
-                answer = obey(self._bus, line)
-            except QuitCommand:
-                self._answer(descriptor, "ok")
-                raise
-            # Disconnected, or not reading: its commands are executed nevertheless.
-            ended = not self._answer(descriptor, answer) or ended
-        if ended:
-            self._poller.unregister(descriptor)
-            del self._pending[descriptor]
-            if descriptor in self._connections:
-                self._connections.pop(descriptor).close()
-            else:
-                self.ended = True
-
-    def _answer(self, descriptor: int, answer: str) -> bool:
-        """Whether the source goes on: the text stream does without its answers."""
-        connection = self._connections.get(descriptor)
-        try:
-            if connection is not None:
-                connection.sendall(answer.encode() + b"\n")
-            else:
-                os.write(1, answer.encode() + b"\n")
-        except OSError:
-            return connection is None
-        return True
-
-    def _lines(self, descriptor: int, data: bytes) -> list[str]:
-        *lines, rest = (self._pending[descriptor] + data).split(b"\n")
-        if len(rest) > LONGEST_LINE:
-            lines.append(rest)
-            rest = b""
-        self._pending[descriptor] = rest
-        return [line[:LONGEST_LINE].decode(errors="replace") for line in lines if line.strip()]
-
-
 def own_socket() -> str:
     """Where this user's virtual sensor takes commands if no other place is given."""
     folder, uid = "/run/user", os.geteuid()
@@ -242,21 +185,25 @@ def send(path: str, command: str) -> str:
     """The answer to a command of a virtual sensor that listens there, this user's or root's; OSError."""
     if Path(path).stat().st_uid not in (0, os.geteuid()):
         raise PermissionError(errno.EPERM, "it is another user's")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock,
+    ):
+        sock.bind(f"{folder}/answer")
         sock.settimeout(_ANSWER_S)
         sock.connect(path)
-        sock.sendall(command.encode() + b"\n")
-        return sock.makefile(encoding="utf-8").readline().strip()
+        sock.send(command.encode())
+        return sock.recv(_LONGEST_ANSWER).decode()
 
 
 @contextlib.contextmanager
-def bound(path: str, kind: socket.SocketKind, poller: select.poll) -> Iterator[socket.socket]:
-    """A Unix socket that this user's programs find at `path` until the end; LinkError if it cannot be."""
-    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, kind) as probe:
+def bound(path: str) -> Iterator[socket.socket]:
+    """A socket for datagrams of this user's programs, at `path` until the end; LinkError if it cannot be."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         # Remove a stale socket, left by a killed process; nothing else.
         if probe.connect_ex(path) == errno.ECONNREFUSED and stat.S_ISSOCK(Path(path).stat().st_mode):
             Path(path).unlink()
-    with socket.socket(socket.AF_UNIX, kind) as made:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as made:
         try:
             made.bind(path)
             Path(path).chmod(0o600)
@@ -264,7 +211,6 @@ def bound(path: str, kind: socket.SocketKind, poller: select.poll) -> Iterator[s
         except OSError as error:
             raise LinkError(f"cannot create the Unix socket {path!r}: {error.strerror or error}") from None
         try:
-            poller.register(made, select.POLLIN)
             yield made
         finally:
             with contextlib.suppress(OSError):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
+import argparse
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from bota_ethercat.program.arguments import typed
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor.world import World
@@ -15,8 +16,8 @@ from ethercat_server.virtual_sensor.world import World
 EEPROM_MS: Final = 2.0  # about what a real EEPROM needs for the eight bytes of a read command
 
 
-class UsageError(Exception):
-    """Wrong or contradictory options, or a command that is wrong or cannot be executed: a sentence."""
+# Wrong or contradictory options, or a command that is wrong or cannot be executed: a sentence.
+UsageError = argparse.ArgumentTypeError
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,28 +53,19 @@ SlaveOptions = SensorOptions | ForeignOptions
 def whole(lowest: int, highest: int) -> Callable[[str], int]:
     """Parses a whole number, decimal or 0x...; UsageError if it is invalid or out of range."""
 
-    def parse(text: str) -> int:
-        try:
-            value = int(text, 0)
-        except ValueError:
-            raise UsageError(f"{text!r} is not a whole number such as 27 or 0x1B") from None
-        if not lowest <= value <= highest:
-            raise UsageError(f"{text} is out of range: it must be from {lowest} to {highest}")
-        return value
+    def within(text: str) -> int:
+        if lowest <= (value := int(text, 0)) <= highest:
+            return value
+        raise ValueError
 
-    return parse
+    return typed(within, f"a whole number from {lowest} to {highest}")
 
 
-def real(lowest: float, highest: float) -> Callable[[str], float]:
-    """Parses a finite number; UsageError if it is invalid or out of range."""
-
-    def parse(text: str) -> float:
-        with contextlib.suppress(ValueError):
-            if lowest <= (value := float(text)) <= highest:
-                return value
-        raise UsageError(f"{text!r} must be a number from {lowest:g} to {highest:g}")
-
-    return parse
+def model_name(text: str) -> str:
+    """Parses the name of a model; UsageError if a sensor cannot have it."""
+    if not text.isascii() or len(text) > 20:
+        raise UsageError(f"model {text!r} must have at most 20 ASCII characters, such as {MODELS[0]}")
+    return text
 
 
 @dataclass(frozen=True, slots=True)

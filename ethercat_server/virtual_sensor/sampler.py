@@ -80,11 +80,9 @@ def _measured(
     values: tuple[float, ...], offsets: tuple[float, ...], limit: float
 ) -> tuple[tuple[float, ...], int]:
     """`values` plus offsets, cut off at the range, and a bit for each axis that was."""
-    x, y, z = values[0] + offsets[0], values[1] + offsets[1], values[2] + offsets[2]
-    if -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit:
-        return (x, y, z), 0
-    bits = sum(1 << axis for axis, value in enumerate((x, y, z)) if abs(value) > limit)
-    return (max(-limit, min(limit, x)), max(-limit, min(limit, y)), max(-limit, min(limit, z))), bits
+    sums = [value + offset for value, offset in zip(values, offsets, strict=False)]
+    bits = sum(1 << axis for axis, value in enumerate(sums) if abs(value) > limit)
+    return tuple(max(-limit, min(limit, value)) for value in sums), bits
 
 
 _U64: Final = 2**64 - 1
@@ -132,7 +130,6 @@ class Sampler:
         self._signal: Measured | Formula = (
             FORMULAS[options.signal] if world is None else Measured(world, options.seed, options.noise)
         )
-        self.exact = isinstance(self._signal, Formula) and self._signal.exact  # settings do not affect it
         self.settings_changed()
 
     def number_at(self, instant: int) -> int:
@@ -168,9 +165,7 @@ class Sampler:
         self.made += 1
         instant = self.clock.instant(number)
         reading = self._signal.reading(number, instant, (instant - self._signal_start) * 1e-9)
-        saturated = 0
-        if not self.exact:
-            reading, saturated = self._disturb(reading)
+        reading, saturated = self._disturb(reading)
         warnings = self._warnings if number < self._warnings_until else 0
         return self._pack(reading, warnings, saturated)
 
@@ -198,22 +193,21 @@ class Sampler:
         counts. `warnings` is ORed into the register, `saturated` (channels as bits) into the fields.
         """
         load, acceleration, rate, temperature, quaternion = reading
-        if not self.exact:
-            load = tuple(a + b for a, b in zip(load, self._offset, strict=True))
-            if not self._calibrated:
-                load = tuple(float(round(a * s)) for a, s in zip(load, _COUNTS, strict=True))
-            load = tuple(
-                a if -_LARGEST_REAL32 < a < _LARGEST_REAL32 else math.copysign(math.inf, a) for a in load
+        load = tuple(a + b for a, b in zip(load, self._offset, strict=True))
+        if not self._calibrated:
+            load = tuple(float(round(a * s)) for a, s in zip(load, _COUNTS, strict=True))
+        load = tuple(
+            a if -_LARGEST_REAL32 < a < _LARGEST_REAL32 else math.copysign(math.inf, a) for a in load
+        )
+        if self._imu:
+            acceleration, beyond = _measured(
+                acceleration, self._acceleration_offset, self._acceleration_range
             )
-            if self._imu:
-                acceleration, beyond = _measured(
-                    acceleration, self._acceleration_offset, self._acceleration_range
-                )
-                rate, rate_beyond = _measured(rate, self._angular_rate_offset, self._angular_rate_range)
-                saturated |= beyond << 6 | rate_beyond << 9
-            else:
-                acceleration = rate = (0.0, 0.0, 0.0)
-                saturated &= 0x3F
+            rate, rate_beyond = _measured(rate, self._angular_rate_offset, self._angular_rate_range)
+            saturated |= beyond << 6 | rate_beyond << 9
+        else:
+            acceleration = rate = (0.0, 0.0, 0.0)
+            saturated &= 0x3F
         if saturated:
             warnings |= sum(flag for mask, flag in _SATURATION if saturated & mask)
         tail: tuple[float, ...] = ()

@@ -20,28 +20,70 @@ _REPETITION_NS: Final = 300_000_000
 _WRITES_REMEMBERED: Final = 200
 
 
-class Firmware(Application):
-    """Objects and measurement behind the application.
+OnWrite = Callable[[int, int, bytes, AlState, int], None]
 
-    `clock` gives the time in ns; `on_write` is called for every SDO write: index, sub-index, data, AL state,
-    abort code or 0. The next transfer of an entry in `aborts` is aborted with the code there.
+
+class WatchedDictionary(Dictionary):
+    """Has `on_write` called for every SDO write: index, sub-index, data, AL state, abort code or 0.
+
+    The next transfer of an entry in `aborts` is aborted with the code there.
     """
+
+    def __init__(self, on_write: OnWrite, *of_dictionary: Any) -> None:
+        super().__init__(*of_dictionary)
+        self._on_write = on_write
+        self.aborts: dict[Address, int] = {}
+        # Code and until when, by write.
+        self._aborted: dict[tuple[Address, bytes | None], tuple[int | None, int]] = {}
+
+    def _check_abort(self, address: Address, data: bytes | None = None) -> None:
+        code, until = self._aborted.get((address, data), (None, 0))
+        if self._now() >= until:
+            code = self.aborts.pop(address, None)
+            if code is not None and data is not None:  # if it is repeated soon after, its answer was lost
+                self._aborted = {(address, data): (code, self._now() + _REPETITION_NS)}
+        if code is not None:
+            raise SdoAbortError(code)
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """See `ObjectTable`."""
+        self._check_abort((index, subindex))
+        return super().read(index, subindex)
+
+    def check_download(self, index: int, subindex: int, length: int, state: AlState) -> None:
+        """See `ObjectTable`."""
+        try:
+            super().check_download(index, subindex, length, state)
+        except SdoAbortError as error:
+            self._on_write(index, subindex, b"", state, error.code)
+            raise
+
+    def write(self, index: int, subindex: int, data: bytes, state: AlState) -> None:
+        """See `ObjectTable`."""
+        abort = 0
+        try:
+            self._check_abort((index, subindex), data)
+            super().write(index, subindex, data, state)
+        except SdoAbortError as error:
+            abort = error.code
+            raise
+        finally:
+            self._on_write(index, subindex, data, state, abort)
+
+
+class Firmware(Application):
+    """Objects and measurement behind the application. `clock` gives the time in ns."""
 
     def __init__(
         self,
         options: SensorOptions,
         flash: Flash,
         clock: Callable[[], int],
-        on_write: Callable[[int, int, bytes, AlState, int], None],
+        on_write: OnWrite,
     ) -> None:
-        self._on_write = on_write
-        self.dictionary = Dictionary(options, flash, self.inputs, clock)
+        self.dictionary = WatchedDictionary(on_write, options, flash, self.inputs, clock)
         self.sampler = Sampler(options, self.dictionary, clock)
         self.dictionary.changed = self.sampler.settings_changed
-        self.aborts: dict[Address, int] = {}
-        self._aborted: dict[
-            tuple[Address, bytes | None], tuple[int | None, int]
-        ] = {}  # code and until when, by write
         device = sensor_device(options.model, options.serial, options.pdo_size)
         super().__init__(device, clock, self.dictionary, options.eeprom_ms)
         self.esc.clock.events.follow(self.sampler.number_at, self.sampler.clock.instant)
@@ -55,40 +97,6 @@ class Firmware(Application):
     def prepare(self, expected: int) -> None:
         """Compute the sample that a frame at the time `expected` will read."""
         self.sampler.prepare(expected)
-
-    def _check_abort(self, address: Address, data: bytes | None = None) -> None:
-        code, until = self._aborted.get((address, data), (None, 0))
-        if self.clock() >= until:
-            code = self.aborts.pop(address, None)
-            if code is not None and data is not None:  # if it is repeated soon after, its answer was lost
-                self._aborted = {(address, data): (code, self.clock() + _REPETITION_NS)}
-        if code is not None:
-            raise SdoAbortError(code)
-
-    def read(self, index: int, subindex: int) -> bytes:
-        """See `Application`."""
-        self._check_abort((index, subindex))
-        return super().read(index, subindex)
-
-    def check_download(self, index: int, subindex: int, length: int) -> None:
-        """See `Application`."""
-        try:
-            super().check_download(index, subindex, length)
-        except SdoAbortError as error:
-            self._on_write(index, subindex, b"", self.state, error.code)
-            raise
-
-    def write(self, index: int, subindex: int, data: bytes) -> None:
-        """See `Application`."""
-        abort = 0
-        try:
-            self._check_abort((index, subindex), data)
-            super().write(index, subindex, data)
-        except SdoAbortError as error:
-            abort = error.code
-            raise
-        finally:
-            self._on_write(index, subindex, data, self.state, abort)
 
 
 class VirtualSensor:

@@ -36,14 +36,10 @@ CONSTANT: Final = (1.5, -2.25, -9.75, 0.125, -0.0625, 0.03125)  # exact in REAL3
 
 @dataclass(frozen=True)
 class Formula:
-    """A signal that is a function of sample number and instant; level and stationary.
-
-    Settings, offsets and noise do not affect one that is `exact`.
-    """
+    """A signal that is a function of sample number and instant; level and stationary."""
 
     load: Callable[[int, int], Iterable[float]]
     temperature: Callable[[int], float] = lambda _: 35.0
-    exact: bool = False
 
     def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
         """The reading of sample `number`, taken at `instant` ns, `seconds` after power-on."""
@@ -63,7 +59,7 @@ def _clock(number: int, instant: int) -> Iterable[float]:
 
 
 FORMULAS: Final = {
-    "clock": Formula(_clock, exact=True),
+    "clock": Formula(_clock),
     "ramp": Formula(lambda k, _: (((k + 100 * i) % 1024) / 64 - 8 for i in range(6))),
     "constant": Formula(lambda *_: CONSTANT),
     # The sample number in the temperature: steps of 2**-18 °C, from 32 to 48 °C, are exact in REAL32.

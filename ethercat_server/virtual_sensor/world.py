@@ -13,7 +13,7 @@ from typing import Final
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
-from bota_ethercat.world import Felt
+from bota_ethercat.world import REST, Felt
 from ethercat_server.virtual_sensor.filters import LoadFilter, filtered, imu_filter
 from ethercat_server.virtual_sensor.signals import Reading, quaternion, reading_of
 
@@ -22,7 +22,6 @@ World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MO
 _HOLD, ZERO, FAULT = LOST = ("hold", "zero", "fault")  # what a world that has stopped is taken for
 LOST_AFTER_S: Final = 0.1  # also by how much a time stamp may differ from the time
 _REMEMBERED: Final = 4096  # moments, of which the filters look at the last second at most
-_REST: Final = Felt((0.0,) * 6)
 
 # Standard deviation at SINC 51, and the power with which it falls with the length: half of what Bota's
 # own test allows at 51, and a little under half of it at 1024.
@@ -37,7 +36,7 @@ class ExternalWorld:
 
     def __init__(self, lost: str = FAULT) -> None:
         self._lost = lost
-        self._moments = deque([(-math.inf, _REST)], maxlen=_REMEMBERED)
+        self._moments = deque([(-math.inf, REST)], maxlen=_REMEMBERED)
         self.counts = {"taken": 0, "refused": 0}  # moments
 
     def take(self, time_s: float, felt: Felt, now_s: float) -> None:
@@ -55,7 +54,7 @@ class ExternalWorld:
         """What the sensor feels."""
         at = bisect.bisect_right(self._moments, seconds, key=operator.itemgetter(0))
         begin_s, felt = self._moments[max(0, at - 1)]
-        return _REST if self._lost == ZERO and seconds - begin_s > LOST_AFTER_S else felt
+        return REST if self._lost == ZERO and seconds - begin_s > LOST_AFTER_S else felt
 
 
 class Measured:

@@ -25,6 +25,9 @@ class Felt(NamedTuple):
     """Yaw, pitch and roll about z, y', x'', rad; None: there is no estimate. Not in datagrams."""
 
 
+REST: Final = Felt((0.0,) * 6)
+
+
 def encode(time_s: float, felt: Felt, sensor: int = 0) -> bytes:
     """The datagram: what the sensor at this position feels at `time_s` of CLOCK_MONOTONIC."""
     return DATAGRAM.pack(

@@ -19,6 +19,7 @@ from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
 from bota_ethercat.settings import start_up_defaults
+from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor import signals
 from ethercat_server.virtual_sensor.dictionary import Flash
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -45,7 +46,7 @@ def process_data(options: SensorOptions, seconds: float) -> Iterator[tuple[float
     now = 0
     firmware = Firmware(options, flash, lambda: now, lambda *_: None)
     for number, offset in enumerate(OFFSET, 1):
-        firmware.write(0x8000, number, struct.pack("<f", offset))
+        firmware.dictionary.write(0x8000, number, struct.pack("<f", offset), AlState.PREOP)
     for number in range(int(seconds * 51200 / SINC)):
         now = firmware.sampler.clock.instant(number)
         yield now * 1e-9, number, firmware.inputs()

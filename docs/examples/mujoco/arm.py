@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
-import os
+import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 STEP_S: Final = 0.001
 READY: Final = (0.0, 20.0, 100.0, 0.0, -30.0, 0.0)  # degrees: the tool before the wall, level
-_DAMPING: Final = 1e-4  # of the inverse of the Jacobian
 _SHOWN_EVERY: Final = 20  # steps
 _LARGEST_LAG_S: Final = 0.05  # behind which no step is made up for
 
@@ -47,14 +47,12 @@ class Arm:
     @property
     def tip(self) -> NDArray[np.float64]:
         """Position of the tip, (3,) m, in the base's frame."""
-        position: NDArray[np.float64] = self.data.site_xpos[self._tip].copy()
-        return position
+        return np.array(self.data.site_xpos[self._tip])
 
     @property
     def rotation(self) -> NDArray[np.float64]:
         """Turns the sensor's vectors into the base's, (3, 3)."""
-        rotation: NDArray[np.float64] = self.data.site_xmat[self._sensor].reshape(3, 3).copy()
-        return rotation
+        return np.array(self.data.site_xmat[self._sensor]).reshape(3, 3)
 
     @property
     def joints(self) -> NDArray[np.float64]:
@@ -70,10 +68,7 @@ class Arm:
         if self.velocity.any():
             mujoco.mj_jacSite(self.model, self.data, self._jacobian[:3], self._jacobian[3:], self._tip)
             twist = np.append(self.velocity, np.zeros(3)) * STEP_S
-            jacobian = self._jacobian
-            self.data.ctrl += jacobian.T @ np.linalg.solve(
-                jacobian @ jacobian.T + _DAMPING * np.eye(6), twist
-            )
+            self.data.ctrl += np.linalg.pinv(self._jacobian) @ twist
         mujoco.mj_step(self.model, self.data)
         values = self.data.sensordata.tolist()
         # MuJoCo gives what the arm does to the tool; the sensor feels the opposite.
@@ -82,13 +77,23 @@ class Arm:
     @contextlib.contextmanager
     def shown(self) -> Iterator[Any]:
         """A window, where there is a screen: `sync` renews it; None where there is none."""
-        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        import glfw  # noqa: PLC0415 - slow, and the tests do without
+
+        from mujoco import viewer  # noqa: PLC0415 - as above
+
+        glfw.ERROR_REPORTING = "ignore"
+        # Tried first, for where the viewer finds no screen it ends the process.
+        if not (glfw.init() and glfw.create_window(640, 480, "arm", None, None)):
+            print(f"no window: {glfw.get_error()[1].decode()}", flush=True)
             yield None
             return
-        from mujoco import viewer  # noqa: PLC0415 - it needs a screen
-
-        with viewer.launch_passive(self.model, self.data) as window:
+        glfw.terminate()
+        with viewer.launch_passive(self.model, self.data, show_left_ui=False, show_right_ui=False) as window:
+            mujoco.mjv_defaultFreeCamera(self.model, window.cam)
             yield window
+        for thread in threading.enumerate():  # of the viewer, which must not draw when Python ends GLFW
+            if thread.daemon:
+                thread.join()
 
 
 def arguments(description: str) -> argparse.ArgumentParser:
@@ -101,6 +106,11 @@ def arguments(description: str) -> argparse.ArgumentParser:
 
 def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace) -> None:
     """In real time, a cycle a millisecond, until the task is done; prints each change of condition."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ends it at once, with the window's threads
+    if not Path(options.world).is_socket():
+        print(f"waiting for a virtual sensor with --world {options.world}", flush=True)
+        while not Path(options.world).is_socket():
+            time.sleep(0.1)
     with World(options.world) as world, Client(options.port) as sensor, arm.shown() as window:
         condition, due = None, time.monotonic()
         for number in itertools.count():
@@ -112,8 +122,10 @@ def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace)
                 return
             if reading.condition is not condition:
                 condition = reading.condition
-                print(f"{number * STEP_S:7.3f} s: {condition}")
+                print(f"{number * STEP_S:7.3f} s: {condition}", flush=True)
             if window is not None and number % _SHOWN_EVERY == 0:
+                if not window.is_running():
+                    raise SystemExit("the window was closed")
                 window.sync()
             due = max(due + STEP_S, time.monotonic() - _LARGEST_LAG_S)
             time.sleep(max(0.0, due - time.monotonic()))

@@ -74,11 +74,12 @@ def main() -> None:
     options, arm = arguments(str(__doc__)).parse_args(), Arm()
     task = Identification(arm)
     perform(task, arm, options)
-    found = task.result()
-    mass, center = found.payload.mass, found.payload.center
-    print(f"mass {mass:.3f} kg, error {1e3 * (mass - MASS):+.1f} g")
-    x, y, z = (1e3 * part for part in center)
-    print(f"center of gravity {x:.1f}, {y:.1f}, {z:.1f} mm, error {1e3 * math.dist(center, CENTER):.1f} mm")
+    tool = task.result().payload
+    print(f"mass {tool.mass:.3f} kg, error {1e3 * (tool.mass - MASS):+.1f} g")
+    x, y, z = (1e3 * part for part in tool.center)
+    print(
+        f"center of gravity {x:.1f}, {y:.1f}, {z:.1f} mm, error {1e3 * math.dist(tool.center, CENTER):.1f} mm"
+    )
 
 
 if __name__ == "__main__":

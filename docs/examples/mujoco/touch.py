@@ -50,11 +50,10 @@ class Touch:
         self.robot, self.rows, self.done = robot, list[Row](), False
         self._unloaded: list[tuple[float, ...]] = []
         self._plan = self._steps()
-        self._seconds = 0.0
 
     def update(self, reading: Reading, seconds: float) -> None:
         """Set the robot's velocity by the newest sample; `seconds` are of any clock."""
-        self._seconds, robot = seconds, self.robot
+        robot = self.robot
         if not reading.fresh or reading.sample is None:
             robot.velocity = np.zeros(3)
             self.rows.append(Row(seconds, np.nan, robot.tip, reading.condition))
@@ -77,8 +76,8 @@ class Touch:
         robot = self.robot
         while self.rows[-1].force < FORCE / 2:
             yield 0.0
-        touched = self._seconds
-        while self._seconds < touched + _PRESS_S:
+        touched = self.rows[-1].seconds
+        while self.rows[-1].seconds < touched + _PRESS_S:
             yield 0.0
         while (way := HOLE[2] - robot.tip[2]) > _NEAR:
             yield min(SLIDE, 5.0 * way)
@@ -112,6 +111,8 @@ def main() -> None:
     parser = arguments(str(__doc__))
     parser.add_argument("--picture", type=Path, metavar="FILE", help="of force and position over time")
     options, arm = parser.parse_args(), Arm()
+    if options.picture and not options.picture.parent.is_dir():
+        parser.error(f"there is no folder {options.picture.parent} for the picture")
     touch = Touch(arm)
     perform(touch, arm, options)
     print(f"{np.nanmax([row.force for row in touch.rows]):.1f} N at most in {len(touch.rows)} control cycles")

@@ -7,8 +7,7 @@ import os
 import socket
 from collections.abc import Sequence
 
-from bota_ethercat.pdo import STANDARD_GRAVITY
-from bota_ethercat.world import Felt, encode
+from bota_ethercat.world import REST, Felt, encode
 
 
 class World:
@@ -27,9 +26,9 @@ class World:
         self,
         t: float,
         wrench: Sequence[float],
-        acceleration: Sequence[float] = (0.0, 0.0, STANDARD_GRAVITY),
-        angular_rate: Sequence[float] = (0.0, 0.0, 0.0),
-        temperature: float = 35.0,
+        acceleration: Sequence[float] = REST.acceleration,
+        angular_rate: Sequence[float] = REST.angular_rate,
+        temperature: float = REST.temperature,
         sensor: int = 0,
     ) -> bool:
         """What a sensor feels at `t`, s of CLOCK_MONOTONIC; False if there is none, or it is behind.
