@@ -13,7 +13,7 @@ from rich.table import Table
 
 from bota_clients.errors import RecordingError
 from bota_clients.identify.cli import IdentifyOptions
-from bota_clients.identify.stationary_periods import StationaryPeriod, find_stationary_periods
+from bota_clients.identify.stationary_periods import LEAST_S, StationaryPeriod, find_stationary_periods
 from bota_clients.program import discard_output, say
 from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
@@ -131,7 +131,7 @@ def run(options: IdentifyOptions) -> int:
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
         data = columns(recording.frames(sensor.sensor), options.imu_units)
-    periods, rejected = find_stationary_periods(data, options.least_seconds, options.limits)
+    periods, rejected = find_stationary_periods(data)
     if len(periods) > MOST_POSES:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
         _say(f"there are more than {MOST_POSES} poses: the longest are used")
@@ -188,10 +188,7 @@ def _solve(
 ) -> tuple[Poses, Identified | None, str | None]:
     """The periods that are poses, and the result or why there is none."""
     poses: list[tuple[StationaryPeriod, Pose]] = []
-    error = (
-        f"the sensor is never stationary for {options.least_seconds:g} s: hold it still, or relax "
-        "the limits with --limit or --least-seconds"
-    )
+    error: str | None = f"the sensor is never stationary for {LEAST_S:g} s: hold it still"
     for period in periods:
         try:
             poses.append((period, pose_of(period.means, magnitude=options.gravity or STANDARD_GRAVITY)))

@@ -22,7 +22,7 @@ from typing import Final
 
 from rich.filesize import decimal
 
-from bota_clients.errors import DiskError
+from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
 from bota_clients.recording.file_format import RECORDER
 from bota_clients.recording.reader import Description, Event
@@ -163,13 +163,13 @@ class Tally:
 
 
 def check_path(path: Path, *, overwrite: bool) -> None:
-    """DiskError if the file exists and may not be overwritten, or its folder does not exist."""
+    """RecordingError if the file exists and may not be overwritten, or its folder does not exist."""
     if not path.parent.is_dir():
-        raise DiskError(f"{path} cannot be created: there is no folder {path.parent}")
+        raise RecordingError(f"{path} cannot be created: there is no folder {path.parent}")
     if path.is_dir():
-        raise DiskError(f"{path} is a folder: name a file in it")
+        raise RecordingError(f"{path} is a folder: name a file in it")
     if path.exists() and not overwrite:
-        raise DiskError(f"{path} {EXISTS}")
+        raise RecordingError(f"{path} {EXISTS}")
 
 
 class Recorder:
@@ -182,9 +182,9 @@ class Recorder:
     """
 
     def __init__(self, path: Path, library: str, notes: Mapping[str, str], *, overwrite: bool) -> None:
-        """Create the file; DiskError. `notes` become its metadata."""
+        """Create the file; RecordingError. `notes` become its metadata."""
         self.tally = Tally()
-        self.error: DiskError | None = None
+        self.error: RecordingError | None = None
         self.saved = 0
         self._queue: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
         self._backlog = self._overflow = self._unflushed = 0
@@ -239,7 +239,7 @@ class Recorder:
         try:
             self._record()
             self._finish()
-        except DiskError as error:
+        except RecordingError as error:
             self.error = error
             # The failed flush was truncated; of a file that was removed nothing is left.
             missing = self._writer.frames if self._disk.removed else self._unflushed
