@@ -19,10 +19,10 @@ from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
-from ft_compensation.identification.estimation import CONFIDENCE
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
+from ft_compensation.identification.weighted import CONFIDENCE
 from ft_compensation.quantities import CROSS_AXES, CompensationError, length
 
 _WIDTH: Final = 80  # every table fits

@@ -33,7 +33,6 @@ from bota_ethercat.client import Client, Connected, Disconnected
 from bota_ethercat.control import Event as ServerEvent
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import printable
 
@@ -160,16 +159,6 @@ class Tally:
                 if number:
                     found.append(f"{count(number, 'frame')} of sensor {position} {what}")
         return ", ".join(found) or "nothing was lost"
-
-
-def check_path(path: Path, *, overwrite: bool) -> None:
-    """RecordingError if the file exists and may not be overwritten, or its folder does not exist."""
-    if not path.parent.is_dir():
-        raise RecordingError(f"{path} cannot be created: there is no folder {path.parent}")
-    if path.is_dir():
-        raise RecordingError(f"{path} is a folder: name a file in it")
-    if path.exists() and not overwrite:
-        raise RecordingError(f"{path} {EXISTS}")
 
 
 class Recorder:

@@ -80,7 +80,7 @@ class DiskFile:
         return self._position
 
     def flush(self) -> None:
-        """Write what is buffered; RecordingError if that fails: then none of it is in the file, or no file."""
+        """Write what is buffered; RecordingError if that fails: then none of it is there, or no file."""
         data = memoryview(b"".join(self._waiting))
         self._waiting.clear()
         done = 0

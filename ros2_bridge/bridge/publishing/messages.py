@@ -163,8 +163,6 @@ def _temperature(send: Send, parameters: Parameters, _: Stamps) -> Publish:
     return lambda sample, frame: send(pack(frame.stamp_ns, sample.temperature, variance))
 
 
-def _covariance(values: Numbers) -> Numbers:
-    """Nine numbers, row by row, from nine or from three variances."""
-    if len(values) == 9:
-        return values
-    return tuple(values[position // 4] if position % 4 == 0 else 0.0 for position in range(9))
+def _covariance(variances: Numbers) -> Numbers:
+    """The nine numbers of a covariance, row by row."""
+    return tuple(variances[position // 4] if position % 4 == 0 else 0.0 for position in range(9))
