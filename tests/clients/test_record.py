@@ -21,7 +21,7 @@ from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
 from bota_clients.record import cli, recorder
-from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch, Source, Tally
+from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch, Source
 from bota_clients.recording.file_format import frame_topic
 from bota_clients.recording.reader import Description, open_recording
 from bota_ethercat.address import Address
@@ -179,11 +179,11 @@ def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.
         ),
     ],
 )
-def test_what_was_lost_is_said(frames: list[DataMessage], sentence: str) -> None:
-    tally = Tally()
-    for each in frames:
-        tally.take(each)
-    assert tally.losses() == sentence
+def test_what_was_lost_is_said(frames: list[DataMessage], sentence: str, out: Path) -> None:
+    recorder = new_recorder(out)
+    recorder.put([*frames])
+    recorder.stop("")
+    assert recorder.so_far.endswith(f"; {sentence}")
 
 
 def test_seconds_of_frames_have_room_in_the_kernel(endless: Replay) -> None:
@@ -249,7 +249,7 @@ def test_of_a_file_that_is_removed_nothing_is_said_to_be_there(out: Path) -> Non
     removed.put([frame(10)])
     removed.stop("asked to stop")
     assert str(removed.error) == f"{out} was removed while it was written: nothing of it is left"
-    assert (removed.saved, removed.tally.dropped) == (0, 11)
+    assert (removed.saved, removed.dropped) == (0, 11)
 
 
 def test_killed_it_leaves_what_was_there(endless: Replay, out: Path) -> None:

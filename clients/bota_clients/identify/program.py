@@ -14,7 +14,7 @@ from rich.table import Table
 from bota_clients.errors import RecordingError
 from bota_clients.identify.cli import IdentifyOptions
 from bota_clients.identify.stationary_periods import LEAST_S, StationaryPeriod, find_stationary_periods
-from bota_clients.program import discard_output, say
+from bota_clients.program import say
 from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY
@@ -136,20 +136,15 @@ def run(options: IdentifyOptions) -> int:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
         _say(f"there are more than {MOST_POSES} poses: the longest are used")
     poses, result, error = _solve(periods, options)
-    try:
-        if options.json:
-            sys.stdout.write(json.dumps(as_json(poses, rejected, result, error), indent=1) + "\n")
-            sys.stdout.flush()
-        else:
-            # A narrower terminal wraps the lines: cells would be cut off.
-            console = Console(highlight=False, width=max(_WIDTH, Console().width))
-            if poses:
-                show_poses(console, poses, result)
-            if result is not None:
-                show_result(console, result)
-    except BrokenPipeError:
-        discard_output()
-        return 1
+    if options.json:
+        sys.stdout.write(json.dumps(as_json(poses, rejected, result, error), indent=1) + "\n")
+    else:
+        # A narrower terminal wraps the lines: cells would be cut off.
+        console = Console(highlight=False, width=max(_WIDTH, Console().width))
+        if poses:
+            show_poses(console, poses, result)
+        if result is not None:
+            show_result(console, result)
     for sentence in rejected if result is None or not options.json else ():
         _say(f"rejected: {sentence}")
     if result is None:
