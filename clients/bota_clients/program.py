@@ -35,6 +35,10 @@ def start(program: str, module: str, *arguments: object) -> int:
     """
     try:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        discard_output()
+        code = 1
     except ImportError as error:
         code = not_installed(program, error)
     except (ClientError, ProtocolError) as error:

@@ -338,7 +338,7 @@ class Monitor:
         return self._status("sensor", problems, "as it should be", values)
 
     def _judge_clock(self, problems: Problems, *, has_samples: bool) -> DiagnosticStatus:
-        clock, delay_ms = mapping(self._row.get("clock")), self._link.info.delay_ms
+        clock, delays = mapping(self._row.get("clock")), self._link.info.delay_ns
         if not has_samples:
             problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
         elif clock.get("mode") is None:
@@ -348,8 +348,8 @@ class Monitor:
         names = "mode", "stamps", "period_us", "offset_ppm", "uncertainty_us"
         values = {name: clock.get(name, "") for name in names} | {
             "stamp": self._stamps.kind,
-            "delay_force_torque_ms": delay_ms.get("force_torque", ""),
-            "delay_acceleration_ms": delay_ms.get("acceleration", ""),
+            "delay_force_torque_ms": "" if delays.force_torque is None else delays.force_torque / 1e6,
+            "delay_acceleration_ms": "" if delays.acceleration is None else delays.acceleration / 1e6,
         }
         return self._status("clock", problems, "locked to the sensor's clock", values)
 

@@ -42,10 +42,10 @@ from bridge.stream.link import (
     offset_text,
 )
 from ft_compensation.bias import Taken, check_at_rest, estimate_bias
-from ft_compensation.identification.estimation import CONFIDENCE
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
 from ft_compensation.identification.poses import Pose, coverage, pose_of
+from ft_compensation.identification.weighted import CONFIDENCE
 from ft_compensation.quantities import NO_WRENCH, ZERO, CompensationError, Wrench, length, vector, wrench_text
 
 TYPED: dict[str, Any] = {}

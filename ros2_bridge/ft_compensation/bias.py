@@ -14,7 +14,6 @@ from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.compensator import Compensator
-from ft_compensation.motion_error import MotionError
 from ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
@@ -43,10 +42,8 @@ def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.
         )
 
 
-def force_bound_95(
-    payload: Payload, accelerometer: Accelerometer, motion: MotionError | None = None
-) -> float:
-    """N: in 95 % of cases what is not known of the accelerometer, and of `motion`, shows as less force.
+def force_bound_95(payload: Payload, accelerometer: Accelerometer) -> float:
+    """N: in 95 % of cases what is not known of the accelerometer shows as less force.
 
     A tare with the tool on takes the part of the accelerometer's offset off.
     """
@@ -55,8 +52,7 @@ def force_bound_95(
         accelerometer.offset_interval, accelerometer.scale_interval, cross[::2], cross[1::2], strict=True
     )
     halves = [math.hypot(offset, STANDARD_GRAVITY * max(parts)) for offset, *parts in per_axis]
-    bound = payload.mass * _ABOUT_THREE_AXES * max(halves)
-    return bound if motion is None else math.hypot(bound, NORMAL_95 * motion.filters) + motion.out_of_range
+    return payload.mass * _ABOUT_THREE_AXES * max(halves)
 
 
 def estimate_bias(means: StationaryMeans, payload: Payload, specific_force: Vector3) -> Wrench:

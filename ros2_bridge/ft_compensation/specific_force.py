@@ -145,18 +145,14 @@ class QuaternionGravity:
             self._gravity = _carried(*self._gravity, (rates[-2], rates[-1]))
 
     def update(self, orientation: Quaternion, time_s: float) -> bool:
-        """Take an orientation x, y, z, w of time `time_s`. False: it is none, or older than what is known."""
+        """Take a unit quaternion x, y, z, w of time `time_s`. False: it is older than what is known."""
         x, y, z, w = orientation
-        size = x * x + y * y + z * z + w * w
-        if not 0.5 <= size <= 2.0:
-            return False
         # Messages may overtake each other; a clock that was set back is another matter.
         if 0.0 < self._newest_s - time_s <= self.stale_after_s:
             return False
         gx, gy, gz = self.base_gravity
-        # The inverse turns base vectors into the sensor's: minus the vector part. |q|² cancels in s.
-        s = 2.0 / size
-        tx, ty, tz = s * (gy * z - gz * y), s * (gz * x - gx * z), s * (gx * y - gy * x)
+        # The inverse turns base vectors into the sensor's: minus the vector part.
+        tx, ty, tz = 2.0 * (gy * z - gz * y), 2.0 * (gz * x - gx * z), 2.0 * (gx * y - gy * x)
         gx, gy, gz = (
             gx + w * tx + (ty * z - tz * y),
             gy + w * ty + (tz * x - tx * z),

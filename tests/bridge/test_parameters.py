@@ -51,7 +51,7 @@ def test_the_configuration_file_says_the_same() -> None:
         ("sensor", -1), ("sensor", 256), ("publishing_frequency", -1.0), ("publishing_frequency", math.nan),
         ("publishing_frequency", math.inf), ("publishing_frequency", True), ("publishing_frequency", "fast"),
         ("imu_raw_units", "SI"), ("imu_raw_units", ""), ("array_topic", ""), ("frame_id", ""),
-        ("orientation_covariance", 0.1), ("orientation_covariance", [0.1]),
+        ("orientation_covariance", 0.1), ("orientation_covariance", [0.1] * 9),
         ("orientation_covariance", "abc"), ("orientation_covariance", [0.1, 0.1, math.nan]),
         ("linear_acceleration_covariance", [True, False, True]), ("diagnostics.stale_after", 0.0),
         ("tool_mass", -0.1), ("tool_mass", "1"), ("tool_mass", True), ("bias", [0.0] * 5), ("bias", 0.0),
@@ -71,7 +71,7 @@ def test_wrong_values_are_named(name: str, value: Any) -> None:
 def test_what_is_taken_and_what_else_is_said() -> None:
     checked = ROWS["publishing_frequency"].check(100)
     assert (checked, type(checked)) == (100.0, float), "a whole number is a number"
-    values: tuple[Any, ...] = ([1, 2, 3], array("d", [1, 2, 3]), [0.5] * 9, [-0.5] * 9)
+    values: tuple[Any, ...] = ([1, 2, 3], array("d", [1, 2, 3]))
     for value in values:
         assert ROWS["orientation_covariance"].check(value) == tuple(map(float, value))
     for name, wrong, words in (
@@ -184,7 +184,7 @@ def test_limits_and_covariances_can_be_set_while_it_runs() -> None:
         assert len(node.fresh(wrenches, 0.5)) == 50
         node.refuse_value("diagnostics.lost_warn", 0, "lost_warn out of range")
         node.refuse_value(
-            "linear_acceleration_covariance", [1.0, 2.0], "it must be 3 numbers, the variances, or 9"
+            "linear_acceleration_covariance", [1.0, 2.0], "it must be 3 numbers from -1e+12 to 1e+12"
         )
 
 

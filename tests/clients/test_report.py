@@ -330,7 +330,8 @@ def test_descriptions_are_taken_for_what_they_are() -> None:
     assert (made.rate_hz, made.nominal_period_s) == (0.0, None)
     assert len(made.firmware) <= 80
     assert made.hardware.isprintable()
-    assert len(made.remarks) <= 21
+    (remark,) = made.remarks
+    assert "ignored: sinc_length, fir, no such, 7" in remark
 
 
 def test_a_rate_that_chop_divides_is_that_of_the_report() -> None:

@@ -7,6 +7,8 @@ The virtual sensor runs in simulated time.
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -38,6 +40,12 @@ _STYLE: Final = {
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 8,
     "axes.titlesize": 8,
+    "path.simplify_threshold": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "xtick.bottom": False,
+    "ytick.left": False,
 }
 _TOUCH: Final = (20.0, 24.0)
 _PUSH: Final = (0.0, 0.0, -12.0)
@@ -136,7 +144,11 @@ def draw(path: Path, data: Samples, shown: Mapping[str, Array]) -> None:
         drawn.supxlabel("time, s")
         drawn.supylabel("force, N")
         drawn.legend(*panel.get_legend_handles_labels(), loc="outside upper right", ncols=3)
-        drawn.savefig(path, metadata={"Date": None})
+        buffer = io.StringIO()
+        drawn.savefig(buffer, format="svg", metadata=dict.fromkeys(["Creator", "Date", "Format", "Type"]))
+    # A tenth of a point is enough, and what follows a point is a line to the next.
+    short = re.sub(r"-?\d+\.\d{2,}", lambda m: f"{round(float(m[0]), 1):g}", buffer.getvalue())
+    path.write_text(short.replace(" \nL ", " "))
 
 
 if __name__ == "__main__":

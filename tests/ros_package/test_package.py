@@ -101,7 +101,7 @@ def test_both_install_the_same_everything_in_the_shared_folders() -> None:
     assert pip == expected
     # A new folder has to be named in both, or it is installed by neither.
     folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] not in "._"}
-    code = {"bridge", "ft_compensation", "resource", "test"}
+    code = {"bridge", "ft_compensation", "resource"}
     assert {name for name in folders if not name.endswith(".egg-info")} == {*SHARED_FOLDERS, *code}
 
 

@@ -6,17 +6,12 @@ import argparse
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import fields, replace
 from pathlib import Path
-from typing import Final
 
 from bota_clients.arguments import add_force, add_imu_units, position
 from bota_clients.program import start
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from bota_ethercat.program.arguments import Parser, number
-from ft_compensation.quantities import StationaryLimits
-
-_LIMITS: Final = tuple(field.name for field in fields(StationaryLimits))
 
 
 class IdentifyOptions(argparse.Namespace):
@@ -26,8 +21,6 @@ class IdentifyOptions(argparse.Namespace):
     sensor: int | None
     imu_units: ImuUnits
     gravity: float | None  # m/s², if given
-    least_seconds: float
-    limits: StationaryLimits
     yaml: Path | None
     force: bool
     json: bool
@@ -47,16 +40,10 @@ def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
     _add_recording(made)
     add("--gravity", type=number(9.0, 10.0), metavar="M/S2",
         help=f"acceleration of gravity, m/s² ({STANDARD_GRAVITY}); written to OUT.yaml if given")  # fmt: skip
-    add("--least-seconds", type=number(0.3, 3600.0), default=1.0, metavar="S",
-        help="shortest stationary period that is a pose (default 1)")  # fmt: skip
-    add("--limit", type=_limit, action="append", default=[], metavar="NAME=VALUE",
-        help=f"change a limit of what counts as stationary: {', '.join(_LIMITS)}")  # fmt: skip
     add("--yaml", type=Path, metavar="OUT", help="write the result as parameters of the ROS 2 node")
     add_force(made)
     add("--json", action="store_true", help="print everything as JSON instead of a table")
-    options = made.parse_args(argv, IdentifyOptions())
-    options.limits = replace(StationaryLimits(), **dict(options.limit))
-    return options
+    return made.parse_args(argv, IdentifyOptions())
 
 
 def parse_delay(argv: Sequence[str]) -> IdentifyOptions:
@@ -77,14 +64,6 @@ def _add_recording(made: argparse.ArgumentParser) -> None:
     made.add_argument("--sensor", type=position, metavar="N",
         help="position on the bus (default: the only one in the recording)")  # fmt: skip
     add_imu_units(made)
-
-
-def _limit(text: str) -> tuple[str, float]:
-    name, _, given = text.partition("=")
-    if name not in _LIMITS:
-        raise argparse.ArgumentTypeError(f"{text!r}: it must be NAME=VALUE, NAME one of {', '.join(_LIMITS)}")
-    value = number(0.0, 1e6)(given)
-    return name, int(value) if name == "least_samples" else value
 
 
 def main(argv: Sequence[str] | None = None) -> int:

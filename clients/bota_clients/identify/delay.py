@@ -11,7 +11,7 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.identify.cli import IdentifyOptions
 from bota_clients.identify.program import choose
-from bota_clients.program import discard_output, say
+from bota_clients.program import say
 from bota_clients.recording.columns import Columns, columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, force_lag_s
@@ -34,19 +34,14 @@ def run(options: IdentifyOptions) -> int:
         error = str(refusal)
     expected_s = force_lag_s(settings, sensor.rate_hz or None)
     expected_ms = None if expected_s is None else expected_s * 1e3
-    try:
-        if options.json:
-            sys.stdout.write(json.dumps(_as_json(found, expected_ms, error), indent=1) + "\n")
-        elif found is not None:
-            implied = "unknown" if expected_ms is None else f"{expected_ms:.2f} ms"
-            sys.stdout.write(
-                f"force and torque come {found.seconds * 1e3:.2f} ms (± {found.interval_s * 1e3:.2f} ms, "
-                f"95 %) after the accelerometer; by the filters that were set: {implied}\n"
-            )
-        sys.stdout.flush()
-    except BrokenPipeError:
-        discard_output()
-        return 1
+    if options.json:
+        sys.stdout.write(json.dumps(_as_json(found, expected_ms, error), indent=1) + "\n")
+    elif found is not None:
+        implied = "unknown" if expected_ms is None else f"{expected_ms:.2f} ms"
+        sys.stdout.write(
+            f"force and torque come {found.seconds * 1e3:.2f} ms (± {found.interval_s * 1e3:.2f} ms, 95 %) "
+            f"after the accelerometer; by the filters that were set: {implied}\n"
+        )
     if found is None:
         say("ethercat-identify", f"{options.path}: {error}")
     return int(found is None)

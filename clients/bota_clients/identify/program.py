@@ -13,16 +13,16 @@ from rich.table import Table
 
 from bota_clients.errors import RecordingError
 from bota_clients.identify.cli import IdentifyOptions
-from bota_clients.identify.stationary_periods import StationaryPeriod, find_stationary_periods
-from bota_clients.program import discard_output, say
+from bota_clients.identify.stationary_periods import LEAST_S, StationaryPeriod, find_stationary_periods
+from bota_clients.program import say
 from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
-from ft_compensation.identification.estimation import CONFIDENCE
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
+from ft_compensation.identification.weighted import CONFIDENCE
 from ft_compensation.quantities import CROSS_AXES, CompensationError, length
 
 _WIDTH: Final = 80  # every table fits
@@ -131,25 +131,20 @@ def run(options: IdentifyOptions) -> int:
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
         data = columns(recording.frames(sensor.sensor), options.imu_units)
-    periods, rejected = find_stationary_periods(data, options.least_seconds, options.limits)
+    periods, rejected = find_stationary_periods(data)
     if len(periods) > MOST_POSES:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
         _say(f"there are more than {MOST_POSES} poses: the longest are used")
     poses, result, error = _solve(periods, options)
-    try:
-        if options.json:
-            sys.stdout.write(json.dumps(as_json(poses, rejected, result, error), indent=1) + "\n")
-            sys.stdout.flush()
-        else:
-            # A narrower terminal wraps the lines: cells would be cut off.
-            console = Console(highlight=False, width=max(_WIDTH, Console().width))
-            if poses:
-                show_poses(console, poses, result)
-            if result is not None:
-                show_result(console, result)
-    except BrokenPipeError:
-        discard_output()
-        return 1
+    if options.json:
+        sys.stdout.write(json.dumps(as_json(poses, rejected, result, error), indent=1) + "\n")
+    else:
+        # A narrower terminal wraps the lines: cells would be cut off.
+        console = Console(highlight=False, width=max(_WIDTH, Console().width))
+        if poses:
+            show_poses(console, poses, result)
+        if result is not None:
+            show_result(console, result)
     for sentence in rejected if result is None or not options.json else ():
         _say(f"rejected: {sentence}")
     if result is None:
@@ -188,10 +183,7 @@ def _solve(
 ) -> tuple[Poses, Identified | None, str | None]:
     """The periods that are poses, and the result or why there is none."""
     poses: list[tuple[StationaryPeriod, Pose]] = []
-    error = (
-        f"the sensor is never stationary for {options.least_seconds:g} s: hold it still, or relax "
-        "the limits with --limit or --least-seconds"
-    )
+    error: str | None = f"the sensor is never stationary for {LEAST_S:g} s: hold it still"
     for period in periods:
         try:
             poses.append((period, pose_of(period.means, magnitude=options.gravity or STANDARD_GRAVITY)))

@@ -25,10 +25,12 @@ from ft_compensation.stationary import (
     stationary_means,
 )
 
+LEAST_S: Final = 1.0  # shorter periods are no poses
 _BLOCK_S: Final = 0.1
 _BLOCK_SAMPLES: Final = 8  # at least, however slow the sensor is
 _LONGEST_GAP_S: Final = 0.5
 _SAME_POSE: Final = math.cos(math.radians(1.5))
+_LIMITS: Final = StationaryLimits()
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -43,10 +45,9 @@ class StationaryPeriod(NamedTuple):
 
 
 def find_stationary_periods(
-    columns: Columns, least_seconds: float = 1.0, limits: StationaryLimits | None = None
+    columns: Columns, least_seconds: float = LEAST_S
 ) -> tuple[list[StationaryPeriod], list[str]]:
     """The stationary periods of at least `least_seconds`, in order; sentences about those that nearly are."""
-    limits = limits or StationaryLimits()
     fresh = columns.where(columns.fresh)
     periods: list[StationaryPeriod] = []
     rejected: list[str] = []
@@ -57,13 +58,13 @@ def find_stationary_periods(
     times = (fresh.monotonic_ns - fresh.monotonic_ns[0]) * 1e-9
     rows = np.where(good[:, np.newaxis], rows, 0.0)
     for part in _parts(times):
-        for begin, end in _stretches(times[part], rows[part], good[part], limits):
+        for begin, end in _stretches(times[part], rows[part], good[part]):
             first, last = part.start + begin, part.start + end
             seconds = float(times[last - 1] - times[first])
             if seconds < least_seconds:
                 continue
             try:
-                means = stationary_means(rows[first:last], limits)
+                means = stationary_means(rows[first:last], _LIMITS)
             except NotStationaryError as error:
                 rejected.append(f"{times[first]:.1f} s to {times[last - 1]:.1f} s: {error}")
             else:
@@ -92,9 +93,7 @@ def _parts(times: Floats) -> Iterator[slice]:
             yield slice(begin, end)
 
 
-def _stretches(
-    times: Floats, rows: Floats, good: Bools, limits: StationaryLimits
-) -> Iterator[tuple[int, int]]:
+def _stretches(times: Floats, rows: Floats, good: Bools) -> Iterator[tuple[int, int]]:
     """First row and the row after the last one of every period, without its first and last block."""
     period = float(times[-1] - times[0]) / (len(times) - 1)
     size = max(_BLOCK_SAMPLES, round(_BLOCK_S / period))
@@ -102,8 +101,8 @@ def _stretches(
     blocks = rows[: count * size].reshape(count, size, rows.shape[1])
     mean, deviation = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
     quiet = good[: count * size].reshape(count, size).all(axis=1)
-    quiet &= (deviation <= limits.deviations).all(axis=1)
-    quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= limits.angular_rate
+    quiet &= (deviation <= _LIMITS.deviations).all(axis=1)
+    quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= _LIMITS.angular_rate
 
     def goes_on(start: int, number: int) -> bool:
         """Whether block `number` belongs to the period that began with block `start`."""
@@ -115,7 +114,7 @@ def _stretches(
             return False
         by_chance = CHANCE * (deviation[start] + deviation[number]) / math.sqrt(size)
         moved = np.abs(b - a) - by_chance
-        return bool((moved[:6] <= limits.drifts[:6]).all())  # of the acceleration the pose was compared
+        return bool((moved[:6] <= _LIMITS.drifts[:6]).all())  # of the acceleration the pose was compared
 
     start = 0
     for number in range(1, count + 1):

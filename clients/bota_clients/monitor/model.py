@@ -230,8 +230,8 @@ class _Sensor:
             return
         self._newest = self.observer.newest
         columns = list(zip(*samples, strict=True))
-        found = tuple(_range(columns[index]) for index in _WRENCH)
-        self.peaks = tuple(map(_widest, self.peaks or found, found))
+        before = self.peaks or ((),) * len(_WRENCH)
+        self.peaks = tuple(_range([*was, *columns[i]]) for was, i in zip(before, _WRENCH, strict=True))
 
     def _judge(self, now_s: float) -> None:
         seen = self._observation(now_s)
@@ -479,10 +479,6 @@ def _range(column: Sequence[float]) -> Range:
     if not math.isfinite(sum(column)):
         column = [value for value in column if math.isfinite(value)] or [0.0]
     return Range(min(column), max(column))
-
-
-def _widest(one: Range, other: Range) -> Range:
-    return Range(min(one.low, other.low), max(one.high, other.high))
 
 
 def _spread(values: Any) -> Spread | None:

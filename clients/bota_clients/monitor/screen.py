@@ -22,7 +22,7 @@ from bota_clients.monitor.model import Alert, Range, SensorState, State
 from bota_ethercat.pdo import AXES
 
 KEYS: Final = (
-    ("t", "tare", "zero this sensor's reading, in the sensor, or undo that; asks first"),
+    ("t", "tare", "zero the reading, in the sensor, or undo that; asks first"),
     ("r", "record", "start or stop a recording in this folder, as of ethercat-record"),
     ("p", "pause", "freeze the display; samples and peaks still count"),
     ("0", "reset", "reset peaks and past warnings"),
@@ -32,8 +32,8 @@ KEYS: Final = (
     ("q", "quit", "also Ctrl-C; Ctrl-L redraws the screen"),
 )  # key, its short name, what it does
 _HELP: Final = """
-Arrows, Page Up and Page Down scroll. Bars are centered on zero; their scale grows
-with the marked peaks, for which every sample counts.
+Arrows, Page Up and Page Down scroll. Bars are centered on zero; their scale
+grows with the marked peaks, for which every sample counts.
 age     of a sample on arrival; only on the server's own machine
 jitter  of the intervals between the samples' stamps
 Delay   of the sensor's filters, which comes before the age
@@ -124,7 +124,7 @@ def _warnings(state: State, width: int) -> list[Text]:
 
 def _overview(state: State, look: Look, width: int) -> list[Text]:
     """Server, sensors from the selected one on, clients."""
-    rows = [_server(state)]
+    rows = _server(state, width)
     if not state.sensors:
         unknown = "no sensor known yet" if not state.server.connected else "the server has no sensors"
         rows.append(Text(unknown, LABEL))
@@ -150,13 +150,14 @@ def _title(state: State, look: Look, width: int) -> Text:
     return left.append_text(right)
 
 
-def _server(state: State) -> Text:
+def _server(state: State, width: int) -> list[Text]:
     server = state.server
-    if wrong := words.trouble(server):
-        return _field("Server", wrong, BAD)
+    if wrong := words.trouble(server):  # the end says what to do
+        lines = textwrap.wrap(wrong, max(20, width - 9), break_on_hyphens=False)
+        return [_field("" if number else "Server", line, BAD) for number, line in enumerate(lines)]
     if server.uptime_s is None:
-        return _field("Server", "waiting for its status")
-    return _field("Server", "  ".join(f"{n.lower()} {v}" for n, v in words.server_facts(server)[:4]))
+        return [_field("Server", "waiting for its status")]
+    return [_field("Server", "  ".join(f"{n.lower()} {v}" for n, v in words.server_facts(server)[:4]))]
 
 
 def _clients(state: State) -> Text:

@@ -17,10 +17,11 @@ from bota_clients.errors import RecordingError
 from bota_clients.numbers import duration
 from bota_clients.program import Signals, say
 from bota_clients.record.cli import RecordOptions
-from bota_clients.record.recorder import BATCH_S, NAME, Batch, Recorder, Source, check_path, notes
+from bota_clients.record.recorder import BATCH_S, NAME, Batch, Recorder, Source, notes
 from bota_clients.recording.reader import Event
 from bota_ethercat.errors import RefusedError, UnreachableError
 from bota_ethercat.health.sentences import event_sentence, no_server
+from bota_ethercat.program.new_file import refuse_existing
 from bota_ethercat.text.untrusted import printable
 
 _say = partial(say, "ethercat-record")
@@ -30,7 +31,7 @@ def run(options: RecordOptions, signals: Signals) -> int:
     """Record; returns the exit code."""
     with contextlib.closing(Source(options.address, options.sensors)) as source:
         try:
-            check_path(options.path, overwrite=options.force)
+            refuse_existing(options.path, force=options.force)
             source.connect()
         except UnreachableError as error:
             raise RecordingError(no_server(options.address, error)) from None

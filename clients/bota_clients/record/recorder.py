@@ -22,7 +22,7 @@ from typing import Final
 
 from rich.filesize import decimal
 
-from bota_clients.errors import DiskError
+from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
 from bota_clients.recording.file_format import RECORDER
 from bota_clients.recording.reader import Description, Event
@@ -33,7 +33,6 @@ from bota_ethercat.client import Client, Connected, Disconnected
 from bota_ethercat.control import Event as ServerEvent
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import printable
 
@@ -120,71 +119,20 @@ def lost(frames: int, reason: str) -> Event:
     return _noted("lost", frames=frames, reason=reason)
 
 
-class Tally:
-    """What came of all sensors.
-
-    Attributes:
-        dropped: frames that came but could not be written.
-    """
-
-    def __init__(self) -> None:
-        self.dropped = 0
-        self._streams: dict[int, StreamAccounting] = {}
-
-    def take(self, frame: DataMessage) -> None:
-        """Count a frame that is recorded."""
-        stream = self._streams.get(frame.sensor)
-        if stream is None:
-            stream = self._streams[frame.sensor] = StreamAccounting(fresh_only=False)
-        stream.take(frame.sequence, frame.monotonic_ns, frame.flags)
-
-    def start_again(self) -> None:
-        """A new connection: the server may have been restarted, and its numbering with it."""
-        for stream in self._streams.values():
-            stream.begin()
-
-    @property
-    def sensors(self) -> dict[int, StreamCounts]:
-        """The counts by position on the bus, ascending; from any thread."""
-        return {position: stream.counts for position, stream in sorted(dict(self._streams).items())}
-
-    def losses(self) -> str:
-        """What is missing, in words; from any thread."""
-        found = [f"{count(self.dropped, 'frame')} came but could not be written"] if self.dropped else []
-        for position, sensor in self.sensors.items():
-            for number, what in (
-                (sensor.withheld, "not read in time"),
-                (sensor.lost, "after a GAP: samples were or may have been lost on the bus"),
-                (sensor.invalid, "invalid"),
-            ):
-                if number:
-                    found.append(f"{count(number, 'frame')} of sensor {position} {what}")
-        return ", ".join(found) or "nothing was lost"
-
-
-def check_path(path: Path, *, overwrite: bool) -> None:
-    """DiskError if the file exists and may not be overwritten, or its folder does not exist."""
-    if not path.parent.is_dir():
-        raise DiskError(f"{path} cannot be created: there is no folder {path.parent}")
-    if path.is_dir():
-        raise DiskError(f"{path} is a folder: name a file in it")
-    if path.exists() and not overwrite:
-        raise DiskError(f"{path} {EXISTS}")
-
-
 class Recorder:
     """Records batches into a file until it is stopped or the file cannot be written.
 
     Attributes:
-        tally: counters of what was recorded and lost.
+        dropped: frames that came but could not be written.
         error: why nothing more can be written, or None.
         saved: number of frames in the file, including the next flush.
     """
 
     def __init__(self, path: Path, library: str, notes: Mapping[str, str], *, overwrite: bool) -> None:
-        """Create the file; DiskError. `notes` become its metadata."""
-        self.tally = Tally()
-        self.error: DiskError | None = None
+        """Create the file; RecordingError. `notes` become its metadata."""
+        self.dropped = 0
+        self._streams: dict[int, StreamAccounting] = {}  # by position on the bus
+        self.error: RecordingError | None = None
         self.saved = 0
         self._queue: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
         self._backlog = self._overflow = self._unflushed = 0
@@ -203,8 +151,20 @@ class Recorder:
     @property
     def so_far(self) -> str:
         """What is recorded and what was lost, in words."""
-        frames = f"{self.saved} frames of {count(len(self.tally.sensors), 'sensor')}"
-        return f"{frames}, {decimal(self._disk.tell())}; {self.tally.losses()}"
+        frames = f"{self.saved} frames of {count(len(self._streams), 'sensor')}"
+        found = [f"{count(self.dropped, 'frame')} came but could not be written"] if self.dropped else []
+        for position, sensor in self._counts().items():
+            for number, what in (
+                (sensor.withheld, "not read in time"),
+                (sensor.lost, "after a GAP: samples were or may have been lost on the bus"),
+                (sensor.invalid, "invalid"),
+            ):
+                if number:
+                    found.append(f"{count(number, 'frame')} of sensor {position} {what}")
+        return f"{frames}, {decimal(self._disk.tell())}; {', '.join(found) or 'nothing was lost'}"
+
+    def _counts(self) -> dict[int, StreamCounts]:
+        return {position: stream.counts for position, stream in sorted(dict(self._streams).items())}
 
     def put(self, batch: Batch) -> None:
         """Queue a batch; never blocks."""
@@ -225,7 +185,7 @@ class Recorder:
         self._queue.put(None)
         self._thread.join()
         while not self._queue.empty():  # queued after a failure
-            self.tally.dropped += _frames_in(self._queue.get() or ())
+            self.dropped += _frames_in(self._queue.get() or ())
 
     def _put_overflow(self) -> None:
         if self._overflow:
@@ -239,11 +199,11 @@ class Recorder:
         try:
             self._record()
             self._finish()
-        except DiskError as error:
+        except RecordingError as error:
             self.error = error
             # The failed flush was truncated; of a file that was removed nothing is left.
             missing = self._writer.frames if self._disk.removed else self._unflushed
-            self.tally.dropped += missing
+            self.dropped += missing
             self.saved -= missing
         finally:
             self._disk.close()
@@ -276,20 +236,23 @@ class Recorder:
         if isinstance(item, DataMessage):
             self._unflushed += 1
             self.saved += 1
-            self.tally.take(item)
+            if item.sensor not in self._streams:
+                self._streams[item.sensor] = StreamAccounting(fresh_only=False)
+            self._streams[item.sensor].take(item.sequence, item.monotonic_ns, item.flags)
             writer.frame(item)
         elif isinstance(item, Description):
             writer.describe(item.stamp_ns, item.reply)
         else:
             if item.by_recorder and item.name == "lost":
-                self.tally.dropped += int(item.event["frames"])
-            elif item.by_recorder:
-                self.tally.start_again()
+                self.dropped += int(item.event["frames"])
+            elif item.by_recorder:  # the server may have been restarted, and its numbering with it
+                for stream in self._streams.values():
+                    stream.begin()
             writer.event(item.stamp_ns, item.event)
 
     def _finish(self) -> None:
-        counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self.tally.sensors.items()}
-        dropped = str(self.tally.dropped)
+        counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self._counts().items()}
+        dropped = str(self.dropped)
         self._writer.finish({"reason": self._reason, "dropped": dropped, "sensors": json.dumps(counts)})
 
 

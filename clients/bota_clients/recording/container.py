@@ -6,7 +6,7 @@ for a complete one, and allocates whatever a zstd frame claims to hold.
 
 - Opening reads record headers, and only those chunks that introduce a channel or have no message index.
 - An incomplete record at the end of a file without a footer is ignored, and `cut_off` says so.
-- Everything else that is malformed raises DamagedError with its position.
+- Everything else that is malformed raises RecordingError with its position.
 - Every length is checked against a limit before anything is allocated for it. Every CRC is verified.
 """
 
@@ -27,7 +27,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata
 from mcap.stream_reader import get_chunk_data_stream
 
-from bota_clients.errors import DamagedError, NotARecordingError, RecordingError
+from bota_clients.errors import RecordingError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 # Largest chunk in bytes, compressed or not. Those of ethercat-record have some hundred kilobytes.
@@ -97,7 +97,7 @@ class McapFile:
     def messages(self, channels: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
         """Channel, log time (ns) and body of the messages of these channels in file order.
 
-        DamagedError at the first corrupt chunk.
+        RecordingError at the first corrupt chunk.
         """
         wanted = frozenset(channels)
         for chunk in self._chunks:
@@ -111,7 +111,7 @@ class McapFile:
 
     def _open(self) -> None:
         if self._file.read(len(MAGIC)) != MAGIC:
-            raise NotARecordingError(f"{self.path} is not an MCAP file, so it is no recording")
+            raise RecordingError(f"{self.path} is not an MCAP file, so it is no recording")
         tail = self._read_at(max(0, self._size - _FOOTER_SIZE), _FOOTER_SIZE)
         has_footer = len(tail) == _FOOTER_SIZE and tail[0] == Opcode.FOOTER and tail.endswith(MAGIC)
         end, ended = self._scan()
@@ -136,9 +136,7 @@ class McapFile:
             if opcode == Opcode.DATA_END or body + length > self._size:
                 return position, opcode == Opcode.DATA_END
             if (opcode == Opcode.HEADER) != (position == len(MAGIC)):
-                raise NotARecordingError(
-                    f"{self.path} is not an MCAP file: its header is missing or repeated"
-                )
+                raise RecordingError(f"{self.path} is not an MCAP file: its header is missing or repeated")
             self._take(opcode, body, length)
             position = body + length
         return position, False
@@ -146,13 +144,13 @@ class McapFile:
     def _forgive(self, left: int) -> None:
         """It was cut off: ignore the `left` bytes of an incomplete record, and damaged chunks before them."""
         if left == self._size - len(MAGIC):
-            raise NotARecordingError(f"{self.path} was cut off before anything was recorded")
+            raise RecordingError(f"{self.path} was cut off before anything was recorded")
         more = f", and the last {left} bytes, an incomplete record, were ignored" if left else ""
         while self._chunks:
             try:
                 self._unpack(self._chunks[-1])
                 break
-            except DamagedError:  # after a power failure the last blocks of the file may be zeros
+            except RecordingError:  # after a power failure the last blocks of the file may be zeros
                 self._chunks.pop()
                 more = ", and its last chunk, which is damaged, was ignored"
         self.cut_off = f"it has no footer{more}"
@@ -173,7 +171,7 @@ class McapFile:
                 raise self._damaged(body, "a message index is malformed or belongs to no chunk")
             self._chunks[-1].counts[channel] = size // 16
         elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-            raise NotARecordingError(f"{self.path} has messages outside of chunks: it is no recording")
+            raise RecordingError(f"{self.path} has messages outside of chunks: it is no recording")
 
     def _learn(self, chunk: _ChunkRecord) -> None:
         """Take the channels that a chunk introduces, and count its messages."""
@@ -236,5 +234,5 @@ class McapFile:
         if size > most:
             raise self._damaged(offset, f"a record claims {size} bytes, more than {most}")
 
-    def _damaged(self, offset: int, what: str) -> DamagedError:
-        return DamagedError(f"{self.path} is damaged at byte {offset}: {what}")
+    def _damaged(self, offset: int, what: str) -> RecordingError:
+        return RecordingError(f"{self.path} is damaged at byte {offset}: {what}")

@@ -10,7 +10,7 @@ import re
 import struct
 from typing import Final
 
-from bota_clients.errors import DamagedError
+from bota_clients.errors import RecordingError
 from bota_ethercat.errors import BadMessageError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import LAYOUTS
@@ -71,13 +71,15 @@ def pack_frame(frame: DataMessage) -> bytes:
 
 
 def unpack_frame(body: bytes | memoryview, sensor: int) -> DataMessage:
-    """The frame in a message body from the topic of `sensor`; DamagedError if it is none."""
+    """The frame in a message body from the topic of `sensor`; RecordingError if it is none."""
     try:
         cdr, *fields, size = _FRAME.unpack_from(body)
     except struct.error:
-        raise DamagedError(f"a frame of sensor {sensor} is only {len(body)} bytes long") from None
+        raise RecordingError(f"a frame of sensor {sensor} is only {len(body)} bytes long") from None
     if cdr != _CDR or size not in LAYOUTS or len(body) != _FRAME.size + size or fields[3] != sensor:
-        raise DamagedError(f"a frame of sensor {sensor} is not in the form that docs/recording.md describes")
+        raise RecordingError(
+            f"a frame of sensor {sensor} is not in the form that docs/recording.md describes"
+        )
     return DataMessage._make((*fields, bytes(body[_FRAME.size :])))
 
 
@@ -88,15 +90,15 @@ def pack_json(message: JsonObject) -> bytes:
 
 
 def unpack_json(body: bytes | memoryview, topic: str) -> JsonObject:
-    """The JSON object in a message body; DamagedError if there is none."""
+    """The JSON object in a message body; RecordingError if there is none."""
     try:
         cdr, size = _TEXT.unpack_from(body)
     except struct.error:
-        raise DamagedError(f"a message on {topic} is only {len(body)} bytes long") from None
+        raise RecordingError(f"a message on {topic} is only {len(body)} bytes long") from None
     text = bytes(body[_TEXT.size :])
     if cdr != _CDR or size != len(text) or not text.endswith(b"\0"):
-        raise DamagedError(f"a message on {topic} is not a text in CDR")
+        raise RecordingError(f"a message on {topic} is not a text in CDR")
     try:
         return parse_json_object(text[:-1])
     except BadMessageError as error:
-        raise DamagedError(f"a message on {topic} is not JSON: {error}") from None
+        raise RecordingError(f"a message on {topic} is not JSON: {error}") from None

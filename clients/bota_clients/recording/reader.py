@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
-from bota_clients.errors import DamagedError, NotARecordingError
+from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_clients.recording.container import McapFile
 from bota_ethercat.errors import SettingError
@@ -169,9 +169,9 @@ class Recording(McapFile):
         super()._open()
         found = self.notes.get(file_format.METADATA)
         if found is None:
-            raise NotARecordingError(f"{self.path} is an MCAP file, but ethercat-record did not write it")
+            raise RecordingError(f"{self.path} is an MCAP file, but ethercat-record did not write it")
         if found.get("format") != file_format.FORMAT_VERSION:
-            raise NotARecordingError(
+            raise RecordingError(
                 f"{self.path} has format {found.get('format', '?')[:20]!r} and this program reads "
                 f"{file_format.FORMAT_VERSION}: use the version that wrote it"
             )
@@ -191,7 +191,7 @@ class Recording(McapFile):
         histories = Histories()
         for taken, note in enumerate(self._read(self._noted)):
             if taken == _MAX_NOTES:
-                raise DamagedError(f"{self.path} has more than {_MAX_NOTES} events")
+                raise RecordingError(f"{self.path} has more than {_MAX_NOTES} events")
             if not isinstance(note, DataMessage):
                 histories.take(note)
             if isinstance(note, Event):
@@ -201,7 +201,7 @@ class Recording(McapFile):
     def frames(self, sensor: int | None = None) -> Iterator[DataMessage]:
         """The frames of the sensor at this position, or of all, in the order in which they came.
 
-        DamagedError at the first corrupt part.
+        RecordingError at the first corrupt part.
         """
         frames = self._read(self._channels(sensor))
         return cast(Iterator[DataMessage], frames)

@@ -15,7 +15,7 @@ from typing import IO, Any, Final, cast
 
 from mcap.writer import CompressionType, Writer
 
-from bota_clients.errors import DiskError
+from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.new_file import EXISTS
@@ -56,7 +56,7 @@ class DiskFile:
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
-        """Create the file; DiskError if that fails, or if it exists and `overwrite` is False."""
+        """Create the file; RecordingError if that fails, or if it exists and `overwrite` is False."""
         self.path = path
         self.removed = False
         self._waiting: list[bytes] = []
@@ -65,7 +65,7 @@ class DiskFile:
         try:
             self._fd = _open_locked(path, flags)
         except FileExistsError:
-            raise DiskError(f"{path} {EXISTS}") from None
+            raise RecordingError(f"{path} {EXISTS}") from None
         except OSError as error:
             raise self._failed(error) from None
 
@@ -80,7 +80,7 @@ class DiskFile:
         return self._position
 
     def flush(self) -> None:
-        """Write what is buffered; DiskError if that fails, and then none of it is in the file, or no file."""
+        """Write what is buffered; RecordingError if that fails: then none of it is there, or no file."""
         data = memoryview(b"".join(self._waiting))
         self._waiting.clear()
         done = 0
@@ -96,10 +96,10 @@ class DiskFile:
         self._written = self._position
         self.removed = os.fstat(self._fd).st_nlink == 0
         if self.removed:
-            raise DiskError(f"{self.path} was removed while it was written: nothing of it is left")
+            raise RecordingError(f"{self.path} was removed while it was written: nothing of it is left")
 
     def sync(self) -> None:
-        """Synchronize the file to the disk; DiskError."""
+        """Synchronize the file to the disk; RecordingError."""
         try:
             os.fsync(self._fd)
         except OSError as error:
@@ -112,8 +112,8 @@ class DiskFile:
             os.close(self._fd)
             self._fd = -1
 
-    def _failed(self, error: OSError, more: str = "") -> DiskError:
-        return DiskError(f"{self.path} cannot be written: {error.strerror}{more}")
+    def _failed(self, error: OSError, more: str = "") -> RecordingError:
+        return RecordingError(f"{self.path} cannot be written: {error.strerror}{more}")
 
 
 class RecordingWriter:
@@ -158,11 +158,11 @@ class RecordingWriter:
         self.frames += 1
 
     def flush(self) -> None:
-        """End the chunk and write it to disk; DiskError if it cannot be written."""
+        """End the chunk and write it to disk; RecordingError if it cannot be written."""
         self._mcap.flush()  # type: ignore[no-untyped-call]
 
     def finish(self, notes: Mapping[str, str]) -> None:
-        """Write what is buffered, the index and the footer, synchronize the disk and close; DiskError."""
+        """Write what is buffered, index and footer, synchronize the disk and close; RecordingError."""
         self.flush()
         self._mcap.add_metadata(file_format.END_METADATA, dict(notes))
         self._mcap.finish()  # type: ignore[no-untyped-call]

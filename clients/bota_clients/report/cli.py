@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bota_clients.arguments import add_force, add_imu_units, add_server, server_of
-from bota_clients.errors import ReportError
+from bota_clients.errors import ClientError
 from bota_clients.program import discard_output, interrupt_on_signals, say, start
 from bota_ethercat.address import Address
 from bota_ethercat.errors import UnreachableError
@@ -96,7 +96,7 @@ def run(options: ReportOptions) -> int:
         say(_PROGRAM, "stopped: no report was written")
         return 1
     except UnreachableError as error:
-        raise ReportError(no_server(options.server, error)) from None
+        raise ClientError(no_server(options.server, error)) from None
     try:
         print(words, flush=True)
     except BrokenPipeError:

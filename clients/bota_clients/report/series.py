@@ -14,19 +14,18 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bota_clients.numbers import listing
 from bota_clients.recording.columns import Columns, Floats, Ints
 from bota_ethercat.accounting import StreamAccounting
-from bota_ethercat.errors import SettingError
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.sensor.filters import LONG_SINC, SHORT_SINC, noise_limit
 from bota_ethercat.sensor.warnings_register import explain
-from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SETTINGS, SettingValue, rate_divisor
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, known_settings, rate_divisor
 from bota_ethercat.text.untrusted import printable, whole
 
 Bools = npt.NDArray[np.bool_]
 
 _LONGEST_TEXT: Final = 80
-_MOST_REMARKS: Final = 20
 _HIGHEST_RATE_HZ: Final = 100_000.0
 
 
@@ -64,28 +63,21 @@ class Subject:
         return 1 / self.rate_hz if 0 < self.rate_hz <= _HIGHEST_RATE_HZ else None
 
     def with_remarks(self, remarks: Iterable[str]) -> Subject:
-        """The same with more remarks, up to a limit."""
-        every = [*self.remarks, *(printable(remark, 300) for remark in remarks)]
-        if len(every) > _MOST_REMARKS:
-            left_out = len(every) - _MOST_REMARKS
-            every = [*every[:_MOST_REMARKS], f"{left_out} more remarks are omitted."]
-        return replace(self, remarks=tuple(every))
+        """The same with more remarks."""
+        return replace(self, remarks=(*self.remarks, *(printable(remark, 300) for remark in remarks)))
 
 
 def subject(
     description: Mapping[str, Any], settings: object, columns: Columns, source: str, position: int
 ) -> Subject:
     """The sensor that one row of a reply to `describe` describes."""
-    known: dict[str, SettingValue] = {}
-    remarks = [] if isinstance(settings, Mapping) else ["The settings are not known."]
-    for name, value in settings.items() if isinstance(settings, Mapping) else ():
-        if name not in SETTINGS:
-            remarks.append(f"The unknown setting {printable(name, 40)!r} was ignored.")
-            continue
-        try:
-            known[name] = SETTINGS[name].check(value)
-        except SettingError as error:
-            remarks.append(f"A setting was ignored: {printable(error)}.")
+    known, remarks = known_settings(settings), list[str]()
+    if not isinstance(settings, dict):
+        remarks.append("The settings are not known.")
+    elif ignored := [printable(name, 40) for name in settings if name not in known]:
+        remarks.append(
+            f"Settings that do not exist, or not with this value, were ignored: {listing(ignored)}."
+        )
     rate = description.get("rate_hz")
     return Subject(
         position=position,

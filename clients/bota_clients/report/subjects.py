@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from bota_clients.errors import ReportError
+from bota_clients.errors import ClientError
 from bota_clients.numbers import count, listing, moment
 from bota_clients.record.recorder import Recorder, Source
 from bota_clients.recording.columns import Columns, columns
@@ -45,7 +45,7 @@ def of_recording(
 ) -> list[Subject]:
     """The sensors of the recording at `path`, or those chosen, by position; it is named as `source`.
 
-    RecordingError if it cannot be read, ReportError if it has no such sensor.
+    RecordingError if it cannot be read, ClientError if it has no such sensor.
     """
     with open_recording(path) as recording:
         recorded = [s for s in recording.sensors if not recording.chosen or s.sensor in recording.chosen]
@@ -64,12 +64,12 @@ def of_recording(
 
 def _no_sensor(
     where: str, choice: SensorChoice | None, there: Iterable[tuple[object, object, object]]
-) -> ReportError:
+) -> ClientError:
     """The error that the chosen sensor does not exist, with those that do."""
     known = [printable(f"{position} ({name}, serial {serial})", 80) for position, name, serial in there]
     if choice is None or not known:
-        return ReportError(f"{where} has no sensor")
-    return ReportError(f"{where} has no sensor {choice}: it has {', '.join(known[:16])}")
+        return ClientError(f"{where} has no sensor")
+    return ClientError(f"{where} has no sensor {choice}: it has {', '.join(known[:16])}")
 
 
 def _event_remarks(names: Iterable[str]) -> list[str]:
@@ -167,7 +167,7 @@ def of_server(
     """The server's sensors, or those chosen, from a recording of `seconds`, which is not kept.
 
     `show` gets the time so far, s, as `completed`. ConnectionFailedError or RefusedError if there is no
-    stream; ReportError if there is no such sensor.
+    stream; ClientError if there is no such sensor.
     """
     with TemporaryDirectory() as folder, contextlib.closing(Source(address, None)) as source:
         source.connect()

@@ -15,12 +15,12 @@ from bota_ethercat.accounting import FrameKind, StreamAccounting
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.sensor.warnings_register import WarningFlag
-from bota_ethercat.text.untrusted import number
+from bota_ethercat.text.untrusted import mapping, number
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
 _MOST_HZ: Final = 1e6  # a higher rate is no sensor's
-_MOST_MS: Final = 1e5  # a longer delay is no filter's
+LONGEST_MS: Final = 1000  # a longer delay is no filter's
 _LEAST_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
 _WARNINGS_AT: Final = LAYOUTS[min(LAYOUTS)].offsets["warnings"]
@@ -64,10 +64,10 @@ class Delays(NamedTuple):
     angular_rate: int | None = None
 
     @classmethod
-    def parse(cls, delay_ms: Mapping[str, object]) -> Delays:
+    def parse(cls, delay_ms: object) -> Delays:
         """From `delay_ms` in a message."""
-        values = (number(delay_ms.get(channel)) for channel in cls._fields)
-        return cls(*(round(ms * 1e6) if ms is not None and 0 <= ms < _MOST_MS else None for ms in values))
+        values = (number(mapping(delay_ms).get(channel)) for channel in cls._fields)
+        return cls(*(round(ms * 1e6) if ms is not None and 0 <= ms <= LONGEST_MS else None for ms in values))
 
 
 class Reading(NamedTuple):

@@ -36,8 +36,6 @@ NO_TEXTS: Final = ("",)  # an empty list of strings: ROS cannot infer the type o
 AUTO: Final = "auto"  # the value of a path that is for the node to choose
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
 _PORT: Final = 12001
-_COVARIANCE_LENGTHS: Final = (3, 9)
-_COVARIANCE: Final = "3 variances or 9 numbers row by row; 0 = unknown"
 _LEAST_GRAVITY: Final = 0.1
 _FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _FARTHEST_M: Final = 10.0
@@ -49,7 +47,7 @@ class ParameterError(Exception):
 
 
 class Row(NamedTuple):
-    """One parameter. The default's type is the parameter's; a tuple is texts, or numbers, `lengths` how many.
+    """One parameter. The default's type is the parameter's; a tuple is texts, or as many numbers.
 
     `low` and `high` bound a number; of several, each from -`high` if `low` is 0. `live`: can be set while the
     node runs; others are read-only.
@@ -61,7 +59,6 @@ class Row(NamedTuple):
     low: float = 0.0
     high: float = 0.0
     choices: tuple[str, ...] = ()
-    lengths: tuple[int, ...] = _COVARIANCE_LENGTHS
     live: bool = True
     optional: bool = False  # whether a text may be empty
 
@@ -73,12 +70,15 @@ class Row(NamedTuple):
             items = list(value)  # rclpy gives an array.array or a list, of whole numbers if all are
         elif several and kind is str and value is None:
             items = []  # what rclpy makes of []
-        if not all(map(self._may_be, items)) or (
-            several and kind is float and len(items) not in self.lengths
-        ):
+        if not all(map(self._may_be, items)) or len(items) != (self._count or len(items)):
             raise ParameterError(f"parameter {self.name} is {value!r}: it must be {self.allowed()}")
         checked = tuple(map(kind, items)) or NO_TEXTS
         return checked if several else checked[0]
+
+    @property
+    def _count(self) -> int:
+        """How many numbers it is; 0: any number of texts, or one value."""
+        return len(self.default) if isinstance(self.default, tuple) and self._kind is float else 0
 
     @property
     def _kind(self) -> type[Any]:
@@ -102,9 +102,7 @@ class Row(NamedTuple):
         if isinstance(self.default, tuple):
             if self._kind is str:
                 return "a list of texts"
-            if self.lengths == _COVARIANCE_LENGTHS:
-                return "3 numbers, the variances, or 9, the covariance row by row"
-            return f"{self.lengths[0]} numbers from {self.low or -self.high:g} to {self.high:g}"
+            return f"{self._count} numbers from {self.low or -self.high:g} to {self.high:g}"
         if isinstance(self.default, str):
             return "text" if self.optional else "text that is not empty"
         if isinstance(self.default, bool):
@@ -143,9 +141,9 @@ PARAMETERS: Final = (
     Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages", live=False),
     Row("imu_raw_units", ImuUnits.G_DPS.value, "What the sensor sends acceleration and angular rate in",
         choices=tuple(units.value for units in ImuUnits), live=False),
-    Row("orientation_covariance", ZERO, f"Of the IMU's orientation, rad²: {_COVARIANCE}", 0, 1e12),
-    Row("angular_velocity_covariance", ZERO, f"Of the IMU, (rad/s)²: {_COVARIANCE}", 0, 1e12),
-    Row("linear_acceleration_covariance", ZERO, f"Of the IMU, (m/s²)²: {_COVARIANCE}", 0, 1e12),
+    Row("orientation_covariance", ZERO, "Variances of the IMU's orientation, rad²; 0 = unknown", 0, 1e12),
+    Row("angular_velocity_covariance", ZERO, "Its variances, (rad/s)²; 0 = unknown", 0, 1e12),
+    Row("linear_acceleration_covariance", ZERO, "Its variances, (m/s²)²; 0 = unknown", 0, 1e12),
     Row("temperature_variance", 0.0, "Of the temperature, K²; 0 = unknown", 0, 1e6),
     # Those limits of every verdict that can be set for this node.
     Row("diagnostics.stale_after", LIMITS.stale_after, "Error: no new sample for so many s", 0.05, 60),
@@ -156,19 +154,19 @@ PARAMETERS: Final = (
     Row("diagnostics.temperature_warn", LIMITS.temperature_warn, "Warning: temperature, °C", -40, 200),
     Row("diagnostics.temperature_error", LIMITS.temperature_error, "Error: temperature, °C", -40, 200),
     Row("tool_mass", 0.0, "Mass of what hangs on the sensor, kg; 0 = it is not compensated", 0, 1000),
-    Row("tool_center_of_gravity", ZERO, "Its center of gravity in frame_id, m", 0, 10, lengths=(3,)),
+    Row("tool_center_of_gravity", ZERO, "Its center of gravity in frame_id, m", 0, 10),
     Row("tool_inertia", NO_PAYLOAD.inertia,
-        "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = a point mass", 0, 1e3, lengths=(6,)),
+        "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = a point mass", 0, 1e3),
     Row("gravity", DEFAULT_GRAVITY,
-        "Gravity, m/s², in the base frame: that of the orientations", 0, 100, lengths=(3,)),
+        "Gravity, m/s², in the base frame: that of the orientations", 0, 100),
     Row("bias", (0.0,) * 6,
-        "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6, lengths=(6,)),
+        "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6),
     Row("temperature_line", False,
         "Shift the bias along the sensor's line of offset by temperature, once the server has learned it"),
     Row("bias_ramp_time", 0.5, "Seconds in which a new bias replaces the old one; 0 = at once", 0, 60),
     Row("imu_position", ZERO,
         "Position in frame_id of the IMU that gravity_source names, m; zeros = that of the sensor's model",
-        0, 1, lengths=(3,)),
+        0, 1),
     Row("on_saturation", "publish",
         "What wrench_compensated does on samples whose force or torque is saturated",
         choices=("publish", "stop")),
@@ -178,19 +176,19 @@ PARAMETERS: Final = (
     Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
     Row("orientation.base_frame", "base_link", "Frame that gravity is given in, for the source tf"),
     Row("orientation.mounting", (0.0, 0.0, 0.0, 1.0),
-        "Quaternion x y z w: frame_id in the frame of the topic", 0, 1, lengths=(4,)),
+        "Quaternion x y z w: frame_id in the frame of the topic", 0, 1),
     Row("orientation.stale_after", 0.1,
         "Largest difference of the stamps of orientation and sample, s", 0.001, 10),
-    Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
-    Row("accelerometer.scale", EXACT.scale, "Its scale factors; ~/identify finds them", 0.5, 2, lengths=(3,)),
+    Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5),
+    Row("accelerometer.scale", EXACT.scale, "Its scale factors; ~/identify finds them", 0.5, 2),
     Row("accelerometer.offset_interval", EXACT.offset_interval,
-        "Half of the 95 % interval of its offset, m/s²; ~/identify finds it", 0, 5, lengths=(3,)),
+        "Half of the 95 % interval of its offset, m/s²; ~/identify finds it", 0, 5),
     Row("accelerometer.scale_interval", EXACT.scale_interval,
-        "Half of the 95 % interval of its scale; ~/identify finds it", 0, 1, lengths=(3,)),
+        "Half of the 95 % interval of its scale; ~/identify finds it", 0, 1),
     Row("accelerometer.cross_axis", EXACT.cross_axis,
-        "Parts of other axes to subtract: xy xz yx yz zx zy; ~/identify finds them", 0, 1, lengths=(6,)),
+        "Parts of other axes to subtract: xy xz yx yz zx zy; ~/identify finds them", 0, 1),
     Row("accelerometer.cross_axis_interval", EXACT.cross_axis_interval,
-        "Half of their 95 % intervals; ~/identify finds them", 0, 1, lengths=(6,)),
+        "Half of their 95 % intervals; ~/identify finds them", 0, 1),
     Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
     Row("rest.force_deviation", _REST.force_deviation, "Largest standard deviation at rest, N", 0, 1e3),
     Row("rest.torque_deviation", _REST.torque_deviation, "Largest standard deviation at rest, Nm", 0, 1e3),

@@ -74,11 +74,11 @@ class Stamps:
         self.kind = kind
         if not link.is_connected:
             return
-        delay_ms = link.info.delay_ms if kind == "measurement" else {"force_torque": 0.0, "acceleration": 0.0}
-        self.wrench_ns = round(1e6 * delay_ms.get("force_torque", 0.0))
-        self.imu_ns = round(1e6 * delay_ms.get("acceleration", 0.0))
-        named = {"force_torque": "wrench", "acceleration": "imu"}
-        unknown = " and ".join(topics for channel, topics in named.items() if channel not in delay_ms)
+        delays = {"wrench": link.info.delay_ns.force_torque, "imu": link.info.delay_ns.acceleration}
+        if kind != "measurement":
+            delays = dict.fromkeys(delays, 0)
+        self.wrench_ns, self.imu_ns = (delay_ns or 0 for delay_ns in delays.values())
+        unknown = " and ".join(topics for topics, delay_ns in delays.items() if delay_ns is None)
         problem = (
             f"stamp is measurement, but the delay of the filters is not known, so {unknown} topics have the "
             "time of the sample: switch settings.chop and settings.fast off, or update the server"
@@ -163,8 +163,6 @@ def _temperature(send: Send, parameters: Parameters, _: Stamps) -> Publish:
     return lambda sample, frame: send(pack(frame.stamp_ns, sample.temperature, variance))
 
 
-def _covariance(values: Numbers) -> Numbers:
-    """Nine numbers, row by row, from nine or from three variances."""
-    if len(values) == 9:
-        return values
-    return tuple(values[position // 4] if position % 4 == 0 else 0.0 for position in range(9))
+def _covariance(variances: Numbers) -> Numbers:
+    """The nine numbers of a covariance, row by row."""
+    return tuple(variances[position // 4] if position % 4 == 0 else 0.0 for position in range(9))

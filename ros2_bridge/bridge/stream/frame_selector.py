@@ -15,6 +15,7 @@ The rules it keeps:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -113,27 +114,23 @@ class FrameSelector:
 
 
 class RateLimit:
-    """A token bucket: at most `hz` samples a second on average, and two more in any interval.
+    """A token bucket of two: at most `hz` samples a second on average, and two more in any interval.
 
     It counts in the samples' own time and begins with half a token to spare, so that a limit equal to the
     stream's rate lets every sample pass although their intervals vary.
     """
 
-    _MOST_CREDIT: Final = 2.0  # with less, a limit just below the stream's rate would not be reached
-
     def __init__(self, hz: float) -> None:
-        self._per_ns = hz / 1e9
-        self._credit = 1.5
-        self._last_ns: int | None = None
+        self._period_ns = 1e9 / hz
+        self._full_ns = math.inf  # when both tokens are there again
 
     def allows(self, time_ns: int) -> bool:
         """Whether a sample of this time may pass; counts it if so."""
-        if self._last_ns is not None:
-            elapsed = max(time_ns - self._last_ns, 0)
-            self._credit = min(self._credit + elapsed * self._per_ns, self._MOST_CREDIT)
-        self._last_ns = time_ns
-        # Slightly less than 1, for rounding: 100 times 1.25 ms at 800 Hz must make 100 tokens.
-        if self._credit < 1.0 - 1e-6:
+        missing = max(0.0, (self._full_ns - time_ns) / self._period_ns)
+        if missing > 2.1:  # the first sample, or the clock was set back
+            missing = 0.5
+        # Slightly more than 1, for rounding: 100 times 1.25 ms at 800 Hz must make 100 tokens.
+        if missing > 1.0 + 1e-6:
             return False
-        self._credit -= 1.0
+        self._full_ns = time_ns + (missing + 1.0) * self._period_ns
         return True

@@ -14,20 +14,20 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.client.client import Client
+from bota_ethercat.client.reading import Delays
 from bota_ethercat.client.session import Disconnected
 from bota_ethercat.control import Event, known_six
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError
 from bota_ethercat.health.sentences import event_sentence, no_server
 from bota_ethercat.settings import SettingValue, known_settings
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import mapping, number, printable, rows
+from bota_ethercat.text.untrusted import printable, rows
 from ft_compensation.quantities import Wrench, wrench_text
 
 CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0
 SHUTDOWN_TIMEOUT_S: Final = 3.0
 _MOST_HZ: Final = 1e6
-LONGEST_DELAY_MS: Final = 1000
 _NEWER_IN_DESCRIPTIONS: Final = ("name", "serial", "state", "hardware", "firmware", "rate_hz", "settling")
 
 
@@ -62,7 +62,7 @@ class SensorInfo(NamedTuple):
     firmware: str = ""
     rate_hz: float = 0.0  # samples a second that are to be expected; 0 if the server does not say
     settings: Mapping[str, SettingValue] = {}  # empty without a connection
-    delay_ms: Mapping[str, float] = {}  # of the filters, by channel, as far as it is known
+    delay_ns: Delays = Delays()  # of the filters
     settling: bool = False  # whether its data has not settled
     # The sensor's own force/torque offset, part of every sample, N and Nm; None if it is not known.
     offset: tuple[float, ...] | None = None
@@ -144,7 +144,7 @@ class Link:
     def _take_settings(self, message: JsonObject) -> None:
         if found := known_settings(message.get("settings")):
             rate_hz = known_rate(message.get("rate_hz")) or self.info.rate_hz
-            self._change(settings=found, rate_hz=rate_hz, delay_ms=known_delays(message.get("delay_ms")))
+            self._change(settings=found, rate_hz=rate_hz, delay_ns=Delays.parse(message.get("delay_ms")))
 
     def _change(self, **values: Any) -> None:
         with self._changing:
@@ -213,12 +213,6 @@ def known_rate(rate_hz: object) -> float:
     return float(rate_hz) if isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ else 0.0
 
 
-def known_delays(delay_ms: object) -> Mapping[str, float]:
-    """The delays of the filters that a message gives, ms by channel; without those that it does not know."""
-    found = {channel: number(mapping(delay_ms).get(channel)) for channel in ("force_torque", "acceleration")}
-    return {channel: ms for channel, ms in found.items() if ms is not None and 0 <= ms <= LONGEST_DELAY_MS}
-
-
 def offset_text(offset: object) -> str:
     """An offset from a message for people."""
     known = known_six(offset)
@@ -236,7 +230,7 @@ def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
                 **{key: printable(row.get(key, "?"), 40) for key in keys},
                 rate_hz=known_rate(row.get("rate_hz")),
                 settings=known_settings(row.get("settings")),
-                delay_ms=known_delays(row.get("delay_ms")),
+                delay_ns=Delays.parse(row.get("delay_ms")),
                 settling=row.get("settling") is True,
                 offset=known_six(row.get("offset")),
             )

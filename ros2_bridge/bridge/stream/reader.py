@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.client.channel import Channel
 from bota_ethercat.client.client import Client
+from bota_ethercat.client.reading import LONGEST_MS
 from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
 from bota_ethercat.control import Event
 from bota_ethercat.errors import ConnectionFailedError
@@ -26,11 +27,11 @@ from bota_ethercat.text.untrusted import rows
 from bridge.parameters.table import Parameters
 from bridge.process import Worker
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
-from bridge.stream.link import LONGEST_DELAY_MS, SYSTEM_CLOCK, Clock, Link, sentence
+from bridge.stream.link import SYSTEM_CLOCK, Clock, Link, sentence
 
 _WAIT_S: Final = 1.0
 # Times that a ROS message can carry, less the longest delay of a filter.
-_FIRST_STAMP_NS: Final = LONGEST_DELAY_MS * 10**6
+_FIRST_STAMP_NS: Final = LONGEST_MS * 10**6
 _LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
 _SOMETIMES: Final = {"throttle_duration_sec": 10.0}
 _MOST_NOTED: Final = 8192

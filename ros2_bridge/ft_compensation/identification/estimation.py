@@ -17,10 +17,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ft_compensation.identification.weighted import Array, Known, Solution, solve, two_sided
+from ft_compensation.identification.weighted import Array, Known, Solution, solve, students_t
 from ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
 
-CONFIDENCE: Final = 0.95  # of all intervals
 # m/s²: what is assumed of the length of a mean acceleration beyond offset and sensitivities, ...
 _LENGTH_DEVIATION: Final = 0.002
 _LENGTH_DEGREES: Final = 6.0  # ... as if it were estimated from so many residuals.
@@ -95,7 +94,7 @@ def estimate(
     rows[..., 4:7, :] /= divisor[..., np.newaxis]
     rows[..., 4:7, 0] = -center / divisor
     deviation, degrees = solution.student(rows)
-    half = two_sided(CONFIDENCE, degrees) * deviation
+    half = students_t(degrees) * deviation
     linear = 10
     if regressor is not None:
         linear = 16
@@ -135,7 +134,7 @@ def calibrate(acceleration: Array, gravity: Array) -> tuple[Value, Value, Value]
         return None
     variance = ((gravity + rows @ answer) ** 2).sum(axis=0) / degrees
     spread = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))[:, np.newaxis] * variance)
-    half = two_sided(CONFIDENCE, degrees) * spread
+    half = students_t(degrees) * spread
     scale = 1.0 / np.diag(straight)
     return (
         Value(-np.linalg.solve(straight, answer[3]), half[3]),

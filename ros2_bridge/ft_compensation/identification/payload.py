@@ -16,9 +16,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from ft_compensation.identification.estimation import CONFIDENCE, Estimate, Value, calibrate, estimate
+from ft_compensation.identification.estimation import Estimate, Value, calibrate, estimate
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
-from ft_compensation.identification.weighted import Array
+from ft_compensation.identification.weighted import CONFIDENCE, Array
 from ft_compensation.quantities import (
     NORMAL_95,
     OFFSET_PRIOR,

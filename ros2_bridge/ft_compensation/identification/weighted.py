@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+CONFIDENCE: Final = 0.95  # of all intervals
 Array = NDArray[np.float64]
 _ROUNDS: Final = 60
 _CONVERGED: Final = 1e-4
@@ -113,21 +114,17 @@ def solve(design: Array, measured: Array, known: Known, variances: Array | None 
     )
 
 
-def two_sided(confidence: float, degrees: ArrayLike) -> Array:
-    """The t with which |T| <= t has probability `confidence` (0 to 1), for each number of `degrees` >= 1 of
-    freedom, which need not be whole.
+def students_t(degrees: ArrayLike) -> Array:
+    """The t with which |T| <= t has probability CONFIDENCE, for each number of `degrees` >= 1 of freedom,
+    which need not be whole.
     """
     nu = np.minimum(np.asarray(degrees, dtype=np.float64), _NORMAL)
-    if not (0.0 < confidence < 1.0 and (nu >= 1.0).all()):
-        raise ValueError(
-            f"no quantile for a confidence of {confidence!r} with {degrees!r} degrees of freedom"
-        )
     # T = sqrt(nu) tan(angle), whose density is a power of the cosine.
     most = np.full(nu.shape, np.pi / 2.0)
     low, high, whole = np.zeros(nu.shape), most, _inside(most, nu)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        below = _inside(middle, nu) < confidence * whole
+        below = _inside(middle, nu) < CONFIDENCE * whole
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     return np.sqrt(nu) * np.tan(low)
 
