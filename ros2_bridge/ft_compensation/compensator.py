@@ -16,6 +16,7 @@ class Stages(NamedTuple):
     """One sample at every stage. `final` is `measured - bias - tool`."""
 
     bias: Wrench  # subtracted
+    corrected: Wrench  # measured - bias
     tool: Wrench  # weight and inertia of the tool; subtracted
     final: Wrench  # the load of the environment on the sensor and its tool
 
@@ -50,6 +51,7 @@ class Compensator:
             tmx, tmy, tmz = tmx - ix, tmy - iy, tmz - iz
         return Stages(
             bias,
+            Wrench((fx, fy, fz), (mx, my, mz)),
             Wrench((tfx, tfy, tfz), (tmx, tmy, tmz)),
             Wrench((fx - tfx, fy - tfy, fz - tfz), (mx - tmx, my - tmy, mz - tmz)),
         )

@@ -22,7 +22,7 @@ def test_what_the_environment_does_is_left_of_any_load_in_any_pose() -> None:
         tool = Payload(draw.uniform(0, 10), tuple(draw.uniform(-1, 1, 3).tolist()))
         x, y, z = gravity_for(up)
         stages = Compensator(tool, bias).compensate(*load(up, tool, bias).plus(contact), (-x, -y, -z))
-        assert stages.final.plus(stages.tool).values == pytest.approx(load(up, tool, contact).values)
+        assert stages.corrected.values == pytest.approx(load(up, tool, contact).values)
         assert stages.tool.values == pytest.approx(load(up, tool, NO_WRENCH).values)
         assert stages.final.values == pytest.approx(contact.values)
 
@@ -33,7 +33,7 @@ def test_stages_add_up_and_have_their_signs() -> None:
     stages = compensator.compensate(*measured, (0.1, 0.2, 9.9))
     total = stages.bias.plus(stages.tool).plus(stages.final)
     assert total.values == pytest.approx(measured.values)
-    assert stages.final.plus(stages.tool).values == pytest.approx(measured.plus(stages.bias, -1.0).values)
+    assert stages.corrected.values == pytest.approx(measured.plus(stages.bias, -1.0).values)
     # Upright sensor, 1 kg: the load on the sensor points down, along gravity.
     stages = Compensator(Payload(1.0, ZERO)).compensate((0.0, 0.0, -9.8), ZERO, (0.0, 0.0, 9.8))
     assert stages.tool.force == (0.0, 0.0, -9.8)
