@@ -707,10 +707,10 @@ def test_more_fmmus_than_ours_were_used_by_the_master_before() -> None:
 )
 def test_a_mapping_that_cannot_be_is_one_sentence(index: int, subindex: int) -> None:
     backend = chain("BOTA,DRIVE")
-    life = life_of(backend)
-    read = life.read
-    life.read = lambda *address: bytes(4 * [0xFF]) if address == (index, subindex) else read(*address)  # type: ignore[method-assign]
-    life.length = lambda *address: len(life.read(*address))  # type: ignore[method-assign]
+    objects: Any = life_of(backend).objects
+    read = objects.read
+    objects.read = lambda *address: bytes(4 * [0xFF]) if address == (index, subindex) else read(*address)
+    objects.length = lambda *address: len(objects.read(*address))
     with pytest.raises(BusError, match=f"sensor 0 has 0xffffffff in object 0x{index:04X}:{subindex}"):
         start(backend)
 

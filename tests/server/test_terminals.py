@@ -221,8 +221,8 @@ def test_a_server_that_was_killed_finds_its_terminal_by_its_position(choice: str
 def test_other_pdos_than_the_sii_has_are_not_decoded(caplog: pytest.LogCaptureFixture) -> None:
     simulation = reading("BOTA,EL3102", "1")
     life: Any = simulation.backend.sensors.slaves[1].life
-    read = life.read
-    life.read = lambda *address: b"\1" if address == (0x1C13, 0) else read(*address)
+    read = life.objects.read
+    life.objects.read = lambda *address: b"\1" if address == (0x1C13, 0) else read(*address)
     client = simulation.subscribe(terminals=[0])
     simulation.run(3.0)
     assert caplog.text.count("maps other PDOs than its SII says") == 1

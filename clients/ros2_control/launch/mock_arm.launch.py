@@ -14,13 +14,12 @@ from launch import LaunchDescription
 
 PACKAGE = FindPackageShare("bota_ethercat_hardware")
 CONTROLLERS = PathJoinSubstitution([PACKAGE, "config", "mock_arm_controllers.yaml"])
-BROADCASTERS = "joint_state_broadcaster force_torque_sensor_broadcaster imu_sensor_broadcaster"
+BROADCASTERS = ["joint_state_broadcaster", "force_torque_sensor_broadcaster", "imu_sensor_broadcaster"]
 ARGUMENTS = (
     ("host", "localhost", "Of ethercat-server"),
     ("port", "12001", "Of ethercat-server"),
     ("virtual", "true", "Start that server, with a simulated sensor; false: it is running"),
     ("server_command", "ethercat-server", "Which needs root: 'sudo -n /path/to/ethercat-server', say"),
-    ("controllers", f"{BROADCASTERS} admittance_controller", "To activate"),
 )
 
 
@@ -31,7 +30,7 @@ def start(context):
     description = Command(["xacro ", urdf, f" host:={given['host']} port:={given['port']}"])
     robot = {"robot_description": ParameterValue(description, value_type=str)}
     server = [*shlex.split(given["server_command"]), "virtual", given["port"]]
-    spawned = [*given["controllers"].split(), "--param-file", CONTROLLERS]
+    spawned = [*BROADCASTERS, "admittance_controller", "--param-file", CONTROLLERS]
     actions = [
         Node(package="robot_state_publisher", executable="robot_state_publisher", parameters=[robot]),
         Node(
