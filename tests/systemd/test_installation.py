@@ -1,4 +1,4 @@
-"""scripts/install-service: its Debian packages, installed, updated and purged in a root of their own; and
+"""scripts/install-service: its Debian packages, installed, updated and purged in a root of their own,
 and the unit files: what systemd makes of them, and that they leave the server no more than it needs."""
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ def test_a_package_keeps_network_managers_off_its_interface(tmp_path: Path) -> N
     manager_file = "/usr/lib/NetworkManager/conf.d/90-ethercat-server-ens5.conf"
     networkd_file = "/usr/lib/systemd/network/05-ethercat-server-ens5.network"
     for_dpkg = {f"/DEBIAN/{part}" for part in ("control", "conffiles", "postinst", "prerm", "postrm")}
-    assert set(files) == {settings, manager_file, networkd_file} | for_dpkg
+    waiting = "/usr/lib/systemd/system/ethercat-server@ens5.service.d/interface.conf"
+    assert set(files) == {settings, manager_file, networkd_file, waiting} | for_dpkg
     assert files["/DEBIAN/conffiles"] == f"{settings}\n"
     assert "\nPORT=13000\n" in files[settings]
     manager, networkd = configparser.ConfigParser(), configparser.ConfigParser()
@@ -85,6 +86,7 @@ def test_a_dash_is_escaped_for_systemd_only_and_a_package_has_a_name_that_dpkg_a
     name, files = interface_package(tmp_path, "Enp3_s0-1")
     assert name.startswith("ethercat-server-enp3-s0-1_")
     assert "/etc/ethercat-server/Enp3_s0-1.env" in files
+    assert "/usr/lib/systemd/system/ethercat-server@Enp3_s0\\x2d1.service.d/interface.conf" in files
     assert "\nservices='ethercat-server@Enp3_s0\\x2d1.service'\n" in files["/DEBIAN/prerm"]
 
 
@@ -106,6 +108,7 @@ def test_a_dry_run_says_what_would_be_done() -> None:
         "/usr/lib/systemd/network/05-ethercat-server-ens5.network",
         "/usr/lib/systemd/system/ethercat-bridge.service",
         "/usr/lib/systemd/system/ethercat-server@.service",
+        "/usr/lib/systemd/system/ethercat-server@ens5.service.d/interface.conf",
         "/usr/lib/sysusers.d/ethercat-server.conf",
     }
     start, watch = done.stderr.splitlines()[-2:]
