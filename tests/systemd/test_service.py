@@ -1,7 +1,7 @@
 """The server as a real service of a running systemd, under everything that its unit forbids.
 
 A copy of the unit goes into /run/systemd/system for the time of a test. It starts a copy of this server as
-nobody. The copy and Python are shown to it, wherever they are; nothing else is different.
+nobody, in the network namespace of the tests. The copy and Python are shown to it; nothing else is different.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from tests import rights
 from tests.server.running import Client, Veth, free_port, needs_bus, virtual_sensor, wait_until
 from tests.systemd.test_installation import SERVER_UNIT
 
+RUNTIME = Path("/run/systemd/system")
 pytestmark = [
     pytest.mark.bus,
     needs_bus,
-    pytest.mark.skipif(not Path("/run/systemd/system").is_dir(), reason="systemd does not run here"),
+    pytest.mark.skipif(not os.access(RUNTIME, os.W_OK), reason="it takes root and a running systemd"),
 ]
-RUNTIME = Path("/run/systemd/system")
 USER = "nobody"
 WATCHDOG_PATIENCE_S = 60.0
 
@@ -66,6 +66,7 @@ def service(veth: Veth, config: str = "", *, starts: bool = True) -> Iterator[Se
 [Service]
 Environment=PORT={running.port} CONFIG={settings} PYTHONPATH={rights.copy()} PYTHONDONTWRITEBYTECODE=1
 BindReadOnlyPaths={shown}
+NetworkNamespacePath=/proc/{os.getpid()}/ns/net
 """
     unit.write_text(text + drop_in)
     try:
