@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final, TextIO
 
 from bota_ethercat.world import DATAGRAM, decode
-from ethercat_server.ethercat.nic import arrived_ns, look_up
+from ethercat_server.ethercat.nic import arrived_ns, look_up, master_sockets
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, QuitCommand, obey
@@ -96,6 +96,10 @@ def run(
     `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is only down is waited
     for), or a path cannot; without `control_path` `own_socket` is used, if it is free.
     """
+    if master_sockets(ifname):  # two that answer each other's answers would take all of the processors
+        raise LinkError(
+            f"{ifname} is in use by another virtual sensor or EtherCAT master: stop that one first"
+        )
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
         # By it others see that the interface is in use for EtherCAT; nobody reads it.
