@@ -97,9 +97,7 @@ def run(
     for), or a path cannot; without `control_path` `own_socket` is used, if it is free.
     """
     if master_sockets(ifname):  # two that answer each other's answers would take all of the processors
-        raise LinkError(
-            f"{ifname} is in use by another virtual sensor or EtherCAT master: stop that one first"
-        )
+        raise LinkError(f"{ifname} is in use by another virtual sensor or master: stop that one first")
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
         # By it others see that the interface is in use for EtherCAT; nobody reads it.

@@ -25,7 +25,6 @@ pytestmark = [
     needs_bus,
     pytest.mark.skipif(not os.access(RUNTIME, os.W_OK), reason="it takes root and a running systemd"),
 ]
-USER = "nobody"
 WATCHDOG_PATIENCE_S = 60.0
 
 
@@ -55,7 +54,7 @@ def service(veth: Veth, config: str = "", *, starts: bool = True) -> Iterator[Se
     program = f"{rights.PYTHON} -m ethercat_server.daemon.cli"
     text = text.replace("/opt/ethercat-server/bin/ethercat-server", program)
     # ProtectHome=yes shows nothing below home directories, not even what is bound there.
-    text = text.replace("ProtectHome=yes", "ProtectHome=tmpfs").replace("User=ethercat", f"User={USER}")
+    text = text.replace("ProtectHome=yes", "ProtectHome=tmpfs").replace("User=ethercat", "User=nobody")
     text = text.replace("Group=ethercat\n", "")
     unit, settings = RUNTIME / f"{template}@.service", RUNTIME / f"{template}.toml"
     settings.write_text(config)
