@@ -235,9 +235,10 @@ class CommandChannel(contextlib.ExitStack):
 
 def own_socket() -> str:
     """Where this user's virtual sensor takes commands if no other place is given."""
-    folder, uid = "/run/user", os.geteuid()
-    folder = f"{folder}/{uid}" if Path(f"{folder}/{uid}").is_dir() else tempfile.gettempdir()
-    return f"{folder}/ethercat-virtual-sensor-{uid}"
+    folder = f"/run/user/{os.geteuid()}"
+    if not os.access(folder, os.W_OK):  # none, or hidden from a service by ProtectHome=
+        folder = tempfile.gettempdir()
+    return f"{folder}/ethercat-virtual-sensor-{os.geteuid()}"
 
 
 def send(path: str, command: str) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests import rights
-from tests.server.running import Client, Veth, free_port, needs_bus, virtual_sensor, wait_until
+from tests.server.running import Client, free_port, needs_bus, virtual_sensor, wait_until
 from tests.systemd.test_installation import SERVER_UNIT
 
 RUNTIME = Path("/run/systemd/system")
@@ -46,10 +46,10 @@ class Service:
 
 
 @contextlib.contextmanager
-def service(veth: Veth, config: str = "", *, starts: bool = True) -> Iterator[Service]:
-    """The unit, started on the near end of `veth`; stopped and removed afterwards."""
+def service(ifname: str, config: str = "", *, starts: bool = True) -> Iterator[Service]:
+    """The unit, started on `ifname`; stopped and removed afterwards."""
     template = f"ethercat-test-{os.getpid()}"
-    running = Service(template, veth.near, free_port())
+    running = Service(template, ifname, free_port())
     text = SERVER_UNIT.read_text()
     program = f"{rights.PYTHON} -m ethercat_server.daemon.cli"
     text = text.replace("/opt/ethercat-server/bin/ethercat-server", program)
@@ -82,7 +82,7 @@ NetworkNamespacePath=/proc/{os.getpid()}/ns/net
 
 
 def test_it_streams_and_shuts_down_as_a_service() -> None:
-    with virtual_sensor() as (veth, _), service(veth) as running:
+    with virtual_sensor() as (veth, _), service(veth.near) as running:
         assert running.show("ActiveState") == "active"
         assert running.show("NRestarts") == "0"
         with Client(running.port) as client:
@@ -94,8 +94,8 @@ def test_it_streams_and_shuts_down_as_a_service() -> None:
         assert running.show("ExecMainStatus") == "0"
 
 
-def test_it_has_real_time_priority_and_locked_memory() -> None:
-    with virtual_sensor() as (veth, _), service(veth) as running:
+def test_on_a_virtual_bus_too_it_has_real_time_priority_and_locked_memory() -> None:
+    with service("virtual") as running:
         process = int(running.show("MainPID"))
         assert os.sched_getscheduler(process) == os.SCHED_FIFO
         status = Path(f"/proc/{process}/status").read_text().splitlines()
@@ -104,14 +104,14 @@ def test_it_has_real_time_priority_and_locked_memory() -> None:
 
 
 def test_a_wrong_configuration_is_not_tried_again() -> None:
-    with virtual_sensor() as (veth, _), service(veth, "nonsense = 1\n", starts=False) as running:
+    with virtual_sensor() as (veth, _), service(veth.near, "nonsense = 1\n", starts=False) as running:
         assert running.show("ExecMainStatus") == "2"
         assert running.show("ActiveState") == "failed"
         assert running.show("NRestarts") == "0"
 
 
 def test_a_server_that_hangs_is_started_again() -> None:
-    with virtual_sensor() as (veth, _), service(veth) as running:
+    with virtual_sensor() as (veth, _), service(veth.near) as running:
         os.kill(int(running.show("MainPID")), signal.SIGSTOP)
         wait_until(lambda: running.show("NRestarts") == "1", "the watchdog", WATCHDOG_PATIENCE_S)
         wait_until(lambda: running.show("ActiveState") == "active", "the second start")
