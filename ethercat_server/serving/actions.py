@@ -143,5 +143,5 @@ def _denial(action: str, who: str | None) -> str:
         )
     return (
         f"{action} is denied to {who}: only root, the server's own user, the user who ran sudo and those "
-        "named with --control-user or --control-group may do that"
+        "named with --control-user or --control-group (control_users, control_groups in a file) may do that"
     )

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Final, TextIO
 
 from bota_ethercat.world import DATAGRAM, decode
-from ethercat_server.ethercat.nic import arrived_ns, look_up
+from ethercat_server.ethercat.nic import arrived_ns, look_up, master_sockets
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, obey
@@ -96,6 +96,8 @@ def run(
     `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is only down is waited
     for), or a path cannot; without `control_path` `own_socket` is used, if it is free.
     """
+    if master_sockets(ifname):  # two that answer each other's answers would take all of the processors
+        raise LinkError(f"{ifname} is in use by another virtual sensor or master: stop that one first")
     with contextlib.ExitStack() as stack:
         raw = stack.enter_context(open_interface(ifname))
         # By it others see that the interface is in use for EtherCAT; nobody reads it.
@@ -176,9 +178,10 @@ def _hear(world: socket.socket, bus: Bus) -> None:
 
 def own_socket() -> str:
     """Where this user's virtual sensor takes commands if no other place is given."""
-    folder, uid = "/run/user", os.geteuid()
-    folder = f"{folder}/{uid}" if Path(f"{folder}/{uid}").is_dir() else tempfile.gettempdir()
-    return f"{folder}/ethercat-virtual-sensor-{uid}"
+    folder = f"/run/user/{os.geteuid()}"
+    if not os.access(folder, os.W_OK):  # none, or hidden from a service by ProtectHome=
+        folder = tempfile.gettempdir()
+    return f"{folder}/ethercat-virtual-sensor-{os.geteuid()}"
 
 
 def send(path: str, command: str) -> str:

@@ -1,7 +1,7 @@
 """The server as a real service of a running systemd, under everything that its unit forbids.
 
 A copy of the unit goes into /run/systemd/system for the time of a test. It starts a copy of this server as
-nobody. The copy and Python are shown to it, wherever they are; nothing else is different.
+nobody, in the network namespace of the tests. The copy and Python are shown to it; nothing else is different.
 """
 
 from __future__ import annotations
@@ -16,16 +16,15 @@ from pathlib import Path
 import pytest
 
 from tests import rights
-from tests.server.running import Client, Veth, free_port, needs_bus, virtual_sensor, wait_until
+from tests.server.running import Client, free_port, needs_bus, virtual_sensor, wait_until
 from tests.systemd.test_installation import SERVER_UNIT
 
+RUNTIME = Path("/run/systemd/system")
 pytestmark = [
     pytest.mark.bus,
     needs_bus,
-    pytest.mark.skipif(not Path("/run/systemd/system").is_dir(), reason="systemd does not run here"),
+    pytest.mark.skipif(not os.access(RUNTIME, os.W_OK), reason="it takes root and a running systemd"),
 ]
-RUNTIME = Path("/run/systemd/system")
-USER = "nobody"
 WATCHDOG_PATIENCE_S = 60.0
 
 
@@ -47,15 +46,15 @@ class Service:
 
 
 @contextlib.contextmanager
-def service(veth: Veth, config: str = "", *, starts: bool = True) -> Iterator[Service]:
-    """The unit, started on the near end of `veth`; stopped and removed afterwards."""
+def service(ifname: str, config: str = "", *, starts: bool = True) -> Iterator[Service]:
+    """The unit, started on `ifname`; stopped and removed afterwards."""
     template = f"ethercat-test-{os.getpid()}"
-    running = Service(template, veth.near, free_port())
+    running = Service(template, ifname, free_port())
     text = SERVER_UNIT.read_text()
     program = f"{rights.PYTHON} -m ethercat_server.daemon.cli"
     text = text.replace("/opt/ethercat-server/bin/ethercat-server", program)
     # ProtectHome=yes shows nothing below home directories, not even what is bound there.
-    text = text.replace("ProtectHome=yes", "ProtectHome=tmpfs").replace("User=ethercat", f"User={USER}")
+    text = text.replace("ProtectHome=yes", "ProtectHome=tmpfs").replace("User=ethercat", "User=nobody")
     text = text.replace("Group=ethercat\n", "")
     unit, settings = RUNTIME / f"{template}@.service", RUNTIME / f"{template}.toml"
     settings.write_text(config)
@@ -66,6 +65,7 @@ def service(veth: Veth, config: str = "", *, starts: bool = True) -> Iterator[Se
 [Service]
 Environment=PORT={running.port} CONFIG={settings} PYTHONPATH={rights.copy()} PYTHONDONTWRITEBYTECODE=1
 BindReadOnlyPaths={shown}
+NetworkNamespacePath=/proc/{os.getpid()}/ns/net
 """
     unit.write_text(text + drop_in)
     try:
@@ -82,7 +82,7 @@ BindReadOnlyPaths={shown}
 
 
 def test_it_streams_and_shuts_down_as_a_service() -> None:
-    with virtual_sensor() as (veth, _), service(veth) as running:
+    with virtual_sensor() as (veth, _), service(veth.near) as running:
         assert running.show("ActiveState") == "active"
         assert running.show("NRestarts") == "0"
         with Client(running.port) as client:
@@ -94,8 +94,8 @@ def test_it_streams_and_shuts_down_as_a_service() -> None:
         assert running.show("ExecMainStatus") == "0"
 
 
-def test_it_has_real_time_priority_and_locked_memory() -> None:
-    with virtual_sensor() as (veth, _), service(veth) as running:
+def test_on_a_virtual_bus_too_it_has_real_time_priority_and_locked_memory() -> None:
+    with service("virtual") as running:
         process = int(running.show("MainPID"))
         assert os.sched_getscheduler(process) == os.SCHED_FIFO
         status = Path(f"/proc/{process}/status").read_text().splitlines()
@@ -104,14 +104,14 @@ def test_it_has_real_time_priority_and_locked_memory() -> None:
 
 
 def test_a_wrong_configuration_is_not_tried_again() -> None:
-    with virtual_sensor() as (veth, _), service(veth, "nonsense = 1\n", starts=False) as running:
+    with virtual_sensor() as (veth, _), service(veth.near, "nonsense = 1\n", starts=False) as running:
         assert running.show("ExecMainStatus") == "2"
         assert running.show("ActiveState") == "failed"
         assert running.show("NRestarts") == "0"
 
 
 def test_a_server_that_hangs_is_started_again() -> None:
-    with virtual_sensor() as (veth, _), service(veth) as running:
+    with virtual_sensor() as (veth, _), service(veth.near) as running:
         os.kill(int(running.show("MainPID")), signal.SIGSTOP)
         wait_until(lambda: running.show("NRestarts") == "1", "the watchdog", WATCHDOG_PATIENCE_S)
         wait_until(lambda: running.show("ActiveState") == "active", "the second start")

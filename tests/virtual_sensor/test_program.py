@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from ethercat_server.ethercat.wire import ETHERTYPE
 from ethercat_server.virtual_sensor.cli import build_parser, main, options_from
+from ethercat_server.virtual_sensor.link import open_interface
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests import rights
 from tests.server.running import VirtualSensor
@@ -65,6 +67,13 @@ def test_an_interface_that_is_down(veth: tuple[str, str], capsys: pytest.Capture
     subprocess.run(["ip", "link", "set", veth[0], "down"], check=True)
     assert main([veth[0]]) == 1
     assert "is down" in capsys.readouterr().err
+
+
+@pytest.mark.bus
+def test_an_interface_that_has_one(veth: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    with open_interface(veth[0], ETHERTYPE):
+        assert main([veth[0]]) == 1
+    assert "in use by another virtual sensor" in capsys.readouterr().err
 
 
 def told(sensor: VirtualSensor) -> list[str]:
