@@ -84,7 +84,8 @@ class Arm:
         glfw.ERROR_REPORTING = "ignore"
         # Tried first, for where the viewer finds no screen it ends the process.
         if not (glfw.init() and glfw.create_window(640, 480, "arm", None, None)):
-            print(f"no window: {glfw.get_error()[1].decode()}", flush=True)
+            why: Any = glfw.get_error()[1]  # bytes, whatever its types say
+            print(f"no window: {why.decode()}", flush=True)
             yield None
             return
         glfw.terminate()
