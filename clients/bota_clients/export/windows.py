@@ -165,11 +165,11 @@ class Windows:
             return math.nan
         felt, turning = np.zeros((len(samples), 3)), cast(Any, STILL)
         if self._payload.mass:
-            rows, turned = list[Vector3](), list[Turning]()
+            rows, turned, follow = list[Vector3](), list[Turning](), self._imu.follow
             times = samples.monotonic_ns * 1e-9
             each = (column.tolist() for column in (samples.acceleration, samples.angular_rate, times))
             for acceleration, rate, time_s in zip(*each, strict=True):
-                rows.append((any(acceleration) and self._imu.follow(acceleration, rate, time_s)) or _UNKNOWN)
+                rows.append((any(acceleration) and follow(acceleration, rate, time_s)) or _UNKNOWN)
                 turned.append(self._imu.turning)
             felt = np.array(rows)
             if any(self._payload.inertia):

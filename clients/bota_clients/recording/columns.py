@@ -67,12 +67,13 @@ def columns(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS)
 
     `imu_units` are the units in which the firmware sends acceleration and angular rate.
     """
-    heads, data = array("q"), bytearray()
+    heads, data = array("Q"), bytearray()
     for frame in frames:
-        # 64-bit values that do not fit an int64 are no valid times.
-        heads.extend([min(value, _MAX) for value in frame[:6]])
+        heads.extend(frame[:6])
         data += frame.process_data.ljust(_SIZE, b"\0")
-    sequence, stamp_ns, monotonic_ns, _, flags, wkc = np.array(heads, np.int64).reshape(-1, 6).T
+    # 64-bit values that do not fit an int64 are no valid times.
+    whole_numbers = np.minimum(np.array(heads, np.uint64), _MAX).astype(np.int64)
+    sequence, stamp_ns, monotonic_ns, _, flags, wkc = whole_numbers.reshape(-1, 6).T
     table = np.frombuffer(data, _RECORD)
 
     def whole(name: str) -> Ints:
