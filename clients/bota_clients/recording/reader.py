@@ -26,7 +26,7 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import rows, visible
 
 _MAX_NOTES: Final = 1_000_000  # descriptions and events
-_BATCH: Final = 16384  # frames
+_BATCH: Final = 4096  # frames
 _LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions
 
 
