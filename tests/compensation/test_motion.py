@@ -61,8 +61,9 @@ def test_with_the_default_filters_moves_leave_little_and_it_says_how_much(name: 
     assert left.error is not None
     assert left.error.out_of_range < 0.1
     last = left._replace(force=left.force[left.times > 3.0])
-    assert 0.6 < left.error.filters / last.rms < 1.6
-    assert last.percentile(0.95) < math.hypot(force_bound_95(tool, imu.known), NORMAL_95 * left.error.filters)
+    assert 0.8 < left.error.filters / last.rms < 1.3
+    # What is left changes slowly: of a single second nine tenths are below a bound of 95 % in all.
+    assert last.percentile(0.9) < math.hypot(force_bound_95(tool, imu.known), NORMAL_95 * left.error.filters)
 
 
 @pytest.mark.parametrize(
