@@ -39,7 +39,7 @@ from bota_ethercat.settings import known_settings
 from bota_ethercat.text.json_text import parse_json_object
 
 _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
-_ZARR_FRAMES: Final = 1024  # in a chunk
+_CHUNK: Final = 1024  # frames, in a file
 _UNITS: Final = {"force": "N", "torque": "Nm", "acceleration": "m/s^2", "angular_rate": "rad/s", "age": "s"}
 _SECOND: Final = 1_000_000_000
 
@@ -264,11 +264,22 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         raise FileError(f"{path} {EXISTS}")
     with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
         made, blocks = Path(folder, path.name), windows_of(recording, frames, windows, sensor.sensor, advance)
-        _WRITERS[path.suffix](made, json.dumps(about, default=str), blocks)
+        _WRITERS[path.suffix](made, json.dumps(about, default=str), _in_chunks(blocks))
         if path.is_dir():
             shutil.rmtree(path)
         made.replace(path)
     return f"windows of {count(length, 'sample')}"
+
+
+def _in_chunks(blocks: Iterable[Arrays]) -> Iterator[Arrays]:
+    held = Arrays()
+    for block in blocks:
+        held = {name: np.concatenate([held[name], block[name]]) for name in block} if held else block
+        while len(held["stamp_ns"]) >= _CHUNK:
+            yield {name: array[:_CHUNK] for name, array in held.items()}
+            held = {name: array[_CHUNK:] for name, array in held.items()}
+    if len(held.get("stamp_ns", ())):
+        yield held
 
 
 def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
@@ -312,7 +323,7 @@ def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
     for block in blocks:
         for name, array in block.items():
             if name not in group:
-                shape, chunks = (0, *array.shape[1:]), (_ZARR_FRAMES, *array.shape[1:])
+                shape, chunks = (0, *array.shape[1:]), (_CHUNK, *array.shape[1:])
                 group.create_array(name, shape=shape, chunks=chunks, dtype=array.dtype)
             group[name].append(array)
 
