@@ -116,8 +116,8 @@ def run(
             heard[world.fileno()] = lambda: _hear(world, bus)
         if commands is not None:
             with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
-                typed = commands.fileno()
-                heard[typed] = lambda: _obey_lines(typed, bus, poller, exit_on_eof)
+                typed, begun = commands.fileno(), bytearray()
+                heard[typed] = lambda: obey_lines(typed, begun, bus, poller, exit_on_eof)
         for descriptor in heard:
             poller.register(descriptor, select.POLLIN)
         # All that is loaded need never be looked through again, which takes some 20 ms.
@@ -149,18 +149,20 @@ def _obey(control: socket.socket, bus: Bus) -> None:
             control.sendto(answer.encode(), sender)
 
 
-def _obey_lines(descriptor: int, bus: Bus, poller: select.poll, exit_on_eof: bool) -> None:
-    """Execute the commands that were typed."""
+def obey_lines(descriptor: int, begun: bytearray, bus: Bus, poller: select.poll, exit_on_eof: bool) -> None:
+    """Execute the commands that were typed; `begun` is the line that has not ended yet."""
     bus.set_time(time.monotonic_ns())
     try:
-        lines = os.read(descriptor, _CHUNK)
+        data = os.read(descriptor, _CHUNK)
     except OSError:  # of a terminal, to a job in the background
-        lines = b""
-    for line in lines.decode(errors="replace").splitlines():
-        answer = obey(bus, line)
+        data = b""
+    *lines, begun[:] = (begun + (data or b"\n")).split(b"\n")
+    del begun[LONGEST_LINE:]
+    for line in filter(bytearray.strip, lines):
+        answer = obey(bus, line[:LONGEST_LINE].decode(errors="replace"))
         with contextlib.suppress(OSError):  # nobody reads the answers
             os.write(1, answer.encode() + b"\n")
-    if not lines:
+    if not data:
         poller.unregister(descriptor)
         bus.quit |= exit_on_eof
 

@@ -80,9 +80,11 @@ def _measured(
     values: tuple[float, ...], offsets: tuple[float, ...], limit: float
 ) -> tuple[tuple[float, ...], int]:
     """`values` plus offsets, cut off at the range, and a bit for each axis that was."""
-    sums = [value + offset for value, offset in zip(values, offsets, strict=False)]
-    bits = sum(1 << axis for axis, value in enumerate(sums) if abs(value) > limit)
-    return tuple(max(-limit, min(limit, value)) for value in sums), bits
+    x, y, z = values[0] + offsets[0], values[1] + offsets[1], values[2] + offsets[2]
+    if -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit:
+        return (x, y, z), 0
+    bits = sum(1 << axis for axis, value in enumerate((x, y, z)) if abs(value) > limit)
+    return (max(-limit, min(limit, x)), max(-limit, min(limit, y)), max(-limit, min(limit, z))), bits
 
 
 _U64: Final = 2**64 - 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -14,11 +15,13 @@ import pytest
 
 from ethercat_server.ethercat.wire import ETHERTYPE
 from ethercat_server.virtual_sensor.cli import build_parser, main, options_from
-from ethercat_server.virtual_sensor.link import open_interface
+from ethercat_server.virtual_sensor.faults import LONGEST_LINE
+from ethercat_server.virtual_sensor.link import obey_lines, open_interface
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests import rights
 from tests.server.running import VirtualSensor
 from tests.virtual_sensor.conftest import Start
+from tests.virtual_sensor.raw_master import RawMaster
 
 
 def sensors(*words: str) -> list[SensorOptions]:
@@ -79,6 +82,23 @@ def test_an_interface_that_has_one(veth: tuple[str, str], capsys: pytest.Capture
 def told(sensor: VirtualSensor) -> list[str]:
     """Its lines, without that on the priority that an ordinary user does not have."""
     return [line for line in sensor.said().splitlines() if "not granted: real-time priority" not in line]
+
+
+def test_a_typed_line_comes_in_pieces(capfd: pytest.CaptureFixture[str]) -> None:
+    bus, (there, here), begun, poller = RawMaster().bus, os.pipe(), bytearray(), select.poll()
+    poller.register(there, select.POLLIN)
+    for typed in (b"deaf-a", b"fter 3\n\nhe", b"ar\n" + b"x" * 5000, b"\nhear", b""):
+        if typed:
+            os.write(here, typed)
+        else:
+            os.close(here)
+        obey_lines(there, begun, bus, poller, exit_on_eof=True)
+        assert len(begun) <= LONGEST_LINE
+    os.close(there)
+    first, second, third, last = capfd.readouterr().out.splitlines()
+    assert (first, second, last) == ("ok", "ok", "ok")
+    assert third.startswith("error: ")
+    assert bus.quit
 
 
 @pytest.mark.bus
