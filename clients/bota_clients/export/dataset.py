@@ -71,8 +71,6 @@ class Clock(NamedTuple):
 class Periodic:
     """Frames at a rate, from the first sample on until the last."""
 
-    count = 0  # of those that there must be
-
     def __init__(self, fps: float) -> None:
         self._period_ns, self._made, self._begin_ns = _SECOND / fps, 0, -1
 
@@ -272,6 +270,7 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
 
 
 def _in_chunks(blocks: Iterable[Arrays]) -> Iterator[Arrays]:
+    """The same in larger blocks: for each small one Zarr rewrites a chunk, and Parquet has a row group."""
     held = Arrays()
     for block in blocks:
         held = {name: np.concatenate([held[name], block[name]]) for name in block} if held else block
