@@ -119,6 +119,7 @@ class RecordingHub(Hub):
     def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
         self._simulation.note(made)
         super().publish(made, now_ns)
+        self._simulation.look()
 
     def serve(self, until_ns: int) -> None:
         self._simulation.serves(until_ns, super().serve)
@@ -229,6 +230,7 @@ class Simulation(SimulatedBus):
         self.announced_ns: list[int] = []  # when each was announced
         self._decoder = FrameDecoder()
         self._awaited: Callable[[], object] = lambda: False
+        self._until_ns = 0
         self.on_serve: Callable[[int], None] = lambda _: None
         self.hub = RecordingHub(self)
         self.bus = Bus(self.backend)
@@ -258,9 +260,15 @@ class Simulation(SimulatedBus):
             self.published_ns.append(self.clock.now_ns)
 
     def serves(self, until_ns: int, serve: Callable[[int], None]) -> None:
-        """Have the hub serve until then."""
+        """Have the hub serve until then, or until somebody goes on who waits for a time."""
+        if self.cycle.stopping:
+            return
         self.on_serve(until_ns)
-        serve(until_ns)
+        serve(min(until_ns, self._until_ns))
+        self.look()
+
+    def look(self) -> None:
+        """Have the clients take what has arrived, and the loop end if what somebody waits for is there."""
         for client in self.clients:
             client.receive()
         if self._awaited():
@@ -280,23 +288,21 @@ class Simulation(SimulatedBus):
 
     def run(self, seconds: float) -> None:
         """Let the loop run for this simulated time."""
-        self.at(seconds, self.cycle.stop)
-        self._run()
+        until_ns = self.clock.now_ns + round(seconds * 1e9)
+        self._run(lambda: self.clock.now_ns >= until_ns, until_ns)
 
     def run_until(self, condition: Callable[[], object], what: str, seconds: float = PATIENCE_S) -> None:
         """Let the loop run until `condition` holds."""
         deadline_ns = self.clock.now_ns + round(seconds * 1e9)
         met = False
 
-        def look() -> bool:
+        def is_over() -> bool:
             nonlocal met
             met = bool(condition())
             return met or self.clock.now_ns >= deadline_ns
 
         if not condition():
-            self._awaited = look
-            self._run()
-            self._awaited = lambda: False
+            self._run(is_over, deadline_ns)
             assert met or condition(), f"{what}: not within {seconds} s; events: {self.events[-6:]}"
 
     def go_on(self, until: Callable[[], object], seconds: float) -> None:
@@ -305,11 +311,15 @@ class Simulation(SimulatedBus):
             self.clock.sleep(seconds)
             return
         until_ns = self.clock.now_ns + round(seconds * 1e9)
-        self.run_until(lambda: until() or self.clock.now_ns >= until_ns, "the end of a wait", seconds + 1)
+        if not until():
+            self._run(lambda: until() or self.clock.now_ns >= until_ns, until_ns)
 
-    def _run(self) -> None:
+    def _run(self, is_over: Callable[[], object], until_ns: int) -> None:
+        """Let the loop run until it is over, which may be at this time."""
+        self._awaited, self._until_ns = is_over, until_ns
         self.cycle.stopping = False
         self.cycle.run()
+        self._awaited = lambda: False
 
     def status(self) -> dict[str, Any]:
         return self.cycle.status()

@@ -277,7 +277,7 @@ class SampleClock:
         # When the last valid exchange was sent from which was learned, or that went on.
         self._looked_ns = 0
         self._moved_ns = timing.moved_ns
-        self._bias_ns = 0.0  # by how much events are later than polls show, where both are followed
+        self._bias_ns = 0.0  # by how much events are later than polls show, while polls are followed
         self._newest = 1  # number of the newest sample, counted from the one before it by the phase alone
         # When the sensor had certainly looked in the exchange that brought the newest sample.
         self._seen_by_ns = 0.0
@@ -377,6 +377,9 @@ class SampleClock:
             self._turn = _TURNS
             self._least_variance, self._most_variance = variance / _CHANGED, variance * _CHANGED
             self._single = timing.usual_ns > _NO_TIME * period_ns
+            if not self._single:  # phase and period are learned from events again
+                estimate.phase_ns += self._bias_ns
+                self._bias_ns = 0.0
             self._usual_margin_ns = self._best_margin_ns()
             self._probed_above = (timing.look_variance + _PROBE_BELOW) / 4
         self._margin_ns = self._usual_margin_ns * (1.0 if self._single or self.by_events else self._caution)
@@ -477,8 +480,7 @@ class SampleClock:
         self.uncertain = False
         events, self._by_event = self.events, 0.0
         if events is not None and events.are_trusted:
-            bias_ns = self._bias_ns if self._single else 0.0
-            expected_ns = phase_ns + outward_ns + bias_ns
+            expected_ns = phase_ns + outward_ns + self._bias_ns
             late = events.date(expected_ns, period_ns, self.estimate.variance, sent_ns, back_ns)
             if late is not None:
                 if self._single:
@@ -544,14 +546,22 @@ class SampleClock:
         estimate = self.estimate
         return look_ns > estimate.phase_ns + _CONTRADICTS * math.sqrt(estimate.variance + variance)
 
+    def learn_events(self, sent_ns: int, arrived_ns: int, count: int) -> None:
+        """Learn when events come to be; `count` exchanges are known by this one."""
+        if self.events is None:
+            return
+        moved_ns = self.events.local_clock.moved_ns
+        self.events.learn(sent_ns, arrived_ns, count)
+        if self._follows_events:  # all events are earlier or later, and so are the samples
+            self.estimate.phase_ns += self.events.local_clock.moved_ns - moved_ns
+
     def learn(self, arrived_ns: int) -> None:  # noqa: PLR0915 - one step of one filter
         """Learn from the exchange that was taken last, whose answer began to arrive at `arrived_ns`."""
         estimate, moved_ns = self.estimate, self._timing.moved_ns
         sent_ns, fresh = self._sent_ns, self._fresh
         estimate.phase_ns += moved_ns - self._moved_ns
         self._moved_ns = moved_ns
-        if self.events is not None:
-            self.events.learn(sent_ns, arrived_ns, 1 + self._skipped)
+        self.learn_events(sent_ns, arrived_ns, 1 + self._skipped)
         if self._skipped:
             estimate.hold_over(self._skipped)
             self._hits += self._skipped

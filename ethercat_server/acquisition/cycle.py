@@ -27,6 +27,7 @@ _SERVE_EVERY_NS: Final = 10_000_000
 _SERVE_IN_FLIGHT_NS: Final = 2_000_000  # and, without waiting, while an exchange is on its way
 _CHORES_EVERY_NS: Final = 20_000_000  # interval between chores, such as whether CLOCK_REALTIME was set
 _RECOVERY_STEP_NS: Final = 500_000  # time between two exchanges while all sensors are lost
+_MOST_UNANSWERED: Final = 40  # unanswered exchanges beyond which that interval grows no more
 # Interval between summaries of the distributions, which take some 100 µs each.
 _SUMMARY_NS: Final = 200_000_000
 _COST_GAIN: Final = 1 / 64
@@ -83,7 +84,7 @@ class Cycle:
         self._streams = streams
         self._hub = hub
         self._recovery = recovery
-        self._missed_deadlines = 0
+        self._missed_deadlines = self._missed_until_ns = 0
         self._timing = timing
         self._cost_ns = _FIRST_COST_NS  # what an exchange and its samples keep the loop busy
         self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
@@ -106,11 +107,13 @@ class Cycle:
         self._in_turn = cycle(self._everyone)
         self._started_ns = bus.clock.monotonic_ns()
         self._summarize_at_ns = 0
+        self._chores_at_ns = self._roll_at_ns = 0
+        self._slept = False  # whether the loop, when it was stopped, had slept until the exchange that is due
         self._summaries: list[tuple[dict[str, float], dict[str, float]]] = []
         self._plan()
 
     def stop(self) -> None:
-        """End `run` after the current cycle."""
+        """End `run` before the next exchange."""
         self.stopping = True
 
     def run(self) -> None:
@@ -123,20 +126,22 @@ class Cycle:
 
     def _run(self) -> None:
         bus, hub, recovery, jobs, timing = self._bus, self._hub, self._recovery, self._jobs, self._timing
-        monotonic_ns, serve_by = bus.clock.monotonic_ns, 0
-        self._chores_at_ns = self._roll_at_ns = self._feed_at_ns = 0
-        while not self.stopping:
+        monotonic_ns, serve_by, slept = bus.clock.monotonic_ns, 0, self._slept
+        self._feed_at_ns = 0
+        while True:
             due = self._due_ns()
             if jobs.waiting:
                 jobs.step(due)
                 due = self._due_ns()
             now = monotonic_ns()
-            slept = due > now and not timing.in_flight
+            slept = slept or (due > now and not timing.in_flight)
             if slept or now > serve_by:
                 hub.serve(now if timing.in_flight else due)
                 serve_by = now + (_SERVE_IN_FLIGHT_NS if timing.in_flight else _SERVE_EVERY_NS)
+            if self.stopping:
+                break
             self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS, slept=slept)
-            now = monotonic_ns()
+            now, slept = monotonic_ns(), False
             if self._answer is not None:
                 if now >= recovery.attend_at_ns or not self._complete:
                     recovery.attend(self._complete, now)
@@ -144,6 +149,7 @@ class Cycle:
                 recovery.miss(now - timing.unanswered_since_ns, now)
             if now >= self._chores_at_ns:
                 self._do_chores(now)
+        self._slept = slept
 
     def _due_ns(self) -> int:
         """When the next exchange is due.
@@ -153,7 +159,8 @@ class Cycle:
         """
         timing, streams = self._timing, self._streams
         if self._recovery.all_lost:
-            return timing.sent_ns + _RECOVERY_STEP_NS
+            # Slaves, or a driver, that cannot keep up get time to answer.
+            return timing.sent_ns + _RECOVERY_STEP_NS * min(1 + timing.unanswered, _MOST_UNANSWERED)
         if len(streams) == 1:
             poll_ns = streams[0].clock.next_poll_ns()
         else:
@@ -190,14 +197,14 @@ class Cycle:
         now = monotonic_ns()
         wait = (due if due < until_ns else until_ns) - now
         if wait > 0 or bus.process_data.in_flight or until_ns <= now:
-            frame = self._receive(wait)
+            frame = self._receive(wait, now)
             if self._answer or (now := monotonic_ns()) < due:
                 return frame
             slept = slept or wait > 0
-        if (late := now - due) > self._shortest_ns:
-            self._missed_deadlines += int(late // self._shortest_ns)
+        if now - due > self._shortest_ns:
+            self._count_missed(due, now)
             if slept:  # else the answer was held up, and what is due was past when it came
-                self._recovery.causes.stood_still(late, now)
+                self._recovery.causes.stood_still(now - due, now)
         if timing.unanswered:
             if timing.unanswered == 1:
                 timing.unanswered_since_ns = timing.sent_ns
@@ -211,11 +218,14 @@ class Cycle:
         if frame is None:
             most = int(timing.patience_ns) if self._one_by_one else self._due_ns() - monotonic_ns()
             if (wait := min(most, until_ns - now)) > 0:
-                return self._receive(wait)
+                return self._receive(wait, sent)
         return frame
 
-    def _receive(self, wait: int) -> bytes | None:
-        """Wait for a frame, `wait` ns at most, and hand it out; returns one that answers no exchange."""
+    def _receive(self, wait: int, since_ns: int) -> bytes | None:
+        """Wait for a frame, `wait` ns from `since_ns` at most, and hand it out.
+
+        Returns one that answers no exchange.
+        """
         bus = self._bus
         frame, back = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0), bus.clock.monotonic_ns()
         if frame is None:
@@ -230,11 +240,11 @@ class Cycle:
         if exchange is None:
             self._recovery.causes.stray(frame, back)
             return frame
-        self._take(exchange)
+        self._take(exchange, since_ns)
         return None
 
-    def _take(self, exchange: Exchange) -> None:
-        """Hand out what an exchange brought; then learn from it."""
+    def _take(self, exchange: Exchange, since_ns: int) -> None:
+        """Hand out what an exchange brought, which was awaited since then; then learn from it."""
         sent, back, frame, wkc, which = self._answer = exchange
         timing, carried = self._timing, self._carried[which]
         new: list[OutgoingFrame] = []
@@ -256,23 +266,30 @@ class Cycle:
         self._exchange.record(back - sent)
         learners = [row[-1].clock for row in carried if row[-1].finish(exchange)]
         if learners or not timing.short_ns < back - sent < timing.usual_ns + self._shortest_ns:
-            self._learn(exchange, learners)
+            self._learn(exchange, learners, since_ns)
 
     def _show_silence(self, now: int) -> None:
         """Hand out frames of the sensors that have been silent for too long while no answer comes."""
         if new := [made for stream in self._streams if (made := stream.idle(now))]:
             self._hub.publish(new, now)
 
-    def _learn(self, exchange: Exchange, learners: Sequence[SampleClock]) -> None:
+    def _count_missed(self, due_ns: float, now_ns: int) -> None:
+        """What was due then is done now: count the sample periods in between that are not counted yet."""
+        missed = max(0, int((now_ns - max(due_ns, self._missed_until_ns)) // self._shortest_ns))
+        self._missed_deadlines += missed
+        self._missed_until_ns = now_ns
+
+    def _learn(self, exchange: Exchange, learners: Sequence[SampleClock], since_ns: int) -> None:
         """Learn from an exchange that `learners` need, was a short one, or was held up."""
         sent, back, _, _, which = exchange
         timing = self._timing
         arrived = self._bus.backend.arrived_ns()
         if not sent < arrived < back:  # the kernel does not say, or CLOCK_REALTIME was set
             arrived = back
-        if (late := back - sent - timing.usual_ns) > self._shortest_ns:  # the computer stood still
-            self._missed_deadlines += int(late // self._shortest_ns)
-            self._recovery.causes.stood_still(back - arrived, back)
+        if back - sent - timing.usual_ns > self._shortest_ns:  # it was held up
+            self._count_missed(sent + timing.usual_ns, back)
+            # By this computer, if it had arrived and was awaited already.
+            self._recovery.causes.stood_still(back - max(arrived, since_ns), back)
         arrived = max(sent, arrived - self._wire_ns[which])
         if learners:
             timing.took(sent, arrived, back)

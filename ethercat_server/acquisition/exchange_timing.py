@@ -137,7 +137,7 @@ class ExchangeTiming:
 
 _POINTS: Final = {"p50": 0.5, "p99": 0.99, "p999": 0.999, "max": 1.0}
 SLOT_NS: Final = 1_000_000_000  # a recent distribution covers the last ten slots of this length
-_WINDOW_SLOTS: Final = 10
+WINDOW_SLOTS: Final = 10
 # The upper bits of a float32 are its sign, its exponent and the first bits of its mantissa: of those, 5 tell
 # 32 buckets an octave apart.
 _UPPER_HALF: Final = slice(sys.byteorder == "little", None, 2)
@@ -202,7 +202,7 @@ class RecentDistribution:
         """A second has passed."""
         self.count()
         self.slots.append(Distribution())
-        if len(self.slots) > _WINDOW_SLOTS:
+        if len(self.slots) > WINDOW_SLOTS:
             self.before.add(self.slots.pop(0))
 
     def summaries_us(self) -> tuple[dict[str, float], dict[str, float]]:

@@ -69,6 +69,7 @@ class LocalClock:
         rate: relative deviation of CLOCK_MONOTONIC from it.
         doubt_ns: uncertainty of `time_at`.
         variance: of `time_at`.
+        moved_ns: by how much corrections have moved `time_at`, in all.
         excess_ns: what the exchanges that count usually take beyond the shortest.
         restarts: how often it turned out to have jumped, or not to run like a clock.
     """
@@ -77,7 +78,7 @@ class LocalClock:
         """`timing` is that of the bus: it knows the shortest round trip."""
         self._timing = timing
         self.local = 0
-        self.excess_ns = 0.0
+        self.moved_ns = self.excess_ns = 0.0
         self.back_ns = 0
         self.restarts = -1
         self._restart()
@@ -85,6 +86,7 @@ class LocalClock:
     def _restart(self) -> None:
         self.restarts += 1
         self.is_known = False
+        self._took_ns = 0.0  # by the exchange of the last correction
         self.rate = 0.0
         self._blocks = self._contradictions = 0
         self._block = self._left = _FIRST_BLOCK
@@ -101,21 +103,27 @@ class LocalClock:
         It stands for `count` exchanges, of which the others were not learned from.
         """
         took_ns = arrived_ns - sent_ns
+        if self.is_known:
+            at_ns = self.time_at + (self.local - self.local_at) * (1 + self.rate)
+            beyond_ns = sent_ns - at_ns if at_ns < sent_ns else min(0.0, arrived_ns - at_ns)
+            if abs(beyond_ns) < self._took_ns / 2:  # else it has jumped
+                self._move(beyond_ns)
         if took_ns < self._best_took_ns:
             self._best_took_ns = took_ns
             self._best_local, self._best_ns = self.local, sent_ns + took_ns / 2
         self._left -= count
         if self._left <= 0:
             self._block = self._left = min(_BLOCK, self._block + _FIRST_BLOCK)
-            excess_ns = self._best_took_ns - self._timing.least_ns
-            self._best_took_ns = math.inf
+            best_took_ns, self._best_took_ns = self._best_took_ns, math.inf
+            excess_ns = best_took_ns - self._timing.least_ns
             self.excess_ns += _EXCESS_GAIN * (excess_ns - self.excess_ns)
-            # The position of the slave within the excess is unknown, and the bias may be the same every time.
-            self._correct(excess_ns * excess_ns / 4 + _LEAST_VARIANCE)
+            self._correct(best_took_ns, excess_ns)
         self._timing.short_ns = self._best_took_ns + self._timing.taking_over_ns
 
-    def _correct(self, variance: float) -> None:
-        """The best exchange of a block, with the variance of when its frame was at the slave."""
+    def _correct(self, took_ns: float, excess_ns: float) -> None:
+        """Correct it by the best exchange of a block, which took so long, and longer than the shortest."""
+        # The position of the slave within the excess is unknown, and the bias may be the same every time.
+        variance = excess_ns * excess_ns / 4 + _LEAST_VARIANCE
         if not self._blocks:
             self._blocks = 1
             self.time_at, self.local_at, self.variance = self._best_ns, self._best_local, variance
@@ -127,14 +135,19 @@ class LocalClock:
         self._covariance += passed * self._rate_variance
         self._rate_variance += passed * _DRIFT
         error_ns, total = self._best_ns - self.time_at, self.variance + variance
-        if error_ns * error_ns > _CONTRADICTS * _CONTRADICTS * total:
+        # A busy machine delays frames on one way more than on the other: it is certain only that a frame was
+        # at the slave after it was sent and before it was back. What is beyond contradicts the clock.
+        beyond_ns = _beyond(error_ns, took_ns / 2)
+        if abs(beyond_ns) > max(_CONTRADICTS * math.sqrt(total), self._took_ns / 2):
             self._contradictions += 1
             if self._contradictions == _JUMPED:
                 self._restart()
             return
-        self._contradictions = 0
-        self._pull += _PULL_GAIN * (error_ns / math.sqrt(total) - self._pull)
-        self.time_at += error_ns * self.variance / total
+        self._contradictions, self._took_ns = 0, took_ns
+        self._pull += _PULL_GAIN * (_beyond(error_ns, excess_ns / 2) / math.sqrt(total) - self._pull)
+        self._move(beyond_ns)
+        error_ns -= beyond_ns
+        self._move(error_ns * self.variance / total)
         self.rate += error_ns * self._covariance / total
         self._rate_variance -= self._covariance * self._covariance / total
         self._covariance -= self._covariance * self.variance / total
@@ -149,6 +162,15 @@ class LocalClock:
             self.doubt_ns = _CONTRADICTS * math.sqrt(self.variance)
             enough_ns = max(_KNOWN_NS, _KNOWN * self._timing.least_ns) * (_STILL if self.is_known else 1)
             self.is_known = self._blocks >= _KNOWN_BLOCKS and self.variance < enough_ns * enough_ns
+
+    def _move(self, by_ns: float) -> None:
+        self.time_at += by_ns
+        self.moved_ns += by_ns
+
+
+def _beyond(error_ns: float, limit_ns: float) -> float:
+    """By how much an error exceeds a limit."""
+    return math.copysign(max(0.0, abs(error_ns) - limit_ns), error_ns)
 
 
 class Verdict(Enum):
@@ -307,6 +329,11 @@ class EventTimes:
         return self._took_ns < self._timing.patience_ns
 
     @property
+    def _counts(self) -> bool:
+        """Whether an event that is not the sample's counts against them all."""
+        return self._is_in_time and (self.local_clock.is_known or not self._answers)
+
+    @property
     def variance(self) -> float:
         """Variance of `instant_ns`, in ns², without the asymmetry of the round trip."""
         return self.local_clock.variance + _EVENT_VARIANCE
@@ -377,7 +404,7 @@ class EventTimes:
                 return late
             counts = self._is_in_time and not is_old
         else:
-            counts = self._is_in_time
+            counts = self._counts
         self.is_doubtful = True
         if counts:
             trust.contradicted(back_ns)
@@ -397,7 +424,7 @@ class EventTimes:
             pass
         elif self.instant_ns:
             trust.compare(difference_ns)
-        elif self._is_in_time and not (self._answers and not self.local_clock.is_known):
+        elif self._counts:
             trust.unfit += 1
         # Polling does not tell where on its way a round trip takes its time.
         asymmetry_ns = _ASYMMETRY * self._timing.least_ns

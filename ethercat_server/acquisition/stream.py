@@ -128,8 +128,8 @@ class SensorStream:
 
     def learn_short(self, exchange: Exchange, arrived_ns: int) -> None:
         """An exchange needed no `clock.learn`, but was a short one: it tells the slave's time well."""
-        if exchange is self._exchange and self.clock.events is not None:
-            self.clock.events.learn(exchange.sent_ns, arrived_ns, 0)
+        if exchange is self._exchange:
+            self.clock.learn_events(exchange.sent_ns, arrived_ns, 0)
 
     def invalid(self, wkc: int, back_ns: int) -> OutgoingFrame | None:
         """The frame for an exchange that brought nothing of this sensor, as `idle`."""

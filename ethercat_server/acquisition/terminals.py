@@ -186,8 +186,8 @@ class CycleWithTerminals(Cycle):
     terminals: Sequence[Terminal] = ()
     _newest_ns = 0  # when the newest exchange that was taken was sent
 
-    def _take(self, exchange: Exchange) -> None:
-        super()._take(exchange)
+    def _take(self, exchange: Exchange, since_ns: int) -> None:
+        super()._take(exchange, since_ns)
         if exchange.sent_ns < self._newest_ns:  # overtaken
             return
         self._newest_ns = exchange.sent_ns
