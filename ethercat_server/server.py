@@ -10,13 +10,13 @@ from typing import Any
 
 from bota_ethercat.control import Event, event
 from ethercat_server.acquisition.cycle import Cycle, Watchdog
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.start_up import Wanted, bring_up
 from ethercat_server.acquisition.stream import make_streams
 from ethercat_server.acquisition.terminals import CycleWithTerminals
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
@@ -64,13 +64,20 @@ class Server:
         """
         self.bus, self.hub = bus, hub
         self.sensors, slaves, terminals = bring_up(bus, wanted, check_interrupt)
-        timing = ExchangeTiming(bus.clock.monotonic_ns())
-        self.streams = make_streams(bus, self.sensors, timing)
+        round_trip = RoundTrip(max(bus.process_data.wire_ns))
+        self.streams = make_streams(bus, self.sensors, round_trip)
         self.others = OtherSlaves(bus, slaves)
         self.recovery = Recovery(bus, self.sensors, self.streams, hub.broadcast, self.others)
         self.jobs = Jobs(bus, self.sensors)
         self.cycle = (CycleWithTerminals if terminals else Cycle)(
-            bus, self.sensors, self.streams, timing, hub, self.recovery, self.jobs, watchdog or NoWatchdog()
+            bus,
+            self.sensors,
+            self.streams,
+            round_trip,
+            hub,
+            self.recovery,
+            self.jobs,
+            watchdog or NoWatchdog(),
         )
         extra = {"others": self.others.rows, **(extra or {})}
         if isinstance(self.cycle, CycleWithTerminals):

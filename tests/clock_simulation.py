@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-from ethercat_server.acquisition.clock import SampleClock
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.slave_clock import EventTimes
-from ethercat_server.ethercat.exchange import DistributedClock, Latched
+from ethercat_server.sampling.observation import DistributedClock, Latched
+from ethercat_server.sampling.round_trip import RoundTrip
+from ethercat_server.sampling.sample_clock import SampleClock
+from ethercat_server.sampling.slave_clock import EventTimes
 
 SECOND: Final = 1e9
 _SEND_NS: Final = 8_000.0
@@ -199,9 +199,11 @@ class ClockSimulation:
         self.card = card
         self.machine = machine
         self.controller = controller
-        self.timing = ExchangeTiming()
-        events = EventTimes(_DISTRIBUTED, self.timing, 0) if controller else None
-        self.clock = SampleClock(SECOND / sensor.rate_hz, self.timing, events)
+        self.round_trip = RoundTrip()
+        events = EventTimes(_DISTRIBUTED, self.round_trip, 0) if controller else None
+        self.clock = SampleClock(SECOND / sensor.rate_hz, self.round_trip, events)
+        self._sent_ns, self._unanswered, self._in_flight = 0, 0, False
+        self._woke_late_ns: float | None = None
         self.now_ns = 1.0
         self.polls_ns: list[float] = []  # when they were sent
         self.samples: list[Sample] = []  # all that were handed out
@@ -219,9 +221,10 @@ class ClockSimulation:
 
     def run(self, until_s: float) -> ClockSimulation:
         """Go on until then; this simulation."""
-        clock, timing, flying = self.clock, self.timing, self._flying
+        clock, flying = self.clock, self._flying
         while self.now_ns < until_s * SECOND:
-            due_ns = int(clock.next_poll_ns() - timing.late_ns)
+            poll_ns = clock.next_poll_ns(self._sent_ns, self._unanswered, in_flight=self._in_flight)
+            due_ns = int(poll_ns - self.round_trip.late_ns)
             if flying and flying[0].back_ns <= max(due_ns, self.now_ns):
                 self.now_ns = max(self.now_ns, self._awake(flying[0].back_ns))
                 self._take(flying.popleft())
@@ -229,8 +232,8 @@ class ClockSimulation:
                 continue
             if due_ns > self.now_ns:
                 self.now_ns = self._awake(due_ns + self._chance.expovariate(1) * self.machine.wake_ns)
-                if timing.woke_late_ns is None:
-                    timing.woke_late_ns = self.now_ns - due_ns
+                if self._woke_late_ns is None:
+                    self._woke_late_ns = self.now_ns - due_ns
             self._send()
             self.now_ns += _SEND_NS
         return self
@@ -242,8 +245,8 @@ class ClockSimulation:
 
     def _send(self) -> None:
         sent_ns = self.now_ns
-        self.timing.sent_ns, self.timing.in_flight = int(sent_ns), True
-        self.timing.unanswered += 1
+        self._sent_ns, self._in_flight = int(sent_ns), True
+        self._unanswered += 1
         self.polls_ns.append(sent_ns)
         out_ns, took_ns = self.card.exchange(self._chance)
         if self._chance.random() < self.card.lost:
@@ -258,18 +261,18 @@ class ClockSimulation:
         clock, number = self.clock, exchange.number
         sent, arrived, back = int(exchange.sent_ns), int(exchange.back_ns), int(self.now_ns)
         fresh = number > (self.samples[-1].number if self.samples else -1)
-        clock.take(sent, back, exchange.latched, fresh=fresh)
+        clock.observe(sent, back, exchange.latched, fresh=fresh)
         if fresh:
             told = clock.uncertainty_ns, clock.locked, clock.steps, clock.uncertain
             self.samples.append(Sample(number, self.instants_ns[number], back, clock.instant_ns, *told))
-        self.timing.in_flight, self.timing.unanswered = sent < self.timing.sent_ns, 0
-        if not clock.goes_on():
-            self.timing.took(sent, arrived, arrived)
+        self._in_flight, self._unanswered = sent < self._sent_ns, 0
+        if clock.learns:
+            self.round_trip.learn(sent, arrived, arrived, self._woke_late_ns)
+            self._woke_late_ns = None
             clock.learn(arrived)
-        elif back - sent < self.timing.short_ns:
-            self.timing.shorten(sent, arrived)
-            if clock.events is not None:
-                clock.events.learn(sent, arrived, 0)
+        elif back - sent < clock.short_ns:
+            self.round_trip.shorten(sent, arrived)
+            clock.learn_events(sent, arrived)
         if clock.events is not None and exchange.latched is not None and clock.events.trust.is_due(back):
             clock.events.retry(_DISTRIBUTED)
         if not clock.locked:

@@ -27,7 +27,7 @@ PROTOCOL: Final = {
     "bota_ethercat.health",
     "bota_ethercat.program",
 }
-ETHERCAT: Final = {S, f"{S}.ethercat"}
+ETHERCAT: Final = {S, f"{S}.ethercat", f"{S}.sampling"}
 SENSOR: Final = ETHERCAT | {f"{S}.sensor"} | PROTOCOL
 ACQUISITION: Final = SENSOR | {f"{S}.acquisition"}
 SERVING: Final = ACQUISITION | {f"{S}.serving"}
@@ -47,6 +47,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     "bota_ethercat.client": PROTOCOL | {"bota_ethercat.client"},
     # The server: ethercat <- sensor <- acquisition <- serving <- daemon.
     S: {S, "bota_ethercat.program"},
+    f"{S}.sampling": {f"{S}.sampling"},
     f"{S}.ethercat": ETHERCAT,
     f"{S}.sensor": SENSOR,
     f"{S}.acquisition": ACQUISITION,
@@ -205,6 +206,13 @@ def test_the_protocol_is_sans_io_but_for_its_client() -> None:
         if is_below(name, "bota_ethercat"):
             found = {imported.split(".")[0] for imported in imports(path)} & (THREADS | SOCKETS)
             assert found <= may_have.get(name, set()), name
+
+
+def test_sampling_is_pure() -> None:
+    allowed = {"__future__", "enum", "math", "typing"}
+    for name, path in MODULES.items():
+        if room(name) == f"{S}.sampling":
+            assert {each for each in imports(path) if each not in MODULES} <= allowed, name
 
 
 @functools.cache

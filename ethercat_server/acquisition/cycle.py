@@ -12,14 +12,15 @@ from collections.abc import Callable, Sequence
 from itertools import cycle
 from typing import Any, Final, Protocol
 
-from ethercat_server.acquisition.clock import SampleClock
-from ethercat_server.acquisition.exchange_timing import SLOT_NS, ExchangeTiming, RecentDistribution
+from ethercat_server.acquisition.distribution import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.health import RoundTripHealth
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import OutgoingFrame, SensorStream
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.exchange import DUPLICATE, LATCHED, Exchange
+from ethercat_server.sampling.round_trip import RoundTrip
+from ethercat_server.sampling.sample_clock import SampleClock
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
 # Sockets are served this often even if every deadline has passed,
@@ -69,7 +70,7 @@ class Cycle:
         bus: Bus,
         sensors: Sequence[Sensor],
         streams: Sequence[SensorStream],
-        timing: ExchangeTiming,
+        round_trip: RoundTrip,
         hub: Outlet,
         recovery: Recovery,
         jobs: Jobs,
@@ -85,11 +86,10 @@ class Cycle:
         self._hub = hub
         self._recovery = recovery
         self._missed_deadlines = self._missed_until_ns = 0
-        self._timing = timing
+        self._round_trip = round_trip
         self._cost_ns = _FIRST_COST_NS  # what an exchange and its samples keep the loop busy
         self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
-        timing.wire_ns = max(self._wire_ns)
-        self._round_trip = RoundTripHealth(timing, bus.ifname)
+        self._round_trip_health = RoundTripHealth(round_trip, bus.ifname)
         # By frame of the exchange: where it carries what of which sensor.
         self._carried = [
             [
@@ -100,6 +100,13 @@ class Cycle:
         ]
         # The answer that the last step took, and whether all sensors that are not lost took part in it.
         self._answer: Exchange | None = None
+        # When the last exchange was sent, whether it is not back, how many were sent since one was back, and
+        # when the first of them was if there are several.
+        self._sent_ns = self._unanswered_since_ns = bus.clock.monotonic_ns()
+        self._in_flight, self._unanswered = False, 0
+        # How late the loop woke when it first slept after it learned.
+        self._woke_late_ns: float | None = None
+        self._short_ns = 0.0  # an exchange that is back sooner is a short one, from which local clocks learn
         self._complete = False
         self._wake = RecentDistribution()
         self._exchange = RecentDistribution()
@@ -125,7 +132,7 @@ class Cycle:
             self._bus.next_frame = self._bus.next_on_wire
 
     def _run(self) -> None:
-        bus, hub, recovery, jobs, timing = self._bus, self._hub, self._recovery, self._jobs, self._timing
+        bus, hub, recovery, jobs = self._bus, self._hub, self._recovery, self._jobs
         monotonic_ns, serve_by, slept = bus.clock.monotonic_ns, 0, self._slept
         self._feed_at_ns = 0
         while True:
@@ -134,19 +141,19 @@ class Cycle:
                 jobs.step(due)
                 due = self._due_ns()
             now = monotonic_ns()
-            slept = slept or (due > now and not timing.in_flight)
+            slept = slept or (due > now and not self._in_flight)
             if slept or now > serve_by:
-                hub.serve(now if timing.in_flight else due)
-                serve_by = now + (_SERVE_IN_FLIGHT_NS if timing.in_flight else _SERVE_EVERY_NS)
+                hub.serve(now if self._in_flight else due)
+                serve_by = now + (_SERVE_IN_FLIGHT_NS if self._in_flight else _SERVE_EVERY_NS)
             if self.stopping:
                 break
-            self._step(due, (now if timing.in_flight else due) + _SERVE_EVERY_NS, slept=slept)
+            self._step(due, (now if self._in_flight else due) + _SERVE_EVERY_NS, slept=slept)
             now, slept = monotonic_ns(), False
             if self._answer is not None:
                 if now >= recovery.attend_at_ns or not self._complete:
                     recovery.attend(self._complete, now)
-            elif timing.unanswered > 1:
-                recovery.miss(now - timing.unanswered_since_ns, now)
+            elif self._unanswered > 1:
+                recovery.miss(now - self._unanswered_since_ns, now)
             if now >= self._chores_at_ns:
                 self._do_chores(now)
         self._slept = slept
@@ -157,18 +164,21 @@ class Cycle:
         Polls that lie close together are merged: the earlier one waits for the later, by no more than the
         time that four exchanges cost this machine, as measured. So three quarters of its time are left.
         """
-        timing, streams = self._timing, self._streams
+        streams, sent_ns = self._streams, self._sent_ns
+        unanswered, in_flight = self._unanswered, self._in_flight
         if self._recovery.all_lost:
             # Slaves, or a driver, that cannot keep up get time to answer.
-            return timing.sent_ns + _RECOVERY_STEP_NS * min(1 + timing.unanswered, _MOST_UNANSWERED)
+            return sent_ns + _RECOVERY_STEP_NS * min(1 + unanswered, _MOST_UNANSWERED)
         if len(streams) == 1:
-            poll_ns = streams[0].clock.next_poll_ns()
+            poll_ns = streams[0].clock.next_poll_ns(sent_ns, unanswered, in_flight=in_flight)
         else:
-            wanted = [stream.clock.next_poll_ns() for stream in streams]
+            wanted = [
+                stream.clock.next_poll_ns(sent_ns, unanswered, in_flight=in_flight) for stream in streams
+            ]
             latest_ns = min(wanted) + self._spacing_ns
             poll_ns = max([each for each in wanted if each <= latest_ns])
-        due_ns = poll_ns - min(timing.late_ns, _LONGEST_LEAD_NS)
-        return int(max(due_ns, timing.sent_ns + self._spacing_ns, self._bus.process_data.blocked_until_ns))
+        due_ns = poll_ns - min(self._round_trip.late_ns, _LONGEST_LEAD_NS)
+        return int(max(due_ns, sent_ns + self._spacing_ns, self._bus.process_data.blocked_until_ns))
 
     def _plan(self) -> None:
         """Derive from the sensors' rates, which change, how exchanges follow each other; once a second."""
@@ -193,7 +203,7 @@ class Cycle:
         exchange. `slept`: the loop has slept until it was due.
         """
         self._answer = frame = None
-        bus, timing, monotonic_ns = self._bus, self._timing, self._bus.clock.monotonic_ns
+        bus, monotonic_ns = self._bus, self._bus.clock.monotonic_ns
         now = monotonic_ns()
         wait = (due if due < until_ns else until_ns) - now
         if wait > 0 or bus.process_data.in_flight or until_ns <= now:
@@ -205,18 +215,18 @@ class Cycle:
             self._count_missed(due, now)
             if slept:  # else the answer was held up, and what is due was past when it came
                 self._recovery.causes.stood_still(now - due, now)
-        if timing.unanswered:
-            if timing.unanswered == 1:
-                timing.unanswered_since_ns = timing.sent_ns
+        if self._unanswered:
+            if self._unanswered == 1:
+                self._unanswered_since_ns = self._sent_ns
             self._show_silence(now)
-        timing.sent_ns = sent = bus.process_data.send()
-        timing.in_flight, timing.unanswered = True, timing.unanswered + 1
+        self._sent_ns = sent = bus.process_data.send()
+        self._in_flight, self._unanswered = True, self._unanswered + 1
         if slept:
             self._wake.record(sent - due)
-            if timing.woke_late_ns is None:
-                timing.woke_late_ns = sent - due
+            if self._woke_late_ns is None:
+                self._woke_late_ns = sent - due
         if frame is None:
-            most = int(timing.patience_ns) if self._one_by_one else self._due_ns() - monotonic_ns()
+            most = int(self._round_trip.patience_ns) if self._one_by_one else self._due_ns() - monotonic_ns()
             if (wait := min(most, until_ns - now)) > 0:
                 return self._receive(wait, sent)
         return frame
@@ -232,7 +242,7 @@ class Cycle:
             return None
         while (exchange := bus.process_data.take(frame, back)) is DUPLICATE:
             # The answer may be behind duplicates of others: they must not pile up.
-            if back > self._timing.sent_ns + _SERVE_EVERY_NS:
+            if back > self._sent_ns + _SERVE_EVERY_NS:
                 return None
             frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
             if frame is None:
@@ -246,11 +256,11 @@ class Cycle:
     def _take(self, exchange: Exchange, since_ns: int) -> None:
         """Hand out what an exchange brought, which was awaited since then; then learn from it."""
         sent, back, frame, wkc, which = self._answer = exchange
-        timing, carried = self._timing, self._carried[which]
+        round_trip, carried = self._round_trip, self._carried[which]
         new: list[OutgoingFrame] = []
         self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
         for start, end, untouched, at, sensor, stream in carried:
-            if back < stream.clock.estimate.phase_ns - stream.clock.quiet_ns:
+            if back < stream.clock.phase.phase_ns - stream.clock.before_ns:
                 continue  # the poll was for another sensor
             data = frame[start:end]
             # The working counter does not tell sensors apart: one that is out may be counted for another.
@@ -262,10 +272,10 @@ class Cycle:
                 new.append(made)
         if new:
             self._hub.publish(new, back)
-        timing.in_flight, timing.unanswered = sent < timing.sent_ns, 0
+        self._in_flight, self._unanswered = sent < self._sent_ns, 0
         self._exchange.record(back - sent)
         learners = [row[-1].clock for row in carried if row[-1].finish(exchange)]
-        if learners or not timing.short_ns < back - sent < timing.usual_ns + self._shortest_ns:
+        if learners or not self._short_ns < back - sent < round_trip.usual_ns + self._shortest_ns:
             self._learn(exchange, learners, since_ns)
 
     def _show_silence(self, now: int) -> None:
@@ -282,24 +292,26 @@ class Cycle:
     def _learn(self, exchange: Exchange, learners: Sequence[SampleClock], since_ns: int) -> None:
         """Learn from an exchange that `learners` need, was a short one, or was held up."""
         sent, back, _, _, which = exchange
-        timing = self._timing
+        round_trip = self._round_trip
         arrived = self._bus.backend.arrived_ns()
         if not sent < arrived < back:  # the kernel does not say, or CLOCK_REALTIME was set
             arrived = back
-        if back - sent - timing.usual_ns > self._shortest_ns:  # it was held up
-            self._count_missed(sent + timing.usual_ns, back)
+        if back - sent - round_trip.usual_ns > self._shortest_ns:  # it was held up
+            self._count_missed(sent + round_trip.usual_ns, back)
             # By this computer, if it had arrived and was awaited already.
             self._recovery.causes.stood_still(back - max(arrived, since_ns), back)
         arrived = max(sent, arrived - self._wire_ns[which])
         if learners:
-            timing.took(sent, arrived, back)
+            round_trip.learn(sent, arrived, back, self._woke_late_ns)
+            self._woke_late_ns = None
             for clock in learners:
                 clock.learn(arrived)
             self._cost_ns += _COST_GAIN * (self._bus.clock.monotonic_ns() - back - self._cost_ns)
         else:
-            timing.shorten(sent, arrived)
+            round_trip.shorten(sent, arrived)
             for row in self._carried[which]:
                 row[-1].learn_short(exchange, arrived)
+        self._short_ns = max(row[-1].clock.short_ns for row in self._carried[which])
 
     def _do_chores(self, now: int) -> None:
         """Housekeeping that is not done for every exchange, a little at a time."""
@@ -320,7 +332,7 @@ class Cycle:
         for distribution in self._everyone:
             distribution.roll()
         self._plan()
-        self._round_trip.check()
+        self._round_trip_health.check()
         self._recovery.check()
         for stream in self._streams:
             stream.check()
@@ -337,7 +349,7 @@ class Cycle:
         (wake, recent_wake), (exchange, recent_exchange), *ages = self._summaries
         return {
             "cycles": self._bus.process_data.sent,
-            "round_trip": self._timing.describe(),
+            "round_trip": self._round_trip.as_json(),
             "missed_deadlines": self._missed_deadlines,
             "lost_frames": self._bus.process_data.lost,
             "duplicate_frames": self._bus.process_data.duplicates,

@@ -14,11 +14,11 @@ from typing import Final
 
 from bota_ethercat.health.sentences import STOOD_STILL
 from bota_ethercat.pdo import is_finite, layout_for
-from ethercat_server.acquisition.clock import PLAUSIBLE_PULL, SampleClock
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming
-from ethercat_server.acquisition.slave_clock import Verdict
 from ethercat_server.ethercat.datagrams import FIRST_INDEX
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
+from ethercat_server.sampling.round_trip import RoundTrip
+from ethercat_server.sampling.sample_clock import PLAUSIBLE_ERROR, SampleClock
+from ethercat_server.sampling.trust import TrustState
 
 SLOW_US: Final = 300.0  # a usual round trip above this is a slow network card's, or a slow driver's
 _PCIE_US: Final = 100.0  # a usual round trip through a PCIe card, system calls included
@@ -36,14 +36,14 @@ def cost(usual_us: float) -> str:
 class RoundTripHealth:
     """Logs once that round trips on `ifname` are slow; call `check` once a second."""
 
-    def __init__(self, timing: ExchangeTiming, ifname: str) -> None:
-        self._timing = timing
+    def __init__(self, round_trip: RoundTrip, ifname: str) -> None:
+        self._round_trip = round_trip
         self._ifname = ifname
         self._slow_s = 0
 
     def check(self) -> None:
         """Check the last second."""
-        usual_us = self._timing.usual_ns / 1000
+        usual_us = self._round_trip.usual_ns / 1000
         if self._slow_s < _SLOW_SECONDS:
             self._slow_s = self._slow_s + 1 if usual_us > SLOW_US else 0
             if self._slow_s == _SLOW_SECONDS:
@@ -132,7 +132,7 @@ class SampleHealth:
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
         self._rate_reported = False
-        self._reported: Verdict | None = None  # of event times, what was reported last
+        self._reported: TrustState | None = None  # of event times, what was reported last
         self._deviating_s = 0
 
     def count(self) -> None:
@@ -190,25 +190,25 @@ class SampleHealth:
 
     def _check_rate(self, clock: SampleClock) -> None:
         """Log once that the sensor samples at another rate than it is set to."""
-        pull = clock.estimate.pull
-        deviates = clock.locked and abs(pull) > PLAUSIBLE_PULL
+        error = clock.phase.period_error
+        deviates = clock.locked and abs(error) > PLAUSIBLE_ERROR
         self._deviating_s = self._deviating_s + 1 if deviates else 0
         if self._deviating_s == _DEVIATING_SECONDS and not self._rate_reported:
             self._rate_reported = True
             log.warning(
                 "sensor %d samples every %.1f µs, %+.1f %% off what it is set to: check its settings",
-                self._number, clock.period_ns / 1000, 100 * pull,
+                self._number, clock.period_ns / 1000, 100 * error,
             )  # fmt: skip
 
     def _check_events(self, clock: SampleClock) -> None:
         """Log when the slave controller time-stamps the samples, and when it no longer does."""
         if clock.events is None:
             return
-        verdict, before = clock.events.trust.verdict, self._reported
-        if verdict in (Verdict.TRIAL, before):
+        state, before = clock.events.trust.state, self._reported
+        if state in (TrustState.TRIAL, before):
             return
-        self._reported = verdict
-        if verdict is Verdict.TRUSTED:
+        self._reported = state
+        if state is TrustState.TRUSTED:
             log.info(
                 "sensor %d: its samples are time-stamped by the distributed clock of its slave controller%s",
                 self._number, "" if before is None else " again",

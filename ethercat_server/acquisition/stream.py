@@ -12,15 +12,19 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from bota_ethercat.framing import DataFlag, encode_data
-from ethercat_server.acquisition.clock import SILENT_PERIODS, SampleClock
+from ethercat_server.acquisition.distribution import RecentDistribution
 from ethercat_server.acquisition.drift import Drift
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming, RecentDistribution
 from ethercat_server.acquisition.health import SampleHealth
-from ethercat_server.acquisition.slave_clock import EventTimes
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, RealtimeOffset
-from ethercat_server.ethercat.exchange import DUPLICATE, DistributedClock, Exchange, Latched
+from ethercat_server.ethercat.exchange import DUPLICATE, Exchange
 from ethercat_server.ethercat.wire import BYTE_NS
+from ethercat_server.sampling.association import SILENT_PERIODS
+from ethercat_server.sampling.observation import DistributedClock, Latched
+from ethercat_server.sampling.round_trip import RoundTrip
+from ethercat_server.sampling.sample_clock import SampleClock
+from ethercat_server.sampling.slave_clock import EventTimes
+from ethercat_server.sampling.trust import TrustState
 from ethercat_server.sensor.sensor import Sensor
 
 DISCARDED_AT_START: Final = 3  # Bota's own driver discards the first three frames after entering OP
@@ -37,21 +41,21 @@ class SensorStream:
     def __init__(
         self,
         sensor: Sensor,
-        timing: ExchangeTiming,
+        round_trip: RoundTrip,
         clock: Clock = SYSTEM_CLOCK,
         latching: DistributedClock | None = None,
         realtime_offset: RealtimeOffset | None = None,
-        passing_ns: int = 0,
+        data_offset_ns: int = 0,
     ) -> None:
         """`latching` is the clock of the slave controller, if that latches when samples come to be.
 
-        Its process data passes the slave `passing_ns` after the frame has arrived there.
+        Its process data passes the slave `data_offset_ns` after the frame has arrived there.
         """
         self.number = sensor.number
         self._monotonic_ns = clock.monotonic_ns
         self.realtime_offset = realtime_offset or RealtimeOffset(clock)
-        self._timing = timing
-        self._passing_ns = passing_ns
+        self._round_trip = round_trip
+        self._data_offset_ns = data_offset_ns
         self.clock = self._new_clock(sensor.period_ns, latching)
         self.process_data = b""  # the newest valid process data
         self._handed_out = b""  # what the last frame carried: a REPEATED or INVALID one carries it again
@@ -75,8 +79,8 @@ class SensorStream:
         self.idle_at_ns = 0.0  # it is silent from then on
 
     def _new_clock(self, period_ns: float, latching: DistributedClock | None) -> SampleClock:
-        events = latching and EventTimes(latching, self._timing, self._passing_ns)
-        return SampleClock(period_ns, self._timing, events, self._passing_ns)
+        events = latching and EventTimes(latching, self._round_trip, self._data_offset_ns)
+        return SampleClock(period_ns, self._round_trip, events, self._data_offset_ns)
 
     @property
     def fresh(self) -> int:
@@ -93,7 +97,7 @@ class SensorStream:
             return None
         clock, self._exchange = self.clock, exchange
         self._fresh = fresh = data != self.process_data
-        is_next = clock.take(sent_ns, back_ns, latched, fresh=fresh)
+        is_next = clock.observe(sent_ns, back_ns, latched, fresh=fresh)
         if not fresh:
             return self.idle(back_ns)
         self.process_data = data
@@ -115,7 +119,7 @@ class SensorStream:
         if exchange is not self._exchange:
             return False
         if self._fresh:
-            self.idle_at_ns = exchange.back_ns + SILENT_PERIODS * self.clock.estimate.period_ns
+            self.idle_at_ns = exchange.back_ns + SILENT_PERIODS * self.clock.phase.period_ns
             if self.clock.locked:
                 self.age.record(exchange.back_ns - self.clock.instant_ns)
             if self._discard:
@@ -124,12 +128,12 @@ class SensorStream:
                 self.sequence += 1
                 self._handed_out = self.process_data
                 self.health.newest.append(self.process_data)
-        return not self.clock.goes_on()
+        return self.clock.learns
 
     def learn_short(self, exchange: Exchange, arrived_ns: int) -> None:
         """An exchange needed no `clock.learn`, but was a short one: it tells the slave's time well."""
         if exchange is self._exchange:
-            self.clock.learn_events(exchange.sent_ns, arrived_ns, 0)
+            self.clock.learn_events(exchange.sent_ns, arrived_ns)
 
     def invalid(self, wkc: int, back_ns: int) -> OutgoingFrame | None:
         """The frame for an exchange that brought nothing of this sensor, as `idle`."""
@@ -146,7 +150,7 @@ class SensorStream:
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
         self.idle_at_ns = max(self.idle_at_ns + period_ns, float(now_ns))
         # INVALID means that no valid exchange was back for two periods: a single lost frame does not suffice.
-        if now_ns - self._exchange.back_ns < max(2 * period_ns, self._timing.patience_ns):
+        if now_ns - self._exchange.back_ns < max(2 * period_ns, self._round_trip.patience_ns):
             self._discard = 0  # a sensor that is stuck from the start has to be visible, too
             self.repeated += 1
             flags, wkc = REPEATED, self._exchange.wkc
@@ -178,7 +182,7 @@ class SensorStream:
         self.health.check(self.fresh, self.repeated, self.clock)
         self.drift.second()
         events = self.clock.events
-        if events is not None and events.trust.is_final:
+        if events is not None and events.trust.state is TrustState.ABSENT:
             self.clock.events = None
 
     def recover(
@@ -211,18 +215,18 @@ class SensorStream:
                 "mode": "locked" if clock.locked else "oversampling",
                 "stamps": "hardware" if clock.by_events else "polling",
                 "period_us": clock.period_ns / 1000,
-                "offset_ppm": round((1 / (1 + clock.estimate.pull) - 1) * 1e6, 1),
+                "offset_ppm": round((1 / (1 + clock.phase.period_error) - 1) * 1e6, 1),
                 "uncertainty_us": round(clock.uncertainty_ns / 1000, 1) if clock.locked else None,
             },
             **self.drift.as_json(),
         }
 
 
-def make_streams(bus: Bus, sensors: Sequence[Sensor], timing: ExchangeTiming) -> list[SensorStream]:
+def make_streams(bus: Bus, sensors: Sequence[Sensor], round_trip: RoundTrip) -> list[SensorStream]:
     """Those of the sensors on a bus in OP."""
     offset = RealtimeOffset(bus.clock)
-    passing_ns = {at.number: at.start * BYTE_NS for inputs in bus.process_data.inputs for at in inputs}
+    offsets_ns = {at.number: at.start * BYTE_NS for inputs in bus.process_data.inputs for at in inputs}
     return [
-        SensorStream(each, timing, bus.clock, bus.read_clock(number), offset, passing_ns[number])
+        SensorStream(each, round_trip, bus.clock, bus.read_clock(number), offset, offsets_ns[number])
         for number, each in enumerate(sensors)
     ]

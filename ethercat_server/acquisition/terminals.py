@@ -200,6 +200,6 @@ class CycleWithTerminals(Cycle):
 
     def _do_chores(self, now: int) -> None:
         super()._do_chores(now)
-        if self._timing.unanswered <= 1:  # without frames coming back there is nothing that could be done
+        if self._unanswered <= 1:  # without frames coming back there is nothing that could be done
             for terminal in self.terminals:
                 next(terminal.steps)

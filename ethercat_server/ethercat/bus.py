@@ -17,12 +17,13 @@ from typing import Final, TypeVar
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, Master
 from ethercat_server.ethercat.datagrams import Datagrams, repeat
-from ethercat_server.ethercat.exchange import Area, DistributedClock, ProcessData, fit_a_frame, read_clock
+from ethercat_server.ethercat.exchange import Area, ProcessData, fit_a_frame, read_clock
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import Emergencies, Steps, finish
 from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.ethercat.slave.sii import Sii
+from ethercat_server.sampling.observation import DistributedClock
 
 T = TypeVar("T")
 _MOST_EMERGENCIES: Final = 16

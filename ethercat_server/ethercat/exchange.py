@@ -28,32 +28,23 @@ from ethercat_server.ethercat.wire import (
     Command,
     build,
 )
+from ethercat_server.sampling.observation import DistributedClock
 
 _U64_U32: Final = struct.Struct("<QI")
 _PORTS: Final = struct.Struct("<4I")
 # Bit of the DL status that says whether port 0 has a link.
 _LINKS: Final = 4
-_MOST_BEHIND_NS: Final = 1_000_000
+_MOST_LOOP_DELAY_NS: Final = 1_000_000
 _WRAP: Final = 1 << 32
 _TIME_SIZE: Final = 4
 _SLACK_NS: Final = 10_000
 # A single lost frame must not disable event times; more attempts would delay the loop.
 _ATTEMPTS: Final = 3
 
-# System time when the frame arrived, a working counter; local time of the event PDI buffer change, a working
-# counter. Both times are modulo 2**32 ns.
-Latched = tuple[int, int, int, int]
+# As `Latched`.
 LATCHED: Final = struct.Struct(f"<IH{DATAGRAM_HEADER}xIH")
 # Bytes in a frame, of two datagrams.
 LATCHED_SIZE: Final = DATAGRAM_HEADER + LATCHED.size
-
-
-class DistributedClock(NamedTuple):
-    """Of one slave controller."""
-
-    offset: int  # system time less local time, modulo 2**32 ns
-    behind_ns: int  # time from when a frame arrives at the slave until it is there again on its way back
-    reading_ns: int  # time from when a frame arrives until it has read what is latched, at most
 
 
 def latched_datagrams(station: int) -> tuple[tuple[int, int, int, bytes], ...]:
@@ -78,10 +69,10 @@ def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
     if not (data := repeat(_ATTEMPTS, bus.read_register, number, reg.DC_OFFSET, _U64_U32.size)):
         return None
     offset, delay = _U64_U32.unpack(data)
-    return DistributedClock((offset - delay) % _WRAP, _behind_ns(bus, number), at * BYTE_NS + _SLACK_NS)
+    return DistributedClock((offset - delay) % _WRAP, _loop_delay_ns(bus, number), at * BYTE_NS + _SLACK_NS)
 
 
-def _behind_ns(bus: Datagrams, number: int) -> int:
+def _loop_delay_ns(bus: Datagrams, number: int) -> int:
     """A write to the receive times has the controller note when a frame arrives at each of its ports."""
     if not bus.write_register(number, reg.DC_RECEIVE_TIMES, bytes(4)):
         return 0
@@ -92,7 +83,7 @@ def _behind_ns(bus: Datagrams, number: int) -> int:
     status = int.from_bytes(links, "little")
     out, *back = _PORTS.unpack(data)
     times = [(time - out) % _WRAP for port, time in enumerate(back, 1) if status >> _LINKS + port & 1]
-    return max((time for time in times if time < _MOST_BEHIND_NS), default=0)
+    return max((time for time in times if time < _MOST_LOOP_DELAY_NS), default=0)
 
 
 # The last datagram of each frame (NOP) carries its number as a tag, which slaves do not change: by the index

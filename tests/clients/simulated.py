@@ -19,10 +19,10 @@ from bota_clients.report.series import Subject, subject
 from bota_ethercat.framing import DataMessage, FrameDecoder
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.settings import sampling_rate_hz, start_up_defaults
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.clock import Clock
 from ethercat_server.ethercat.exchange import Exchange
+from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sensor.sensor import Identity, Sensor
 from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.faults import obey
@@ -61,24 +61,24 @@ def simulate(
     assert life is not None
     wire = list[bytes]()
     end = start + round(seconds * 1e9)
-    timing = ExchangeTiming(now)
+    round_trip, sent, unanswered = RoundTrip(), now, 0
     settings = {"sinc_length": life.sampler.clock.sinc_length}
-    stream = SensorStream(Sensor(0, Identity("", 1, "", ""), settings), timing, cast(Clock, clock))
+    stream = SensorStream(Sensor(0, Identity("", 1, "", ""), settings), round_trip, cast(Clock, clock))
     while now < end:
         while todo and now >= start + todo[0][0] * 1e9:
             answer = obey(bus, todo.pop(0)[1])
             assert answer == "ok", answer
-        sent = max(now, int(stream.clock.next_poll_ns())) + round(chance.expovariate(1 / 8_000))
+        poll = stream.clock.next_poll_ns(sent, unanswered, in_flight=unanswered > 0)
+        sent = max(now, int(poll)) + round(chance.expovariate(1 / 8_000))
         bus.set_time(sent + _EXCHANGE_NS // 2)
         data, now = life.inputs(), sent + _EXCHANGE_NS
         valid = not (script.lost_frames and chance.random() < script.lost_frames)
-        timing.sent_ns, timing.in_flight, timing.unanswered = sent, True, timing.unanswered + 1
-        made = None
+        made, unanswered = None, unanswered + 1
         if valid:
             made = stream.take(data, exchange := Exchange(sent, now, b"", 3, 0))
-            timing.in_flight, timing.unanswered = False, 0
+            unanswered = 0
             if stream.finish(exchange):
-                timing.took(sent, now, now)
+                round_trip.learn(sent, now, now)
                 stream.clock.learn(now)
         if made is None and now >= stream.idle_at_ns:
             made = stream.idle(now)

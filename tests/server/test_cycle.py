@@ -13,9 +13,9 @@ import pytest
 
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.acquisition import health
-from ethercat_server.acquisition.exchange_timing import RecentDistribution
-from ethercat_server.acquisition.slave_clock import Verdict
+from ethercat_server.acquisition.distribution import RecentDistribution
 from ethercat_server.acquisition.stream import OutgoingFrame
+from ethercat_server.sampling.trust import TrustState
 from ethercat_server.simulation.machine import REALTIME_START_NS, START_NS, Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import Simulation, check_frames, fresh, more_if_long, reading
@@ -180,10 +180,10 @@ def test_event_times_stay_in_use_while_frames_are_held_up_on_their_way_out(
     running.run(busy_s[0] - 0.1)
     events = running.streams[0].clock.events
     assert events is not None
-    assert events.trust.verdict is Verdict.TRUSTED
+    assert events.trust.state is TrustState.TRUSTED
     while running.clock.now_ns - began_ns < (busy_s[-1] + 1.0) * 1e9:
         running.run(0.1)
-        assert events.trust.verdict is Verdict.TRUSTED, events.trust.why
+        assert events.trust.state is TrustState.TRUSTED, events.trust.why
     assert events.local_clock.restarts == 0
     check_frames(running.frames)
 

@@ -16,7 +16,6 @@ from bota_ethercat.control import ErrorCode
 from bota_ethercat.errors import RequestError
 from bota_ethercat.pdo import LAYOUTS
 from bota_ethercat.settings import SETTINGS
-from ethercat_server.acquisition.exchange_timing import ExchangeTiming
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, SdoAbortError
@@ -25,6 +24,7 @@ from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.slave.al import AlStatus
 from ethercat_server.ethercat.slave.coe import MailboxSdo, Steps, T, finish
 from ethercat_server.ethercat.slave.registers import MAILBOX_IN_STATUS
+from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sensor.objects.access import write
 from ethercat_server.sensor.objects.dictionary import (
     BY_ADDRESS,
@@ -274,7 +274,7 @@ def run_tare(
 ) -> dict[str, Any]:
     """Tare a sensor whose Fx, without offset, is the next of `force` with every step; it turns about z."""
     sensor, layout = new_sensor(), LAYOUTS[61]
-    stream = SensorStream(sensor, ExchangeTiming())
+    stream = SensorStream(sensor, RoundTrip())
     steps = tare(sdo, sensor, stream, samples, target)
     while True:
         values = list(layout.struct.unpack(bytes(layout.size)))

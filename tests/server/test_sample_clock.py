@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.acquisition.slave_clock import Trust, Verdict
+from ethercat_server.sampling.trust import Trust, TrustState
 from tests.clock_simulation import SECOND, Card, ClockSimulation, Controller, Machine, Outcome, Sensor
 from tests.simulation import more_if_long
 
@@ -102,7 +102,7 @@ def test_follows_a_simulated_sensor_that_sleeps_between_its_samples(sleep_ns: fl
         assert simulation.outcome(1).lost == 0
         assert whole.counted <= 1, "while the rate is not known"
         assert simulation.outcome(1).unlocked == 0
-        assert simulation.clock.estimate.pull == pytest.approx(sleep_ns / 1.25e6, rel=0.1)
+        assert simulation.clock.phase.period_error == pytest.approx(sleep_ns / 1.25e6, rel=0.1)
 
 
 def test_a_sensor_that_is_not_periodic_is_not_taken_for_one_for_long() -> None:
@@ -203,8 +203,8 @@ def trust(simulation: ClockSimulation) -> Trust:
     return simulation.clock.events.trust
 
 
-def verdict(simulation: ClockSimulation) -> Verdict:
-    return trust(simulation).verdict
+def state(simulation: ClockSimulation) -> TrustState:
+    return trust(simulation).state
 
 
 def percentile(values: list[float], percent: float) -> float:
@@ -226,7 +226,7 @@ def assert_right(outcome: Outcome) -> None:
 @pytest.mark.parametrize(("rate_hz", "seconds"), [(1600.0, 3.0), (150.0, 12.0), (25.0, 40.0)])
 def test_events_date_samples_with_one_exchange_each(rate_hz: float, seconds: float) -> None:
     runs = [run(HONEST, Sensor(rate_hz, ppm=-300.0), seconds=seconds, seed=seed) for seed in range(1, 4)]
-    assert {verdict(simulation) for simulation in runs} == {Verdict.TRUSTED}
+    assert {state(simulation) for simulation in runs} == {TrustState.TRUSTED}
     by_polling = run(None, Sensor(rate_hz, ppm=-300.0), seconds=seconds).outcome(seconds / 2)
     for outcome in (simulation.outcome(seconds / 2) for simulation in runs):
         assert_right(outcome)
@@ -251,7 +251,7 @@ def test_events_date_samples_with_one_exchange_each(rate_hz: float, seconds: flo
 )
 def test_events_date_samples_where_polling_hardly_can(given: dict[str, Any]) -> None:
     simulation = run(HONEST, **given)
-    assert verdict(simulation) is Verdict.TRUSTED
+    assert state(simulation) is TrustState.TRUSTED
     (assert_dated if "sensor" in given else assert_right)(simulation.outcome(3.0))
 
 
@@ -281,7 +281,8 @@ EVERY_WRONG = [(name, since_s) for name in WRONG for since_s in (0.0, LIES_FROM_
 )
 def test_wrong_event_times_are_refused_and_polling_goes_on(name: str, since_s: float) -> None:
     simulation = run(replace(WRONG[name], lies_from_s=since_s), seconds=8.0)
-    assert verdict(simulation) is Verdict.REFUSED
+    never_shown = name in REASONS and not since_s
+    assert state(simulation) is (TrustState.ABSENT if never_shown else TrustState.REFUSED)
     assert REASONS.get(name, "they ") in trust(simulation).why
     outcome = simulation.outcome(1.0)
     assert outcome.lost == outcome.counted == outcome.unflagged == 0
@@ -322,7 +323,7 @@ def test_no_lie_costs_a_sample_on_a_slow_card(late_ns: float, since_s: float) ->
 )
 def test_event_times_that_are_worse_than_polling_are_not_used(controller: Controller) -> None:
     simulation = run(controller, seconds=12.0)
-    assert verdict(simulation) is Verdict.REFUSED
+    assert state(simulation) is TrustState.REFUSED
     outcome = simulation.outcome(4.0)
     assert percentile(outcome.errors_ns, 99) < 12e3
     by_polling = run(None, seconds=12.0).outcome(4.0)
@@ -333,20 +334,20 @@ def test_pauses_between_trials_double_until_event_times_have_proved_right_for_lo
     """So those that are hardly right do not switch stamps on and off."""
     simulation, lying = run(HONEST, Sensor(150.0), seconds=3.0), Controller(jitter_ns=50e3)
 
-    def run_until(wanted: Verdict) -> float:
+    def run_until(wanted: TrustState) -> float:
         since_s = simulation.now_ns / 1e9
-        while verdict(simulation) is not wanted:
+        while state(simulation) is not wanted:
             simulation.run(simulation.now_ns / 1e9 + 0.1)
         return simulation.now_ns / 1e9 - since_s
 
     def pause_s() -> float:
-        run_until(Verdict.REFUSED)
-        return run_until(Verdict.TRIAL)
+        run_until(TrustState.REFUSED)
+        return run_until(TrustState.TRIAL)
 
     simulation.controller = lying
     assert [pause_s() for _ in range(3)] == pytest.approx([10, 20, 40], abs=0.5)
     simulation.controller = HONEST
-    run_until(Verdict.TRUSTED)
+    run_until(TrustState.TRUSTED)
     simulation.run(simulation.now_ns / 1e9 + 61.0)
     simulation.controller = lying
     assert pause_s() == pytest.approx(10, abs=0.5)
@@ -366,7 +367,7 @@ def show(
         sent = int(simulation.now_ns)
         back = sent + int(took_ns)
         latched = HONEST.local(sent), 1, HONEST.local(sent - ago_ns), 1
-        events.take(latched, sent, back, True, period_ns)
+        events.observe(latched, sent, back, True, period_ns)
         if events.are_trusted:
             dated.append(events.date(sent - ago_ns - off_ns, period_ns, 1e6, sent, back))
         else:
@@ -423,7 +424,7 @@ def test_a_clock_that_jumps_or_changes_its_rate_is_believed_once_it_has_proved_r
     simulation = run(replace(controller, lies_from_s=LIES_FROM_S), seconds=9.0)
     outcome = simulation.outcome(1.0)
     assert outcome.outside == outcome.lost == outcome.counted == 0
-    assert verdict(simulation) is Verdict.TRUSTED
+    assert state(simulation) is TrustState.TRUSTED
     assert percentile(simulation.outcome(8.0).errors_ns, 99) < 10e3
 
 

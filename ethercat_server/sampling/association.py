@@ -1,0 +1,91 @@
+"""Which sample an exchange brought, and how sure that is: pure functions of what is known and was seen."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+SILENT_PERIODS: Final = 3  # periods without a new sample after which a sensor is silent, not just late
+_EARLY: Final = -0.25  # lateness in periods below which a sample is the one expected before
+# Time without a PDI read, in periods: below the first only one sample can have come, above the second more
+# may.
+_ONE_ONLY, _MISSABLE = 0.8, 1.25
+# Excess of an exchange, in periods, beyond which it says nothing of when the process data was read.
+_LONGEST_READ: Final = 0.5
+
+
+class Expected(NamedTuple):
+    """What is known of the sampling clock before an exchange. Times in ns."""
+
+    phase_ns: float  # when the next sample comes to be, less the outward part of the shortest round trip
+    period_ns: float
+    doubt_ns: float  # uncertainty of the phase
+    is_doubtful: bool  # whether the sample before may have been another one
+
+
+class Read(NamedTuple):
+    """When the slave read the process data in which the new sample is, and before. Times in ns."""
+
+    before_ns: int  # when the exchange before was sent
+    sent_ns: int
+    back_ns: int
+    least_ns: float  # the shortest round trip
+
+
+class Association(NamedTuple):
+    """Which sample it is."""
+
+    number: int  # counted from the one before by the phase alone: 1 if it is the next
+    late: float  # by how many periods later than the expected one it came
+    uncertain: bool  # whether more samples may have passed than `number` says
+
+
+def by_polls(expected: Expected, read: Read, *, has_events: bool, lost_track: bool) -> Association:
+    """Which sample it is by when the process data was read with and without it.
+
+    `has_events`: the phase is so exact that no sample can have come before it: it was held back.
+    `lost_track`: samples may have been lost before it that nobody knows of.
+    """
+    phase_ns, period_ns, doubt_ns, is_doubtful = expected
+    excess_ns = max(0.0, read.back_ns - read.sent_ns - read.least_ns)
+    read_ns = read.sent_ns + read_delay_ns(excess_ns, period_ns)
+    most = math.floor((read.sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
+    unread_ns = read.back_ns - read.before_ns
+    if unread_ns - read.least_ns < _ONE_ONLY * period_ns:
+        # It came between two reads: it is the one expected nearest to them.
+        late = ((read.before_ns + read_ns) / 2 - phase_ns) / period_ns
+        return Association(1 + (min(round(late), most) if has_events else round(late)), late, False)
+    late = (read_ns - phase_ns) / period_ns
+    least = math.floor((read.sent_ns - phase_ns - doubt_ns) / period_ns)
+    lost_track = lost_track and unread_ns > _MISSABLE * period_ns
+    return Association(1 + math.floor(late), late, is_doubtful or lost_track or (most > 0 and least < most))
+
+
+def by_event(late: float, *, uncertain: bool) -> Association:
+    """Which sample it is by its event, which is `late` periods after the expected instant."""
+    return Association(1 + round(late), late, uncertain)
+
+
+def count(found: Association, *, is_doubtful: bool, absent: int, unchanged_periods: float) -> tuple[int, int]:
+    """The number of the new sample by the phase, and how many samples it is after the one before.
+
+    `is_doubtful`: the sample before may have been another one. `absent`: samples that were polled for since
+    and did not come. `unchanged_periods`: time in which exchanges brought nothing new that were sent after
+    the sample before was identified. Samples that pass while the slave holds up the frames exist, although
+    none brings them.
+    """
+    number = found.number
+    if number < 1:  # too early for the next one: it is that, or one too many was counted before
+        number = 0 if is_doubtful and found.late < -0.5 else 1
+    if absent >= SILENT_PERIODS and unchanged_periods > SILENT_PERIODS - 1:
+        return number, 1  # a silent sensor loses nothing
+    return number, number + absent if found.late > _EARLY else number
+
+
+def read_delay_ns(excess_ns: float, period_ns: float) -> float:
+    """When the process data was read after its frame was sent, by what that took beyond the shortest.
+
+    A long exchange is taken for a stall after the frame had left: what it brought is dated from before, never
+    as younger than it may be.
+    """
+    return excess_ns / 2 if excess_ns < _LONGEST_READ * period_ns else 0.0

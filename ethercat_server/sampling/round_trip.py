@@ -1,0 +1,131 @@
+"""How long exchanges take on a bus and how late this machine wakes, measured all the time.
+
+A round trip ends when the answer begins to arrive, as it begins when the frame leaves: neither its length nor
+how late this machine wakes counts. The shortest recent one is what the wire, the slaves and the network card
+need at least. What an exchange took beyond it was spent somewhere on its way, before the slaves read their
+process data or after.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+_GAIN: Final = 1 / 64
+_TURNS: Final = 7  # exchanges after which what follows from the averages is derived anew
+_WINDOW_NS: Final = 2_000_000_000  # the shortest round trip is that of the last one or two of these
+_FIRST_GUESS_NS: Final = 100_000.0
+_FIRST_EXCESS_NS: Final = 20_000.0
+_FIRST_LATE_NS: Final = 15_000.0
+_LEAST_VARIANCE: Final = 1_000.0**2
+_MOVED_NS: Final = 20_000.0  # change of the shortest round trip from which it is another; below, it is jitter
+_OUTLIER: Final = 4.0  # standard deviations at which outliers are clipped: a stall is no jitter
+_ROOM_NS: Final = 10_000.0
+_PATIENCE_NS: Final = 100_000.0
+
+
+class RoundTrip:
+    """Round trips, and lateness of wake-ups, of one bus.
+
+    Attributes:
+        least_ns: the shortest recent round trip.
+        excess_ns: what an exchange usually takes beyond the shortest.
+        usual_ns: what it usually takes until its answer is there.
+        patience_ns: after this time an answer is overdue.
+        taking_over_ns: usual time from the arrival of an answer until the program has it.
+        read_ns: usual delay of the slaves' PDI read by what an exchange takes beyond the shortest.
+        read_variance: of that.
+        late_ns: usual lateness of a wake-up.
+        variance: of the difference between the instant aimed at and that of the PDI read.
+        moved_ns: by how much instants less the outward part of the shortest are later than they were at
+        first.
+    """
+
+    def __init__(self, wire_ns: int = 0) -> None:
+        """`wire_ns`: what the bytes of the longest frame take on the wire."""
+        self._wire_ns = wire_ns
+        self.least_ns = math.inf
+        self.moved_ns = 0.0
+        self.late_ns = 0.0
+        self.excess_ns = _FIRST_EXCESS_NS
+        self._excess_square = 2 * _FIRST_EXCESS_NS**2
+        self._late_variance = _FIRST_LATE_NS**2
+        self.taking_over_ns = 0.0
+        self._least_now_ns = math.inf
+        self._roll_at_ns = self._turn = 0
+        self._derive()
+
+    def _derive(self) -> None:
+        self.read_ns = self.excess_ns / 2
+        # Uniform within the excess: E[(x·e)²] = E[e²]/3.
+        self.read_variance = max(self._excess_square / 3 - self.read_ns * self.read_ns, _LEAST_VARIANCE)
+        self.variance = self.read_variance + self._late_variance
+        least_ns = self.least_ns if self.least_ns < math.inf else _FIRST_GUESS_NS
+        self.usual_ns = least_ns + self.excess_ns + self._wire_ns
+        self._most_excess_ns = _OUTLIER * math.sqrt(self._excess_square) + _ROOM_NS
+        self._most_late_ns = _OUTLIER * math.sqrt(self._late_variance) + _ROOM_NS
+        self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
+
+    def learn(self, sent_ns: int, arrived_ns: int, back_ns: int, late_ns: float | None = None) -> None:
+        """Learn from an exchange whose answer began to arrive, and was there, then.
+
+        `late_ns`: how late the loop woke when it first slept after the one before, if it did. Not the last
+        time: late wake-ups have it learn at once, and would count for too much.
+        """
+        if late_ns is not None:
+            self._learn_wake_up(late_ns)
+        self.shorten(sent_ns, arrived_ns)
+        excess_ns = min(arrived_ns - sent_ns - self.least_ns, self._most_excess_ns)
+        self.excess_ns += _GAIN * (excess_ns - self.excess_ns)
+        self._excess_square += _GAIN * (excess_ns * excess_ns - self._excess_square)
+        took_over_ns = min(back_ns - arrived_ns, self.taking_over_ns + _ROOM_NS)
+        self.taking_over_ns += _GAIN * (took_over_ns - self.taking_over_ns)
+        self._turn -= 1
+        if self._turn < 0:
+            self._turn = _TURNS
+            self._derive()
+
+    def shorten(self, sent_ns: int, arrived_ns: int) -> None:
+        """Learn from an exchange, which may be a short one, what the shortest is."""
+        took_ns = arrived_ns - sent_ns
+        before_ns = self.least_ns
+        if arrived_ns >= self._roll_at_ns:
+            self._roll_at_ns = arrived_ns + _WINDOW_NS
+            if self._least_now_ns < math.inf:
+                self.least_ns = self._least_now_ns
+            self._least_now_ns = math.inf
+        if took_ns < self._least_now_ns:
+            self._least_now_ns = took_ns
+            self.least_ns = min(self.least_ns, took_ns)
+        more_ns = before_ns - self.least_ns
+        if not -_MOVED_NS < more_ns < _MOVED_NS and before_ns < math.inf:
+            # Round trips take what they took before: the excess is another, and where phases count from.
+            more_ns = max(more_ns, -self.excess_ns)
+            self._excess_square = max(self._excess_square + more_ns * (2 * self.excess_ns + more_ns), 0.0)
+            self.excess_ns += more_ns
+            self.moved_ns += more_ns / 2
+
+    def _learn_wake_up(self, late_ns: float) -> None:
+        error, most = late_ns - self.late_ns, self._most_late_ns
+        if not -most < error < most:
+            error = math.copysign(most, error)
+        self.late_ns += _GAIN * error
+        self._late_variance += _GAIN * (error * error - self._late_variance)
+
+    def read(self, sent_ns: int, arrived_ns: int) -> tuple[float, float]:
+        """When the slaves read their data in an exchange, less the outward part of the shortest one.
+
+        Returns the instant and its variance.
+        """
+        excess_ns = arrived_ns - sent_ns - self.least_ns
+        if excess_ns <= 0:
+            return sent_ns, 0.0
+        return sent_ns + excess_ns / 2, excess_ns * excess_ns / 12
+
+    def as_json(self) -> dict[str, Any]:
+        """What `status` says of it."""
+        known = self.least_ns < math.inf
+        return {
+            "least_us": round((self.least_ns + self._wire_ns) / 1000, 1) if known else None,
+            "usual_us": round(self.usual_ns / 1000, 1) if known else None,
+        }
