@@ -28,7 +28,7 @@ from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
 from bridge.parameters.declare import LiveParameters, SettingsParameters, declare, warn_of_others
 from bridge.parameters.table import ParameterError, Parameters
-from bridge.process import Worker, call_on_stop_signal, prepare
+from bridge.process import StopSignals, Worker, prepare
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.publishing.messages import Stamps, make_measured
 from bridge.publishing.terminals import TerminalTopics
@@ -246,7 +246,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.finish(0)
 
 
-def run(arguments: Sequence[str]) -> int:
+def run(arguments: Sequence[str], signals: StopSignals) -> int:
     """Run the node with these command-line arguments until it ends; returns the exit code."""
     try:
         unknown = remove_ros_args(["bridge-client", *arguments])[1:]
@@ -260,7 +260,7 @@ def run(arguments: Sequence[str]) -> int:
         return _refuse(f"ROS cannot start: {text}", 2 if is_about_arguments(error) else 1)
     try:
         node = BridgeNode.create()
-        call_on_stop_signal(lambda _signal: node.finish(0))
+        signals.call(lambda _: node.finish(0))
         return spin(node)
     except StartError as error:
         return _refuse(str(error), 2)

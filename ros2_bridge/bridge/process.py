@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's own process: stop signals, the scheduling of its threads, and threads that do not die silently.
 
-SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in every thread and one
-thread waits for them. A handler would run only when the main thread next executes Python, which it does not
-while it waits inside ROS for the next message.
+Once the node is built SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in every
+thread and one thread waits for them. A handler would run only when the main thread next executes Python, which
+it does not while it waits inside ROS for the next message.
 
 The stream's thread gets `rt_priority` and `cpu`. It takes locks that know no priorities, Python's (GIL) and
 the middleware's: whoever holds one while another program has its CPU delays the stream, beside endless loops
@@ -54,27 +54,37 @@ class Worker(threading.Thread):
         return not self.is_alive()
 
 
-def block_stop_signals() -> None:
-    """Keep SIGINT and SIGTERM pending in this thread and all it starts later."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+class StopSignals:
+    """SIGINT and SIGTERM from here on; to be made by the main thread before there are others.
 
-
-def call_on_stop_signal(callback: Callable[[signal.Signals], None]) -> None:
-    """Call `callback` from a thread of its own at the first signal.
-
-    A later one ends the process at once, but not one right behind the first: a terminal and a launcher may
-    each send theirs.
+    Until `call` they have their default action: it ends the process even while ROS holds Python's lock.
     """
 
-    def wait() -> None:
-        callback(signal.Signals(signal.sigwait(STOP_SIGNALS)))
+    def __init__(self) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # in all threads that this one starts, too
+        self._call: Callable[[signal.Signals], object] = lambda _: None
+        self._has_call = threading.Event()
+        threading.Thread(target=self._wait, name="signals", daemon=True).start()
+
+    def call(self, callback: Callable[[signal.Signals], object]) -> None:
+        """Call `callback`, from a thread of its own, at the first signal from now on.
+
+        A later one ends the process at once, but not one right behind the first: a terminal and a launcher
+        may each send theirs.
+        """
+        self._call = callback
+        self._has_call.set()
+
+    def _wait(self) -> None:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
+        self._has_call.wait()
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+        self._call(signal.Signals(signal.sigwait(STOP_SIGNALS)))
         impatient_s = time.monotonic() + _SAME_S
         while True:
             number = signal.sigwait(STOP_SIGNALS)
             if time.monotonic() >= impatient_s:
                 os._exit(128 + number)
-
-    threading.Thread(target=wait, name="signals", daemon=True).start()
 
 
 def prepare(rt_priority: int, cpu: int, log: Any) -> None:

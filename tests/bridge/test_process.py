@@ -7,6 +7,7 @@ import os
 import queue
 import re
 import signal
+import subprocess
 import sys
 import threading
 from collections import Counter
@@ -34,13 +35,41 @@ from tests.rights import needs_root, skip_if_forbidden
 def test_a_missing_module_is_named(
     missing: str, remedy: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(client, "block_stop_signals", lambda: None)
+    monkeypatch.setattr(process, "StopSignals", lambda: None)
     for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bridge"}]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
     assert client.main([]) == 1
     said = capsys.readouterr().err
     assert re.match(rf"bridge-client: {missing} cannot be loaded \(.*\): {remedy}", said)
+
+
+HANGING = """
+import ctypes, sys
+import rclpy, rclpy.node
+def hang(*_, **__):
+    print("hangs", flush=True)
+    ctypes.PyDLL(None).sleep(600)  # with Python's lock, as rclpy calls the middleware
+{where} = hang
+from bridge import client
+sys.exit(client.main([]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("where", ["rclpy.init", "rclpy.node.Node.__init__"])
+def test_a_signal_ends_it_while_the_middleware_hangs(where: str, number: signal.Signals) -> None:
+    """A process: only the kernel ends one whose Python cannot run."""
+    command = [sys.executable, "-c", HANGING.format(where=where)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as node:
+        assert node.stdout is not None
+        try:
+            assert node.stdout.readline() == "hangs\n"
+            node.send_signal(number)
+            _, said = node.communicate(timeout=PATIENCE_S)
+        finally:
+            node.kill()
+    assert (node.returncode, said) == (-number, "")
 
 
 def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,7 +89,8 @@ def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.Monkey
     monkeypatch.setattr(signal, "sigwait", wait)
     monkeypatch.setattr(os, "_exit", end)
     monkeypatch.setattr(process, "time", SimpleNamespace(monotonic=lambda: now_s))
-    process.call_on_stop_signal(called.append)
+    monkeypatch.setattr(signal, "pthread_sigmask", lambda *_: None)
+    process.StopSignals().call(called.append)
     assert ended.get(timeout=PATIENCE_S) == 128 + signal.SIGTERM
     assert called == [signal.SIGINT]
     assert next(signals, None) is None
