@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's own process: stop signals, the scheduling of its threads, and threads that do not die silently.
 
-Once the node is built SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in every
-thread and one thread waits for them. A handler would run only when the main thread next executes Python, which
-it does not while it waits inside ROS for the next message.
+Once the node is built SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in
+every thread and one thread waits for them. A handler would run only when the main thread next executes
+Python, which it does not while it waits inside ROS for the next message.
 
 The stream's thread gets `rt_priority` and `cpu`. It takes locks that know no priorities, Python's (GIL) and
 the middleware's: whoever holds one while another program has its CPU delays the stream, beside endless loops
