@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import queue
@@ -23,9 +24,11 @@ from rclpy.executors import SingleThreadedExecutor
 from bota_ethercat.client import Scheduling
 from bridge import client, process
 from bridge.spinning import Spinner
+from tests import without_ipv6
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.rights import needs_root, skip_if_forbidden
+from tests.server.running import Program, free_port
 
 
 @pytest.mark.parametrize(
@@ -70,6 +73,18 @@ def test_a_signal_ends_it_while_the_middleware_hangs(where: str, number: signal.
         finally:
             node.kill()
     assert (node.returncode, said) == (-number, "")
+
+
+@needs_root
+def test_without_ipv6_it_waits_for_the_server() -> None:
+    """A process: the kernel gives it no IPv6 socket, although `localhost` has such an address."""
+    port = free_port()
+    arguments = ("--ros-args", "-p", f"server_port:={port}", "-r", f"__ns:=/test_{port}")
+    under = sys.executable, str(Path(without_ipv6.__file__))
+    with contextlib.closing(Program("bridge.client", arguments, under)) as node:
+        node.wait_for(f"no server at localhost:{port} (Connection refused)")
+        with ScriptedServer(port):
+            node.wait_for("connected to")
 
 
 def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ What it makes of a stream, `latest` above all, is in tests/protocol/golden/readi
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import re
@@ -15,7 +16,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -283,6 +284,30 @@ def test_a_host_that_is_not_known_is_said_so(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
     with pytest.raises(UnreachableError, match=r"^Name or service not known$"):
         connect(12001, "sensor-cell-3")
+
+
+@pytest.mark.parametrize("hosts", [("::1", "127.0.0.1"), ("127.0.0.1", "::1")])
+def test_an_address_that_this_computer_cannot_have_is_passed_over(
+    hosts: Sequence[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without IPv6 `localhost` has its address all the same. With a server, and without one before that."""
+
+    class Socket(socket.socket):
+        def __init__(self, family: int = socket.AF_INET, *arguments: Any, **named: Any) -> None:
+            if family == socket.AF_INET6:
+                raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
+            super().__init__(family, *arguments, **named)
+
+    families = [socket.AF_INET6 if ":" in host else socket.AF_INET for host in hosts]
+    port = free_port()
+    found = [(family, 0, 0, "", (host, port)) for family, host in zip(families, hosts, strict=True)]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    monkeypatch.setattr(socket, "socket", Socket)
+    with contextlib.closing(Client(port)) as client:
+        with pytest.raises(UnreachableError, match=r"^Connection refused$"):
+            client.connect()
+        with ScriptedServer(port):
+            client.connect()
 
 
 def test_another_thread_may_close_it(scripted: ScriptedServer) -> None:
