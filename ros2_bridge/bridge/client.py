@@ -15,7 +15,7 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C is never a traceback, wha
 import sys  # noqa: E402
 from collections.abc import Sequence  # noqa: E402
 
-from bridge.process import StopSignals  # noqa: E402
+from bridge.process import StopSignals, environment_problem, refuse  # noqa: E402
 
 USAGE = """\
 examples:
@@ -38,6 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if own and own[0] in {"-h", "--help"}:
         sys.stdout.write(USAGE)
         return 0
+    if problem := environment_problem():
+        return refuse(problem, 1)
     try:
         from bridge.node import run  # noqa: PLC0415 - --help needs no ROS, which may be missing
     except ImportError as error:
@@ -45,8 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         remedy = "source ROS 2, or pip install the extra 'ros'"
         if missing == "bota_ethercat":
             remedy = "build the package bota_ethercat_protocol too"
-        sys.stderr.write(f"bridge-client: {missing} cannot be loaded ({error}): {remedy}\n")
-        return 1
+        return refuse(f"{missing} cannot be loaded ({error}): {remedy}", 1)
     return run(own, signals)
 
 

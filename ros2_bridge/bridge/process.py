@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's own process: stop signals, the scheduling of its threads, and threads that do not die silently.
+"""The node's own process: environment, stop signals, scheduling, and threads that do not die silently.
 
 Once the node is built SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in
 every thread and one thread waits for them. A handler would run only when the main thread next executes
@@ -15,6 +15,7 @@ may take long.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import os
 import signal
@@ -27,6 +28,7 @@ from typing import Any, Final
 
 STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
 _SAME_S: Final = 1.0
+_HIGHEST_DOMAIN: Final = 232  # of DDS: the ports of others are too high
 STREAM: Final = "reader"
 BESIDE: Final = ("monitor", "listener", "frames")  # threads that share Python's lock with the stream's
 _MIDDLEWARE: Final = "dds."  # how Fast DDS names its threads
@@ -52,6 +54,31 @@ class Worker(threading.Thread):
         """Wait for it; False if it does not end in time."""
         self.join(within_s)
         return not self.is_alive()
+
+
+def environment_problem() -> str:
+    """What is wrong with variables at which the middleware would end the process; empty if nothing is."""
+    middleware, domain = (os.environ.get(name, "") for name in ("RMW_IMPLEMENTATION", "ROS_DOMAIN_ID"))
+    try:
+        if middleware:
+            ctypes.CDLL(f"lib{middleware}.so")
+    except OSError as error:
+        return (
+            f"RMW_IMPLEMENTATION is {middleware!r}, which cannot be loaded ({error}): unset it, or install "
+            "that middleware for this ROS"
+        )
+    number = 0
+    with contextlib.suppress(ValueError):  # ROS itself refuses what is no number
+        number = int(domain, 0)
+    if 0 <= number <= _HIGHEST_DOMAIN or "zenoh" in middleware:
+        return ""
+    return f"ROS_DOMAIN_ID is {domain}: set it to a whole number from 0 to {_HIGHEST_DOMAIN}, or unset it"
+
+
+def refuse(text: str, exit_code: int) -> int:
+    """Say why the node does not start; returns the exit code."""
+    sys.stderr.write(f"bridge-client: {text}\n")
+    return exit_code
 
 
 class StopSignals:

@@ -47,6 +47,42 @@ def test_a_missing_module_is_named(
     assert re.match(rf"bridge-client: {missing} cannot be loaded \(.*\): {remedy}", said)
 
 
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        (
+            {"ROS_DOMAIN_ID": "233"},
+            "ROS_DOMAIN_ID is 233: set it to a whole number from 0 to 232, or unset it",
+        ),
+        ({"ROS_DOMAIN_ID": "-3"}, "ROS_DOMAIN_ID is -3: set it to a whole number from 0 to 232, or unset it"),
+        ({"ROS_DOMAIN_ID": "ten"}, "ROS_DOMAIN_ID is not an integral number: set it to a whole number, or"),
+        (
+            {"RMW_IMPLEMENTATION": "rmw_other_cpp"},
+            "RMW_IMPLEMENTATION is 'rmw_other_cpp', which cannot be lo",
+        ),
+        (
+            {"HOME": "/proc/home", "ROS_LOG_DIR": ""},
+            "set ROS_LOG_DIR, or HOME, to a directory that can be wri",
+        ),
+        (
+            {"ROS_STATIC_PEERS": "@@"},
+            "ROS cannot create the node (error creating node: Unable to resolve peer",
+        ),
+    ],
+)
+def test_what_the_environment_makes_impossible_is_a_sentence(variables: dict[str, str], said: str) -> None:
+    """Processes: at some of it the middleware ends them by itself, and ROS reads the rest once."""
+    done = subprocess.run(
+        [sys.executable, "-m", "bridge.client"], env={**os.environ, **variables},
+        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
+    )  # fmt: skip
+    *_, line = done.stderr.splitlines()
+    assert line.startswith("bridge-client: ")
+    assert said in line
+    assert done.returncode in (1, 2)
+    assert "/project/src" not in line
+
+
 HANGING = """
 import ctypes, sys
 import rclpy, rclpy.node
