@@ -252,7 +252,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.finish(0)
 
 
-def run(arguments: Sequence[str], signals: StopSignals) -> int:
+def run(arguments: Sequence[str], signals: StopSignals | None = None) -> int:
     """Run the node with these command-line arguments until it ends; returns the exit code."""
     try:
         unknown = remove_ros_args(["bridge-client", *arguments])[1:]
@@ -262,13 +262,14 @@ def run(arguments: Sequence[str], signals: StopSignals) -> int:
     except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
         text = _text_of(error)
         if "initialize logging" in text:
-            text += ": set ROS_LOG_DIR, or HOME, to a directory that can be written"
+            text += ": set HOME, or ROS_LOG_DIR to a directory for its log, which can be written"
         elif "ROS_DOMAIN_ID" in text:
             text += ": set it to a whole number, or unset it"
         return refuse(f"ROS cannot start: {text}", 2 if is_about_arguments(error) else 1)
     try:
         node = BridgeNode.create()
-        signals.call(lambda _: node.finish(0))
+        if signals is not None:
+            signals.call(lambda _: node.finish(0))
         return spin(node)
     except StartError as error:
         return refuse(str(error), 2)

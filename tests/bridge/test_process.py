@@ -62,7 +62,7 @@ def test_a_missing_module_is_named(
         ),
         (
             {"HOME": "/proc/home", "ROS_LOG_DIR": ""},
-            "set ROS_LOG_DIR, or HOME, to a directory that can be wri",
+            "set HOME, or ROS_LOG_DIR to a directory for its log, which",
         ),
         (
             {"ROS_STATIC_PEERS": "@@"},
