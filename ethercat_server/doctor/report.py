@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, TextIO
 
-from bota_ethercat.health.sentences import DOCTOR
+from bota_ethercat.health.sentences import CHECK_IT, IT_TELLS
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.text.untrusted import visible
 from ethercat_server.errors import ServerError
@@ -100,7 +100,10 @@ def examine(
 
 def _here(text: str) -> str:
     """What others advise, as the doctor says it."""
-    return text.replace(DOCTOR, "see the checks of machine and bus")
+    return text.replace(CHECK_IT, _SEE).replace(IT_TELLS, _SEE)
+
+
+_SEE: Final = "see the checks of machine and bus"
 
 
 def worst(findings: Iterable[Finding]) -> Level:

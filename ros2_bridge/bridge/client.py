@@ -2,8 +2,8 @@
 """The program `ros2 run bridge client`, on PATH as `bridge-client`: arguments, signals, exit codes.
 
 Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong arguments or
-parameters, 3 ended as the supervisor asked, but the server refused to shut down. Until the node is built
-SIGINT and SIGTERM have their default action, so that nothing of ROS can hold it up.
+parameters, 3 ended as the supervisor asked, but the server refused to shut down. While ROS starts and
+the node is built SIGINT and SIGTERM have their default action, so that nothing of ROS can hold it up.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if missing == "bota_ethercat":
             remedy = "build the package bota_ethercat_protocol too"
         return refuse(f"{missing} cannot be loaded ({error}): {remedy}", 1)
-    return run(own, signals)
+    return run(own, signals) if signals.begin() else 0
 
 
 if __name__ == "__main__":

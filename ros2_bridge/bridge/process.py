@@ -84,14 +84,21 @@ def refuse(text: str, exit_code: int) -> int:
 class StopSignals:
     """SIGINT and SIGTERM from here on; to be made by the main thread before there are others.
 
-    Until `call` they have their default action: it ends the process even while ROS holds Python's lock.
+    They wait until `begin`. From there to `call` they have their default action: it ends the process even
+    while ROS holds Python's lock.
     """
 
     def __init__(self) -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # in all threads that this one starts, too
         self._call: Callable[[signal.Signals], object] = lambda _: None
         self._has_call = threading.Event()
+
+    def begin(self) -> bool:
+        """All is loaded, and ROS begins; False if a signal has come already."""
+        if signal.sigtimedwait(STOP_SIGNALS, 0) is not None:
+            return False
         threading.Thread(target=self._wait, name="signals", daemon=True).start()
+        return True
 
     def call(self, callback: Callable[[signal.Signals], object]) -> None:
         """Call `callback`, from a thread of its own, at the first signal from now on.

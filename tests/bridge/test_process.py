@@ -141,7 +141,10 @@ def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.Monkey
     monkeypatch.setattr(os, "_exit", end)
     monkeypatch.setattr(process, "time", SimpleNamespace(monotonic=lambda: now_s))
     monkeypatch.setattr(signal, "pthread_sigmask", lambda *_: None)
-    process.StopSignals().call(called.append)
+    monkeypatch.setattr(signal, "sigtimedwait", lambda *_: None)
+    stop_signals = process.StopSignals()
+    assert stop_signals.begin()
+    stop_signals.call(called.append)
     assert ended.get(timeout=PATIENCE_S) == 128 + signal.SIGTERM
     assert called == [signal.SIGINT]
     assert next(signals, None) is None

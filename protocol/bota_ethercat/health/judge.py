@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
-from bota_ethercat.health.sentences import DOCTOR, STOOD_STILL, did_not_read
+from bota_ethercat.health.sentences import IT_TELLS, STOOD_STILL, did_not_read
 from bota_ethercat.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
 from bota_ethercat.pdo import AXES
 from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain
@@ -194,7 +194,7 @@ def _losses(seen: Observation, limits: Limits) -> Iterator[Finding]:
     if seen.lost >= limits.lost_warn:
         total = seen.samples + seen.lost
         found = f"{seen.lost} of {total} samples ({_percent(seen.lost, total)}) were lost"
-        remedy = f"The machine is too busy or the cable is bad, {DOCTOR}"
+        remedy = f"The machine is too busy or the cable is bad; {IT_TELLS}"
         if seen.unread_s > _BUFFERED_S:
             why, advice = did_not_read(seen.unread_s, busy=seen.busy)
             found, remedy = f"{found}, {why}", advice

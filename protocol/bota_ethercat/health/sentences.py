@@ -12,8 +12,10 @@ from typing import Any, Final
 from bota_ethercat.control import Event
 from bota_ethercat.text.untrusted import number, printable, text, whole
 
-DOCTOR: Final = "check it with ethercat-doctor"
-STOOD_STILL: Final = f"computer stood still{{}}, {DOCTOR}"
+# What others than the doctor advise.
+CHECK_IT: Final = "check it with ethercat-doctor"
+IT_TELLS: Final = "ethercat-doctor tells which"
+STOOD_STILL: Final = f"computer stood still{{}}, {CHECK_IT}"
 _EVENTS: Final[Mapping[str, str]] = {
     Event.SENSOR_LOST: "{} is lost",
     Event.SENSOR_BACK: "{} is back",
