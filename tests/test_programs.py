@@ -71,6 +71,38 @@ def test_a_signal_while_it_is_imported_is_no_traceback(
     assert interrupted(name, number, module, arguments) == (-number, "", "")
 
 
+LOADED_BEFORE = """
+import _signal, sys
+sys.path[:0] = {path!r}
+def note(event, arguments):
+    if event == "import" and _signal.getsignal(_signal.SIGINT) is not _signal.SIG_DFL:
+        print(arguments[0])
+sys.addaudithook(note)
+import {module}
+"""
+
+
+@pytest.mark.parametrize("module", sorted({entry.partition(":")[0] for entry in SCRIPTS.values()}))
+def test_nothing_is_loaded_before_ctrl_c_ends_the_program(module: str) -> None:
+    """A process, without what `site` loads before."""
+
+    def before(module: str) -> set[str]:
+        script = LOADED_BEFORE.format(
+            path=[str(ROOT / f) for f in ("clients", "", "protocol", "ros2_bridge")], module=module
+        )
+        return {*subprocess.check_output([sys.executable, "-S", "-c", script], text=True).split()}
+
+    own = {
+        "__future__",
+        module,
+        module.partition(".")[0],
+        "bota_ethercat",
+        "bota_ethercat.program",
+        "bota_ethercat.program.start",
+    }
+    assert before(module) <= before("signal") | own
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_interfaces_are_listed_is_no_traceback(number: int) -> None:
     """Where pyroute2 makes its event loop, which is then half-made."""

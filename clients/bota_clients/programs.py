@@ -1,8 +1,10 @@
 """Entry points of the programs here."""
 
-from collections.abc import Callable
+from bota_ethercat.program.start import run  # first, for Ctrl-C
 
-from bota_ethercat.program.start import run
+# isort: split
+
+from collections.abc import Callable
 
 
 def _program(module: str) -> Callable[[], int]:

@@ -331,7 +331,8 @@ class SensorRecovery:
 
     def _set_up(self) -> Steps[None]:
         """From PREOP to OP."""
-        yield from set_up(self.sdo, self._sensor)
+        asked = self._change is not None and self._change.failed is None
+        yield from set_up(self.sdo, self._sensor, asked=asked)
         self._slave.map()
         yield from self._slave.enter_op()
 

@@ -148,7 +148,7 @@ EMPTY: Final = ConfigFile({}, {}, {})
 def read_config(path: Path) -> ConfigFile:
     """Read a configuration file; UsageError names file and key."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # Windows' editors put a mark first
     except OSError as error:
         raise UsageError(f"cannot read the configuration {path}: {error.strerror}") from None
     except UnicodeDecodeError:

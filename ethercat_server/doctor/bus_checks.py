@@ -294,6 +294,7 @@ class ServerView:
         """Watch for `seconds`, then close `sensors`. A private server's figures are those since its start."""
         self._own, clock, private = sensors.private is not None, sensors.clock, sensors.private
         self._events: list[dict[str, Any]] = []
+        self._unread = 0.0, False
         with contextlib.closing(sensors):
             rows: list[dict[str, Any]] = sensors.ask("describe")["sensors"]
             self.before: dict[str, Any] = sensors.ask("status")
@@ -302,6 +303,7 @@ class ServerView:
             for frames, events in sensors.stream(fresh_only=False) if seconds else ():
                 self._take(frames, clock.monotonic_ns(), same_machine=sensors.client.session.same_machine)
                 self._events += events
+                self._unread = max(self._unread, sensors.client.take_unread())
                 if end.passed:
                     sensors.ask("unsubscribe")
                     break
@@ -329,6 +331,8 @@ class ServerView:
         recoveries = int(after["recoveries"]) - int(self.before["sensors"][position]["recoveries"])
         seen = self._observers[position].observation(self._end_ns)
         return seen._replace(
+            unread_s=self._unread[0],
+            busy=self._unread[1],
             locked=after["clock"]["mode"] == "locked",
             recoveries=max(0, recoveries),
             missed_deadlines=self._grown("missed_deadlines"),

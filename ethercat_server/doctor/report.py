@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, TextIO
 
+from bota_ethercat.health.sentences import CHECK_IT, IT_TELLS
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.text.untrusted import visible
 from ethercat_server.errors import ServerError
@@ -83,17 +84,26 @@ def examine(
     try:
         found = look(*arguments)
         for each in (found,) if isinstance(found, Finding) else found:
+            each = replace(each, found=_here(each.found), why=_here(each.why))  # noqa: PLW2901
             yield replace(each, subject=subject, check=check)
         return
     except CannotLookError as error:
         failed = skipped(str(error))
     except ServerError as error:
-        failed = bad(str(error))
+        failed = bad(_here(str(error)))
     except OSError as error:
         failed = skipped(error.strerror or str(error))
     except Exception as error:  # noqa: BLE001 - a check that fails must not stop the others
         failed = skipped(f"{type(error).__name__}: {error}; an error in ethercat-doctor, please report it")
     yield replace(failed, subject=subject, check=check)
+
+
+def _here(text: str) -> str:
+    """What others advise, as the doctor says it."""
+    return text.replace(CHECK_IT, _SEE).replace(IT_TELLS, _SEE)
+
+
+_SEE: Final = "see the checks of machine and bus"
 
 
 def worst(findings: Iterable[Finding]) -> Level:

@@ -51,11 +51,11 @@ def identify(sdo: Sdo, sii_name: str) -> Steps[Identity]:
     return Identity(name or sii_name, int.from_bytes(serial or b"", "little"), hardware, firmware)
 
 
-def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
+def set_up(sdo: Sdo, sensor: Sensor, *, asked: bool = False) -> Steps[None]:
     """Write the wanted settings that are not in force yet, in the device's order, and verify them.
 
-    The sensor must be in PREOP. Afterwards `settings` and `rate_hz` are what is in force. BusError says which
-    setting did not take.
+    `asked`: because somebody asks for other ones. The sensor must be in PREOP. Afterwards `settings` and
+    `rate_hz` are what is in force. BusError says which setting did not take.
     """
     written = yield from _write_differing(sdo, sensor, preop=True)
     held = {name: _setting_text(name, found) for name, found in written.items() if found is not None}
@@ -66,15 +66,18 @@ def set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     if not right or ((written or sensor.wanted.get("chop")) and not sensor.sinc_guessed):
         yield from write_setting(sdo, sensor, _LAST)
         yield from _check_rate(sdo, sensor)
-    texts = [f"{name} = {text} (wanted: {_text(sensor.wanted[name])})" for name, text in held.items()]
+    found = [(f"{name} = ", text, _text(sensor.wanted[name])) for name, text in held.items()]
     if rate_hz != sensor.rate_hz:
-        texts.append(f"a sampling rate of {rate_hz} Hz (wanted: {sensor.rate_hz} Hz)")
+        found.append(("a sampling rate of ", f"{rate_hz} Hz", f"{sensor.rate_hz} Hz"))
         held[_LAST] = str(rate_hz)
-    if texts:
+    if found and asked:
+        texts = ", ".join(f"{what}{now} (was {before})" for what, before, now in found)
+        log.info("sensor %d was changed as requested: %s", sensor.number, texts)
+    elif found:
         unset = ", ".join(name for name in held if name not in sensor.asked)
         log.info(
             "sensor %d held %s: what is wanted was written and verified%s",
-            sensor.number, ", ".join(texts),
+            sensor.number, ", ".join(f"{what}{before} (wanted: {now})" for what, before, now in found),
             unset and f"; nobody set {unset}: --unset-settings keep leaves what the sensor has",
         )  # fmt: skip
     yield from _finish_set_up(sdo, sensor)

@@ -138,11 +138,14 @@ def _watch(args: argparse.Namespace) -> int:
         finally:
             _show(opened, args, watched)
         silent_s = (opened.clock.monotonic_ns() - began_ns) * 1e-9
+        unread_s, _ = opened.client.take_unread()
     silent = {sensor: each.observer.counts for sensor, each in watched.items() if not each.samples}
     if silent_s <= LIMITS.stale_after or not silent:
         return DONE
     for sensor, counts in silent.items():
-        seen = Observation(invalid=counts.invalid, repeated=counts.repeated, silent_s=silent_s)
+        seen = Observation(
+            invalid=counts.invalid, repeated=counts.repeated, silent_s=silent_s, unread_s=unread_s
+        )
         note(f"sensor {sensor}: {judge(seen).sentence}")
     return FAILED
 

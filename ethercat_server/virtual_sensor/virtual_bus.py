@@ -13,6 +13,7 @@ import ctypes
 import os
 import select
 import shlex
+import signal
 import socket
 import subprocess
 import sys
@@ -77,12 +78,7 @@ class VirtualBus:
                     self._process.wait(_START_TIMEOUT_S)
             code = self._process.poll()
             self.__exit__()
-            raise ServerError(
-                "the virtual sensor did not start"
-                + (f" (exit code {code})" if code is not None else "")
-                + ": see its message above"
-                + ("" if code == _USAGE_EXIT_CODE else "; it needs root, or a kernel with user namespaces")
-            )
+            raise ServerError(_why_not_started(code))
         self._enter_namespaces()
         return self
 
@@ -112,6 +108,18 @@ class VirtualBus:
         deadline = time.monotonic() + _GONE_TIMEOUT_S
         while time.monotonic() < deadline and self.ifname in {name for _, name in socket.if_nameindex()}:
             time.sleep(0.01)
+
+
+def _why_not_started(code: int | None) -> str:
+    """A sentence; `code` is that of its process, None if that goes on."""
+    what = "the virtual sensor did not start"
+    if code is None:
+        return f"{what} within {_START_TIMEOUT_S:g} s: this computer is too busy, start it again later"
+    if code < 0:
+        return f"{what}: its process was ended by {signal.Signals(-code).name}, start it again"
+    text = f"{what} (exit code {code}): see its message above"
+    rights = "; it needs root, or a kernel with user namespaces"
+    return text + rights if code != _USAGE_EXIT_CODE and missing_capabilities() else text
 
 
 def _enter_own_namespaces() -> None:

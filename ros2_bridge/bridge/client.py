@@ -2,16 +2,20 @@
 """The program `ros2 run bridge client`, on PATH as `bridge-client`: arguments, signals, exit codes.
 
 Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong arguments or
-parameters, 3 ended as the supervisor asked, but the server refused to shut down.
-Everything of ROS is imported only after the signals are in hand, so that Ctrl-C is never a traceback.
+parameters, 3 ended as the supervisor asked, but the server refused to shut down. While ROS starts and
+the node is built SIGINT and SIGTERM have their default action, so that nothing of ROS can hold it up.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+import signal
 
-from bridge.process import block_stop_signals
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C is never a traceback, whatever is being imported
+
+import sys  # noqa: E402
+from collections.abc import Sequence  # noqa: E402
+
+from bridge.process import StopSignals, environment_problem, refuse  # noqa: E402
 
 USAGE = """\
 examples:
@@ -29,21 +33,22 @@ defaults: share/bota_ethercat_bridge/config/client.yaml.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until it is told to stop; returns the exit code."""
-    block_stop_signals()
+    signals = StopSignals()
     own = list(sys.argv[1:] if arguments is None else arguments)
     if own and own[0] in {"-h", "--help"}:
         sys.stdout.write(USAGE)
         return 0
+    if problem := environment_problem():
+        return refuse(problem, 1)
     try:
-        from bridge.node import run  # noqa: PLC0415 - rclpy takes a while to load, see above
+        from bridge.node import run  # noqa: PLC0415 - --help needs no ROS, which may be missing
     except ImportError as error:
         missing = (error.name or "").partition(".")[0]
         remedy = "source ROS 2, or pip install the extra 'ros'"
         if missing == "bota_ethercat":
             remedy = "build the package bota_ethercat_protocol too"
-        sys.stderr.write(f"bridge-client: {missing} cannot be loaded ({error}): {remedy}\n")
-        return 1
-    return run(own)
+        return refuse(f"{missing} cannot be loaded ({error}): {remedy}", 1)
+    return run(own, signals) if signals.begin() else 0
 
 
 if __name__ == "__main__":

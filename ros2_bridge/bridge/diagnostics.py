@@ -94,6 +94,7 @@ class Monitor:
         self._rate_fresh, self._rate_s, self._rate_ns = 0, now_s, -1
         # When the number of fresh samples changed, whether that is long ago, and the link's epoch.
         self._fresh_s, self._is_silent, self._epoch = now_s, False, -1
+        self._unread = 0.0, False  # the worst `take_unread` since the last regular report, or sample
         self._stopping = threading.Event()
         self.thread = Worker("monitor", self._run, on_failure)
 
@@ -180,12 +181,14 @@ class Monitor:
             self._epoch, self._rate_hz = link.epoch, None
             self._rate_fresh, self._rate_s = counts["samples"], now_s
             self._rate_ns = self._reader.accounting.new_ns
+        self._unread = max(self._unread, link.client.take_unread())
         if counts["samples"] != before:
             self._fresh_s = now_s
 
     def _begin_interval(self, now_s: float) -> None:
         """A regular report was made: what is new counts from there on. Asks the server again."""
         self._flags, link = Flags(), self._link
+        self._unread = self._unread if self._is_silent else (0.0, False)
         # What a server has counted is compared with what the same one had counted before.
         self._then = Counter({**(self._then if link.is_connected else {}), **self._counts})
         if link.is_connected and not self._waiting:  # unless an answer is still owed
@@ -202,7 +205,8 @@ class Monitor:
         """The five statuses, in the order in which one would look for a cause."""
         link, new = self._link, self._new
         silent_s = max(now_s - max(self._fresh_s, link.since_s), 0.0)
-        answer_s = now_s - self._asked_s if self._waiting else 0.0  # how long the server has owed an answer
+        # How long the server has owed an answer that this node would have seen.
+        answer_s = max(now_s - self._asked_s - self._unread[0], 0.0) if self._waiting else 0.0
         mode = mapping(self._row.get("clock")).get("mode")
         sample = self._reader.watch.sample
         temperature = None if sample is None else sample.temperature
@@ -210,9 +214,12 @@ class Monitor:
             seconds=1.0,
             samples=new["samples"],
             lost=max(new["lost"], new["server_lost_samples"]),
+            skipped=new["stale"],
             repeated=new["repeated"],
             invalid=new["invalid"],
             silent_s=silent_s,
+            unread_s=self._unread[0],
+            busy=self._unread[1],
             rate_hz=self._rate_hz,
             nominal_hz=link.info.rate_hz,
             age_p99_us=None if self._age_us is None else self._age_us[1],
@@ -279,12 +286,9 @@ class Monitor:
         return self._status("link", problems, f"connected to {link.address}", values)
 
     def _judge_stream(self, problems: Problems) -> DiagnosticStatus:
-        link, counts, skipped = self._link, self._counts, self._new["stale"]
+        link, counts = self._link, self._counts
         if not link.is_connected:
             problems = [(Level.NOT_POSSIBLE, "no samples: there is no connection to the server, see link")]
-        elif skipped >= self.limits.lost_warn:
-            text = f"{skipped} old samples skipped: the node or the server was stopped"
-            problems = [*problems, (Level.LOOK, text)]
         recent = mapping(self._server.get("last_10s"))
         age = row_of(recent.get("age_us"), link.sensor)
         wake, exchange = mapping(recent.get("wake_us")), mapping(recent.get("exchange_us"))

@@ -8,7 +8,7 @@ several nodes in one process.
 from __future__ import annotations
 
 import contextlib
-import sys
+import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, Self
@@ -28,7 +28,7 @@ from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
 from bridge.parameters.declare import LiveParameters, SettingsParameters, declare, warn_of_others
 from bridge.parameters.table import ParameterError, Parameters
-from bridge.process import Worker, call_on_stop_signal, prepare
+from bridge.process import StopSignals, Worker, prepare, refuse
 from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.publishing.messages import Stamps, make_measured
 from bridge.publishing.terminals import TerminalTopics
@@ -57,12 +57,18 @@ def _sentences() -> Iterator[None]:
     try:
         yield
     except (ParameterError, InvalidTopicNameException, ParameterException) as error:
-        raise StartError(" ".join(str(error).split())) from None
+        raise StartError(_text_of(error)) from None
     except RuntimeError as error:  # rclpy says no more, and not of what
-        raise StartError(
-            f"ROS cannot create the node's topics and services ({' '.join(str(error).split())}): check "
-            "qos_overrides, and that array_topic and the remappings give no two topics one name"
-        ) from None
+        text, what = _text_of(error), "the node's topics and services"
+        remedy = "qos_overrides, and that array_topic and the remappings give no two topics one name"
+        if text.startswith("error creating node"):
+            what, remedy = "the node", "the environment variables of ROS and of its middleware"
+        raise StartError(f"ROS cannot create {what} ({text}): check {remedy}") from None
+
+
+def _text_of(error: Exception) -> str:
+    """What ROS says, in one line and without the places in its source."""
+    return re.sub(r", at /\S+:\d+", "", " ".join(str(error).split()))
 
 
 def _transition(act: Callable[[Any], object]) -> Callable[[Any, LifecycleState], TransitionCallbackReturn]:
@@ -246,24 +252,27 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.finish(0)
 
 
-def run(arguments: Sequence[str]) -> int:
+def run(arguments: Sequence[str], signals: StopSignals | None = None) -> int:
     """Run the node with these command-line arguments until it ends; returns the exit code."""
     try:
         unknown = remove_ros_args(["bridge-client", *arguments])[1:]
         if unknown:
-            return _refuse(f"unknown argument {unknown[0]!r}: see --help", 2)
+            return refuse(f"unknown argument {unknown[0]!r}: see --help", 2)
         rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # noqa: BLE001 - rclpy raises several unrelated ones, most about arguments
-        text = " ".join(str(error).split())
-        if "logging directory" in text:
-            text += "; set HOME, or ROS_LOG_DIR to a directory for its log"
-        return _refuse(f"ROS cannot start: {text}", 2 if is_about_arguments(error) else 1)
+        text = _text_of(error)
+        if "initialize logging" in text:
+            text += ": set HOME, or ROS_LOG_DIR to a directory for its log, which can be written"
+        elif "ROS_DOMAIN_ID" in text:
+            text += ": set it to a whole number, or unset it"
+        return refuse(f"ROS cannot start: {text}", 2 if is_about_arguments(error) else 1)
     try:
         node = BridgeNode.create()
-        call_on_stop_signal(lambda _signal: node.finish(0))
+        if signals is not None:
+            signals.call(lambda _: node.finish(0))
         return spin(node)
     except StartError as error:
-        return _refuse(str(error), 2)
+        return refuse(str(error), 2)
     finally:
         rclpy.try_shutdown()
 
@@ -296,8 +305,3 @@ def spin(node: BridgeNode) -> int:
                 part.shutdown()
         executor.shutdown()
         node.destroy_node()
-
-
-def _refuse(text: str, exit_code: int) -> int:
-    sys.stderr.write(f"bridge-client: {text}\n")
-    return exit_code

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's own process: stop signals, the scheduling of its threads, and threads that do not die silently.
+"""The node's own process: environment, stop signals, scheduling, and threads that do not die silently.
 
-SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in every thread and one
-thread waits for them. A handler would run only when the main thread next executes Python, which it does not
-while it waits inside ROS for the next message.
+Once the node is built SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in
+every thread and one thread waits for them. A handler would run only when the main thread next executes
+Python, which it does not while it waits inside ROS for the next message.
 
 The stream's thread gets `rt_priority` and `cpu`. It takes locks that know no priorities, Python's (GIL) and
 the middleware's: whoever holds one while another program has its CPU delays the stream, beside endless loops
@@ -15,6 +15,7 @@ may take long.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import os
 import signal
@@ -27,6 +28,7 @@ from typing import Any, Final
 
 STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
 _SAME_S: Final = 1.0
+_HIGHEST_DOMAIN: Final = 232  # of DDS: the ports of others are too high
 STREAM: Final = "reader"
 BESIDE: Final = ("monitor", "listener", "frames")  # threads that share Python's lock with the stream's
 _MIDDLEWARE: Final = "dds."  # how Fast DDS names its threads
@@ -54,27 +56,69 @@ class Worker(threading.Thread):
         return not self.is_alive()
 
 
-def block_stop_signals() -> None:
-    """Keep SIGINT and SIGTERM pending in this thread and all it starts later."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+def environment_problem() -> str:
+    """What is wrong with variables at which the middleware would end the process; empty if nothing is."""
+    middleware, domain = (os.environ.get(name, "") for name in ("RMW_IMPLEMENTATION", "ROS_DOMAIN_ID"))
+    try:
+        if middleware:
+            ctypes.CDLL(f"lib{middleware}.so")
+    except OSError as error:
+        return (
+            f"RMW_IMPLEMENTATION is {middleware!r}, which cannot be loaded ({error}): unset it, or install "
+            "that middleware for this ROS"
+        )
+    number = 0
+    with contextlib.suppress(ValueError):  # ROS itself refuses what is no number
+        number = int(domain, 0)
+    if 0 <= number <= _HIGHEST_DOMAIN or "zenoh" in middleware:
+        return ""
+    return f"ROS_DOMAIN_ID is {domain}: set it to a whole number from 0 to {_HIGHEST_DOMAIN}, or unset it"
 
 
-def call_on_stop_signal(callback: Callable[[signal.Signals], None]) -> None:
-    """Call `callback` from a thread of its own at the first signal.
+def refuse(text: str, exit_code: int) -> int:
+    """Say why the node does not start; returns the exit code."""
+    sys.stderr.write(f"bridge-client: {text}\n")
+    return exit_code
 
-    A later one ends the process at once, but not one right behind the first: a terminal and a launcher may
-    each send theirs.
+
+class StopSignals:
+    """SIGINT and SIGTERM from here on; to be made by the main thread before there are others.
+
+    They wait until `begin`. From there to `call` they have their default action: it ends the process even
+    while ROS holds Python's lock.
     """
 
-    def wait() -> None:
-        callback(signal.Signals(signal.sigwait(STOP_SIGNALS)))
+    def __init__(self) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # in all threads that this one starts, too
+        self._call: Callable[[signal.Signals], object] = lambda _: None
+        self._has_call = threading.Event()
+
+    def begin(self) -> bool:
+        """All is loaded, and ROS begins; False if a signal has come already."""
+        if signal.sigtimedwait(STOP_SIGNALS, 0) is not None:
+            return False
+        threading.Thread(target=self._wait, name="signals", daemon=True).start()
+        return True
+
+    def call(self, callback: Callable[[signal.Signals], object]) -> None:
+        """Call `callback`, from a thread of its own, at the first signal from now on.
+
+        A later one ends the process at once, but not one right behind the first: a terminal and a launcher
+        may each send theirs.
+        """
+        self._call = callback
+        self._has_call.set()
+
+    def _wait(self) -> None:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
+        self._has_call.wait()
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+        self._call(signal.Signals(signal.sigwait(STOP_SIGNALS)))
         impatient_s = time.monotonic() + _SAME_S
         while True:
             number = signal.sigwait(STOP_SIGNALS)
             if time.monotonic() >= impatient_s:
                 os._exit(128 + number)
-
-    threading.Thread(target=wait, name="signals", daemon=True).start()
 
 
 def prepare(rt_priority: int, cpu: int, log: Any) -> None:

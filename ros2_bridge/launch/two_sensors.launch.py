@@ -6,9 +6,10 @@
 
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PythonExpression
+from launch_ros.actions import PushRosNamespace
 
 from launch import LaunchDescription
 
@@ -18,33 +19,55 @@ FOLDER = Path(__file__).parent
 SENSORS = {"sensone": "BFT-SENS-ECAT-M8", "rokubi": "BFT-ROKS-ECAT-M8"}
 
 
+# Those of bridge.launch.py, for two nodes; its others go for both as they are.
+ARGUMENTS = {
+    "namespace": ("", "Namespace of both nodes' own, such as a robot's"),
+    "sensor": ("0", "The first sensor's position on the bus, from 0; the other is the next"),
+    "array_topic": ("sensor_data", "Topic of the Float64MultiArray, in the node's namespace"),
+    "frame_id": ("ft_sensor", "Frame of the wrench, after the sensor's name and _"),
+    "imu_frame_id": ("ft_sensor_imu", "Frame of the IMU, likewise"),
+    "sensor_options": ("", "Options of ethercat-virtual-sensor, such as '--pdo 77'; the models are given"),
+    "server_port": ("12001", "TCP port of the server"),
+    "virtual": ("false", "true starts a server with two virtual sensors"),
+}
+
+
+def value(name):
+    return LaunchConfiguration(name)
+
+
 def generate_launch_description():
-    # The other arguments of the included files, such as params_file, go for both nodes.
     return LaunchDescription(
         [
-            DeclareLaunchArgument("server_port", default_value="12001", description="TCP port of the server"),
-            DeclareLaunchArgument(
-                "virtual", default_value="false", description="true starts a server with two virtual sensors"
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=description)
+                for name, (default, description) in ARGUMENTS.items()
             ),
             # The nodes first: if launch cannot make sense of their arguments, no server is left behind.
+            # A group keeps to itself what the first node is given.
             *(
-                IncludeLaunchDescription(
-                    str(FOLDER / "bridge.launch.py"),
-                    launch_arguments={
-                        "namespace": namespace,
-                        "sensor": str(position),
-                        # Without the model, which is in the namespace.
-                        "array_topic": "sensor_data",
-                        "frame_id": f"{namespace}_ft_sensor",
-                        "imu_frame_id": f"{namespace}_ft_sensor_imu",
-                    }.items(),
+                GroupAction(
+                    [
+                        PushRosNamespace(value("namespace")),
+                        IncludeLaunchDescription(
+                            str(FOLDER / "bridge.launch.py"),
+                            launch_arguments={
+                                "namespace": name,
+                                "sensor": PythonExpression([value("sensor"), f" + {place}"]),
+                                "frame_id": [f"{name}_", value("frame_id")],
+                                "imu_frame_id": [f"{name}_", value("imu_frame_id")],
+                            }.items(),
+                        ),
+                    ]
                 )
-                for position, namespace in enumerate(SENSORS)
+                for place, name in enumerate(SENSORS)
             ),
             IncludeLaunchDescription(
                 str(FOLDER / "virtual_server.launch.py"),
-                condition=IfCondition(LaunchConfiguration("virtual")),
-                launch_arguments=[("sensor_options", f"--model {','.join(SENSORS.values())}")],
+                condition=IfCondition(value("virtual")),
+                launch_arguments=[
+                    ("sensor_options", [f"--model {','.join(SENSORS.values())} ", value("sensor_options")])
+                ],
             ),
         ]
     )

@@ -392,11 +392,15 @@ class Node(Asking):
         """Subscribe no more."""
         self.topics[f"{self.name.removesuffix('bridge')}{topic}"].is_heard = False
 
+    def latest(self) -> dict[str, Any]:
+        """The newest array of /diagnostics, as `statuses`."""
+        return self._named(self._arrays[-1])
+
     def statuses(self) -> dict[str, Any]:
         """The next array of /diagnostics: {short name: status}."""
         self._arrays.clear()
         self.run_until(lambda: self._arrays, "diagnostics")
-        return self._named(self._arrays[-1])
+        return self.latest()
 
     def until(self, *words: str, **levels: str) -> dict[str, Any]:
         """The first array in which these statuses have these levels and their messages hold these words."""

@@ -133,6 +133,24 @@ def test_what_is_skipped_and_what_is_repeated(node: Node, server: Server) -> Non
     node.until("the same sample again and again", stream="error", sensor="stale", clock="stale")
 
 
+def test_a_node_that_was_not_run_blames_itself(node: Node, server: Server) -> None:
+    """Its monitor looks first. What it reads then is old, or was withheld; and the server goes on."""
+    node.until(**HEALTHY)
+    for _ in range(840):
+        server.step()
+    node.node.monitor.tick()
+    assert "No new sample for 8.4 s, this computer did not run this program for 8.4 s: give it" in node.log
+    assert node.latest()["link"].message == "connected to localhost:12001"
+    array = node.until("old samples skipped, this computer did not run this program for", stream="warn")
+    assert "server" not in array["stream"].message
+    assert "sends none" not in node.log
+    node.until(**HEALTHY)
+    server.paused = True
+    node.until("the server sends none: see its log", stream="error")
+    server.paused = False
+    node.until(**HEALTHY)
+
+
 @pytest.mark.parametrize(
     ("code", "ago_s", "expected"), [(0x4210, 3.0, "warn"), (0x4210, 90.0, "ok"), (0x0000, 3.0, "ok")]
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import queue
 import re
 import signal
+import subprocess
 import sys
 import threading
 from collections import Counter
@@ -22,9 +24,11 @@ from rclpy.executors import SingleThreadedExecutor
 from bota_ethercat.client import Scheduling
 from bridge import client, process
 from bridge.spinning import Spinner
+from tests import without_ipv6
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.rights import needs_root, skip_if_forbidden
+from tests.server.running import Program, free_port
 
 
 @pytest.mark.parametrize(
@@ -34,13 +38,89 @@ from tests.rights import needs_root, skip_if_forbidden
 def test_a_missing_module_is_named(
     missing: str, remedy: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(client, "block_stop_signals", lambda: None)
+    monkeypatch.setattr(process, "StopSignals", lambda: None)
     for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bridge"}]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
     assert client.main([]) == 1
     said = capsys.readouterr().err
     assert re.match(rf"bridge-client: {missing} cannot be loaded \(.*\): {remedy}", said)
+
+
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        (
+            {"ROS_DOMAIN_ID": "233"},
+            "ROS_DOMAIN_ID is 233: set it to a whole number from 0 to 232, or unset it",
+        ),
+        ({"ROS_DOMAIN_ID": "-3"}, "ROS_DOMAIN_ID is -3: set it to a whole number from 0 to 232, or unset it"),
+        ({"ROS_DOMAIN_ID": "ten"}, "ROS_DOMAIN_ID is not an integral number: set it to a whole number, or"),
+        (
+            {"RMW_IMPLEMENTATION": "rmw_other_cpp"},
+            "RMW_IMPLEMENTATION is 'rmw_other_cpp', which cannot be lo",
+        ),
+        (
+            {"HOME": "/proc/home", "ROS_LOG_DIR": ""},
+            "set HOME, or ROS_LOG_DIR to a directory for its log, which",
+        ),
+        (
+            {"ROS_STATIC_PEERS": "@@"},
+            "ROS cannot create the node (error creating node: Unable to resolve peer",
+        ),
+    ],
+)
+def test_what_the_environment_makes_impossible_is_a_sentence(variables: dict[str, str], said: str) -> None:
+    """Processes: at some of it the middleware ends them by itself, and ROS reads the rest once."""
+    done = subprocess.run(
+        [sys.executable, "-m", "bridge.client"], env={**os.environ, **variables},
+        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
+    )  # fmt: skip
+    *_, line = done.stderr.splitlines()
+    assert line.startswith("bridge-client: ")
+    assert said in line
+    assert done.returncode in (1, 2)
+    assert "/project/src" not in line
+
+
+HANGING = """
+import ctypes, sys
+import rclpy, rclpy.node
+def hang(*_, **__):
+    print("hangs", flush=True)
+    ctypes.PyDLL(None).sleep(600)  # with Python's lock, as rclpy calls the middleware
+{where} = hang
+from bridge import client
+sys.exit(client.main([]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("where", ["rclpy.init", "rclpy.node.Node.__init__"])
+def test_a_signal_ends_it_while_the_middleware_hangs(where: str, number: signal.Signals) -> None:
+    """A process: only the kernel ends one whose Python cannot run."""
+    command = [sys.executable, "-c", HANGING.format(where=where)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as node:
+        assert node.stdout is not None
+        try:
+            assert node.stdout.readline() == "hangs\n"
+            node.send_signal(number)
+            _, said = node.communicate(timeout=PATIENCE_S)
+        finally:
+            node.kill()
+    assert (node.returncode, said) == (-number, "")
+
+
+@needs_root
+def test_without_ipv6_it_waits_for_the_server() -> None:
+    """A process: the kernel gives it no IPv6 socket, although `localhost` has such an address."""
+    port = free_port()
+    arguments = ("--ros-args", "-p", f"server_port:={port}", "-r", f"__ns:=/test_{port}")
+    under = sys.executable, str(Path(without_ipv6.__file__))
+    with contextlib.closing(Program("bridge.client", arguments, under)) as node:
+        node.wait_for(f"no server at localhost:{port} (Connection refused)")
+        with ScriptedServer(port):
+            node.wait_for("connected to")
 
 
 def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,7 +140,11 @@ def test_a_second_signal_counts_only_when_it_is_meant(monkeypatch: pytest.Monkey
     monkeypatch.setattr(signal, "sigwait", wait)
     monkeypatch.setattr(os, "_exit", end)
     monkeypatch.setattr(process, "time", SimpleNamespace(monotonic=lambda: now_s))
-    process.call_on_stop_signal(called.append)
+    monkeypatch.setattr(signal, "pthread_sigmask", lambda *_: None)
+    monkeypatch.setattr(signal, "sigtimedwait", lambda *_: None)
+    stop_signals = process.StopSignals()
+    assert stop_signals.begin()
+    stop_signals.call(called.append)
     assert ended.get(timeout=PATIENCE_S) == 128 + signal.SIGTERM
     assert called == [signal.SIGINT]
     assert next(signals, None) is None

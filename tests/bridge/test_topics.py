@@ -461,6 +461,7 @@ def test_without_tf2_ros(monkeypatch: pytest.MonkeyPatch) -> None:
     ("texts", "words"),
     [
         (["tool-0"], "'tool-0', which cannot be part of a topic's name"),
+        (["/left/tool0"], "has '/left/tool0': frames have no leading slash, give 'left/tool0'"),
         (["0tool 1 2 3"], "'0tool', which cannot be part of a topic's name"),
         (["tcp 1 2"], "it must be NAME, NAME x y z, or NAME x y z qx qy qz qw, in m .2 numbers follow"),
         (["tcp 0 0 x"], "'tcp 0 0 x': it must be NAME.* .could not convert string to float"),

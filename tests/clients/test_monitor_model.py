@@ -210,6 +210,19 @@ def test_drift_and_the_line_by_temperature_are_told(model: Model) -> None:
     assert sensor.zero == f"{texts(sensor)[0]}; by temperature, of 3 runs: Fz +0.250 ± 0.100 N/K"
 
 
+def test_a_monitor_that_was_not_run_blames_neither_server_nor_sensor(model: Model) -> None:
+    """Seen by the thread of the screen first, then by the one that reads."""
+    take(model, *run(0, 10))
+    model.note_unread(0.0, False, now(10))
+    starved = model.state(now(10) + 8.4)
+    assert not starved.server.silent
+    model.note_unread(8.35, False, now(10) + 8.4)
+    model.take(run(10, 1), now(10) + 8.4)
+    (alert,) = only(model, now(10) + 8.4).alerts
+    assert alert.text == "No new sample for 8.4 s, this computer did not run this program for 8.3 s"
+    assert alert.remedy == "Give it a priority, or the computer less to do"
+
+
 @pytest.mark.parametrize(
     ("said", "remedy"),
     [
@@ -268,7 +281,11 @@ def test_an_age_is_noted_only_of_what_was_waited_for(
     came: list[list[int]], noted: list[int], model: Model
 ) -> None:
     batches = iter([[frame(k) for k in batch] for batch in came])
-    client = SimpleNamespace(poll_all=lambda _=0: next(batches), session=SimpleNamespace(same_machine=True))
+    client = SimpleNamespace(
+        poll_all=lambda _=0: next(batches),
+        session=SimpleNamespace(same_machine=True),
+        take_unread=lambda: (0.0, False),
+    )
     ages: list[int] = []
     with mock.patch.object(model, "note_age", lambda made, _: ages.append(made.sequence)):
         Reader(Address("localhost", 1), model)._take(cast("Client", client))

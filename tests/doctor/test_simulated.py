@@ -16,6 +16,7 @@ from ethercat_server.access.adapters import Holder
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor import bus_checks
 from ethercat_server.doctor.bus_checks import ServerView
+from ethercat_server.doctor.report import examine
 from ethercat_server.errors import InterfaceError
 from tests.doctor.running import examined
 from tests.simulation import (
@@ -276,6 +277,8 @@ def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable() -> None:
         ask=lambda action: {"sensors": [sensor]} if action == "describe" else next(statuses),
     )  # fmt: skip
     view = ServerView(cast("Sensors", link), 0.0)
-    [finding] = view.sensors()
+    [finding] = examine("server", "sensors", view.sensors)
     assert "The server lost the sensor once and has it back" in finding.found
     assert "computer stood still" in finding.why
+    assert "see the checks of machine and bus" in finding.why
+    assert "ethercat-doctor" not in finding.why

@@ -6,6 +6,7 @@ What it makes of a stream, `latest` above all, is in tests/protocol/golden/readi
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import re
@@ -14,8 +15,9 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -283,6 +285,81 @@ def test_a_host_that_is_not_known_is_said_so(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
     with pytest.raises(UnreachableError, match=r"^Name or service not known$"):
         connect(12001, "sensor-cell-3")
+
+
+class HeldUp(ScriptedChannel):
+    """Its client is not run for `held_s` once, in a `receive`, and does other things for `busy_s` of it."""
+
+    held_s = 0.0
+
+    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+        count = super().receive(buffer, timeout_s)
+        self._server.now_ns, self.held_s = self._server.now_ns + round(self.held_s * 1e9), 0.0
+        return count
+
+
+@pytest.mark.parametrize("busy", [True, False])
+def test_a_client_knows_of_itself_that_it_did_not_look(
+    busy: bool, server: MemoryServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cpu_ns = 0
+    monkeypatch.setattr(time, "process_time_ns", lambda: cpu_ns)
+    client = Client(1, channel=HeldUp(server))
+    assert client.take_unread() == (0.0, False), "without a connection there is nothing to read"
+    client.connect()
+    client.take_unread()
+    client.poll(1.0)  # nobody sends anything
+    assert client.take_unread()[0] == 0.0
+    server.now_ns += 8_400_000_000
+    cpu_ns += 8_400_000_000 * busy
+    assert client.take_unread() == (8.4, busy)
+    client.poll(0.0)
+    assert client.take_unread() == (8.4, busy), "the same, once it has looked"
+    client.poll(0.1)
+    assert client.take_unread()[0] == 0.0
+    for _ in range(84):  # the thread that reads does other things, which need no CPU: another one runs
+        server.now_ns += 100_000_000
+        unread_s, is_busy = client.take_unread()
+    assert (round(unread_s, 3), is_busy) == (8.4, True)
+
+
+def test_a_client_that_was_not_run_does_not_say_that_the_server_is_silent(server: MemoryServer) -> None:
+    channel = HeldUp(server)
+    client = Client(1, channel=channel).connect()
+    server.now_ns += 10**9  # its caller's
+    channel.held_s = 0.12
+    with pytest.raises(
+        NoSampleError, match=r"for 20 ms: late: this program did not read for 120 ms$"
+    ) as late:
+        client.receive(0.02)
+    assert late.value.condition is Condition.SILENT
+    server.now_ns += 10**9
+    with pytest.raises(NoSampleError, match=r"for 20 ms: silent: nothing arrives from the server$"):
+        client.receive(0.02)
+
+
+@pytest.mark.parametrize("hosts", [("::1", "127.0.0.1"), ("127.0.0.1", "::1")])
+def test_an_address_that_this_computer_cannot_have_is_passed_over(
+    hosts: Sequence[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without IPv6 `localhost` has its address all the same. With a server, and without one before that."""
+
+    class Socket(socket.socket):
+        def __init__(self, family: int = socket.AF_INET, *arguments: Any, **named: Any) -> None:
+            if family == socket.AF_INET6:
+                raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
+            super().__init__(family, *arguments, **named)
+
+    families = [socket.AF_INET6 if ":" in host else socket.AF_INET for host in hosts]
+    port = free_port()
+    found = [(family, 0, 0, "", (host, port)) for family, host in zip(families, hosts, strict=True)]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    monkeypatch.setattr(socket, "socket", Socket)
+    with contextlib.closing(Client(port)) as client:
+        with pytest.raises(UnreachableError, match=r"^Connection refused$"):
+            client.connect()
+        with ScriptedServer(port):
+            client.connect()
 
 
 def test_another_thread_may_close_it(scripted: ScriptedServer) -> None:

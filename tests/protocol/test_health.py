@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, cast
 import pytest
 
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.health.judge import Observation, judge
+from bota_ethercat.health.judge import Observation, judge, who_was_late
 from bota_ethercat.health.observer import StreamObserver
 from bota_ethercat.health.verdict import LIMITS, Level, Verdict
 from bota_ethercat.pdo import encode
@@ -130,6 +130,67 @@ def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable(seen: Obser
         verdict = judge(seen._replace(nominal_hz=800.0, missed_deadlines=missed))
         assert ("its cable" in verdict.sentence) is cable
         assert ("computer stood still" in verdict.sentence) is not cable
+
+
+# What each knows of itself in 8.4 s without a new sample, and who was late by that.
+ITSELF: dict[str, tuple[dict[str, Any], str]] = {
+    "the program did not look": ({"unread_s": 8.3, "busy": False}, "this computer did not run this program"),
+    "the program did not look, and ran": ({"unread_s": 8.3, "busy": True}, "this program did other things"),
+    "the samples were made in time": ({"held_s": 8.3}, "they came late"),
+    "the server says it is lost": ({"is_lost": True}, "the sensor does not answer the bus"),
+    "the sensor does not answer": ({"invalid": 5}, "the sensor does not answer the bus"),
+    "the sensor repeats": ({"repeated": 5}, "the sensor repeats the same sample"),
+    "the server owes an answer": ({"server_silent": True}, "the server does not answer"),
+    "the sensor is out of OP": ({"state": "SAFEOP"}, "in state SAFEOP, not OP"),
+    "the server's loop did not run": ({"missed_deadlines": 6400}, "The server's computer stood still"),
+    "nothing": ({}, "the server sends none"),
+}
+
+
+@pytest.mark.parametrize("known", ITSELF)
+def test_who_was_late_is_decided_by_what_each_knows_of_itself(known: str) -> None:
+    """Who comes earlier hides those after it; 0.3 s in which the program did not look hide nobody."""
+    fields, words = ITSELF[known]
+    seen = Observation(silent_s=8.4, nominal_hz=800.0)
+    for others in [name for name in ITSELF if [*ITSELF].index(name) >= [*ITSELF].index(known)]:
+        both = seen._replace(**{**ITSELF[others][0], **fields})
+        clause, remedy = who_was_late(both)
+        assert words in f"{clause}: {remedy}", others
+        if words not in ("this computer did not run this program", "this program did other things"):
+            assert words in ": ".join(who_was_late(both._replace(unread_s=0.3, busy=False)))
+
+
+def test_losses_and_old_samples_of_a_program_that_did_not_read_are_its_own() -> None:
+    seen = Observation(samples=400, lost=400, skipped=300, nominal_hz=800.0)
+    server = [each.sentence for each in judge(seen).findings]
+    assert ["ethercat-doctor" in sentence for sentence in server] == [True, False]
+    assert "the network, or the server's computer, is too slow" in server[1]
+    for sentence in [each.sentence for each in judge(seen._replace(unread_s=1.0, busy=True)).findings]:
+        assert sentence.endswith("this program did other things for 1.0 s: have it read more often")
+
+
+def arriving(*batches: tuple[float, Sequence[tuple[int, float, int]]]) -> Observation:
+    """Of each batch when it came, s, and of its frames number, stamp, s, and flags."""
+    observer = StreamObserver(800.0, 0)
+    for at_s, rows in batches:
+        frames = [frame(k, flags=flags)._replace(monotonic_ns=round(at * 1e9)) for k, at, flags in rows]
+        observer.take(frames, round(at_s * 1e9))
+    return observer.observation(round(batches[-1][0] * 1e9))
+
+
+def test_stamps_and_numbers_tell_samples_that_came_late_from_samples_that_were_not_made() -> None:
+    first = (0.01, [(1, 0.0, 0)])
+    made = [(number, (number - 1) / 800, 0) for number in range(2, 1601)]
+    late = arriving(first, (2.0, made))
+    assert late.silent_s - late.held_s < 0.1
+    # Most of them were withheld from a program that did not read.
+    late = arriving(first, (2.0, [*made[:400], *made[-3:]]))
+    assert late.silent_s - late.held_s < 0.1
+    not_made = arriving(first, (2.0, [(2, 1.999, 0), (3, 2.0, 0)]))
+    assert not_made.held_s < 0.1
+    repeats = [(number, number / 800, int(DataFlag.REPEATED)) for number in range(2, 1600)]
+    stuck = arriving(first, (1.0, repeats[:800]), (2.0, [*repeats[800:], (1600, 2.0, 0)]))
+    assert stuck.held_s == 0.0
 
 
 def test_the_documented_verdicts_are_these() -> None:

@@ -75,6 +75,15 @@ class IncludeLaunchDescription(StandIn):
         return [runpy.run_path(self.given_to_it[0])["generate_launch_description"]()]
 
 
+class GroupAction(StandIn):
+    def get_sub_entities(self) -> list[Any]:
+        return list(self.given_to_it[0])
+
+
+class PushRosNamespace(StandIn):
+    pass
+
+
 class LaunchConfiguration(StandIn):
     def perform(self, context: dict[str, str]) -> str:
         return context.get(self.given_to_it[0], "")
@@ -88,7 +97,10 @@ class Module(types.ModuleType):
             raise AttributeError(name)
         if name == "get_package_share_path":
             return PACKAGES.get
-        ours = LaunchDescription, DeclareLaunchArgument, IncludeLaunchDescription, LaunchConfiguration
+        ours = (
+            LaunchDescription, DeclareLaunchArgument, IncludeLaunchDescription, GroupAction,
+            PushRosNamespace, LaunchConfiguration,
+        )  # fmt: skip
         return next((own for own in ours if own.__name__ == name), StandIn)
 
 
@@ -118,6 +130,34 @@ def test_it_offers_its_arguments_under_both_names_of_the_package(name: str, pack
     assert set(listed) == ARGUMENTS[name]
 
 
+def configurations(value: Any) -> set[str]:
+    """The names of all arguments that a value is made of."""
+    if isinstance(value, LaunchConfiguration):
+        return {value.given_to_it[0]}
+    if isinstance(value, StandIn):
+        value = value.given_to_it
+    return set().union(*map(configurations, value)) if isinstance(value, list | tuple) else set()
+
+
+@pytest.mark.usefixtures("stand_in")
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_what_it_offers_has_an_effect(name: str) -> None:
+    """An argument that it gives to a file that it includes is made of the argument of that name."""
+    ignored: list[str] = []
+
+    def walk(entity: Any) -> None:
+        entities = entity.get_sub_entities()
+        pushed = {"namespace"} & configurations([e for e in entities if isinstance(e, PushRosNamespace)])
+        for inner in entities:
+            for given, value in dict(inner.named.get("launch_arguments", ())).items():
+                if given not in configurations(value) | pushed:
+                    ignored.append(given)
+            walk(inner)
+
+    walk(runpy.run_path(str(LAUNCH / f"{name}.launch.py"))["generate_launch_description"]())
+    assert not ignored
+
+
 @pytest.mark.usefixtures("stand_in")
 def test_a_parameter_file_is_found_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     start_node = runpy.run_path(str(LAUNCH / "bridge.launch.py"))["start_node"]
@@ -139,6 +179,21 @@ def test_a_parameter_file_is_found_or_refused(tmp_path: Path, monkeypatch: pytes
     assert not node.named["additional_env"]
     (node,) = start_node({"params_file": "~/robot.yaml", "compat": "bota"})  # what that is: tests/bridge
     assert (node.named["name"], len(node.named["parameters"])) == ("bota_ft_sensor", 2)
+
+
+@pytest.mark.usefixtures("stand_in")
+@pytest.mark.parametrize(
+    ("code", "is_shutdown", "fails"), [(0, False, False), (1, False, True), (-2, True, False)]
+)
+def test_a_launch_whose_server_fails_fails_unless_it_was_stopped(
+    code: int, is_shutdown: bool, fails: bool
+) -> None:
+    """Launch has exit code 1 for an exception, and no other way."""
+    end = runpy.run_path(str(LAUNCH / "virtual_server.launch.py"))["end"]
+    event = types.SimpleNamespace(process_name="ethercat-server-2", returncode=code)
+    said = rf"^ethercat-server-2 has ended with exit code {code}: see its message above$"
+    with pytest.raises(RuntimeError, match=said) if fails else contextlib.nullcontext():
+        end(event, types.SimpleNamespace(is_shutdown=is_shutdown))
 
 
 # Run by `ros2 launch`.
@@ -250,10 +305,17 @@ def test_namespace_log_level_respawn_and_text_that_looks_like_a_number(launch: L
 
 
 @pytest.mark.ros
+def test_two_sensors_are_in_a_robots_namespace(launch: Launch) -> None:
+    launched = launch("two_sensors.launch.py", "namespace:=left", f"server_port:={free_port()}")
+    launched.says(r"\[left.sensone.bridge\]: no server", r"\[left.rokubi.bridge\]: no server")
+
+
+@pytest.mark.ros
 def test_a_server_that_is_not_there_ends_the_demo_with_a_sentence(launch: Launch) -> None:
     launched = launch("demo.launch.py", "server_command:=/no/such/server")
-    launched.process.wait(PATIENCE_S)
+    assert launched.process.wait(PATIENCE_S) == 1
     assert "'/no/such/server' is no program: give server_command:=" in launched.log
+    assert "[client-1]: process started" not in launched.log or "[client-1]: process has" in launched.log
 
 
 @pytest.mark.ros

@@ -141,6 +141,11 @@ def test_a_wrong_file_is_refused_by_name(configured: Configured, text: str | byt
         configured(text)
 
 
+def test_a_file_as_editors_of_windows_write_it(configured: Configured) -> None:
+    options = configured("\ufeff[sensor]\r\nsinc_length = 128\r\n")
+    assert options.asked_settings(0, NAME, 1) == {"sinc_length": 128}
+
+
 def test_the_servers_own_settings_from_file_and_command_line(configured: Configured) -> None:
     text = '[server]\ncontrol_users = ["anna", "ben"]\nrt_priority = 50\nstall_timeout_s = 2.5\n'
     plain = parse_options(["ens5", "1"]).server

@@ -750,6 +750,25 @@ def test_lost_at_any_moment_of_a_tare_it_has_the_old_or_new_offset(bench: Bench,
     assert offset(bench) == pytest.approx(reply["new_offset"] if reply["ok"] else [0.0] * 6)
 
 
+def test_a_change_that_somebody_asked_for_is_not_logged_as_one_that_had_to_be_put_right(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    assert bench.ask("configure", settings={"sinc_length": 32, "fir": True})["ok"]
+    (line,) = [
+        line
+        for line in caplog.messages
+        if "1600 Hz" in line and "sensor 0 was changed as requested: " in line
+    ]
+    assert "fir = true (was false)" in line
+    assert "a sampling rate of 1600 Hz (was 800 Hz)" in line
+    assert " held " not in caplog.text
+    # Without what was not saved it is put right, and that is said.
+    bench.command("power cycle 0.2")
+    bench.run(1.0)
+    assert "sensor 0 held fir = false (wanted: true), a sampling rate of 800 Hz" in caplog.text
+
+
 # -- a server that is started again
 
 

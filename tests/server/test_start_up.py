@@ -38,6 +38,7 @@ from ethercat_server.sensor.objects.dictionary import BY_SETTING
 from ethercat_server.sensor.scan import look_safely
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
+from ethercat_server.virtual_sensor import virtual_bus
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.foreign import ForeignSlave, parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -344,6 +345,38 @@ def test_a_virtual_sensor_that_does_not_start(caplog: pytest.LogCaptureFixture) 
     """Its process and its exit code."""
     said = fails(caplog, "virtual", "PORT", "--virtual", "--sensors 0")
     assert said.startswith("the virtual sensor did not start (exit code 2): see its message above")
+
+
+@on_a_bus
+def test_a_virtual_sensor_that_takes_too_long_is_not_said_to_lack_rights(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its process, which has not said anything yet."""
+    monkeypatch.setattr(virtual_bus, "_START_TIMEOUT_S", 0.0)
+    with pytest.raises(ServerError) as said, virtual_bus.VirtualBus():
+        pass
+    sentence = "the virtual sensor did not start within 0 s: this computer is too busy, start it again later"
+    assert str(said.value) == sentence
+
+
+@pytest.mark.parametrize(
+    ("code", "missing", "words"),
+    [
+        (1, [], " (exit code 1): see its message above"),
+        (
+            1,
+            ["CAP"],
+            " (exit code 1): see its message above; it needs root, or a kernel with user namespaces",
+        ),
+        (2, ["CAP"], " (exit code 2): see its message above"),
+        (-9, ["CAP"], ": its process was ended by SIGKILL, start it again"),
+    ],
+)
+def test_why_a_virtual_sensor_did_not_start(
+    code: int, missing: list[str], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(virtual_bus, "missing_capabilities", lambda: missing)
+    assert virtual_bus._why_not_started(code) == f"the virtual sensor did not start{words}"
 
 
 def stop_in_time(ifname: str, sensor: Program | None = None) -> str:

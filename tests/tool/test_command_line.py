@@ -132,6 +132,7 @@ def test_no_such_interface(command: str) -> None:
         ("[]", "not a snapshot"),
         ('{"format": "ethercat-sensor snapshot", "version": 2}', "not a snapshot"),
         ('{"format": "ethercat-sensor snapshot", "version": 1}', "damaged"),
+        ('\ufeff{"format": "ethercat-sensor snapshot", "version": 1}', "damaged"),
     ],
 )
 def test_a_file_that_is_no_snapshot(tmp_path: Path, text: str, named: str) -> None:

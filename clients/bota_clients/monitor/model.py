@@ -186,6 +186,7 @@ class _Sensor:
         self._saturated: frozenset[str] = frozenset()
         self._now: list[Finding] = []
         self._seen: dict[str, tuple[Finding, float]] = {}  # since the reset, each at its worst, and when last
+        self.unread = 0.0, False, -math.inf  # the latest that matters of `Client.take_unread`, and when
         self._grown: dict[str, tuple[int, float]] = {}  # by how much counts of `status` last grew, and when
         self._emergency = "", 0.0
         self._emergencies: int | None = 0  # how many there were when `_emergency` was the last
@@ -253,7 +254,10 @@ class _Sensor:
         said, at_s = self._emergency
         grown = {name: by for name, (by, then_s) in self._grown.items() if now_s - then_s < _JUDGED_S}
         seen = self.observer.observation(_ns(now_s), _JUDGED_NS)
+        unread_s, busy, unread_at_s = self.unread
         return seen._replace(
+            unread_s=unread_s if now_s - unread_at_s < _JUDGED_S else 0.0,
+            busy=busy,
             not_finite=seen.not_finite + ("not_finite" in grown),
             recoveries=int("recoveries" in grown),
             missed_deadlines=grown.get("missed_deadlines", 0),
@@ -336,6 +340,7 @@ class Model:
         self._since_s: float | None = None
         self._own_peer = ""
         self._heard_s = 0.0
+        self._read_s = math.inf  # when somebody looked last whether anything had come
         self._status: JsonObject = {}
         self._status_s = 0.0
         self._clients: tuple[Client, ...] = ()
@@ -372,6 +377,14 @@ class Model:
             for position, of_one in by_sensor(frames).items():
                 if position in self._sensors:
                     self._sensors[position].take(of_one, now_s)
+
+    def note_unread(self, seconds: float, busy: bool, now_s: float) -> None:
+        """The frames that come next were not read for so long; see `Client.take_unread`."""
+        with self._lock:
+            self._read_s = now_s
+            if seconds >= SILENT_S:
+                for sensor in self._sensors.values():
+                    sensor.unread = seconds, busy, now_s
 
     def note_age(self, frame: DataMessage, now_ns: int) -> None:
         """This frame arrived exactly at this CLOCK_MONOTONIC."""
@@ -435,7 +448,7 @@ class Model:
             server = replace(
                 self._server,
                 since_s=None if self._since_s is None else now_s - self._since_s,
-                heard_s=now_s - self._heard_s if connected else None,
+                heard_s=max(min(now_s, self._read_s) - self._heard_s, 0.0) if connected else None,
                 uptime_s=up_s + now_s - self._status_s if up_s is not None and connected else up_s,
                 cycles=whole(status.get("cycles")),
                 missed_deadlines=whole(status.get("missed_deadlines")),

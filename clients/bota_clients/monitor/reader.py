@@ -60,6 +60,7 @@ class Reader(threading.Thread):
         piled_up = self._sort(client, client.poll_all())
         fresh = self._sort(client, client.poll_all(_NEXT_SAMPLE_S))
         now_ns = time.monotonic_ns()
+        self._model.note_unread(*client.take_unread(), now_ns * 1e-9)
         self._model.take(piled_up + fresh, now_ns * 1e-9)
         # What arrived while this thread decoded waited for it: its age is not that of the server.
         if len(piled_up) < _MOST_PILED and client.session.same_machine:

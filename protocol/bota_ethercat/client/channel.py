@@ -85,18 +85,20 @@ class TcpChannel:
 
     def connect(self, timeout_s: float) -> bool:
         """See `Channel`."""
-        try:
-            if self._sock is None:
-                if not 0 < self._port < 65536:
-                    raise UnreachableError(f"{self._port} is no port: it must be from 1 to 65535")
-                found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
-                self._untried = [(family, address) for family, _, _, _, address in found]
-                self._begin(*self._untried.pop(0))
-        except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
-            raise UnreachableError(_reason(error)) from None
-        while True:
-            assert self._sock is not None
+        if self._sock is None:
+            if not 0 < self._port < 65536:
+                raise UnreachableError(f"{self._port} is no port: it must be from 1 to 65535")
             try:
+                found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
+            except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
+                raise UnreachableError(_reason(error)) from None
+            self._untried = [(family, address) for family, _, _, _, address in found]
+        why = ""
+        while True:
+            try:
+                if self._sock is None:
+                    self._begin(*self._untried.pop(0))
+                assert self._sock is not None
                 if not _is_writable(self._sock, timeout_s):
                     if self.monotonic_ns() < self._give_up_ns:
                         return False
@@ -107,9 +109,10 @@ class TcpChannel:
                 return True
             except OSError as error:  # "localhost" is ::1 and 127.0.0.1: the server may listen on one only
                 self.close()
+                if not why or error.errno != errno.EAFNOSUPPORT:  # this: no IPv6 here
+                    why = _reason(error)
                 if not self._untried:
-                    raise UnreachableError(_reason(error)) from None
-                self._begin(*self._untried.pop(0))
+                    raise UnreachableError(why) from None
 
     def _begin(self, family: socket.AddressFamily, address: tuple[object, ...]) -> None:
         self._give_up_ns = self.monotonic_ns() + round(CONNECT_TIMEOUT_S * 1e9)
@@ -117,7 +120,9 @@ class TcpChannel:
         # Before connecting: else the kernel lets it grow to megabytes, which hold a minute of samples.
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._receive_buffer)
         self._sock.setblocking(False)
-        self._sock.connect_ex(address)  # how it went, SO_ERROR tells
+        failed = self._sock.connect_ex(address)
+        if failed not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):  # how others went, SO_ERROR tells
+            raise OSError(failed, os.strerror(failed))
 
     def _prepare(self, sock: socket.socket) -> None:
         own, peer = sock.getsockname(), sock.getpeername()

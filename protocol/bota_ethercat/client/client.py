@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
@@ -29,6 +30,7 @@ from bota_ethercat.client.real_time import Scheduling, make_real_time
 from bota_ethercat.client.session import ClientEvent, Session, check_granted
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, ProtocolError, UnreachableError
 from bota_ethercat.framing import DataMessage, TerminalMessage
+from bota_ethercat.health.sentences import did_not_read
 from bota_ethercat.pdo import ImuUnits, Sample
 from bota_ethercat.terminal import decode_terminal
 from bota_ethercat.text.json_text import JsonObject
@@ -133,6 +135,11 @@ class Client:
         self._failed: ProtocolError | None = None
         self._reader: int | None = None
         self._stepping = False
+        # When it looked at its connection last, until when it may wait there, and the longest time beyond.
+        self._looked_ns = self._watched_ns = self._unread_ns = 0
+        # Of `take_unread`: the last call; when the present wait began; the CPU time at the first call in it,
+        # and the longest time between calls.
+        self._taken_ns, self._since_ns, self._cpu_ns, self._apart_ns = 0, 0, 0, 0
         self._sending = threading.Lock()
         self._closing = threading.Event()
 
@@ -202,6 +209,7 @@ class Client:
             timeout_s = session.timeout_s if self._timeout_s is None else self._timeout_s
         deadline_ns = self.channel.monotonic_ns() + round(timeout_s * 1e9)
         left_s, frames = timeout_s, list[DataMessage]()
+        self._looked_ns, self._unread_ns = self.channel.monotonic_ns(), 0  # what was before is its caller's
         while not frames and left_s > 0:
             self._gather(left_s)
             frames = self._take_items()
@@ -214,6 +222,8 @@ class Client:
             round(timeout_s * 1e9), self.channel.monotonic_ns(), connected=session.connected
         )
         why = f"{condition} ({session.problem})" if session.problem else str(condition)
+        if condition is Condition.SILENT and (unread_s := self._unread_ns * 1e-9) > timeout_s:
+            why = f"late: {did_not_read(unread_s)[0]}"
         raise NoSampleError(condition, f"no new sample of sensor {silent} for {timeout_s * 1e3:g} ms: {why}")
 
     def __iter__(self) -> Iterator[Sample]:
@@ -271,7 +281,9 @@ class Client:
             while not over.is_set():
                 left_ns = deadline_ns - self.channel.monotonic_ns()
                 if left_ns <= 0:
-                    raise NoReplyError(f"no reply to {action} within {timeout_s:g} s")
+                    late_s = (self.channel.monotonic_ns() - self._watched_ns) * 1e-9
+                    why = f": {did_not_read(late_s)[0]}" if late_s > timeout_s / 2 else ""
+                    raise NoReplyError(f"no reply to {action} within {timeout_s:g} s{why}")
                 if self._reader == threading.get_ident():
                     self._step(left_ns * 1e-9)
                 else:
@@ -296,6 +308,22 @@ class Client:
             self.session.forget(future)
             raise
         return future
+
+    def take_unread(self) -> tuple[float, bool]:
+        """The longest time since the last call in which it did not look at its connection though it should
+        have, s, and whether this process did other things meanwhile, or was not run. For health's `judge`;
+        to be called regularly, from any thread.
+        """
+        now_ns, cpu_ns = self.channel.monotonic_ns(), time.process_time_ns()
+        longest_ns = max(self._unread_ns, now_ns - self._watched_ns) if self._open else 0
+        # It did other things if it used the CPU, or if the thread that calls this was run all the time.
+        apart_ns = now_ns - self._taken_ns
+        self._apart_ns = max(self._apart_ns, apart_ns)
+        busy = max(cpu_ns - self._cpu_ns, longest_ns - self._apart_ns) > longest_ns // 2
+        if self._since_ns != self._looked_ns:
+            self._since_ns, self._cpu_ns, self._apart_ns = self._looked_ns, cpu_ns, apart_ns
+        self._taken_ns, self._unread_ns = now_ns, 0
+        return longest_ns * 1e-9, busy
 
     # -- one step at a time
 
@@ -332,9 +360,13 @@ class Client:
             if self._closing.is_set():
                 raise ConnectionFailedError(_CLOSED)
             if self._open:
+                self._watched_ns = self._looked_ns + round(timeout_s * 1e9)
                 with session.get_buffer() as buffer:
                     count = channel.receive(buffer, timeout_s)
-                answer = session.received(count, channel.monotonic_ns())
+                now_ns = channel.monotonic_ns()
+                self._unread_ns = max(self._unread_ns, now_ns - self._watched_ns)
+                self._looked_ns = self._watched_ns = now_ns
+                answer = session.received(count, now_ns)
                 if answer:
                     self._send(answer)
                 return count
@@ -345,6 +377,7 @@ class Client:
                 channel.wait(self._closing, min(wait_s, timeout_s))
             elif channel.connect(timeout_s):
                 self._open = True
+                self._looked_ns = self._watched_ns = channel.monotonic_ns()
                 self._send(session.opened(channel.monotonic_ns(), is_near=channel.is_near))
         except ProtocolError as error:
             if self._failed is error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
-from bota_ethercat.health.sentences import STOOD_STILL
+from bota_ethercat.health.sentences import IT_TELLS, STOOD_STILL, did_not_read
 from bota_ethercat.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
 from bota_ethercat.pdo import AXES
 from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain
@@ -22,9 +22,13 @@ class Observation(NamedTuple):
     seconds: float = 0.0  # how long it was observed
     samples: int = 0  # new ones
     lost: int = 0  # samples that did not come: lost on the bus or in the server, or not read in time
+    skipped: int = 0  # samples that came, but too old
     repeated: int = 0
     invalid: int = 0  # frames
     silent_s: float = 0.0  # the longest time without a new sample, up to the end of the observation
+    held_s: float = 0.0  # of that, the time by which samples that had been made came later
+    unread_s: float = 0.0  # the longest time in which the program that observes did not look for samples
+    busy: bool | None = None  # whether it did other things meanwhile; None: unknown
     rate_hz: float | None = None  # new samples a second, by their stamps
     nominal_hz: float = 0.0
     age_p99_us: float | None = None  # of the samples on arrival; None on another machine than the server's
@@ -68,6 +72,9 @@ _CABLE: Final = "Check its cable and power"
 _STOOD_STILL: Final = f"The server's {STOOD_STILL.format(' meanwhile')}"
 # Missed deadlines that amount to this time explain why a sensor did not answer, or left OP.
 _STANDSTILL_S: Final = 0.02
+_STALL_S: Final = 0.02  # a shorter one makes no sample old
+# Samples of about this time wait for a program that does not read; what comes then is withheld from it.
+_BUFFERED_S: Final = 0.25
 
 
 def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:
@@ -78,7 +85,7 @@ def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:
 def _findings(seen: Observation, limits: Limits) -> Iterator[Finding]:
     silent = seen.silent_s > limits.stale_after
     if silent:
-        yield _silence(seen)
+        yield _silence(seen, limits)
     elif seen.is_lost:
         yield _trouble("silence", "The server has lost the sensor", _advice(seen))
     elif not seen.samples and seen.state not in _STREAMING:
@@ -100,22 +107,45 @@ def _look(key: str, found: str, remedy: str, about: About = About.STREAM, size: 
 
 def _advice(seen: Observation) -> str:
     """Where to look for the reason why a sensor did not answer."""
-    stood_still = seen.missed_deadlines > _STANDSTILL_S * seen.nominal_hz > 0
-    return _STOOD_STILL if stood_still else _CABLE
+    return _STOOD_STILL if _stood_still(seen) else _CABLE
 
 
-def _silence(seen: Observation) -> Finding:
-    if seen.is_lost or seen.invalid:
-        why, remedy = "the sensor does not answer the bus", _advice(seen)
-    elif seen.repeated:
-        why, remedy = "the sensor repeats the same sample again and again", "Power-cycle it"
-    elif seen.server_silent:
-        why, remedy = "the server does not answer", "It is stopped or overloaded"
-    elif seen.state not in _STREAMING:
-        why, remedy = f"the server has the sensor in state {seen.state}, not OP", "See its log"
-    else:
-        why, remedy = "the server sends none", "See its log"
+def _stood_still(seen: Observation) -> bool:
+    """Whether the server's loop did not run for a time that explains it."""
+    return seen.missed_deadlines > _STANDSTILL_S * seen.nominal_hz > 0
+
+
+def _silence(seen: Observation, limits: Limits) -> Finding:
+    why, remedy = who_was_late(seen, limits)
     return _trouble("silence", f"No new sample for {seen.silent_s:.1f} s, {why}", remedy, size=seen.silent_s)
+
+
+def who_was_late(seen: Observation, limits: Limits = LIMITS) -> tuple[str, str]:
+    """Why there was no new sample for `silent_s`, and what to do: a clause each.
+
+    From what each knows of itself: this program, whether it looked for samples, or did other things; the
+    numbers and stamps of the samples, whether they were made; the frames, whether the sensor answered; the
+    server, whether its loop ran and it answers. Who did not look knows nothing of the others.
+    """
+    least_s = seen.silent_s - limits.stale_after  # what explains this much explains it
+    if seen.unread_s >= least_s or seen.held_s >= least_s:
+        return _who_held_up(seen, least_s)
+    if seen.is_lost or seen.invalid:
+        return "the sensor does not answer the bus", _advice(seen)
+    if seen.repeated:
+        return "the sensor repeats the same sample again and again", "Power-cycle it"
+    if seen.server_silent:
+        return "the server does not answer", "It is stopped or overloaded"
+    if seen.state not in _STREAMING:
+        return f"the server has the sensor in state {seen.state}, not OP", "See its log"
+    return "the server sends none", _STOOD_STILL if _stood_still(seen) else "See its log"
+
+
+def _who_held_up(seen: Observation, least_s: float) -> tuple[str, str]:
+    """As `who_was_late`, of samples that were made in time."""
+    if seen.unread_s >= least_s:
+        return did_not_read(seen.unread_s, busy=seen.busy)
+    return "they came late", "The network, or the server's computer, is too slow"
 
 
 def _values(seen: Observation, limits: Limits) -> Iterator[Finding]:
@@ -164,9 +194,15 @@ def _losses(seen: Observation, limits: Limits) -> Iterator[Finding]:
     if seen.lost >= limits.lost_warn:
         total = seen.samples + seen.lost
         found = f"{seen.lost} of {total} samples ({_percent(seen.lost, total)}) were lost"
-        remedy = "The machine is too busy or the cable is bad; ethercat-doctor tells which"
+        remedy = f"The machine is too busy or the cable is bad; {IT_TELLS}"
+        if seen.unread_s > _BUFFERED_S:
+            why, advice = did_not_read(seen.unread_s, busy=seen.busy)
+            found, remedy = f"{found}, {why}", advice
         level = _many(seen.lost, total, seen, limits)
         yield Finding(level, About.STREAM, "lost", found, remedy, seen.lost)
+    if seen.skipped >= limits.lost_warn:
+        why, remedy = _who_held_up(seen, _STALL_S)
+        yield _look("skipped", f"{seen.skipped} old samples skipped, {why}", remedy, size=seen.skipped)
     if seen.recoveries:
         times = "once" if seen.recoveries == 1 else f"{seen.recoveries} times"
         yield _look("recoveries", f"The server lost the sensor {times} and has it back", _advice(seen))
@@ -206,7 +242,7 @@ def _arrival(seen: Observation, limits: Limits) -> Iterator[Finding]:
 
 def _rate(seen: Observation, limits: Limits) -> Iterator[Finding]:
     rate, nominal = seen.rate_hz, seen.nominal_hz
-    if rate is None or not nominal:
+    if rate is None or not nominal or seen.unread_s > _BUFFERED_S:
         return
     # One sample more or less at either end of a short observation is no deviation.
     slack = 2.0 / seen.seconds if seen.seconds > 0 else 2.0

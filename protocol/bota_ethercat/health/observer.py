@@ -40,6 +40,7 @@ class _Batch(NamedTuple):
     counts: tuple[int, ...] = (0,) * 5  # samples, missing ones; frames repeated and invalid; not finite
     flags: tuple[int, ...] = (0,) * len(_FLAGS)
     silent_ns: int = 0  # how long before there had been no sample; 0 if it brings none
+    held_ns: int = 0  # of that, for how long samples had been made that came later
     first_ns: int = 0  # `monotonic_ns` of the first and the last sample; 0 if it brings none
     last_ns: int = 0
 
@@ -49,7 +50,7 @@ class _Batch(NamedTuple):
             later.at_ns,
             tuple(map(operator.add, self.counts, later.counts)),
             tuple(map(operator.or_, self.flags, later.flags)),
-            max(self.silent_ns, later.silent_ns),
+            *max((self.silent_ns, self.held_ns), (later.silent_ns, later.held_ns)),
             self.first_ns or later.first_ns,
             later.last_ns or self.last_ns,
         )
@@ -99,12 +100,16 @@ class StreamObserver:
         counts, take, before = self._accounting.counts, self._accounting.take, self._counted()
         fresh: list[DataMessage] = []
         previous, missing = self._previous_ns, counts.missing
+        apart_ns = -1 if previous is None else 0  # the longest time in which no sample was made; -1: unknown
         for frame in frames:
             if take(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
-                previous = None
+                previous, apart_ns = None, -1
                 continue
             if previous is not None and counts.missing == missing:
                 self._intervals.append((now_ns, frame.monotonic_ns - previous))
+            if previous is not None and apart_ns >= 0:
+                made_ns = round((counts.missing - missing) * 1e9 / (self._nominal_hz or 1e9))
+                apart_ns = max(apart_ns, frame.monotonic_ns - previous - made_ns)
             previous, missing = frame.monotonic_ns, counts.missing
             fresh.append(frame)
         self._previous_ns = previous
@@ -116,6 +121,7 @@ class StreamObserver:
             batch = batch._replace(
                 flags=tuple(functools.reduce(operator.or_, (row[index] for row in rows)) for index in _FLAGS),
                 silent_ns=now_ns - self._fresh_at_ns,
+                held_ns=max(now_ns - self._fresh_at_ns - apart_ns, 0) if apart_ns >= 0 else 0,
                 first_ns=fresh[0].monotonic_ns,
                 last_ns=fresh[-1].monotonic_ns,
             )
@@ -145,13 +151,15 @@ class StreamObserver:
         samples, lost, repeated, invalid, not_finite = seen.counts
         warnings, force_torque, acceleration, angular_rate = seen.flags
         span_ns = seen.last_ns - seen.first_ns
+        since_ns = now_ns - self._fresh_at_ns
         return Observation(
             seconds=seconds if window_ns is None else min(seconds, window_ns * 1e-9),
             samples=samples,
             lost=lost,
             repeated=repeated,
             invalid=invalid,
-            silent_s=max(seen.silent_ns, now_ns - self._fresh_at_ns) * 1e-9,
+            silent_s=max(seen.silent_ns, since_ns) * 1e-9,
+            held_s=seen.held_ns * 1e-9 if seen.silent_ns > since_ns else 0.0,
             rate_hz=(samples - 1) * 1e9 / span_ns if span_ns > 0 else None,
             nominal_hz=self._nominal_hz,
             age_p99_us=p99(self.ages_us(now_ns, window_ns)),

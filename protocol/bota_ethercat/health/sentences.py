@@ -12,7 +12,10 @@ from typing import Any, Final
 from bota_ethercat.control import Event
 from bota_ethercat.text.untrusted import number, printable, text, whole
 
-STOOD_STILL: Final = "computer stood still{}, check it with ethercat-doctor"
+# What others than the doctor advise.
+CHECK_IT: Final = "check it with ethercat-doctor"
+IT_TELLS: Final = "ethercat-doctor tells which"
+STOOD_STILL: Final = f"computer stood still{{}}, {CHECK_IT}"
 _EVENTS: Final[Mapping[str, str]] = {
     Event.SENSOR_LOST: "{} is lost",
     Event.SENSOR_BACK: "{} is back",
@@ -26,6 +29,19 @@ _EVENTS: Final[Mapping[str, str]] = {
 def no_server(address: object, why: object) -> str:
     """Nothing answers at that address."""
     return f"no server at {address} ({why}): start ethercat-server, or give its address"
+
+
+def did_not_read(seconds: float, *, busy: bool | None = None) -> tuple[str, str]:
+    """That this program itself was late, and what to do; `busy`: whether it used the CPU, None if unknown."""
+    lasted = f"for {seconds:.1f} s" if seconds >= 1 else f"for {seconds * 1e3:.0f} ms"
+    if busy is None:
+        return f"this program did not read {lasted}", "It, or this computer, is too busy"
+    if busy:
+        return f"this program did other things {lasted}", "Have it read more often"
+    return (
+        f"this computer did not run this program {lasted}",
+        "Give it a priority, or the computer less to do",
+    )
 
 
 def event_sentence(event: Mapping[str, Any]) -> str:

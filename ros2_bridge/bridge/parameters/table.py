@@ -269,11 +269,7 @@ def gather(given: Mapping[str, Any]) -> Parameters:
             )
         values["server_port"] = alias
     for name in ("frame_id", "imu_frame_id", "orientation.base_frame"):
-        if values[name].startswith("/"):
-            raise ParameterError(
-                f"parameter {name} is {values[name]!r}: frames have no leading slash, give "
-                f"{values[name].lstrip('/') or 'a name'!r}"
-            )
+        _refuse_slash(f"parameter {name} is", values[name])
     gravity, mounting = values["gravity"], values["orientation.mounting"]
     if length(gravity) < _LEAST_GRAVITY:
         raise ParameterError(
@@ -309,6 +305,12 @@ def gather(given: Mapping[str, Any]) -> Parameters:
     return Parameters(**groups, **{name.replace(".", "_"): value for name, value in values.items()})
 
 
+def _refuse_slash(what: str, frame: str) -> None:
+    if frame.startswith("/"):
+        name = frame.lstrip("/") or "a name"
+        raise ParameterError(f"{what} {frame!r}: frames have no leading slash, give {name!r}")
+
+
 def parse_frames(texts: Sequence[str]) -> tuple[WrenchFrame, ...]:
     """The frames of all strings of `wrench_frames` that are not empty; ParameterError.
 
@@ -324,6 +326,7 @@ def parse_frames(texts: Sequence[str]) -> tuple[WrenchFrame, ...]:
 
 def _parse_frame(text: str) -> WrenchFrame:
     name, *words = text.split()
+    _refuse_slash("parameter wrench_frames has", name)
     if not _FRAME_NAME.fullmatch(name):
         raise ParameterError(
             f"parameter wrench_frames has {name!r}, which cannot be part of a topic's name: use letters, "

@@ -29,7 +29,7 @@ from bridge.process import Worker
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
 from bridge.stream.link import SYSTEM_CLOCK, Clock, Link, sentence
 
-_WAIT_S: Final = 1.0
+_WAIT_S: Final = 0.1  # so that silence is known to be the server's
 # Times that a ROS message can carry, less the longest delay of a filter.
 _FIRST_STAMP_NS: Final = LONGEST_MS * 10**6
 _LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
