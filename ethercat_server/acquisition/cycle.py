@@ -17,10 +17,12 @@ from ethercat_server.acquisition.health import RoundTripHealth
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import OutgoingFrame, SensorStream
+from ethercat_server.acquisition.tracing import Tracing
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.exchange import DUPLICATE, LATCHED, Exchange
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.sample_clock import SampleClock
+from ethercat_server.sampling.trace import Kind
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
 # Sockets are served this often even if every deadline has passed,
@@ -89,6 +91,7 @@ class Cycle:
         self._round_trip = round_trip
         self._cost_ns = _FIRST_COST_NS  # what an exchange and its samples keep the loop busy
         self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
+        self.tracing = Tracing(round_trip, streams, bus.process_data)
         self._round_trip_health = RoundTripHealth(round_trip, bus.ifname)
         # By frame of the exchange: where it carries what of which sensor.
         self._carried = [
@@ -265,7 +268,7 @@ class Cycle:
             data = frame[start:end]
             # The working counter does not tell sensors apart: one that is out may be counted for another.
             if not complete or sensor.state is not _STREAMING or data == untouched:
-                made = stream.invalid(wkc, back)
+                made = stream.invalid(exchange)
             else:
                 made = stream.take(data, exchange, LATCHED.unpack_from(frame, at) if at else None)
             if made is not None:
@@ -302,12 +305,14 @@ class Cycle:
             self._recovery.causes.stood_still(back - max(arrived, since_ns), back)
         arrived = max(sent, arrived - self._wire_ns[which])
         if learners:
+            self.tracing.notes.append((-1, exchange, arrived, self._woke_late_ns, Kind.LEARNED))
             round_trip.learn(sent, arrived, back, self._woke_late_ns)
             self._woke_late_ns = None
             for clock in learners:
                 clock.learn(arrived)
             self._cost_ns += _COST_GAIN * (self._bus.clock.monotonic_ns() - back - self._cost_ns)
         else:
+            self.tracing.notes.append((-1, exchange, arrived, None, Kind.SHORT))
             round_trip.shorten(sent, arrived)
             for row in self._carried[which]:
                 row[-1].learn_short(exchange, arrived)
@@ -317,6 +322,7 @@ class Cycle:
         """Housekeeping that is not done for every exchange, a little at a time."""
         self._chores_at_ns = now + _CHORES_EVERY_NS
         self._streams[0].realtime_offset.follow()
+        self.tracing.pack()
         next(self._in_turn).count()
         for stream in self._streams:
             stream.health.count()
@@ -334,6 +340,7 @@ class Cycle:
         self._plan()
         self._round_trip_health.check()
         self._recovery.check()
+        self.tracing.second()
         for stream in self._streams:
             stream.check()
             if stream.clock.events is None:

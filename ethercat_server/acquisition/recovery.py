@@ -164,7 +164,7 @@ class SensorRecovery:
         if events and self._sensor.streams and events.trust.is_due(self._bus.clock.monotonic_ns()):
             self._slave.latch_events()
             if (clock := self._bus.read_clock(self._number)) is not None:
-                events.retry(clock)
+                self._stream.retry_events(clock)
 
     def lose(self, reason: str) -> None:
         """The sensor does not take part any more, if it did."""

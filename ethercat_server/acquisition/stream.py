@@ -8,7 +8,7 @@ that was overtaken by a later one is ignored.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.framing import DataFlag, encode_data
@@ -76,6 +76,9 @@ class SensorStream:
         # The working counter of an exchange since then that was not valid; 0 for none.
         self._short_wkc = 0
         self._moment_ns = 0  # of the newest sample
+        self.notes: list[tuple[Any, ...]] = []  # see `Tracing`
+        self.on_change: Callable[[], None] = lambda: None  # the clock is another one, or begins anew
+        self.model, self.nominal_hz = sensor.identity.name, 1e9 / sensor.period_ns
         self.idle_at_ns = 0.0  # it is silent from then on
 
     def _new_clock(self, period_ns: float, latching: DistributedClock | None) -> SampleClock:
@@ -118,6 +121,7 @@ class SensorStream:
         """Account for what an exchange brought, once it is handed out; whether `clock.learn` must follow."""
         if exchange is not self._exchange:
             return False
+        self.notes.append((self.number, exchange, self._fresh))
         if self._fresh:
             self.idle_at_ns = exchange.back_ns + SILENT_PERIODS * self.clock.phase.period_ns
             if self.clock.locked:
@@ -135,10 +139,11 @@ class SensorStream:
         if exchange is self._exchange:
             self.clock.learn_events(exchange.sent_ns, arrived_ns)
 
-    def invalid(self, wkc: int, back_ns: int) -> OutgoingFrame | None:
+    def invalid(self, exchange: Exchange) -> OutgoingFrame | None:
         """The frame for an exchange that brought nothing of this sensor, as `idle`."""
-        self._short_wkc = wkc
-        return self.idle(back_ns)
+        self.notes.append((self.number, exchange, None))
+        self._short_wkc = exchange.wkc
+        return self.idle(exchange.back_ns)
 
     def idle(self, now_ns: int) -> OutgoingFrame | None:
         """The frame that shows the sensor's silence, one a period; None if there is none to show."""
@@ -184,6 +189,13 @@ class SensorStream:
         events = self.clock.events
         if events is not None and events.trust.state is TrustState.ABSENT:
             self.clock.events = None
+            self.on_change()
+
+    def retry_events(self, latching: DistributedClock) -> None:
+        """Try refused event times again; the slave controller's clock may be another one."""
+        if self.clock.events is not None:
+            self.clock.events.retry(latching)
+            self.on_change()
 
     def recover(
         self, period_ns: float | None, *, lost: bool = True, latching: DistributedClock | None = None
@@ -198,6 +210,7 @@ class SensorStream:
             self._discard = DISCARDED_AT_START
             self._gap = 1
             self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
+            self.on_change()
 
     def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply, except for the age."""

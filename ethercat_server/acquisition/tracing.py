@@ -1,0 +1,79 @@
+"""Keeps what the exchanges of the last minute said, for a trace (`sampling.trace`).
+
+The loop only notes what it has at hand; the notes become records in a chore.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any, Final
+
+from bota_ethercat.program.version import VERSION
+from ethercat_server.acquisition.stream import SensorStream
+from ethercat_server.ethercat.exchange import LATCHED, Exchange, ProcessData
+from ethercat_server.sampling.round_trip import RoundTrip
+from ethercat_server.sampling.trace import Clocks, Kind, Ring
+
+_SNAPSHOT_EVERY_S: Final = 20
+_PART: Final = 24 << 10  # bytes of a trace in one reply
+
+
+class Tracing:
+    """The trace of all sensors of a bus. `learned` is a list that the loop appends to."""
+
+    def __init__(
+        self, round_trip: RoundTrip, streams: Sequence[SensorStream], process_data: ProcessData
+    ) -> None:
+        self._round_trip, self._streams = round_trip, streams
+        self._ring = Ring(sum(1e9 / stream.clock.period_ns for stream in streams))
+        # Where a frame has what is latched for a sensor, 0 for nowhere.
+        self._latched = {
+            (which, at.number): at.latched
+            for which, inputs in enumerate(process_data.inputs)
+            for at in inputs
+        }
+        # (sensor, exchange, whether it was new; None if it was invalid), or (-1, exchange, when its answer
+        # arrived, how late the loop had woken, kind of record).
+        self.notes: list[tuple[Any, ...]] = []
+        for stream in streams:
+            stream.notes, stream.on_change = self.notes, self.snapshot
+        self._snapshot_in_s = 0
+        self.snapshot()
+
+    def pack(self) -> None:
+        """Make records of the notes."""
+        ring = self._ring
+        for note in self.notes:
+            exchange: Exchange = note[1]
+            sent_ns, back_ns, frame, wkc, which = exchange
+            if note[0] < 0:
+                ring.learned(sent_ns, back_ns, *note[2:])
+            elif note[2] is None:
+                ring.add(sent_ns, back_ns, note[0], Kind.INVALID, wkc)
+            else:
+                at = self._latched[which, note[0]]
+                latched = LATCHED.unpack_from(frame, at) if at else None
+                ring.observed(sent_ns, back_ns, note[0], wkc, latched, fresh=note[2])
+        self.notes.clear()
+
+    def snapshot(self) -> None:
+        """Keep the state of the clocks: now and then, and where it changed otherwise than by records."""
+        self.pack()
+        self._ring.snapshot(Clocks(self._round_trip, [stream.clock for stream in self._streams]))
+        self._snapshot_in_s = _SNAPSHOT_EVERY_S
+
+    def second(self) -> None:
+        """A second has passed."""
+        self._snapshot_in_s -= 1
+        if self._snapshot_in_s <= 0:
+            self.snapshot()
+
+    def part(self, offset: int) -> dict[str, Any]:
+        """A part of a trace file, from `offset` on; that from 0 on begins a new one."""
+        if not offset:
+            self.pack()
+            sensors = [{"model": stream.model, "nominal_hz": stream.nominal_hz} for stream in self._streams]
+            self._size = self._ring.freeze({"program": f"ethercat-server {VERSION}", "sensors": sensors})
+        data = self._ring.read(offset, _PART)
+        return {"size": self._size, "data": base64.b64encode(data).decode()}
