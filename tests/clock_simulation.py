@@ -270,7 +270,7 @@ class ClockSimulation:
             self.round_trip.learn(sent, arrived, arrived, self._woke_late_ns)
             self._woke_late_ns = None
             clock.learn(arrived)
-        elif back - sent < clock.short_ns:
+        elif clock.events is not None and back - sent < clock.events.local_clock.short_ns:
             self.round_trip.shorten(sent, arrived)
             clock.learn_events(sent, arrived)
         if clock.events is not None and exchange.latched is not None and clock.events.trust.is_due(back):

@@ -22,7 +22,7 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.exchange import DUPLICATE, LATCHED, Exchange
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.sample_clock import SampleClock
-from ethercat_server.sampling.trace import Kind
+from ethercat_server.sampling.trace import Kind, learned
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
 # Sockets are served this often even if every deadline has passed,
@@ -91,7 +91,7 @@ class Cycle:
         self._round_trip = round_trip
         self._cost_ns = _FIRST_COST_NS  # what an exchange and its samples keep the loop busy
         self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
-        self.tracing = Tracing(round_trip, streams, bus.process_data)
+        self.tracing = Tracing(round_trip, streams)
         self._round_trip_health = RoundTripHealth(round_trip, bus.ifname)
         # By frame of the exchange: where it carries what of which sensor.
         self._carried = [
@@ -187,6 +187,8 @@ class Cycle:
         """Derive from the sensors' rates, which change, how exchanges follow each other; once a second."""
         self._shortest_ns = min(stream.clock.period_ns for stream in self._streams)
         self._spacing_ns = min(self._cost_ns / _BUDGET, _LARGEST_WAIT * self._shortest_ns)
+        events = [stream.clock.events for stream in self._streams]
+        self._local_clocks = [each.local_clock for each in events if each is not None]
         # Whether the answer to an exchange is usually back before the next one is due.
         self._one_by_one = all(stream.clock.one_by_one for stream in self._streams)
 
@@ -305,18 +307,19 @@ class Cycle:
             self._recovery.causes.stood_still(back - max(arrived, since_ns), back)
         arrived = max(sent, arrived - self._wire_ns[which])
         if learners:
-            self.tracing.notes.append((-1, exchange, arrived, self._woke_late_ns, Kind.LEARNED))
+            self.tracing.notes.append(learned(exchange, arrived, Kind.LEARNED, self._woke_late_ns))
             round_trip.learn(sent, arrived, back, self._woke_late_ns)
             self._woke_late_ns = None
             for clock in learners:
                 clock.learn(arrived)
             self._cost_ns += _COST_GAIN * (self._bus.clock.monotonic_ns() - back - self._cost_ns)
         else:
-            self.tracing.notes.append((-1, exchange, arrived, None, Kind.SHORT))
+            self.tracing.notes.append(learned(exchange, arrived))
             round_trip.shorten(sent, arrived)
             for row in self._carried[which]:
                 row[-1].learn_short(exchange, arrived)
-        self._short_ns = max(row[-1].clock.short_ns for row in self._carried[which])
+        if self._local_clocks:
+            self._short_ns = max([each.short_ns for each in self._local_clocks])
 
     def _do_chores(self, now: int) -> None:
         """Housekeeping that is not done for every exchange, a little at a time."""

@@ -24,6 +24,7 @@ from ethercat_server.sampling.observation import DistributedClock, Latched
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.sample_clock import SampleClock
 from ethercat_server.sampling.slave_clock import EventTimes
+from ethercat_server.sampling.trace import NOTHING, Kind, Note
 from ethercat_server.sampling.trust import TrustState
 from ethercat_server.sensor.sensor import Sensor
 
@@ -76,7 +77,8 @@ class SensorStream:
         # The working counter of an exchange since then that was not valid; 0 for none.
         self._short_wkc = 0
         self._moment_ns = 0  # of the newest sample
-        self.notes: list[tuple[Any, ...]] = []  # see `Tracing`
+        self.notes: list[Note] = []  # see `Tracing`
+        self._latched: Latched | None = None
         self.on_change: Callable[[], None] = lambda: None  # the clock is another one, or begins anew
         self.model, self.nominal_hz = sensor.identity.name, 1e9 / sensor.period_ns
         self.idle_at_ns = 0.0  # it is silent from then on
@@ -98,7 +100,7 @@ class SensorStream:
         sent_ns, back_ns, _, wkc, _ = exchange
         if sent_ns < self._exchange.sent_ns:  # overtaken
             return None
-        clock, self._exchange = self.clock, exchange
+        clock, self._exchange, self._latched = self.clock, exchange, latched
         self._fresh = fresh = data != self.process_data
         is_next = clock.observe(sent_ns, back_ns, latched, fresh=fresh)
         if not fresh:
@@ -121,7 +123,7 @@ class SensorStream:
         """Account for what an exchange brought, once it is handed out; whether `clock.learn` must follow."""
         if exchange is not self._exchange:
             return False
-        self.notes.append((self.number, exchange, self._fresh))
+        self.notes.append((exchange, self._latched or NOTHING, self.number, self._fresh))
         if self._fresh:
             self.idle_at_ns = exchange.back_ns + SILENT_PERIODS * self.clock.phase.period_ns
             if self.clock.locked:
@@ -141,7 +143,7 @@ class SensorStream:
 
     def invalid(self, exchange: Exchange) -> OutgoingFrame | None:
         """The frame for an exchange that brought nothing of this sensor, as `idle`."""
-        self.notes.append((self.number, exchange, None))
+        self.notes.append((exchange, NOTHING, self.number, Kind.INVALID))
         self._short_wkc = exchange.wkc
         return self.idle(exchange.back_ns)
 

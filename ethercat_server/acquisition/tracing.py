@@ -11,31 +11,20 @@ from typing import Any, Final
 
 from bota_ethercat.program.version import VERSION
 from ethercat_server.acquisition.stream import SensorStream
-from ethercat_server.ethercat.exchange import LATCHED, Exchange, ProcessData
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.trace import Clocks, Kind, Ring
+from ethercat_server.sampling.trace import Clocks, Note, Ring
 
 _SNAPSHOT_EVERY_S: Final = 20
 _PART: Final = 24 << 10  # bytes of a trace in one reply
 
 
 class Tracing:
-    """The trace of all sensors of a bus. `learned` is a list that the loop appends to."""
+    """The trace of all sensors of a bus; the loop appends to `notes`."""
 
-    def __init__(
-        self, round_trip: RoundTrip, streams: Sequence[SensorStream], process_data: ProcessData
-    ) -> None:
+    def __init__(self, round_trip: RoundTrip, streams: Sequence[SensorStream]) -> None:
         self._round_trip, self._streams = round_trip, streams
         self._ring = Ring(sum(1e9 / stream.clock.period_ns for stream in streams))
-        # Where a frame has what is latched for a sensor, 0 for nowhere.
-        self._latched = {
-            (which, at.number): at.latched
-            for which, inputs in enumerate(process_data.inputs)
-            for at in inputs
-        }
-        # (sensor, exchange, whether it was new; None if it was invalid), or (-1, exchange, when its answer
-        # arrived, how late the loop had woken, kind of record).
-        self.notes: list[tuple[Any, ...]] = []
+        self.notes: list[Note] = []
         for stream in streams:
             stream.notes, stream.on_change = self.notes, self.snapshot
         self._snapshot_in_s = 0
@@ -43,18 +32,7 @@ class Tracing:
 
     def pack(self) -> None:
         """Make records of the notes."""
-        ring = self._ring
-        for note in self.notes:
-            exchange: Exchange = note[1]
-            sent_ns, back_ns, frame, wkc, which = exchange
-            if note[0] < 0:
-                ring.learned(sent_ns, back_ns, *note[2:])
-            elif note[2] is None:
-                ring.add(sent_ns, back_ns, note[0], Kind.INVALID, wkc)
-            else:
-                at = self._latched[which, note[0]]
-                latched = LATCHED.unpack_from(frame, at) if at else None
-                ring.observed(sent_ns, back_ns, note[0], wkc, latched, fresh=note[2])
+        self._ring.add(self.notes)
         self.notes.clear()
 
     def snapshot(self) -> None:

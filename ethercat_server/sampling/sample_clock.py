@@ -139,11 +139,6 @@ class SampleClock:
         return self.by_events and not self._schedule.single
 
     @property
-    def short_ns(self) -> float:
-        """An exchange that is back sooner is a short one: `learn_events` from it; 0 without events."""
-        return 0.0 if self.events is None else self.events.local_clock.short_ns
-
-    @property
     def one_by_one(self) -> bool:
         """Whether it is followed, and an exchange is back before the next one is wanted."""
         return self.locked and not self._schedule.single

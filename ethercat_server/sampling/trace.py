@@ -23,6 +23,7 @@ import math
 import struct
 from collections.abc import Iterator, Sequence
 from enum import Enum, IntEnum
+from itertools import count
 from typing import Any, Final, NamedTuple
 
 from ethercat_server.sampling.observation import DistributedClock, Latched
@@ -66,6 +67,21 @@ class Record(NamedTuple):
     kind: Kind
     latched: bool
     wkc: int
+
+
+# (sent_ns, back_ns, frame, working counter, which frame), as the server's `Exchange`.
+Exchanged = tuple[int, int, bytes, int, int]
+# An exchange, what is latched, the sensor, the kind.
+Note = tuple[Exchanged, Latched, int, int]
+NOTHING: Final[Latched] = (0, 0, 0, 0)
+
+
+def learned(
+    exchange: Exchanged, arrived_ns: int, kind: Kind = Kind.SHORT, late_ns: float | None = None
+) -> Note:
+    """That the clocks learn from an exchange; see `RoundTrip.learn`."""
+    late = 0 if late_ns is None else 1 + min(max(0, round(late_ns)), _MOST - 1)
+    return exchange, (min(arrived_ns - exchange[0], _MOST), 0, late, 0), 0, kind
 
 
 class TraceError(Exception):
@@ -150,27 +166,13 @@ class Ring:
         self._snapshots: list[tuple[int, dict[str, Any]]] = []  # with the records before each, in bytes
         self._header, self._begin, self._until = b"", 0, 0
 
-    def add(
-        self, sent_ns: int, back_ns: int, sensor: int, kind: int, wkc: int, a: int = 0, b: int = 0
-    ) -> None:
-        """Keep a record."""
-        at = self._end % len(self._ring)
-        _RECORD.pack_into(self._ring, at, sent_ns, min(back_ns - sent_ns, _MOST), a, b, sensor, kind, wkc)
-        self._end += _RECORD.size
-
-    def observed(
-        self, sent_ns: int, back_ns: int, sensor: int, wkc: int, latched: Latched | None, *, fresh: bool
-    ) -> None:
-        """Keep what `SampleClock.observe` was told."""
-        if latched is not None and latched[1] == latched[3] == 1:
-            self.add(sent_ns, back_ns, sensor, fresh | _LATCHED, wkc, latched[0], latched[2])
-        else:
-            self.add(sent_ns, back_ns, sensor, fresh, wkc)
-
-    def learned(self, sent_ns: int, back_ns: int, arrived_ns: int, late_ns: float | None, kind: Kind) -> None:
-        """Keep from what the clocks learned; see `RoundTrip.learn`."""
-        late = 0 if late_ns is None else 1 + min(max(0, round(late_ns)), _MOST - 1)
-        self.add(sent_ns, back_ns, 0, kind, 0, min(arrived_ns - sent_ns, _MOST), late)
+    def add(self, notes: Sequence[Note]) -> None:
+        """Make records of the notes."""
+        ring, size, at = self._ring, len(self._ring), count(self._end, _RECORD.size)
+        for (sent, back, _, wkc, _), (a, counted, b, too), sensor, kind in notes:
+            kind |= (counted == too == 1) * _LATCHED  # noqa: PLW2901 - a line less for each sample
+            _RECORD.pack_into(ring, next(at) % size, sent, min(back - sent, _MOST), a, b, sensor, kind, wkc)
+        self._end = next(at)
 
     def snapshot(self, clocks: Clocks) -> None:
         """Keep the state before the next record."""
