@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import ipaddress
 import logging
 import os
 from collections.abc import Sequence
+from functools import partial
 
 from ethercat_server.daemon.histories import kept
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
@@ -48,7 +50,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         hub.permissions.names = names
         hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
         server = Server(bus, hub, options, signals.check, watchdog=notifier, extra={"interface": ifname})
-        server.cycle.every_second = lambda: notifier.update(server)
+        server.cycle.every_second = partial(every_second, server, notifier)
         signals.call(server.stop)
         for sensor in server.sensors:
             log.info(
@@ -61,13 +63,23 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
                 log.warning("listening on %s: every machine that can reach it may read the sensors", host)
         log.info("streaming %s on port %d", ifname, options.port)
         notifier.send("READY=1")
-        notifier.update(server)
+        every_second(server, notifier)
         try:
             with kept([stream.drift for stream in server.streams]):
                 server.run()
         finally:
             notifier.send("STOPPING=1")
         log.info("shutting down: the sensors go to INIT")
+
+
+def every_second(server: Server, notifier: Notifier) -> None:
+    """What the loop has done once a second.
+
+    Nothing should be left in reference cycles. For what is all the same, a look at what was made since the
+    last one takes 20 to 40 µs, and sets a limit to the memory of a server that runs for months.
+    """
+    gc.collect(0)
+    notifier.update(server)
 
 
 def _give_up_root(user: User | None, options: ServerOptions) -> None:
