@@ -38,13 +38,11 @@ def no_exception_cycles() -> Iterator[None]:
 
 
 def exception_cycles(garbage: Iterable[object]) -> list[str]:
-    """Where the tracebacks in `garbage` are that are reached from their own frames, but by no test's."""
+    """Where the tracebacks in `garbage` are that are reached from their own frames, not by way of others'."""
     members = {id(each): each for each in garbage}
     found = set[str]()
     for traceback in list(members.values()):
-        if not isinstance(traceback, TracebackType):
-            continue
-        if _is_product(traceback.tb_frame) and not traceback.tb_frame.f_code.co_filename.startswith(_EXCEPT):
+        if isinstance(traceback, TracebackType) and _is_product(traceback.tb_frame):
             seen, waiting = set[int](), [traceback.tb_frame]
             while waiting:
                 each: object = waiting.pop()
@@ -54,15 +52,16 @@ def exception_cycles(garbage: Iterable[object]) -> list[str]:
                         found.add(f"{Path(code.co_filename).relative_to(_ROOT)}:{traceback.tb_lineno}")
                         waiting.clear()
                         break
-                    if id(next_one) in members and id(next_one) not in seen and not _is_tests(next_one):
+                    if id(next_one) in members and id(next_one) not in seen and not _is_others(next_one):
                         seen.add(id(next_one))
                         waiting.append(next_one)
     return sorted(found)
 
 
 def _is_product(frame: FrameType) -> bool:
-    return frame.f_code.co_filename.startswith(_PACKAGES)
+    name = frame.f_code.co_filename
+    return name.startswith(_PACKAGES) and not name.startswith(_EXCEPT)
 
 
-def _is_tests(each: object) -> bool:
+def _is_others(each: object) -> bool:
     return isinstance(each, FrameType) and not _is_product(each)

@@ -124,16 +124,19 @@ class Hub:
             self._pause_ends_ns = ended_ns + min(_PAUSE_RATIO * (ended_ns - began_ns), _LONGEST_PAUSE_NS)
 
     def _read(self, readable: Sequence[int]) -> None:
+        listening = []
         for fd in readable:
-            connection = self.connections.get(fd)
-            if connection is None:
-                self._accept(fd)
+            if (connection := self.connections.get(fd)) is None:
+                listening.append(fd)
                 continue
             connection.receive()
             if connection.state is State.READY:
                 self._ready.append(connection)
             elif connection.state.ending:
                 self._sweep_at_ns = 0
+        # Last: it may close connections that were idle until this pass.
+        for fd in listening:
+            self._accept(fd)
 
     def _accept(self, fd: int) -> None:
         for _ in range(_MAX_ACCEPTS):
