@@ -20,7 +20,7 @@ from ethercat_server.process.signals import Signals
 from ethercat_server.server import Server
 from ethercat_server.serving.connection import Limits
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.permissions import controlling_uids, local_names
+from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import SocketTransport
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 
@@ -33,10 +33,13 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
     user = user_to_become(options.server["user"])
     if user is not None:
         forbid_new_privileges()  # before the log's thread starts
-    control_uids = controlling_uids(options.server["control_users"], options.server["control_groups"])
-    names, notifier = local_names(), Notifier()
+    permissions = Permissions(
+        options.server["control_users"], options.server["control_groups"], user and user.uid
+    )
+    notifier = Notifier()
     with contextlib.ExitStack() as cleanup:
         hub = Hub(SocketTransport(options.server["hosts"], options.port))
+        hub.permissions = permissions
         cleanup.callback(hub.close)
         ifname, priority = options.ifname, options.server["rt_priority"]
         if options.ifname == VIRTUAL_INTERFACE:
@@ -46,8 +49,6 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         bus = cleanup.enter_context(open_bus(ifname, allow_ip=options.allow_ip))
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
         _give_up_root(user, options)
-        hub.permissions.control_uids = control_uids | {os.geteuid()}
-        hub.permissions.names = names
         hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
         server = Server(bus, hub, options, signals.check, watchdog=notifier, extra={"interface": ifname})
         server.cycle.every_second = partial(every_second, server, notifier)

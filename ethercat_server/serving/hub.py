@@ -196,7 +196,7 @@ class Hub:
             return error_reply(message, error.code, str(error), **error.extra)
         except Exception:  # a defect in one action must not stop the acquisition
             log.exception("internal error in a request: %.200r", message)
-            return error_reply(None, ErrorCode.INTERNAL, "the server failed on this request: see its log")
+            return error_reply(message, ErrorCode.INTERNAL, "the server failed on this request: see its log")
 
     def _sweep(self, now_ns: int) -> None:
         """Close those that are beyond a timeout, have received their last reply, or are broken."""

@@ -247,10 +247,11 @@ def test_a_handler_that_fails_costs_one_reply(served: Served, caplog: pytest.Log
     def broken(_connection: Connection, _message: JsonObject) -> JsonObject:
         raise ZeroDivisionError
 
-    bystander, client = served.subscribe(), served.connect(sent=DESCRIBE)
+    bystander, client = served.subscribe(), served.connect()
     served.hub.start(broken)
+    client.send(numbered(1, 7))
     (answer,) = served.read(client)
-    assert answer["error"]["code"] == "internal"
+    assert (answer["reply"], answer["id"], answer["error"]["code"]) == ("describe", 7, "internal")
     assert "internal error in a request" in caplog.text
     served.publish()
     assert served.sequences(bystander) == [0]

@@ -425,9 +425,9 @@ def test_who_is_closed_to_make_room_may_be_ready_too(kind: str | int) -> None:
         watched = hub._watched
         assert watched.readers == {*hub.connections, *network.transport.listening()}
         assert not watched.writers
-    hub.close()
     for client in (*holders, *third):
         client.close()
+    hub.close()
 
 
 # -- only real sockets
