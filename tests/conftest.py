@@ -10,12 +10,14 @@ import re
 import shutil
 import tempfile
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 from scripts.benchmarks.chain import loopback_up
+from tests.exception_cycles import no_exception_cycles
 
 _DOMAINS = 101
 """ROS domains whose ports every system leaves free."""
@@ -57,6 +59,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return None
     text = str(collection_path).lower() + collection_path.read_text(encoding="utf-8").lower()
     return not any(word in text for word in words) or None
+
+
+@pytest.fixture(autouse=True)
+def _no_exception_cycles() -> Iterator[None]:
+    with no_exception_cycles():
+        yield
 
 
 def pytest_collection_finish() -> None:

@@ -392,7 +392,7 @@ class MemoryChannel:
         """The server ends without a word."""
         self.server = None
         if self._stream is not None:
-            self._stream.other.close()
+            self._stream.other.end_sending()  # it may be just running, and must not find it closed
 
     def monotonic_ns(self) -> int:
         now_ns: int = self._clock.monotonic_ns()

@@ -19,7 +19,6 @@ from typing import Final
 
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
 from ethercat_server.acquisition.start_up import AsFound
-from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
@@ -28,7 +27,7 @@ from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.transport import SocketStream, SocketTransport
 from ethercat_server.virtual_sensor.virtual_bus import VIRTUAL_INTERFACE, VirtualBus
 
-STOPPED: Final = BusError("stopped before it was done")
+STOPPED: Final = "stopped before it was done"
 _END_S: Final = 5.0
 _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_PROMISC = 0x8913, 0x8914, 0x100
 _IFREQ: Final = struct.Struct("16sH14x")

@@ -46,7 +46,7 @@ class Jobs:
         self.waiting: list[_Job] = []
         self._turn = 0
         self._stepped_ns = 0
-        self._interrupted: BusError | None = None
+        self._interrupted = ""
 
     def start(
         self,
@@ -69,9 +69,9 @@ class Jobs:
             )
         self.waiting.append(_Job(number, steps, done, changes))
 
-    def interrupt(self, error: BusError) -> None:
-        """Raise `error` in the job that is under way, if there is one; from any thread."""
-        self._interrupted = error
+    def interrupt(self, reason: str) -> None:
+        """Raise BusError with this text in the job that is under way, if there is one; from any thread."""
+        self._interrupted = reason
 
     def is_changing(self, number: int) -> bool:
         """Whether a job that changes the sensor `number` is under way or waits."""
@@ -93,24 +93,24 @@ class Jobs:
         self._step(next(job for job in self.waiting if job.number == self._turn))
 
     def _step(self, job: _Job) -> None:
+        # No variable of this frame may hold what is raised in it: with its traceback, that would keep itself
+        # alive, and the loop runs without a garbage collector.
         number, steps, done, _ = job
         result: Any = None
         error: RequestError | None = None
         try:
             if not self._sensors[number].streams:
-                cut_off = CutOffError(f"sensor {number} {_AWAY}")
-                steps.throw(cut_off)
-                raise cut_off
-            if (interrupted := self._interrupted) is None:
+                steps.throw(CutOffError(f"sensor {number} {_AWAY}"))
+                raise CutOffError(f"sensor {number} {_AWAY}")
+            if not (reason := self._interrupted):
                 next(steps)
             else:
-                self._interrupted = None
-                steps.throw(interrupted)
+                self._interrupted = ""
+                steps.throw(BusError(reason))
             return
         except StopIteration as stop:
             result = stop.value
         except RequestError as refused:
-            # A new one: in a variable of this frame, the one that was raised would keep itself alive.
             error = RequestError(refused.code, str(refused), **refused.extra)
         except BusError as failed:
             error = refusal(failed)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import ipaddress
 import logging
 import os
 from collections.abc import Sequence
+from functools import partial
 
 from ethercat_server.daemon.histories import kept
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
@@ -18,7 +20,7 @@ from ethercat_server.process.signals import Signals
 from ethercat_server.server import Server
 from ethercat_server.serving.connection import Limits
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.permissions import controlling_uids, local_names
+from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import SocketTransport
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 
@@ -31,10 +33,13 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
     user = user_to_become(options.server["user"])
     if user is not None:
         forbid_new_privileges()  # before the log's thread starts
-    control_uids = controlling_uids(options.server["control_users"], options.server["control_groups"])
-    names, notifier = local_names(), Notifier()
+    permissions = Permissions(
+        options.server["control_users"], options.server["control_groups"], user and user.uid
+    )
+    notifier = Notifier()
     with contextlib.ExitStack() as cleanup:
         hub = Hub(SocketTransport(options.server["hosts"], options.port))
+        hub.permissions = permissions
         cleanup.callback(hub.close)
         ifname, priority = options.ifname, options.server["rt_priority"]
         if options.ifname == VIRTUAL_INTERFACE:
@@ -44,11 +49,9 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         bus = cleanup.enter_context(open_bus(ifname, allow_ip=options.allow_ip))
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
         _give_up_root(user, options)
-        hub.permissions.control_uids = control_uids | {os.geteuid()}
-        hub.permissions.names = names
         hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
         server = Server(bus, hub, options, signals.check, watchdog=notifier, extra={"interface": ifname})
-        server.cycle.every_second = lambda: notifier.update(server)
+        server.cycle.every_second = partial(every_second, server, notifier)
         signals.call(server.stop)
         for sensor in server.sensors:
             log.info(
@@ -61,13 +64,23 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
                 log.warning("listening on %s: every machine that can reach it may read the sensors", host)
         log.info("streaming %s on port %d", ifname, options.port)
         notifier.send("READY=1")
-        notifier.update(server)
+        every_second(server, notifier)
         try:
             with kept([stream.drift for stream in server.streams]):
                 server.run()
         finally:
             notifier.send("STOPPING=1")
         log.info("shutting down: the sensors go to INIT")
+
+
+def every_second(server: Server, notifier: Notifier) -> None:
+    """What the loop has done once a second.
+
+    Nothing should be left in reference cycles. For what is all the same, a look at what was made since the
+    last one takes 20 to 40 µs, and sets a limit to the memory of a server that runs for months.
+    """
+    gc.collect(0)
+    notifier.update(server)
 
 
 def _give_up_root(user: User | None, options: ServerOptions) -> None:

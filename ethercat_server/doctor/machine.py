@@ -107,7 +107,7 @@ class Machine:
                 self.facts[name] = CannotLookError(text)
         found = self.facts[name]
         if isinstance(found, CannotLookError):
-            raise found
+            raise CannotLookError(str(found))
         return found
 
     @property

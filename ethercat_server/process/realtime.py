@@ -53,7 +53,8 @@ def prepare(priority: int, cpu: int | None, *, becomes_user: bool = False) -> No
     if refused:
         log.warning("not granted: %s; expect more jitter", ", ".join(refused))
     sys.setswitchinterval(_SWITCH_S)
-    # The loop makes no reference cycles, so it needs no collector, which would pause it.
+    # The loop makes no reference cycles, so it needs no collector, which would pause it: a look at the newest
+    # objects once a second is enough.
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -103,9 +103,8 @@ def tare(
         after = yield from _average(sdo.clock, sensor, stream, samples)
         _check_better(sensor, before, after, samples, target)
     except (BusError, RequestError) as error:
-        failed = yield from _take_back(sdo, sensor, old, error)
-        on_offset(sensor)
-        raise failed from None
+        # In a variable of this frame, what is raised here would keep itself alive.
+        raise (yield from _take_back(sdo, sensor, old, error, on_offset)) from None
     return {
         "old_offset": list(old),
         "new_offset": list(new),
@@ -122,7 +121,11 @@ def _check_fits(offset: Sequence[float], what: str) -> None:
 
 
 def _take_back(
-    sdo: Sdo, sensor: Sensor, old: tuple[float, ...], error: BusError | RequestError
+    sdo: Sdo,
+    sensor: Sensor,
+    old: tuple[float, ...],
+    error: BusError | RequestError,
+    on_offset: Callable[[Sensor], object],
 ) -> Steps[BusError | RequestError]:
     """Write the old offset again; returns `error` with what came of that."""
     addition = "; the old offset is in force"
@@ -135,6 +138,7 @@ def _take_back(
         except BusError as worse:
             sensor.offset, sensor.change_interrupted = old, True
             addition = f"; restoring the former offset failed too: {worse}; tare it again"
+    on_offset(sensor)
     if isinstance(error, RequestError):
         return RequestError(error.code, f"{error}{addition}", **error.extra)
     return extended(error, addition)

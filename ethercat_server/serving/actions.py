@@ -7,13 +7,14 @@ no bus, is served by the same code.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Protocol
 
 from bota_ethercat.address import boot_id
 from bota_ethercat.control import ACTIONS, PROTOCOL_VERSION, ErrorCode, Request, parse_request, reply
 from bota_ethercat.errors import RequestError
 from bota_ethercat.program.version import VERSION
+from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.serving.connection import Connection, Subscription
 from ethercat_server.serving.hub import Hub
@@ -48,12 +49,11 @@ class OnSensors(Protocol):
     def sensors(self) -> Sequence[Described]:
         """All of them, by number."""
 
-    @property
-    def handlers(self) -> Container[str]:
-        """The actions it handles."""
-
     def handle(self, connection: Connection, request: Request) -> None:
-        """Start one and answer later through the hub; RequestError refuses it."""
+        """Start what `request` asks of the sensor whose number it has, and answer later through the hub.
+
+        RequestError refuses it.
+        """
 
 
 class Actions:
@@ -92,10 +92,20 @@ class Actions:
             uid = connection.uid
             who = None if uid is None else self._hub.permissions.name(uid)
             raise RequestError(ErrorCode.DENIED, _denial(request.action, who))
-        if request.action in self._on_sensors.handlers:
-            self._on_sensors.handle(connection, request)
+        if "sensor" in action.parameters:
+            values = {**request.values, "sensor": self._number(request.values["sensor"])}
+            self._on_sensors.handle(connection, request._replace(values=values))
             return None
         return self._handlers[request.action](connection, request)
+
+    def _number(self, choice: SensorChoice) -> int:
+        rows = [sensor.describe() for sensor in self._sensors]
+        found = [row["sensor"] for row in rows if choice.matches(row["sensor"], row["name"], row["serial"])]
+        if len(found) != 1:
+            available = "; ".join("{sensor}: {name} with serial {serial}".format(**row) for row in rows)
+            problem = f"{len(found)} sensors match" if found else "no sensor"
+            raise RequestError(ErrorCode.BAD_REQUEST, f"{problem} {choice} (available: {available})")
+        return int(found[0])
 
     def _describe(self, _: Connection, request: Request) -> JsonObject:
         rows = [sensor.describe() for sensor in self._sensors]

@@ -124,16 +124,19 @@ class Hub:
             self._pause_ends_ns = ended_ns + min(_PAUSE_RATIO * (ended_ns - began_ns), _LONGEST_PAUSE_NS)
 
     def _read(self, readable: Sequence[int]) -> None:
+        listening = []
         for fd in readable:
-            connection = self.connections.get(fd)
-            if connection is None:
-                self._accept(fd)
+            if (connection := self.connections.get(fd)) is None:
+                listening.append(fd)
                 continue
             connection.receive()
             if connection.state is State.READY:
                 self._ready.append(connection)
             elif connection.state.ending:
                 self._sweep_at_ns = 0
+        # Last: it may close connections that were idle until this pass.
+        for fd in listening:
+            self._accept(fd)
 
     def _accept(self, fd: int) -> None:
         for _ in range(_MAX_ACCEPTS):
@@ -193,7 +196,7 @@ class Hub:
             return error_reply(message, error.code, str(error), **error.extra)
         except Exception:  # a defect in one action must not stop the acquisition
             log.exception("internal error in a request: %.200r", message)
-            return error_reply(None, ErrorCode.INTERNAL, "the server failed on this request: see its log")
+            return error_reply(message, ErrorCode.INTERNAL, "the server failed on this request: see its log")
 
     def _sweep(self, now_ns: int) -> None:
         """Close those that are beyond a timeout, have received their last reply, or are broken."""

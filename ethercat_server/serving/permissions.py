@@ -30,9 +30,17 @@ class Permissions:
         names: of this machine's users, by their numbers.
     """
 
-    def __init__(self) -> None:
-        self.control_uids: frozenset[int] = frozenset({0})
-        self.names: Mapping[int, str] = {}
+    def __init__(
+        self, users: Iterable[str] = (), groups: Iterable[str] = (), own_uid: int | None = None
+    ) -> None:
+        """Root, the user `own_uid` that the server becomes (None: is), who ran sudo, and the named ones.
+
+        UsageError names an unknown user or group.
+        """
+        self.control_uids = _controlling_uids(users, groups)
+        if own_uid is not None or hasattr(os, "geteuid"):  # not on Windows, where recordings are replayed
+            self.control_uids |= {os.geteuid() if own_uid is None else own_uid}
+        self.names: Mapping[int, str] = _local_names()
 
     def have_room(self, uid: int | None, clients: Collection[Connection]) -> bool:
         """Whether the user `uid` may connect once more beside these clients."""
@@ -65,8 +73,7 @@ class Permissions:
         return client.find_uid() in self.control_uids
 
 
-def controlling_uids(users: Iterable[str], groups: Iterable[str]) -> frozenset[int]:
-    """Who may control it besides the server's own user; UsageError names an unknown user or group."""
+def _controlling_uids(users: Iterable[str], groups: Iterable[str]) -> frozenset[int]:
     found = {0}
     sudo_uid = os.environ.get("SUDO_UID", "")
     if sudo_uid.isdecimal():
@@ -78,7 +85,7 @@ def controlling_uids(users: Iterable[str], groups: Iterable[str]) -> frozenset[i
     return frozenset(found)
 
 
-def local_names() -> dict[int, str]:
+def _local_names() -> dict[int, str]:
     """The names of this machine's own users: no directory service is asked."""
     try:
         rows = [line.split(":") for line in Path("/etc/passwd").read_text(errors="replace").splitlines()]

@@ -7,7 +7,6 @@ from typing import Any, Final
 
 from bota_ethercat.control import ErrorCode, Event, Request, error_reply, event, reply
 from bota_ethercat.errors import RequestError, SettingError
-from bota_ethercat.sensor_choice import SensorChoice
 from ethercat_server.acquisition.jobs import Done, Jobs, refusal
 from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import SensorStream
@@ -47,7 +46,7 @@ class SensorActions:
         self._recovery = recovery
         self._jobs = jobs
         self._streams = streams
-        self.handlers: Mapping[str, Callable[[Connection, Request], None]] = {
+        self._handlers: Mapping[str, Callable[[Connection, Request], None]] = {
             "sdo_read": self._sdo_read,
             "sdo_write": self._sdo_write,
             "sii_read": self._sii_read,
@@ -57,24 +56,11 @@ class SensorActions:
 
     def handle(self, connection: Connection, request: Request) -> None:
         """Start `request`; RequestError refuses it."""
-        number = self._number(request.values["sensor"])
+        number = request.values["sensor"]
         if request.action in _CHANGES:
             self._check_unchanging(number)  # the sensor may be out of OP because of a change
         self._jobs.check_present(number)
-        values = {**request.values, "sensor": number}
-        self.handlers[request.action](connection, request._replace(values=values))
-
-    def _number(self, choice: SensorChoice) -> int:
-        found = [
-            sensor.number
-            for sensor in self.sensors
-            if choice.matches(sensor.number, sensor.identity.name, sensor.identity.serial)
-        ]
-        if len(found) != 1:
-            available = "; ".join(f"{sensor.number}: {sensor.identity}" for sensor in self.sensors)
-            problem = f"{len(found)} sensors match" if found else "no sensor"
-            raise RequestError(ErrorCode.BAD_REQUEST, f"{problem} {choice} (available: {available})")
-        return found[0]
+        self._handlers[request.action](connection, request)
 
     def _answering(self, connection: Connection, request: Request) -> Done:
         def done(values: Mapping[str, Any], error: RequestError | None) -> None:

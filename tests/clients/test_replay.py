@@ -5,7 +5,10 @@ It runs in a thread, except where its imports are what a test is about.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import random
 import signal
 import socket
 import time
@@ -20,16 +23,21 @@ from bota_clients.replay import cli
 from bota_clients.replay.sensors import ReplayedSensors
 from bota_clients.replay.timeline import Timeline
 from bota_ethercat.client import Client, connect
-from bota_ethercat.control import ErrorCode
+from bota_ethercat.control import ACTIONS, ErrorCode
 from bota_ethercat.errors import RefusedError
 from bota_ethercat.framing import DataFlag, DataMessage
 from bridge.stream.link import find_sensor
+from ethercat_server.serving.actions import Actions
+from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
 from tests.clients.running import Replay, listen, signalled
 from tests.ended import run_here
+from tests.rights import NOBODY, needs_another_user
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port, wait_until
 from tests.server.running import Client as Requests
+from tests.server.test_memory import any_request
+from tests.simulation import Simulation
 
 COUNT = 400
 FRAMES = [frame(n // 2, sensor=n % 2, flags=4 if n == 50 else 0) for n in range(COUNT)]
@@ -116,7 +124,7 @@ def test_describe_says_that_it_is_a_replay(path: Path) -> None:
     assert reply["replay"] == {
         "files": ["run.mcap"], "recorded": "?", "recorded_version": "?", "pace": 2.0, "loop": True,
     }  # fmt: skip
-    assert reply["sensors"] == describe(0, 1)["sensors"]
+    assert reply["sensors"] == [{**row, "settling": False} for row in describe(0, 1)["sensors"]]
     assert reply["protocol"] == 1
 
 
@@ -152,12 +160,81 @@ def test_status_has_all_that_a_server_s_has(path: Path) -> None:
     assert status["clients"][0]["sent"] > 0
 
 
+def test_the_first_subscriber_gets_the_description_that_the_second_gets(path: Path) -> None:
+    made, described = writer(path), describe(0)
+    described["sensors"][0] |= {
+        "offset": [0.5] * 6, "meaning": {"sinc_length": "800 Hz"},
+        "delay_ms": {"force_torque": 2.5, "acceleration": 1.0, "angular_rate": 1.0},
+    }  # fmt: skip
+    made.describe(START_NS, described)
+    for number in range(2000):
+        made.frame(frame(number))
+    made.finish({})
+    with Replay(path) as running, connect(running.port) as first:
+        reading = first.latest(timeout_s=PATIENCE_S)
+        assert reading.frame is not None
+        assert reading.measured_ns() == reading.frame.stamp_ns - 2_500_000
+        with connect(running.port) as second:
+            assert second.latest(timeout_s=PATIENCE_S).fresh
+            assert first.description["sensors"] == second.description["sensors"]
+        assert first.description["sensors"] == [{**described["sensors"][0], "settling": False}]
+
+
+def test_a_position_that_no_sensor_can_have_costs_nothing(path: Path) -> None:
+    made = writer(path)
+    for position in (0, 1_000_000, 256, -1, 10**30, True, 1.0, "0"):
+        reply = describe(0)
+        reply["sensors"][0]["sensor"] = position
+        made.describe(START_NS, reply)
+        made.event(START_NS, {"event": "reconfigured", "sensor": position, "settings": {"sinc_length": 32}})
+    made.frame(frame(0))
+    made.finish({})
+    with open_recording(path) as recording:
+        assert [sensor.sensor for sensor in recording.sensors] == [0]
+        assert len(ReplayedSensors(recording.sensors).sensors) == 1
+
+
+@needs_another_user
+def test_its_own_user_may_end_it_and_nobody_else(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: NOBODY.pw_uid)
+    with Replay("--loop", path) as running:
+        monkeypatch.undo()
+        with Requests(running.port, NOBODY.pw_uid + 1) as client:
+            assert client.ask("shutdown")["error"]["code"] == "denied"
+        with Requests(running.port, NOBODY.pw_uid) as client:
+            assert client.ask("shutdown")["ok"]
+        assert running.wait() == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_requests_are_answered_as_by_a_server_whose_sensors_are_lost(path: Path, seed: int) -> None:
+    """Requests at random, and whether they are granted, or refused with which code."""
+    chance, server = random.Random(seed), Simulation(SensorOptions(), SensorOptions())
+    server.command("power off @0")
+    server.run(1.0)
+    expected = server.connect()
+    with open_recording(path) as recording, contextlib.closing(Simulation()) as other:
+        replayed = ReplayedSensors(recording.sensors)
+        other.hub.start(Actions(other.hub, other.cycle, replayed).handle)
+        client, codes = other.connect(), set[str]()
+        for _ in range(300):
+            action = chance.choice([action for action in (*ACTIONS, "no_such") if action != "shutdown"])
+            keys = any_request(chance, action) if action in ACTIONS else {}
+            found = [each.ask(action, **keys) for each in (expected, client)]
+            wanted, given = [(each["ok"], each.get("error", {}).get("code")) for each in found]
+            assert given == wanted, (action, keys)
+            codes.add(str(wanted[1]))
+    assert codes == {"None", "bad_request", "not_ready", "unknown_action"}
+
+
 @pytest.mark.parametrize(
     ("action", "values"),
     [
         ("configure", {"settings": {"sinc_length": 64}}),
         ("tare", {}),
         ("sdo_read", {"index": 0x8010, "subindex": 1}),
+        ("sdo_write", {"index": 0x8010, "subindex": 1, "hex": "00"}),
+        ("sii_read", {"word": 0}),
     ],
 )
 def test_what_needs_a_sensor_is_refused_in_a_sentence(
@@ -200,15 +277,21 @@ def test_what_happened_happens_again(path: Path) -> None:
 def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
     with open_recording(path) as recording:
         sensors = ReplayedSensors(recording.sensors)
-    for event, state in (("sensor_lost", "lost"), ("sensor_back", "OP")):
+    for event, state in (("sensor_lost", "LOST"), ("sensor_back", "OP")):
         row = {"event": event, "sensor": 1, "settings": {"sinc_length": 32}, "rate_hz": 1600}
+        row |= {"offset": [1.0] * 6, "delay_ms": {"force_torque": 1.0}}
         sensors.take(Event(0, row))
         described = [sensor.describe() for sensor in sensors.sensors]
         assert [sensor["rate_hz"] for sensor in described] == [800, 1600]
+        assert described[1]["offset"] == row["offset"]
         assert [(row["state"], row["settings"]["sinc_length"]) for row in described] == [
             ("OP", 64),
             (state, 32),
         ]
+    sensors.take(Event(0, {"event": "sensor_lost", "sensor": 1, "reason": "different_sensor"}))
+    assert sensors.sensors[1].describe()["state"] == "REFUSED"
+    sensors.take(Event(0, {"event": "offset_changed", "sensor": 1, "offset": [2.0] * 6}))
+    assert sensors.sensors[1].describe()["offset"] == [2.0] * 6
     reply = describe(0)
     reply["sensors"][0]["settling"] = True  # it did when it was described; the node's tare waits for the end
     sensors.describe(Description(0, reply))

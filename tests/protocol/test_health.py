@@ -193,6 +193,16 @@ def test_stamps_and_numbers_tell_samples_that_came_late_from_samples_that_were_n
     assert stuck.held_s == 0.0
 
 
+@pytest.mark.parametrize("explained", ["lost", "invalid", "repeated"])
+def test_what_is_found_already_explains_a_low_rate(explained: str) -> None:
+    """A twentieth of the periods has no sample: nothing, all and half of them are accounted for."""
+    seen = Observation(seconds=10.0, samples=7600, rate_hz=760.0, nominal_hz=800.0)
+    for count, keys in ((0, {"rate"}), (400, {explained}), (200, {explained, "rate"})):
+        changed: dict[str, Any] = {explained: count}
+        found = judge(seen._replace(**changed)).findings
+        assert {finding.key for finding in found} == keys
+
+
 def test_the_documented_verdicts_are_these() -> None:
     rows = (Path(__file__).parents[2] / "docs" / "programs.md").read_text().splitlines()
     for row in (

@@ -26,7 +26,7 @@ from bota_ethercat.control import request
 from bota_ethercat.framing import encode_json
 from ethercat_server.errors import UsageError
 from ethercat_server.serving.bare_json import encode_bare_json
-from ethercat_server.serving.permissions import controlling_uids
+from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import open_diagnostics, peer_uid
 from tests.rights import NOBODY, needs_another_user, socket_of
 from tests.server.running import (
@@ -124,23 +124,24 @@ def test_who_only_listens_on_the_port_is_not_the_owner(diagnostics: socket.socke
         assert peer_uid(diagnostics, Elsewhere(waiting.getsockname()[1])) is None  # type: ignore[arg-type]
 
 
-def test_root_and_the_user_of_sudo_may_control(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_root_its_own_user_and_the_user_of_sudo_may_control(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SUDO_UID", raising=False)
-    assert controlling_uids((), ()) == {0}
-    for uid, controlling in (("1234", {0, 1234}), ("-1", {0})):
+    assert Permissions().control_uids == {0, os.geteuid()}
+    assert Permissions(own_uid=7).control_uids == {0, 7}, "the one that it becomes"
+    for uid, controlling in (("1234", {0, 7, 1234}), ("-1", {0, 7})):
         monkeypatch.setenv("SUDO_UID", uid)
-        assert controlling_uids((), ()) == controlling
+        assert Permissions(own_uid=7).control_uids == controlling
 
 
 def test_named_users_and_groups_may_control() -> None:
     group = grp.getgrgid(NOBODY.pw_gid).gr_name
-    assert NOBODY.pw_uid in controlling_uids(("nobody",), ())
-    assert NOBODY.pw_uid in controlling_uids((), (group,)), "it is their primary group"
-    assert 4711 in controlling_uids(("4711",), ()), "a number needs no entry"
+    assert NOBODY.pw_uid in Permissions(["nobody"]).control_uids
+    assert NOBODY.pw_uid in Permissions(groups=[group]).control_uids, "it is their primary group"
+    assert 4711 in Permissions(["4711"]).control_uids, "a number needs no entry"
     with pytest.raises(UsageError, match="no-such-user: there is no such user"):
-        controlling_uids(("no-such-user",), ())
+        Permissions(["no-such-user"])
     with pytest.raises(UsageError, match="no-such-group: there is no such group"):
-        controlling_uids((), ("no-such-group",))
+        Permissions(groups=["no-such-group"])
 
 
 # -- at one server for all of these, which none may change but the last

@@ -589,13 +589,15 @@ def check_former(bench: Bench, before: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("settings", "what", "said"),
     [
-        (IN_OP, "0x8010 3", "imu_active = 3 did not take"),
-        (BY_PREOP, "0x8006 1", "sinc_length = 128 did not take"),
+        (IN_OP, f"abort 0x8010 3 {ABORT}", "imu_active = 3 did not take"),
+        # It took, but cannot be read back.
+        (IN_OP, f"on-write 0x8010 3 abort 0x8010 3 {ABORT}", "imu_active = 3 did not take"),
+        (BY_PREOP, f"abort 0x8006 1 {ABORT}", "sinc_length = 128 did not take"),
     ],
 )
 def test_an_abort_half_way(bench: Bench, settings: dict[str, Any], what: str, said: str) -> None:
     before = bench.described()
-    bench.command(f"abort {what} {ABORT}")
+    bench.command(what)
     refused = bench.refused("configure", settings=settings)
     assert (refused["code"], refused["abort_code"]) == ("sensor", int(ABORT, 16))
     assert said in refused["message"]

@@ -23,7 +23,7 @@ from bota_ethercat.errors import SettingError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.settings import SETTINGS, sampling_rate_hz
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import rows, visible
+from bota_ethercat.text.untrusted import rows, visible, whole
 
 _MAX_NOTES: Final = 1_000_000  # descriptions and events
 _BATCH: Final = 4096  # frames
@@ -98,8 +98,10 @@ class Histories:
         """Take the next description or event of the file."""
         described = isinstance(note, Description)
         for row in rows(note.reply.get("sensors")) if isinstance(note, Description) else [note.event]:
-            position, values = row.get("sensor"), row.get("settings")
-            if isinstance(position, int) and not isinstance(position, bool) and isinstance(values, dict):
+            position, values = whole(row.get("sensor")), row.get("settings")
+            if position is None or not 0 <= position <= file_format.MAX_SENSOR:
+                continue
+            if isinstance(values, dict):
                 self._learn(position, note.stamp_ns, row, values, described=described)
 
     def of(self, position: int) -> Sequence[Settings]:

@@ -8,6 +8,7 @@ import math
 import sys
 import time
 from functools import partial
+from itertools import takewhile
 from typing import Any, Final
 
 from bota_clients.errors import RecordingError
@@ -22,7 +23,6 @@ from bota_ethercat.framing import DataMessage, encode_data
 from ethercat_server.errors import ServerError
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.permissions import controlling_uids, local_names
 from ethercat_server.serving.transport import SocketTransport
 
 # Sockets are not served this shortly before a frame is due, because select may wake late.
@@ -59,6 +59,10 @@ class Player:
         self.sensors = ReplayedSensors(recording.sensors)
         if not self.sensors.sensors:
             raise RecordingError(f"{recording.path} has neither frames nor sensors: there is nothing to play")
+        # As the first subscriber finds it: its description comes before its first frame.
+        for item in takewhile(lambda item: not isinstance(item, DataMessage), recording.everything()):
+            if isinstance(item, Description):
+                self.sensors.describe(item)
         self.hub = Hub(SocketTransport(options.hosts, options.port))
         self._recording = recording
         self._options = options
@@ -77,8 +81,6 @@ class Player:
     def run(self) -> None:
         """Play from the first subscriber on."""
         hub, options, recording = self.hub, self._options, self._recording
-        hub.permissions.control_uids = controlling_uids((), ())
-        hub.permissions.names = local_names()
         hub.start(Actions(hub, self, self.sensors, {"replay": self._about()}).handle)
         name = f"{recording.path.name}, {recording.frame_count} frames,"
         _say(f"replaying {name} on port {options.port}, waiting for a subscriber; Ctrl-C ends it")

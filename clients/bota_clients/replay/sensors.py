@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any, Final, NoReturn
 
 from bota_clients.recording.reader import Description, Event, Identity, RecordedSensor
@@ -14,11 +14,12 @@ from bota_ethercat.control import Event as ServerEvent
 from bota_ethercat.errors import RequestError
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import is_finite
-from bota_ethercat.text.untrusted import rows
+from bota_ethercat.text.untrusted import rows, whole
 from ethercat_server.serving.connection import Connection
 
 _NO_BUS: Final = {"p50": 0.0, "p99": 0.0, "p999": 0.0, "max": 0.0}
-_STATES: Final[Mapping[str, str]] = {ServerEvent.SENSOR_LOST: "lost", ServerEvent.SENSOR_BACK: "OP"}
+# Keys of events and descriptions alike.
+_IN_FORCE: Final = ("settings", "rate_hz", "delay_ms", "offset")
 
 
 class ReplayedSensor:
@@ -43,10 +44,11 @@ class ReplayedSensor:
             self._emergencies += 1
             self._emergency = {key: said.get(key) for key in ("code", "text", "register", "data")}
             self._emergency_at = time.monotonic()
-        if isinstance(said.get("settings"), dict):
-            self.row |= {key: said[key] for key in ("settings", "rate_hz") if key in said}
-        if event.name in _STATES:
-            self.row["state"] = _STATES[event.name]
+        self.row |= {key: said[key] for key in _IN_FORCE if key in said}
+        if event.name == ServerEvent.SENSOR_LOST:
+            self.row["state"] = "REFUSED" if said.get("reason") == "different_sensor" else "LOST"
+        elif event.name == ServerEvent.SENSOR_BACK:
+            self.row["state"] = "OP"
 
     def count(self, frame: DataMessage) -> None:
         """A frame was sent."""
@@ -94,8 +96,6 @@ class ReplayedSensors:
         sent: number of frames.
     """
 
-    handlers: Final = frozenset({"sdo_read", "sdo_write", "configure", "tare"})
-
     def __init__(self, recorded: Iterable[RecordedSensor]) -> None:
         found = {sensor.sensor: sensor for sensor in recorded}
         self.sensors = [
@@ -109,7 +109,7 @@ class ReplayedSensors:
         """Take a later description of the recording."""
         for row in rows(description.reply.get("sensors")):
             if (sensor := self._at(row.get("sensor"))) is not None:
-                sensor.row = {**row, "settling": False}  # it was, when it was described
+                sensor.row |= {**row, "settling": False}  # it was, when it was described
 
     def take(self, event: Event) -> None:
         """Apply an event of the recording to the descriptions."""
@@ -148,6 +148,5 @@ class ReplayedSensors:
         )
 
     def _at(self, position: object) -> ReplayedSensor | None:
-        if isinstance(position, bool) or not isinstance(position, int):
-            return None
-        return self.sensors[position] if 0 <= position < len(self.sensors) else None
+        number = whole(position)
+        return self.sensors[number] if number is not None and 0 <= number < len(self.sensors) else None
