@@ -38,7 +38,7 @@ from tests.clients.cpp_programs import (
 )
 from tests.clients.played_sensor import frame
 from tests.golden_vectors import READ, ReadStream, odd_messages
-from tests.server.running import PATIENCE_S, free_port, wait_until
+from tests.server.running import PATIENCE_S, free_port, full_listener, wait_until
 
 pytestmark = [needs_gxx, patient]
 
@@ -420,6 +420,15 @@ def test_it_starts_without_the_server(step: str) -> None:
             accept_while(late, running, step=step)
             late.send(frame(1))
             running.until(lambda r: r["fresh"], "the first sample")
+
+
+def test_a_host_that_does_not_answer_takes_no_longer_than_the_timeout() -> None:
+    """Connecting is pending, and every call returns; then it is said that nobody answers."""
+    with full_listener() as port, driver(port, reconnect_every_ms=1) as running:
+        assert "did not answer in time" in running.do("connect", 50)["error"]
+        for words in (("latest",), ("next", 50), ("next", 0), ("reconnect",)):
+            running.do(*words)
+        running.until(lambda _: running.info()["error"].endswith("no answer"), "the end of an attempt")
 
 
 def is_down(running: Driver) -> Callable[[], bool]:
