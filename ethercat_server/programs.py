@@ -1,10 +1,11 @@
 """Entry points of the programs here, which need Linux and what `pip install .` installs there."""
 
+from bota_ethercat.program import start  # first: from here on Ctrl-C is no traceback
+
+# isort: split
 import sys
 from collections.abc import Callable
 from pathlib import PurePath
-
-from bota_ethercat.program import start
 
 # What is missing after `pip install --no-deps`, and on other systems.
 _NEEDED = frozenset({"pysoem", "pyroute2", "fcntl", "grp", "pwd", "resource"})

@@ -9,15 +9,18 @@ import signal
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from types import FrameType
 from typing import TYPE_CHECKING, Final
 
 from bota_clients.errors import ClientError
 from bota_ethercat.errors import ProtocolError
+from bota_ethercat.program.signals import Signals, interrupt_on_signals
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
 
+__all__ = [
+    "Signals", "call_on", "discard_output", "interrupt_on_signals", "not_installed", "say", "start",
+]  # fmt: skip
 
 _OF_DATASETS: Final = ("pyarrow", "zarr", "rosbags", "yaml")
 
@@ -62,12 +65,6 @@ def discard_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def interrupt_on_signals() -> None:
-    """SIGINT and SIGTERM raise KeyboardInterrupt: for when everything is imported, see `start`."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
-
-
 def call_on(loop: AbstractEventLoop, stop: Callable[[], object], *names: str) -> None:
     """Have these signals call `stop`; those that nohup ignores do not, nor any on Windows."""
     for name in names:
@@ -75,19 +72,3 @@ def call_on(loop: AbstractEventLoop, stop: Callable[[], object], *names: str) ->
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
             with contextlib.suppress(NotImplementedError):
                 loop.add_signal_handler(number, stop)
-
-
-class Signals:
-    """SIGINT and SIGTERM, remembered from the first moment until there is something to stop.
-
-    Attributes:
-        asked: whether one has arrived; set it to stop without one.
-    """
-
-    def __init__(self) -> None:
-        self.asked = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
-
-    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
-        self.asked = True

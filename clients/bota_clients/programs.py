@@ -1,8 +1,9 @@
 """Entry points of the programs here."""
 
-from collections.abc import Callable
+from bota_ethercat.program.start import run  # first: from here on Ctrl-C is no traceback
 
-from bota_ethercat.program.start import run
+# isort: split
+from collections.abc import Callable
 
 
 def _program(module: str) -> Callable[[], int]:

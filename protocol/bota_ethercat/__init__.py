@@ -9,10 +9,10 @@ values mean, `program` what programs do alike. Only `client`, which nothing else
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # without `typing`: until `program.start` is loaded, Ctrl-C is a traceback
 if TYPE_CHECKING:
+    from typing import Any
+
     from bota_ethercat.client import Client, Condition, NoSampleError, Reading, connect
 
 __all__ = ["Client", "Condition", "NoSampleError", "Reading", "connect"]
@@ -22,4 +22,6 @@ def __getattr__(name: str) -> Any:
     """What `client` has, loaded when it is asked for: the server needs none of it."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib  # noqa: PLC0415 - the server needs none of it
+
     return getattr(importlib.import_module("bota_ethercat.client"), name)
