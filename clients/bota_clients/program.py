@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import shlex
 import signal
@@ -17,6 +18,8 @@ from bota_ethercat.program.signals import Signals, interrupt_on_signals
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
+
+    from _typeshed import ReadableBuffer
 
 __all__ = [
     "Signals", "call_on", "discard_output", "interrupt_on_signals", "not_installed", "say", "start",
@@ -34,8 +37,10 @@ def say(program: str, sentence: str) -> None:
 def start(program: str, module: str, *arguments: object) -> int:
     """The exit code of `run` in a module that is imported only now: `--help` needs nothing of the extra.
 
-    Errors of this project become one sentence and exit code 1.
+    Errors of this project become one sentence and exit code 1. That nobody reads standard error is none.
     """
+    if sys.stderr is None or sys.stderr is sys.__stderr__:  # not in a test
+        sys.stderr = _standard_error()
     try:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)
         sys.stdout.flush()
@@ -48,6 +53,24 @@ def start(program: str, module: str, *arguments: object) -> int:
         say(program, str(error))
         code = 1
     return code
+
+
+class _Unheard(io.FileIO):
+    """Standard error whose reader, terminal or disk may go: what it said is not worth the program's end."""
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        """How much of it is done with: all, unless a part was written."""
+        written: int | None = None
+        with contextlib.suppress(OSError):
+            written = super().write(data)
+        return memoryview(data).nbytes if written is None else written
+
+
+def _standard_error() -> io.TextIOWrapper:
+    """Without one, whose descriptor may be another file's by now, there is no reader either."""
+    file = _Unheard(2, "w", closefd=False) if sys.stderr else io.FileIO(os.devnull, "w")
+    encoding = getattr(sys.stderr, "encoding", None)
+    return io.TextIOWrapper(io.BufferedWriter(file), encoding, "backslashreplace", line_buffering=True)
 
 
 def not_installed(program: str, error: ImportError) -> int:

@@ -39,11 +39,11 @@ def run(options: RecordOptions, signals: Signals) -> int:
 
 
 def _record(source: Source, options: RecordOptions, signals: Signals) -> int:
-    recorder = Recorder(options.path, NAME, notes(source), overwrite=options.force)
     console = Console(stderr=True, highlight=False)
     show = partial(console.print, markup=False, soft_wrap=True)
     began, reason = time.monotonic(), "asked to stop"
-    with console.status("") as status:
+    made = Recorder(options.path, NAME, notes(source), overwrite=options.force)
+    with made as recorder, console.status("") as status:
         show(f"recording {options.address} to {options.path}; Ctrl-C ends it")
         while True:
             batch = source.batch()
