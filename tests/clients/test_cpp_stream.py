@@ -26,6 +26,7 @@ from bota_ethercat.control import request
 from bota_ethercat.framing import DataFlag, FrameDecoder, encode_json
 from bota_ethercat.text.json_text import JsonObject
 from tests.clients.cpp_programs import (
+    FAST,
     ROOT,
     Driver,
     assert_no_faults,
@@ -322,6 +323,30 @@ def test_a_recent_sample_whose_imu_is_judged_too(
     with stream(server, judge_imu=1) as running:
         server.send(frame(1, **values))
         assert picked(running.latest(), "condition", "is_new", "has_sample") == (condition, True, True)
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_a_program_of_fast_math_sees_what_is_not_finite(server: PlayedServer, value: float) -> None:
+    vectors = [
+        f"{vector}__{axis}"
+        for vector in ("force", "torque", "acceleration", "angular_rate")
+        for axis in "xyz"
+    ]
+    process = start_driver(flags=FAST)
+    try:
+        running = Driver(server.port, process, judge_imu=1, **PATIENT)
+        running.begin("connect", int(PATIENCE_S * 1000))
+        server.accept()
+        assert running.answer()["ok"]
+        for number, name in enumerate([*vectors, *(f"orientation__{axis}" for axis in "xyzw")]):
+            for sequence, values, wanted in ((1, {name: value}, "not_finite"), (2, {}, "fresh")):
+                at = 2 * number + sequence
+                server.send(frame(at, size=77, **values))
+                seen = running.until(lambda reading, at=at: reading["sequence"] == at, name)
+                assert seen["condition"] == wanted, name
+        assert running.do("tare", 1, 0, 0, value, 0, 0, 0)["error"].endswith("must be six finite numbers")
+    finally:
+        assert end_driver(process) == 0
 
 
 # -- next
