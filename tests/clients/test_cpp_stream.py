@@ -325,6 +325,10 @@ def test_a_recent_sample_whose_imu_is_judged_too(
         assert picked(running.latest(), "condition", "is_new", "has_sample") == (condition, True, True)
 
 
+def is_at(sequence: int, reading: JsonObject) -> bool:
+    return bool(reading["sequence"] == sequence)
+
+
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
 def test_a_program_of_fast_math_sees_what_is_not_finite(server: PlayedServer, value: float) -> None:
     vectors = [
@@ -339,10 +343,11 @@ def test_a_program_of_fast_math_sees_what_is_not_finite(server: PlayedServer, va
         server.accept()
         assert running.answer()["ok"]
         for number, name in enumerate([*vectors, *(f"orientation__{axis}" for axis in "xyzw")]):
-            for sequence, values, wanted in ((1, {name: value}, "not_finite"), (2, {}, "fresh")):
+            spoilt: dict[str, Any] = {name: value}
+            for sequence, values, wanted in ((1, spoilt, "not_finite"), (2, {}, "fresh")):
                 at = 2 * number + sequence
                 server.send(frame(at, size=77, **values))
-                seen = running.until(lambda reading, at=at: reading["sequence"] == at, name)
+                seen = running.until(functools.partial(is_at, at), name)
                 assert seen["condition"] == wanted, name
         assert running.do("tare", 1, 0, 0, value, 0, 0, 0)["error"].endswith("must be six finite numbers")
     finally:
