@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from bota_clients.errors import ClientError
 from bota_ethercat.errors import ProtocolError
@@ -18,8 +18,6 @@ from bota_ethercat.program.signals import Signals, interrupt_on_signals
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
-
-    from _typeshed import ReadableBuffer
 
 __all__ = [
     "Signals", "call_on", "discard_output", "interrupt_on_signals", "not_installed", "say", "start",
@@ -58,7 +56,7 @@ def start(program: str, module: str, *arguments: object) -> int:
 class _Unheard(io.FileIO):
     """Standard error whose reader, terminal or disk may go: what it said is not worth the program's end."""
 
-    def write(self, data: ReadableBuffer, /) -> int:
+    def write(self, data: Any, /) -> int:
         """How much of it is done with: all, unless a part was written."""
         written: int | None = None
         with contextlib.suppress(OSError):

@@ -54,13 +54,13 @@ inline std::uint64_t bits_of(double value) noexcept {
     return as_they_are;
 }
 
-inline constexpr std::uint64_t kInfinityBits = 0x7FFull << 52;
+inline constexpr std::uint64_t infinity_bits = 0x7FFull << 52;
 
 }  // namespace detail
 
 /// Neither NaN nor infinite, and NaN: also in a program of -ffast-math, where std::isfinite is always true.
-inline bool is_finite(double value) noexcept { return (detail::bits_of(value) & detail::kInfinityBits) != detail::kInfinityBits; }
-inline bool is_nan(double value) noexcept { return detail::bits_of(value) << 1 > detail::kInfinityBits << 1; }
+inline bool is_finite(double value) noexcept { return (detail::bits_of(value) & detail::infinity_bits) != detail::infinity_bits; }
+inline bool is_nan(double value) noexcept { return detail::bits_of(value) << 1 > detail::infinity_bits << 1; }
 
 /// One decoded sample in SI units and the sensor's own frame: `protocol.pdo.Sample` in C++, to the bit.
 struct Sample {
