@@ -1,9 +1,8 @@
 """Entry points of the programs here, which need Linux and what `pip install .` installs there."""
 
-from bota_ethercat.program import start  # first, for Ctrl-C
+from bota_ethercat.program import start  # first: from here on Ctrl-C is no traceback
 
 # isort: split
-
 import sys
 from collections.abc import Callable
 from pathlib import PurePath

@@ -52,7 +52,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     f"{S}.sensor": SENSOR,
     f"{S}.acquisition": ACQUISITION,
     f"{S}.serving": SERVING,
-    f"{S}.process": {S, f"{S}.process", "bota_ethercat.errors"},
+    f"{S}.process": {S, f"{S}.process", "bota_ethercat.errors", "bota_ethercat.program"},
     f"{S}.server": SERVING,
     f"{S}.daemon": DAEMON,
     # Programs beside the server.

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import shlex
 import signal
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from types import FrameType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from bota_clients.errors import ClientError
 from bota_ethercat.errors import ProtocolError
+from bota_ethercat.program.signals import Signals, interrupt_on_signals
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
 
+__all__ = [
+    "Signals", "call_on", "discard_output", "interrupt_on_signals", "not_installed", "say", "start",
+]  # fmt: skip
 
 _OF_DATASETS: Final = ("pyarrow", "zarr", "rosbags", "yaml")
 
@@ -31,8 +35,10 @@ def say(program: str, sentence: str) -> None:
 def start(program: str, module: str, *arguments: object) -> int:
     """The exit code of `run` in a module that is imported only now: `--help` needs nothing of the extra.
 
-    Errors of this project become one sentence and exit code 1.
+    Errors of this project become one sentence and exit code 1. That nobody reads standard error is none.
     """
+    if sys.stderr is None or sys.stderr is sys.__stderr__:  # not in a test
+        sys.stderr = _standard_error()
     try:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)
         sys.stdout.flush()
@@ -45,6 +51,24 @@ def start(program: str, module: str, *arguments: object) -> int:
         say(program, str(error))
         code = 1
     return code
+
+
+class _Unheard(io.FileIO):
+    """Standard error whose reader, terminal or disk may go: what it said is not worth the program's end."""
+
+    def write(self, data: Any, /) -> int:
+        """How much of it is done with: all, unless a part was written."""
+        written: int | None = None
+        with contextlib.suppress(OSError):
+            written = super().write(data)
+        return memoryview(data).nbytes if written is None else written
+
+
+def _standard_error() -> io.TextIOWrapper:
+    """Without one, whose descriptor may be another file's by now, there is no reader either."""
+    file = _Unheard(2, "w", closefd=False) if sys.stderr else io.FileIO(os.devnull, "w")
+    encoding = getattr(sys.stderr, "encoding", None)
+    return io.TextIOWrapper(io.BufferedWriter(file), encoding, "backslashreplace", line_buffering=True)
 
 
 def not_installed(program: str, error: ImportError) -> int:
@@ -62,12 +86,6 @@ def discard_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def interrupt_on_signals() -> None:
-    """SIGINT and SIGTERM raise KeyboardInterrupt: for when everything is imported, see `start`."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
-
-
 def call_on(loop: AbstractEventLoop, stop: Callable[[], object], *names: str) -> None:
     """Have these signals call `stop`; those that nohup ignores do not, nor any on Windows."""
     for name in names:
@@ -75,19 +93,3 @@ def call_on(loop: AbstractEventLoop, stop: Callable[[], object], *names: str) ->
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
             with contextlib.suppress(NotImplementedError):
                 loop.add_signal_handler(number, stop)
-
-
-class Signals:
-    """SIGINT and SIGTERM, remembered from the first moment until there is something to stop.
-
-    Attributes:
-        asked: whether one has arrived; set it to stop without one.
-    """
-
-    def __init__(self) -> None:
-        self.asked = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
-
-    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
-        self.asked = True

@@ -1,9 +1,8 @@
 """Entry points of the programs here."""
 
-from bota_ethercat.program.start import run  # first, for Ctrl-C
+from bota_ethercat.program.start import run  # first: from here on Ctrl-C is no traceback
 
 # isort: split
-
 from collections.abc import Callable
 
 

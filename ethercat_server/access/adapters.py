@@ -157,13 +157,14 @@ def server_here() -> tuple[Address, str]:
     """The server that is used where none is given, and its interface; ServerError if that is none of here."""
     try:
         address = default_server()
-        with Client(address.port, address.host, stream=False).connect() as client:
+        client = Client(address.port, address.host, stream=False)
+        with client.connect():
             ifname = client.description.get("interface")
             if not (client.session.same_machine and isinstance(ifname, str)):
                 raise ServerError(f"the server at {address} has no interface on this computer")
             return address, ifname
-    except UnreachableError as error:
-        raise ServerError(f"no server at {address} ({error})") from None
+    except UnreachableError:
+        raise ServerError(f"no server at {address} ({client.session.problem})") from None
     except (ValueError, ProtocolError) as error:
         raise ServerError(str(error)) from None
 

@@ -18,7 +18,6 @@ from bota_ethercat.errors import (
     UnreachableError,
 )
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health.sentences import no_server
 from bota_ethercat.program.server_choice import default_server, is_address
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import SettingValue
@@ -74,7 +73,7 @@ class Sensors:
         try:
             return cls(client.connect(), name, used or name)
         except UnreachableError as error:
-            raise ServerError(no_server(address, error)) from None
+            raise ServerError(str(error)) from None
         except (ProtocolError, KeyError, TypeError) as error:
             client.close()
             raise ServerError(

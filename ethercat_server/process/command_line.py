@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import os
-import signal
 import sys
 from collections.abc import Callable
-from types import FrameType
 from typing import Final
 
 from bota_ethercat.errors import ProtocolError
+from bota_ethercat.program.signals import interrupt_on_signals
 from ethercat_server.errors import ServerError
 from ethercat_server.process.logs import OneLine
 
@@ -19,8 +18,7 @@ FAILED: Final = 1
 
 
 def begin(program: str) -> None:
-    """What is logged appears as `PROGRAM: message`. Until `run`, SIGINT ends the program at once."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """What is logged appears as `PROGRAM: message`."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(OneLine(program))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
@@ -33,8 +31,7 @@ def run(program: str, work: Callable[[], int], *, as_json: bool) -> int:
     With `as_json` the sentence is on standard output too, as {"error": ...}.
     """
     try:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, _interrupt)
+        interrupt_on_signals()
         return work()
     except (ServerError, ProtocolError) as error:
         text, exit_code = str(error), getattr(error, "exit_code", FAILED)
@@ -51,7 +48,3 @@ def run(program: str, work: Callable[[], int], *, as_json: bool) -> int:
         sys.stdout.write(json.dumps({"error": text}) + "\n")
     sys.stderr.write(f"{program}: {text}\n")
     return exit_code
-
-
-def _interrupt(_number: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

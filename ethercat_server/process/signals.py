@@ -5,44 +5,24 @@ from __future__ import annotations
 import contextlib
 import signal
 from collections.abc import Callable, Iterator
-from types import FrameType
 
+from bota_ethercat.program import signals
 from ethercat_server.errors import StopRequestedError
 
 
-class Signals:
+class Signals(signals.Signals):
     """Checked between the steps of start-up; passed on to the loop once it runs."""
-
-    def __init__(self) -> None:
-        self._stop: Callable[[], None] | None = None
-        self._received = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_stop)
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-            signal.signal(signal.SIGHUP, self._on_stop)
 
     def check(self) -> None:
         """StopRequestedError if a signal has arrived."""
-        if self._received:
+        if self.asked:
             raise StopRequestedError("stopped during start-up")
-
-    def call(self, stop: Callable[[], None]) -> None:
-        """From now on a signal calls `stop`."""
-        self._stop = stop
-        if self._received:
-            stop()
-
-    def _on_stop(self, _number: int, _frame: FrameType | None) -> None:
-        self._received = True
-        if self._stop is not None:
-            self._stop()
 
 
 @contextlib.contextmanager
 def signals_held_back() -> Iterator[None]:
     """Defer SIGINT and SIGTERM during a change."""
-    signals = {signal.SIGINT, signal.SIGTERM}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     finally:

@@ -9,7 +9,7 @@ values mean, `program` what programs do alike. Only `client`, which nothing else
 
 from __future__ import annotations
 
-TYPE_CHECKING = False  # imports nothing: `program.start` must come first, for Ctrl-C
+TYPE_CHECKING = False  # without `typing`: until `program.start` is loaded, Ctrl-C is a traceback
 if TYPE_CHECKING:
     from typing import Any
 
@@ -22,6 +22,6 @@ def __getattr__(name: str) -> Any:
     """What `client` has, loaded when it is asked for: the server needs none of it."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib  # noqa: PLC0415 - see above
+    import importlib  # noqa: PLC0415 - the server needs none of it
 
     return getattr(importlib.import_module("bota_ethercat.client"), name)

@@ -50,7 +50,7 @@ class ConnectionFailedError(ProtocolError):
 
 
 class UnreachableError(ConnectionFailedError):
-    """Nothing answers at that address; `health.sentences.no_server` is the sentence about it."""
+    """Nothing answers at that address; a client's own is the sentence of `health.sentences.no_server`."""
 
 
 class NoReplyError(ConnectionFailedError):

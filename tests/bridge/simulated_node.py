@@ -20,7 +20,7 @@ import math
 import threading
 import uuid
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -348,13 +348,19 @@ class Node(Asking):
         """The response of one of the node's services."""
         offered = [*self.node.services, *self.stand_ins]
         (service,) = [found for found in offered if found.service_name == f"{self.name}/{name}"]
-        self._is_busy = True
-        try:
+        with self.busy():
             response = service.callback(request, service.srv_type.Response())
-        finally:
-            self._is_busy = False
         self.settle()
         return response
+
+    @contextlib.contextmanager
+    def busy(self) -> Iterator[None]:
+        """The executor does not get to what is triggered meanwhile."""
+        was, self._is_busy = self._is_busy, True
+        try:
+            yield
+        finally:
+            self._is_busy = was
 
     def ask(self, service_type: Any, name: str, request: Any) -> Any:
         return self.call(name, request)

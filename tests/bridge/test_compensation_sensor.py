@@ -97,6 +97,25 @@ def test_a_change_of_the_sensors_own_offset_shifts_the_bias(
     node.until(compensation="ok")
 
 
+def test_a_parameter_that_the_shift_has_not_reached_is_no_wish(
+    sensor: Sensor, node: Node, stages: Stages
+) -> None:
+    """The parameter `bias` follows when the executor gets to it; another one may be set before."""
+    new = [-1.5, 2.25, 9.75, 0.5, 0.25, -0.125]
+    node.do("tare")
+    stages.settle(ZERO6)
+    with node.busy():
+        sensor.set_offset(new, tell=True)
+        node.run(0.05)
+        assert list(node.parameters("bias")[0]) == pytest.approx(BIAS.values, abs=1e-4), "not yet"
+        node.set("bias_ramp_time", 0.25)
+    stages.forget()
+    node.run(0.5)
+    shifted = [b + o for b, o in zip(BIAS.values, new, strict=True)]
+    assert list(node.parameters("bias")[0]) == pytest.approx(shifted, abs=1e-4)
+    assert max(abs(value) for message in stages.final for value in six(message)) < 1e-3
+
+
 def test_an_offset_that_was_not_known_puts_the_bias_in_doubt(sensor: Sensor, node: Node) -> None:
     """As of a server that was too old to tell it."""
     sensor.set_offset(None, tell=True)

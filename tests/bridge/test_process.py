@@ -28,7 +28,7 @@ from tests import without_ipv6
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.rights import needs_root, skip_if_forbidden
-from tests.server.running import Program, free_port
+from tests.server.running import Program, free_port, full_listener
 
 
 @pytest.mark.parametrize(
@@ -230,6 +230,12 @@ def node() -> Iterator[Any]:
     made = rclpy.create_node("spinning")
     yield made
     made.destroy_node()
+
+
+def test_a_host_that_does_not_answer_is_said_so(start_process: StartProcess) -> None:
+    """Connecting is pending: a process, because only the kernel leaves it so."""
+    with full_listener() as port:
+        start_process(port).says(f"no server at localhost:{port} (Connection timed out)")
 
 
 @pytest.fixture

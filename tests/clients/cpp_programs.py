@@ -33,6 +33,8 @@ patient: Final = pytest.mark.timeout(300)
 
 STRICT: Final = ("-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZED: Final = ("-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+FAST: Final = (*SANITIZED, "-O2", "-ffast-math")
+"""As many controllers are built: what the compiler assumes then must not hide a NaN."""
 # System calls that the driver counts, and the clock, which it can set.
 WRAPPED: Final = (
     "socket", "connect", "close", "poll", "ppoll", "setsockopt", "getsockopt", "send", "recv",
@@ -85,9 +87,9 @@ def build(source: Path, flags: Sequence[str], others: Sequence[Path] = (), compi
     return program
 
 
-def driver_program() -> Path:
+def driver_program(flags: Sequence[str] = SANITIZED) -> Path:
     """tests/clients/cpp/driver.cpp: one program for all tests, because g++ takes seconds."""
-    return build(SOURCES / "driver.cpp", (*SANITIZED, *(f"-Wl,--wrap={name}" for name in WRAPPED)))
+    return build(SOURCES / "driver.cpp", (*flags, *(f"-Wl,--wrap={name}" for name in WRAPPED)))
 
 
 _idle: list[subprocess.Popen[str]] = []
@@ -149,10 +151,10 @@ class Driver(Commanded):
         return last
 
 
-def start_driver(*inside: str) -> subprocess.Popen[str]:
+def start_driver(*inside: str, flags: Sequence[str] = SANITIZED) -> subprocess.Popen[str]:
     """A driver, started by the command `inside`."""
     return subprocess.Popen(
-        [*inside, driver_program()],
+        [*inside, driver_program(flags)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -26,6 +26,7 @@ from bota_ethercat.control import request
 from bota_ethercat.framing import DataFlag, FrameDecoder, encode_json
 from bota_ethercat.text.json_text import JsonObject
 from tests.clients.cpp_programs import (
+    FAST,
     ROOT,
     Driver,
     assert_no_faults,
@@ -38,7 +39,7 @@ from tests.clients.cpp_programs import (
 )
 from tests.clients.played_sensor import frame
 from tests.golden_vectors import READ, ReadStream, odd_messages
-from tests.server.running import PATIENCE_S, free_port, wait_until
+from tests.server.running import PATIENCE_S, free_port, full_listener, wait_until
 
 pytestmark = [needs_gxx, patient]
 
@@ -324,6 +325,35 @@ def test_a_recent_sample_whose_imu_is_judged_too(
         assert picked(running.latest(), "condition", "is_new", "has_sample") == (condition, True, True)
 
 
+def is_at(sequence: int, reading: JsonObject) -> bool:
+    return bool(reading["sequence"] == sequence)
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_a_program_of_fast_math_sees_what_is_not_finite(server: PlayedServer, value: float) -> None:
+    vectors = [
+        f"{vector}__{axis}"
+        for vector in ("force", "torque", "acceleration", "angular_rate")
+        for axis in "xyz"
+    ]
+    process = start_driver(flags=FAST)
+    try:
+        running = Driver(server.port, process, judge_imu=1, **PATIENT)
+        running.begin("connect", int(PATIENCE_S * 1000))
+        server.accept()
+        assert running.answer()["ok"]
+        for number, name in enumerate([*vectors, *(f"orientation__{axis}" for axis in "xyzw")]):
+            spoilt: dict[str, Any] = {name: value}
+            for sequence, values, wanted in ((1, spoilt, "not_finite"), (2, {}, "fresh")):
+                at = 2 * number + sequence
+                server.send(frame(at, size=77, **values))
+                seen = running.until(functools.partial(is_at, at), name)
+                assert seen["condition"] == wanted, name
+        assert running.do("tare", 1, 0, 0, value, 0, 0, 0)["error"].endswith("must be six finite numbers")
+    finally:
+        assert end_driver(process) == 0
+
+
 # -- next
 
 
@@ -420,6 +450,15 @@ def test_it_starts_without_the_server(step: str) -> None:
             accept_while(late, running, step=step)
             late.send(frame(1))
             running.until(lambda r: r["fresh"], "the first sample")
+
+
+def test_a_host_that_does_not_answer_takes_no_longer_than_the_timeout() -> None:
+    """Connecting is pending, and every call returns; then it is said that nobody answers."""
+    with full_listener() as port, driver(port, reconnect_every_ms=1) as running:
+        assert "did not answer in time" in running.do("connect", 50)["error"]
+        for words in (("latest",), ("next", 50), ("next", 0), ("reconnect",)):
+            running.do(*words)
+        running.until(lambda _: running.info()["error"].endswith("no answer"), "the end of an attempt")
 
 
 def is_down(running: Driver) -> Callable[[], bool]:

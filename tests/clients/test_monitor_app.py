@@ -127,7 +127,7 @@ def test_a_recording_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.Mon
 
     async def scene(stage: Stage) -> None:
         await stage.press("r")
-        wait_until(lambda: "The recording failed: Connection refused" in stage.shown(), "the reason")
+        wait_until(lambda: "The recording failed: no server at localhost" in stage.shown(), "the reason")
         assert "REC" not in stage.shown()
 
     play(scene)

@@ -10,6 +10,9 @@ import itertools
 import os
 import queue
 import signal
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,16 +22,17 @@ import pytest
 from mcap.reader import NonSeekingReader
 from rosbags.rosbag2 import Reader
 
-from bota_clients.record import cli, recorder
+from bota_clients.record import cli, program, recorder
 from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch
 from bota_clients.recording.file_format import frame_topic
-from bota_clients.recording.reader import Description, open_recording
+from bota_clients.recording.reader import Description, Event, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.bridge.scripted_server import ScriptedServer
+from tests.bridge.scripted_server import ScriptedServer, description
 from tests.clients.recordings import frame, record
 from tests.clients.running import Recorder, RecorderProcess, Replay, frames_in, signalled
 from tests.ended import run_here
+from tests.golden_vectors import odd_messages
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, wait_until
 
@@ -163,13 +167,28 @@ def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.
 # -- what is lost
 
 
+def later(sent: DataMessage, ms: float) -> DataMessage:
+    """The same frame, so long after the first."""
+    return sent._replace(monotonic_ns=frame(1).monotonic_ns + round(ms * 1e6))
+
+
 @pytest.mark.parametrize(
     ("frames", "sentence"),
     [
         ([frame(1), frame(2), frame(1, 1)], "nothing was lost"),
         (
             [frame(1), frame(2, 0, DataFlag.GAP), frame(3, 0, DataFlag.GAP), frame(1, 1)],
-            "2 frames of sensor 0 after a GAP: samples were or may have been lost on the bus",
+            "2 samples of sensor 0 lost on the bus (estimated)",
+        ),
+        (  # 800 Hz, and 400 Hz later
+            [
+                Description(0, description()),
+                frame(1),
+                later(frame(2, 0, DataFlag.GAP), 12.5),
+                Event(0, {"event": "reconfigured", "sensor": 0, "rate_hz": 400}),
+                later(frame(3, 0, DataFlag.GAP), 32.5),
+            ],
+            "16 samples of sensor 0 lost on the bus (estimated)",
         ),
         (
             [frame(1), frame(5, 0, DataFlag.GAP), frame(1, 1, DataFlag.INVALID)],
@@ -177,7 +196,7 @@ def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.
         ),
     ],
 )
-def test_what_was_lost_is_said(frames: list[DataMessage], sentence: str, out: Path) -> None:
+def test_what_was_lost_is_said(frames: Batch, sentence: str, out: Path) -> None:
     recorder = new_recorder(out)
     recorder.put([*frames])
     recorder.stop("")
@@ -256,6 +275,80 @@ def test_killed_it_leaves_what_was_there(endless: Replay, out: Path) -> None:
     assert {item.sensor for item in left} == {0, 1}
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_it_records_on_when_nobody_reads_what_it_says(out: Path, number: signal.Signals) -> None:
+    """A process: its standard error is a pipe whose reader goes before something is said."""
+    reading, writing = os.pipe()
+    with ScriptedServer() as server, open(reading) as said:  # noqa: PTH123
+        command = [sys.executable, "-m", "bota_clients.record.cli", str(out), "--server", f":{server.port}"]
+        process = subprocess.Popen(command, stderr=writing)
+        os.close(writing)
+        try:
+            assert "Ctrl-C ends it" in said.readline()
+            said.close()
+            for sequence in range(3):
+                server.send_json({"event": "reconfigured", "sensor": 0})
+                server.send_sample(float(sequence))
+                wait_until(lambda: frames_in(out) == server.sequence, "the sample")
+            process.send_signal(number)
+            assert process.wait(PATIENCE_S) == 0
+        finally:
+            process.kill()
+            process.wait()
+    assert end(out)["reason"] == "asked to stop"
+    assert len(read(out)) == 3
+
+
+def test_without_a_standard_error_it_records_too(endless: Replay, out: Path) -> None:
+    command = f'exec "$0" -m bota_clients.record.cli {out} --server :{endless.port} --for 0.2s 2>&-'
+    subprocess.run(["sh", "-c", command, sys.executable], check=True, timeout=PATIENCE_S)
+    assert end(out)["reason"] == "time is up"
+
+
+def test_whatever_ends_it_finishes_the_file(
+    endless: Replay, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And leaves no thread that keeps the program from ending."""
+
+    def fail(*_: object) -> None:
+        raise SystemExit(3)
+
+    monkeypatch.setattr(program, "_report", fail)
+    assert run(out, "--server", f":{endless.port}")[0] == 3
+    assert end(out)["reason"] == "an error ended it"
+    assert "recorder" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_fault_of_its_own_is_no_success(
+    endless: Replay, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise LookupError("of the writer")
+
+    monkeypatch.setattr("bota_clients.recording.writer.RecordingWriter.describe", fail)
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    code, said = run(out, "--server", endless.port)
+    assert code == 1
+    assert "a fault of this program ended the recording: LookupError('of the writer')" in said
+
+
+def test_whatever_the_server_says_is_survived_and_recorded(
+    out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with ScriptedServer() as server, Recorder(out, server.port) as recorder:
+        assert server.subscribed.wait(PATIENCE_S)
+        for message in odd_messages():
+            server.send_json(message)
+        server.send_sample(1.0)
+        recorder.wait_for_frames(1)
+        assert recorder.stop() == 0
+    assert "Traceback" not in capsys.readouterr().err
+    with open_recording(out) as opened:
+        known = {event.event["event"] for event in opened.events}
+    assert {"sensor_lost", "unknown", ""} <= known
+    assert all(isinstance(name, str) for name in known)
+
+
 def test_a_full_disk_ends_it_with_what_was_written_whole(
     endless: Replay, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -319,7 +412,7 @@ def test_a_refusal_is_one_sentence_and_leaves_no_file(endless: Replay, out: Path
         (2, ("x.mcap", "--seconds", "-1"), "it must be a time such as"),
         (2, ("x.mcap", "--sensor", "300"), "a position on the bus"),
         *((2, ("x.mcap", f"--for={text}"), "it must be a time such as 30s, 5min or 2h")
-          for text in ("0s", "-1s", "30x", "s", "nan", "1e3s")),
+          for text in ("0s", "-1s", "30x", "s", "nan", "1e3s", "5 ms", "5 months")),
         (1, ("x.mcap", "--server", "localhost:1"), "start ethercat-server"),
     ],
 )  # fmt: skip
@@ -334,10 +427,17 @@ def test_what_cannot_be_done_is_said(
 
 
 @pytest.mark.parametrize(
-    ("text", "seconds"), [("30s", 30), ("30", 30), ("1.5min", 90), ("2h", 7200), ("0.5 s", 0.5)]
-)
+    ("text", "seconds"),
+    [
+        ("30s", 30), ("30", 30), ("1.5min", 90), ("2h", 7200), ("0.5 s", 0.5), ("5 minutes", 300),
+        ("1 minute", 60), ("5m", 300), ("90 sec", 90), ("2hours", 7200),
+    ],
+)  # fmt: skip
 def test_a_recording_for_a_time(text: str, seconds: float) -> None:
     assert cli.parse_options(["x.mcap", "--for", text]).seconds == seconds
+    for arguments in (["x.mcap", "--for", *text.split()], ["--seconds", *text.split(), "x.mcap"]):
+        options = cli.parse_options(arguments)
+        assert (options.seconds, str(options.path)) == (seconds, "x.mcap")
 
 
 # -- with a server

@@ -21,6 +21,7 @@ from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
 from tests.clients.cpp_programs import (
+    FAST,
     ROOT,
     SANITIZED,
     SOURCES,
@@ -103,9 +104,9 @@ class Loop(Commanded):
         )
 
 
-@pytest.fixture(scope="module")
-def running() -> Iterator[Loop]:
-    loop = Loop(program())
+@pytest.fixture(scope="module", params=[SANITIZED, FAST], ids=["strict", "fast math"])
+def running(request: pytest.FixtureRequest) -> Iterator[Loop]:
+    loop = Loop(program(request.param))
     yield loop
     assert end_driver(loop.process) == 0
 

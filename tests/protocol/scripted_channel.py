@@ -18,6 +18,7 @@ class MemoryServer(Script):
         super().__init__(self)
         self.now_ns = 10**15
         self.listens = self.is_connected = True
+        self.is_there = True  # its computer answers; else connecting is pending for ever
         self.arrived = bytearray()
         self._agenda: list[tuple[int, Callable[[], object]]] = []
 
@@ -58,10 +59,13 @@ class ScriptedChannel:
         self.monotonic_ns = server.monotonic_ns
 
     def wait(self, event: threading.Event, seconds: float, /) -> bool:
-        self._server.now_ns += math.ceil(seconds * 1e9)
+        self._server.now_ns += math.ceil(max(seconds, 0.0) * 1e9)
         return event.is_set()
 
     def connect(self, timeout_s: float) -> bool:
+        if not self._server.is_there:
+            self.wait(threading.Event(), timeout_s)
+            return False
         if not self._server.listens:
             raise UnreachableError("Connection refused")
         self._server.connections += 1

@@ -5,9 +5,12 @@ What it makes of a stream, `latest` above all, is in tests/protocol/golden/readi
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
+import fcntl
 import functools
+import math
 import os
 import re
 import resource
@@ -17,7 +20,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +29,23 @@ import pytest
 from bota_ethercat import address
 from bota_ethercat.address import boot_id
 from bota_ethercat.client import Client, Condition, Connected, Disconnected, NoSampleError, connect
-from bota_ethercat.client.channel import TcpChannel
+from bota_ethercat.client.channel import Channel, TcpChannel
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.bridge.scripted_server import ScriptedServer, description, process_data
 from tests.golden_vectors import odd_messages
 from tests.protocol.scripted_channel import MemoryServer, ScriptedChannel
-from tests.server.running import PATIENCE_S, free_port
+from tests.server.running import (
+    HERE,
+    PATIENCE_S,
+    THERE,
+    Veth,
+    free_port,
+    full_listener,
+    on_a_bus,
+    steady_addresses,
+)
 from tests.simulation import MemoryChannel, Simulation
 
 ROOT = Path(__file__).parents[2]
@@ -176,12 +188,134 @@ def test_what_comes_before_a_reply_is_kept(server: MemoryServer) -> None:
     assert sensor.poll() == []
 
 
+def test_frames_that_are_put_back_stay_in_order(server: MemoryServer) -> None:
+    rows = [{"sensor": number, "rate_hz": 800} for number in (0, 1)]
+    server.description = description() | {"sensors": rows}
+    sensor = client_of(server)
+    server.send_sample(1.0, sensor=1)
+    sensor.receive()
+    server.now_ns += 25_000_000
+    for number in range(3):
+        server.send_sample(float(number))
+    with pytest.raises(NoSampleError, match="sensor 1"):
+        sensor.receive()
+    assert [frame.sequence for frame in sensor.receive()] == [2, 3, 4]
+
+
+@pytest.mark.parametrize("rate_hz", [800, None])
+def test_reading_connects_by_itself(server: MemoryServer, rate_hz: float | None) -> None:
+    """Whether or not a rate is known."""
+    server.description["sensors"][0]["rate_hz"] = rate_hz
+    server.on_subscribe = lambda: server.send_sample(1.0)
+    assert [frame.sequence for frame in Client(1, channel=ScriptedChannel(server)).receive()] == [1]
+    for sample in Client(1, channel=ScriptedChannel(server)):
+        assert sample.force[0] == 1.0
+        break
+
+
+@pytest.mark.parametrize("timeout_s", [0, -1.0])
+def test_a_timeout_of_0_takes_what_has_arrived(server: MemoryServer, timeout_s: float) -> None:
+    rows = [{"sensor": number, "rate_hz": 800} for number in (0, 1)]
+    server.description = description() | {"sensors": rows}
+    sensor, begun_ns = client_of(server), server.now_ns
+    for number in range(3):
+        server.send_sample(1.0, sensor=number % 2)
+    assert [frame.sequence for frame in sensor.receive(timeout_s)] == [1, 2, 3]
+    with pytest.raises(NoSampleError, match="0 ms: the one before came within the last 20 ms"):
+        sensor.receive(timeout_s)
+    server.now_ns += 20_000_000
+    with pytest.raises(NoSampleError, match="0 ms: silent"):
+        sensor.receive(timeout_s)
+    server.listens = False
+    server.drop()
+    with pytest.raises(NoSampleError, match="0 ms: disconnected"):
+        sensor.receive(timeout_s)
+    assert server.now_ns == begun_ns + 20_000_000
+
+
+WAITS: dict[str, Callable[[Client, float], object]] = {
+    "latest": lambda client, timeout_s: client.latest(timeout_s=timeout_s),
+    "receive": lambda client, timeout_s: client.receive(timeout_s),
+    "poll": Client.poll,
+    "poll_all": Client.poll_all,
+}
+
+
+@pytest.mark.parametrize("wait", WAITS.values(), ids=WAITS)
+def test_a_host_that_does_not_answer_takes_no_longer_than_the_timeout(
+    wait: Callable[[Client, float], object], server: MemoryServer
+) -> None:
+    server.is_there = False
+    client = Client(1, channel=ScriptedChannel(server))
+    for timeout_s in (0.1, 2.0, 0.0, -1.0):
+        begun_ns = server.now_ns
+        with contextlib.suppress(NoSampleError):
+            wait(client, timeout_s)
+        assert begun_ns <= server.now_ns <= begun_ns + round(max(timeout_s, 0.0) * 1e9) + 1000
+
+
+def test_the_newest_sample_is_asked_for_and_nothing_is_raised(server: MemoryServer) -> None:
+    """After the only connection has ended, and while another thread closes it."""
+    client = client_of(server, reconnect=False)
+    server.drop()
+    begun_ns = server.now_ns
+    assert [client.latest(timeout_s=0.01).condition for _ in range(3)] == [Condition.DISCONNECTED] * 3
+    assert server.now_ns <= begun_ns + 30_001_000
+    client.close()
+    assert client.latest(timeout_s=0.01).condition is Condition.DISCONNECTED
+
+
+def test_what_nobody_takes_is_dropped_with_a_gap(server: MemoryServer) -> None:
+    """While the only thread waits for a reply; of each sensor, and events as well."""
+    rows = [{"sensor": number, "rate_hz": 800} for number in (0, 1, 2)]
+    server.description = description() | {"sensors": rows}
+    client = client_of(server)
+    count, most = 70_000, 65_536
+    for number in range(2):
+        server.send_sample(1.0, sensor=number)
+    for _ in range(count):
+        server.send_sample(1.0, sensor=2, sequence=server.sequence - 1)
+    server.send_sample(1.0, sensor=0, sequence=2)
+    client.ask("status")
+    frames = client.poll()
+    assert len(frames) <= most
+    kept = [frame for frame in frames if frame.sensor == 2]
+    assert kept[-1].sequence - kept[0].sequence == len(kept) - 1, "the newest"
+    flagged = [(frame.sensor, frame.sequence) for frame in frames if frame.flags & DataFlag.GAP]
+    assert flagged == [(2, kept[0].sequence), (0, 2)]
+    for sequence in (3, 4):
+        server.send_sample(1.0, sensor=1, sequence=sequence)
+    assert [frame.flags for frame in client.poll()] == [DataFlag.GAP, 0]
+
+
+def test_a_request_that_nobody_waits_for_any_more_ends_nothing(server: MemoryServer) -> None:
+    server.answers["status"] = lambda _: None
+    client = client_of(server)
+
+    async def ask() -> None:
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(asyncio.wrap_future(client.request("status")), 0)
+
+    asyncio.run(ask())
+    future = client.request("status")
+    assert not future.cancel(), "it is sent"
+    for request in server.requests[-2:]:
+        server.send_json({"reply": "status", "id": request["id"], "ok": True})
+    server.send_sample(1.0)
+    assert len(client.poll()) == 1
+    assert future.result()["ok"]
+    client.request("status").cancel()
+    server.drop()
+    assert client.poll() == [], "the connection ended before the reply"
+
+
 def test_odd_messages_cost_nothing(server: MemoryServer) -> None:
     sensor = client_of(server)
     for message in odd_messages():
         server.send_json(message)
     server.send_sample(1.0)
     assert sensor.latest().fresh
+    assert all(isinstance(item["event"], str) for item in sensor.events if isinstance(item, dict))
 
 
 @pytest.fixture
@@ -272,10 +406,15 @@ def test_what_is_not_granted_does_not_end_it(scripted: ScriptedServer) -> None:
 
 
 def test_nobody_there() -> None:
-    with pytest.raises(UnreachableError):
-        connect(free_port())
-    with pytest.raises(UnreachableError):
+    port = free_port()
+    with pytest.raises(
+        UnreachableError, match=rf"^no server at localhost:{port} \(Connection refused\): start"
+    ):
+        connect(port)
+    with pytest.raises(UnreachableError, match="65535"):
         connect(70000)
+    with pytest.raises(ConnectionFailedError, match=f"not connected to localhost:{port}"):
+        Client(port).ask("status")
 
 
 def test_a_host_that_is_not_known_is_said_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,7 +422,8 @@ def test_a_host_that_is_not_known_is_said_so(monkeypatch: pytest.MonkeyPatch) ->
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
-    with pytest.raises(UnreachableError, match=r"^Name or service not known$"):
+    sentence = "no server at sensor-cell-3:12001 (Name or service not known): start ethercat-server, or give"
+    with pytest.raises(UnreachableError, match=f"^{re.escape(sentence)} its address$"):
         connect(12001, "sensor-cell-3")
 
 
@@ -338,28 +478,97 @@ def test_a_client_that_was_not_run_does_not_say_that_the_server_is_silent(server
         client.receive(0.02)
 
 
-@pytest.mark.parametrize("hosts", [("::1", "127.0.0.1"), ("127.0.0.1", "::1")])
-def test_an_address_that_this_computer_cannot_have_is_passed_over(
-    hosts: Sequence[str], monkeypatch: pytest.MonkeyPatch
+@contextlib.contextmanager
+def returned(client: Client) -> Iterator[None]:
+    """What is done meanwhile does not wait until the client is closed."""
+    closer = threading.Timer(PATIENCE_S, client.close)
+    closer.start()
+    try:
+        yield
+        assert closer.is_alive(), "it returned because it was closed"
+    finally:
+        closer.cancel()
+        client.close()
+
+
+def waits_everywhere(client: Client) -> None:
+    """All that waits returns while connecting is pending; then it is said that nobody answers."""
+    with returned(client):
+        for wait in (*WAITS.values(), *WAITS.values()):
+            for timeout_s in (0.01, 0.0, -1.0):
+                with contextlib.suppress(NoSampleError):
+                    wait(client, timeout_s)
+        assert client.latest().condition is Condition.DISCONNECTED
+        with pytest.raises(UnreachableError, match=f"^no server at {client.address} \\((?!no conn)"):
+            client.connect()
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A connection has to be made within a moment."""
+    monkeypatch.setattr("bota_ethercat.client.channel.CONNECT_TIMEOUT_S", 0.2)
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_full_backlog_takes_no_longer_than_the_timeout() -> None:
+    """`connect` is pending: the computer or its program hangs."""
+    with full_listener() as port:
+        waits_everywhere(Client(port))
+
+
+@on_a_bus
+@pytest.mark.usefixtures("hasty")
+def test_a_computer_that_is_off_takes_no_longer_than_the_timeout() -> None:
+    with steady_addresses(fcntl.LOCK_EX), Veth() as veth:
+        veth.ip("address", "add", f"{HERE}/30", "dev", veth.near)
+        waits_everywhere(Client(12001, THERE))
+
+
+@pytest.mark.usefixtures("hasty")
+def test_name_servers_that_do_not_answer_take_no_longer_than_the_timeout(
+    monkeypatch: pytest.MonkeyPatch, scripted: ScriptedServer
 ) -> None:
-    """Without IPv6 `localhost` has its address all the same. With a server, and without one before that."""
+    answered, asked, look_up = threading.Event(), list[object](), socket.getaddrinfo
 
-    class Socket(socket.socket):
-        def __init__(self, family: int = socket.AF_INET, *arguments: Any, **named: Any) -> None:
-            if family == socket.AF_INET6:
-                raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
-            super().__init__(family, *arguments, **named)
+    def late(host: object, *arguments: Any, **options: Any) -> Any:
+        asked.append(host)
+        answered.wait()
+        return look_up("localhost", *arguments, **options)
 
-    families = [socket.AF_INET6 if ":" in host else socket.AF_INET for host in hosts]
-    port = free_port()
-    found = [(family, 0, 0, "", (host, port)) for family, host in zip(families, hosts, strict=True)]
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
-    monkeypatch.setattr(socket, "socket", Socket)
-    with contextlib.closing(Client(port)) as client:
-        with pytest.raises(UnreachableError, match=r"^Connection refused$"):
-            client.connect()
-        with ScriptedServer(port):
-            client.connect()
+    monkeypatch.setattr(socket, "getaddrinfo", late)
+    client = Client(scripted.port, "robot")
+    waits_everywhere(client)
+    client = Client(scripted.port, "robot")
+    with contextlib.closing(client):
+        for _ in range(3):
+            with pytest.raises(UnreachableError, match="the name servers do not answer"):
+                client.connect()
+        assert asked == ["robot"] * 2, "no more threads, however often"
+        answered.set()
+        client.connect()
+
+
+def test_no_socket_of_a_family_is_an_address_that_does_not_answer(
+    monkeypatch: pytest.MonkeyPatch, scripted: ScriptedServer
+) -> None:
+    """::1 comes first, and a process may be allowed IPv4 only; whichever comes first."""
+    found = [(socket.AF_INET6, ("::1", scripted.port)), (socket.AF_INET, ("127.0.0.1", scripted.port))]
+    real = socket.socket
+
+    def made(family: int = -1, *rest: Any, **options: Any) -> socket.socket:
+        if family == socket.AF_INET6:
+            raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
+        return real(family, *rest, **options)
+
+    monkeypatch.setattr(socket, "socket", made)
+    for addresses in (found, found[::-1]):
+        rows = [(family, socket.SOCK_STREAM, 6, "", address) for family, address in addresses]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, rows=rows, **__: rows)
+        with connect(scripted.port) as client:
+            assert client.ask("status")["ok"]
+    scripted.close()
+    with pytest.raises(UnreachableError):
+        connect(scripted.port)
 
 
 def test_another_thread_may_close_it(scripted: ScriptedServer) -> None:
@@ -462,15 +671,21 @@ PULLS: dict[str, tuple[Pull, str]] = {
 }
 
 
-@pytest.mark.parametrize(("pull", "reason"), PULLS.values(), ids=PULLS)
-def test_the_guard_of_the_docs_stops_within_two_timeouts(pull: Pull, reason: str) -> None:
+def guard(channel: Channel | None = None, port: int = 1) -> Callable[[Callable[[str], object]], object]:
+    """The guard of the docs."""
     source = examples()[1]
     assert len(source.splitlines()) <= 15
-    server = Simulation(settings={"sinc_length": 64})
-    channel = MemoryChannel(server)
     names: dict[str, Any] = {}
     exec(source, names)
-    names["connect"] = lambda port, **options: Client(port, channel=channel, **options).connect()
+    names["Client"] = lambda _, **options: Client(port, channel=channel, **options)
+    found: Callable[[Callable[[str], object]], object] = names["guard"]
+    return found
+
+
+@pytest.mark.parametrize(("pull", "reason"), PULLS.values(), ids=PULLS)
+def test_the_guard_of_the_docs_stops_within_two_timeouts(pull: Pull, reason: str) -> None:
+    server = Simulation(settings={"sinc_length": 64})
+    channel = MemoryChannel(server)
     pulled_ns = server.clock.now_ns + 2_000_000_000
 
     def stop(why: str) -> None:
@@ -478,4 +693,79 @@ def test_the_guard_of_the_docs_stops_within_two_timeouts(pull: Pull, reason: str
         assert re.match(reason, why)
 
     server.clock.at(pulled_ns, lambda: pull(server, channel))
-    names["guard"](stop)
+    guard(channel)(stop)
+
+
+BEGINNINGS: dict[str, tuple[Callable[[MemoryServer], object], str]] = {
+    "no server": (lambda server: setattr(server, "listens", False), "no force: disconnected"),
+    "computer off": (lambda server: setattr(server, "is_there", False), "no force: disconnected"),
+    "server hangs": (lambda server: server.answers.update(describe=lambda _: None), "no force: disconnected"),
+    "refused": (lambda server: server.answers.update(subscribe=lambda _: {"ok": False}), "no force: disconn"),
+    "no sensor": (lambda server: setattr(server, "description", description(1)), "no force: disconnected"),
+    "another program": (
+        lambda server: setattr(server, "receive", lambda *_: server.send_raw(b"HTTP/1.1 400 Bad\r\n")),
+        "no force: disconnected",
+    ),
+    "sensor lost": (
+        lambda server: setattr(server, "on_subscribe", lambda: server.send_sample(0.0, DataFlag.INVALID)),
+        "no force: (silent|invalid)",
+    ),
+    "nothing comes": (lambda server: None, "no force: silent"),
+    "not finite": (
+        lambda server: setattr(server, "on_subscribe", lambda: server.send_sample(math.nan)),
+        "no force: not finite",
+    ),
+    "over the limit": (
+        lambda server: setattr(server, "on_subscribe", lambda: server.send_sample(-60.0)), "60.0 N",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("begin", "reason"), BEGINNINGS.values(), ids=BEGINNINGS)
+def test_the_guard_of_the_docs_stops_in_every_state_that_it_begins_in(
+    begin: Callable[[MemoryServer], object], reason: str, server: MemoryServer
+) -> None:
+    begin(server)
+    begun_ns, said = server.now_ns, list[str]()
+    guard(ScriptedChannel(server))(said.append)
+    assert len(said) == 1
+    assert re.match(reason, said[0]), said
+    assert server.now_ns <= begun_ns + 1_010_000_000
+
+
+def test_the_guard_of_the_docs_waits_for_a_server_that_starts(
+    server: MemoryServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.listens = False
+    server.on_subscribe = lambda: server.send_sample(-60.0)
+    channel = ScriptedChannel(server)
+    wait, said = channel.wait, list[str]()
+
+    def waited(event: threading.Event, seconds: float) -> bool:
+        server.listens = True
+        return wait(event, seconds)
+
+    monkeypatch.setattr(channel, "wait", waited)
+    guard(channel)(said.append)
+    assert said == ["60.0 N"]
+
+
+def test_the_guard_of_the_docs_stops_when_it_is_ended(
+    server: MemoryServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> int:
+        raise KeyboardInterrupt
+
+    channel, said = ScriptedChannel(server), list[str]()
+    monkeypatch.setattr(channel, "receive", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        guard(channel)(said.append)
+    assert said == ["the guard has ended"]
+
+
+def test_the_guard_of_the_docs_stops_without_a_server_over_tcp() -> None:
+    said = list[str]()
+    guard(port=free_port())(said.append)
+    with full_listener() as port:
+        guard(port=port)(said.append)
+    assert said == ["no force: disconnected"] * 2

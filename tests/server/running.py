@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import random
+import select
 import signal
 import socket
 import subprocess
@@ -98,6 +99,20 @@ def wait_until(
     while not condition():
         assert time.monotonic() < deadline, f"waited {seconds} s for {what}"
         time.sleep(step_s)
+
+
+@contextlib.contextmanager
+def full_listener() -> Iterator[int]:
+    """The port of a listener that takes nobody any more: connecting to it is pending."""
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as listener, contextlib.ExitStack() as queued:
+        where = listener.getsockname()
+        while True:
+            client = queued.enter_context(socket.socket())
+            client.setblocking(False)
+            client.connect_ex(where)
+            if not select.select([], [client], [], 0.1)[1]:
+                break
+        yield where[1]
 
 
 _AWAY = "taken out of OP to be set up: ask again"

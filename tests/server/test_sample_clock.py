@@ -167,6 +167,15 @@ def faults(seed: int, stolen: float) -> list[str]:
     return [what for what, is_so in found.items() if is_so]
 
 
+@pytest.mark.parametrize("controller", [None, Controller()])
+@pytest.mark.parametrize("seed", range(4))
+def test_no_sample_is_dated_after_its_arrival(seed: int, controller: Controller | None) -> None:
+    """Not the first ones, of which nothing is known, nor those that are expected later than they came."""
+    cards = (Card(), slow(2.0), slow(0.5, 0.3), Card(40e3, spread=0.0, jitter_ns=40e3))
+    simulation = ClockSimulation(Sensor(1600.0), cards[seed], Machine(stolen=0.1), 5, controller).run(4.0)
+    assert all(sample.stamp_ns <= sample.back_ns for sample in simulation.samples)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("stolen", [0.0, 0.02, 0.05, 0.1])
 @pytest.mark.parametrize("first", range(0, 1000, 100))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -68,8 +67,6 @@ def _add_recording(made: argparse.ArgumentParser) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Identify; returns the exit code."""
-    # It only reads, so Ctrl-C may end it at any time.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["delay"]:
         return start("ethercat-identify", "identify.delay", parse_delay(given[1:]))

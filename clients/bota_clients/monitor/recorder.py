@@ -65,11 +65,11 @@ class Recorder:
     def _record(self, path: Path) -> str:
         with contextlib.closing(files.Source(self._address, None)) as source:
             source.connect()
-            recorder = files.Recorder(path, files.NAME, files.notes(source), overwrite=False)
-            while not (self._asked.wait(files.BATCH_S) or recorder.failed):
-                recorder.put(source.batch())
-            source.close()
-            recorder.stop("asked to stop")
+            with files.Recorder(path, files.NAME, files.notes(source), overwrite=False) as recorder:
+                while not (self._asked.wait(files.BATCH_S) or recorder.failed):
+                    recorder.put(source.batch())
+                source.close()
+                recorder.stop("asked to stop")
         if recorder.error is not None:
             raise recorder.error
         return recorder.so_far

@@ -15,7 +15,8 @@ from bota_ethercat.address import Address
 from bota_ethercat.program.arguments import Parser, typed
 from bota_ethercat.program.server_choice import is_address
 
-_UNITS_S: Final = {"": 1, "s": 1, "min": 60, "h": 3600}
+_UNITS_S: Final = {"": 1, "s": 1, "m": 60, "h": 3600}  # by their first letter
+_UNIT: Final = "s(?:ec(?:ond)?s?)?|m(?:in(?:ute)?s?)?|h(?:(?:ou)?rs?)?"
 
 
 class RecordOptions(argparse.Namespace):
@@ -30,8 +31,8 @@ class RecordOptions(argparse.Namespace):
 
 
 def _duration(text: str) -> float:
-    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?(s|min|h|)", text, re.ASCII)
-    if match and 1e-9 <= (value := float(match[1]) * _UNITS_S[match[2]]) <= 1e9:
+    match = re.fullmatch(rf"([0-9]+(?:\.[0-9]+)?) ?({_UNIT}|)", text, re.ASCII)
+    if match and 1e-9 <= (value := float(match[1]) * _UNITS_S[match[2][:1]]) <= 1e9:
         return value
     raise ValueError
 
@@ -54,7 +55,11 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     add_force(made)
     add("--no-reconnect", action="store_false", dest="reconnect",
         help="stop when the connection ends, instead of reconnecting")  # fmt: skip
-    options = made.parse_args(argv, RecordOptions())
+    words = list(sys.argv[1:] if argv is None else argv)
+    for at in range(len(words) - 3, -1, -1):  # `--for 5 minutes`
+        if words[at] in ("--for", "--seconds") and re.fullmatch(_UNIT, words[at + 2]):
+            words[at + 1 : at + 3] = [" ".join(words[at + 1 : at + 3])]
+    options = made.parse_args(words, RecordOptions())
     name: str = options.name
     if is_address(name):
         made.error(

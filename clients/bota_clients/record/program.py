@@ -19,8 +19,8 @@ from bota_clients.program import Signals, say
 from bota_clients.record.cli import RecordOptions
 from bota_clients.record.recorder import BATCH_S, NAME, Batch, Recorder, Source, notes
 from bota_clients.recording.reader import Event
-from bota_ethercat.errors import RefusedError, UnreachableError
-from bota_ethercat.health.sentences import event_sentence, no_server
+from bota_ethercat.errors import RefusedError
+from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ethercat.text.untrusted import printable
 
@@ -33,19 +33,17 @@ def run(options: RecordOptions, signals: Signals) -> int:
         try:
             refuse_existing(options.path, force=options.force)
             source.connect()
-        except UnreachableError as error:
-            raise RecordingError(no_server(options.address, error)) from None
         except RefusedError as error:
             raise RecordingError(f"the server refused: {error}") from None
         return _record(source, options, signals)
 
 
 def _record(source: Source, options: RecordOptions, signals: Signals) -> int:
-    recorder = Recorder(options.path, NAME, notes(source), overwrite=options.force)
     console = Console(stderr=True, highlight=False)
     show = partial(console.print, markup=False, soft_wrap=True)
     began, reason = time.monotonic(), "asked to stop"
-    with console.status("") as status:
+    made = Recorder(options.path, NAME, notes(source), overwrite=options.force)
+    with made as recorder, console.status("") as status:
         show(f"recording {options.address} to {options.path}; Ctrl-C ends it")
         while True:
             batch = source.batch()

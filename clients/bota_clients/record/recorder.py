@@ -34,7 +34,9 @@ from bota_ethercat.control import Event as ServerEvent
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.version import VERSION
-from bota_ethercat.text.untrusted import printable
+from bota_ethercat.sensor_choice import MOST_PLACES
+from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.text.untrusted import printable, rows
 
 NAME: Final = f"ethercat-record {VERSION}"
 Batch = list[DataMessage | Description | Event]
@@ -120,7 +122,7 @@ def lost(frames: int, reason: str) -> Event:
 
 
 class Recorder:
-    """Records batches into a file until it is stopped or the file cannot be written.
+    """Records batches into a file until it is stopped or the file cannot be written; `with` stops it.
 
     Attributes:
         dropped: frames that came but could not be written.
@@ -143,6 +145,13 @@ class Recorder:
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if not self._reason:
+            self.stop("an error ended it")
+
     @property
     def failed(self) -> bool:
         """Whether the recorder has stopped; `error` says why."""
@@ -151,20 +160,21 @@ class Recorder:
     @property
     def so_far(self) -> str:
         """What is recorded and what was lost, in words."""
-        frames = f"{self.saved} frames of {count(len(self._streams), 'sensor')}"
+        frames = f"{self.saved} frames of {count(len(self._counts()), 'sensor')}"
         found = [f"{count(self.dropped, 'frame')} came but could not be written"] if self.dropped else []
         for position, sensor in self._counts().items():
-            for number, what in (
-                (sensor.withheld, "not read in time"),
-                (sensor.lost, "after a GAP: samples were or may have been lost on the bus"),
-                (sensor.invalid, "invalid"),
+            for number, thing, what in (
+                (sensor.withheld, "frame", "not read in time"),
+                (sensor.lost, "sample", "lost on the bus (estimated)"),
+                (sensor.invalid, "frame", "invalid"),
             ):
                 if number:
-                    found.append(f"{count(number, 'frame')} of sensor {position} {what}")
+                    found.append(f"{count(number, thing)} of sensor {position} {what}")
         return f"{frames}, {decimal(self._disk.tell())}; {', '.join(found) or 'nothing was lost'}"
 
     def _counts(self) -> dict[int, StreamCounts]:
-        return {position: stream.counts for position, stream in sorted(dict(self._streams).items())}
+        counts = {position: stream.counts for position, stream in sorted(dict(self._streams).items())}
+        return {position: each for position, each in counts.items() if each.frames}
 
     def put(self, batch: Batch) -> None:
         """Queue a batch; never blocks."""
@@ -200,13 +210,19 @@ class Recorder:
             self._record()
             self._finish()
         except RecordingError as error:
-            self.error = error
-            # The failed flush was truncated; of a file that was removed nothing is left.
-            missing = self._writer.frames if self._disk.removed else self._unflushed
-            self.dropped += missing
-            self.saved -= missing
+            self._fail(error)
+        except BaseException as error:
+            self._fail(RecordingError(f"a fault of this program ended the recording: {error!r}"))
+            raise
         finally:
             self._disk.close()
+
+    def _fail(self, error: RecordingError) -> None:
+        self.error = error
+        # The failed flush was truncated; of a file that was removed nothing is left.
+        missing = self._writer.frames if self._disk.removed else self._unflushed
+        self.dropped += missing
+        self.saved -= missing
 
     def _record(self) -> None:
         flush_at = time.monotonic() + FLUSH_S
@@ -236,19 +252,31 @@ class Recorder:
         if isinstance(item, DataMessage):
             self._unflushed += 1
             self.saved += 1
-            if item.sensor not in self._streams:
-                self._streams[item.sensor] = StreamAccounting(fresh_only=False)
-            self._streams[item.sensor].take(item.sequence, item.monotonic_ns, item.flags)
+            self._stream(item.sensor).take(item.sequence, item.monotonic_ns, item.flags)
             writer.frame(item)
         elif isinstance(item, Description):
             writer.describe(item.stamp_ns, item.reply)
+            self._take_rates(rows(item.reply.get("sensors")))
         else:
             if item.by_recorder and item.name == "lost":
                 self.dropped += int(item.event["frames"])
             elif item.by_recorder:  # the server may have been restarted, and its numbering with it
                 for stream in self._streams.values():
                     stream.begin()
+            else:
+                self._take_rates([item.event])
             writer.event(item.stamp_ns, item.event)
+
+    def _take_rates(self, told: Sequence[JsonObject]) -> None:
+        """By them the samples that are missing are counted."""
+        for row in told:
+            if type(position := row.get("sensor")) is int and 0 <= position < MOST_PLACES:
+                self._stream(position).take_rate(row.get("rate_hz"))
+
+    def _stream(self, position: int) -> StreamAccounting:
+        if position not in self._streams:
+            self._streams[position] = StreamAccounting(fresh_only=False)
+        return self._streams[position]
 
     def _finish(self) -> None:
         counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self._counts().items()}

@@ -10,11 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bota_clients.arguments import add_force, add_imu_units, add_server, server_of
-from bota_clients.errors import ClientError
 from bota_clients.program import discard_output, interrupt_on_signals, say, start
 from bota_ethercat.address import Address
-from bota_ethercat.errors import UnreachableError
-from bota_ethercat.health.sentences import no_server
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.arguments import Parser, number, typed
@@ -95,8 +92,6 @@ def run(options: ReportOptions) -> int:
     except KeyboardInterrupt:
         say(_PROGRAM, "stopped: no report was written")
         return 1
-    except UnreachableError as error:
-        raise ClientError(no_server(options.server, error)) from None
     try:
         print(words, flush=True)
     except BrokenPipeError:

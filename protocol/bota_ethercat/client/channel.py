@@ -38,7 +38,10 @@ class Channel(Protocol):
         """Wait until `event` is set, `seconds` at most; whether it is."""
 
     def connect(self, timeout_s: float) -> bool:
-        """Begin or go on connecting, waiting at most `timeout_s`; whether it is done. UnreachableError."""
+        """Begin or go on connecting, waiting at most `timeout_s`; whether it is done. UnreachableError.
+
+        Without an answer for ever it may never be; here and in `receive` 0 or less does not wait.
+        """
 
     def receive(self, buffer: memoryview, timeout_s: float) -> int:
         """Receive what fits, waiting at most `timeout_s` for the first byte; 0: nothing came.
@@ -67,6 +70,28 @@ class Channel(Protocol):
         """For `poll`: readable when something has arrived; -1 without a connection."""
 
 
+_Found = tuple[socket.AddressFamily, tuple[object, ...]]
+
+
+class _Lookup(threading.Thread):
+    """Looks a host's addresses up, for which name servers can take half a minute; `join`, then read them."""
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(name="look-up", daemon=True)
+        self.found: list[_Found] = []
+        self.failed: OSError | ValueError | None = None
+        self._where = host, port
+        self.start()
+
+    def run(self) -> None:
+        """The thread."""
+        try:
+            found = socket.getaddrinfo(*self._where, type=socket.SOCK_STREAM)
+            self.found = [(family, address) for family, _, _, _, address in found]
+        except (OSError, ValueError) as error:  # ValueError: a host name that cannot be one
+            self.failed = error
+
+
 class TcpChannel:
     """A `Channel` to `host`:`port`."""
 
@@ -74,9 +99,10 @@ class TcpChannel:
     wait = staticmethod(threading.Event.wait)
 
     def __init__(self, host: str, port: int, receive_buffer: int = RECEIVE_BUFFER) -> None:
-        """Nothing is sent yet. Each attempt looks the host's name up, which may wait for name servers."""
+        """Nothing is sent yet. Each attempt looks the host's name up."""
         self._host, self._port, self._receive_buffer = host, port, receive_buffer
-        self._untried: list[tuple[socket.AddressFamily, tuple[object, ...]]] = []
+        self._lookup: _Lookup | None = None
+        self._untried: list[_Found] = []
         self._sock: socket.socket | None = None
         self._give_up_ns = 0
         self._timeout_s = -1.0
@@ -84,35 +110,55 @@ class TcpChannel:
         self.is_near = False
 
     def connect(self, timeout_s: float) -> bool:
-        """See `Channel`."""
-        if self._sock is None:
-            if not 0 < self._port < 65536:
-                raise UnreachableError(f"{self._port} is no port: it must be from 1 to 65535")
-            try:
-                found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
-            except (OSError, UnicodeError) as error:  # UnicodeError: a host name that cannot be one
-                raise UnreachableError(_reason(error)) from None
-            self._untried = [(family, address) for family, _, _, _, address in found]
-        why = ""
+        """See `Channel`. Each address has `CONNECT_TIMEOUT_S`, and so have the name servers."""
+        deadline_ns, why = self.monotonic_ns() + round(timeout_s * 1e9), ""
         while True:
+            left_s = max(0.0, (deadline_ns - self.monotonic_ns()) * 1e-9)
             try:
+                if self._sock is None and not self._look_up(left_s):
+                    return self._is_pending()
                 if self._sock is None:
                     self._begin(*self._untried.pop(0))
-                assert self._sock is not None
-                if not _is_writable(self._sock, timeout_s):
-                    if self.monotonic_ns() < self._give_up_ns:
-                        return False
-                    raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
+                    continue
+                if not _is_writable(self._sock, left_s):
+                    return self._is_pending()
                 if (failed := self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)) != 0:
                     raise OSError(failed, os.strerror(failed))
                 self._prepare(self._sock)
+                self._untried.clear()
                 return True
-            except OSError as error:  # "localhost" is ::1 and 127.0.0.1: the server may listen on one only
+            except (OSError, ValueError) as error:
                 self.close()
-                if not why or error.errno != errno.EAFNOSUPPORT:  # this: no IPv6 here
+                if not why or getattr(error, "errno", 0) != errno.EAFNOSUPPORT:  # this: no IPv6 here
                     why = _reason(error)
-                if not self._untried:
+                if not self._untried:  # "localhost" is ::1 and 127.0.0.1: the server may listen on one only
                     raise UnreachableError(why) from None
+
+    def _is_pending(self) -> bool:
+        """False, as `connect` returns it; OSError after `CONNECT_TIMEOUT_S`."""
+        if self.monotonic_ns() < self._give_up_ns:
+            return False
+        if self._sock is None:
+            raise OSError("the name servers do not answer")
+        raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
+
+    def _look_up(self, left_s: float) -> bool:
+        """Whether there are addresses to try; waits at most `left_s` for them."""
+        if self._untried:
+            return True
+        if not self._give_up_ns:
+            self._give_up_ns = self.monotonic_ns() + round(CONNECT_TIMEOUT_S * 1e9)
+        if self._lookup is None:
+            if not 0 < self._port < 65536:
+                raise UnreachableError(f"{self._port} is no port: it must be from 1 to 65535")
+            self._lookup = _Lookup(self._host, self._port)
+        self._lookup.join(left_s)
+        if self._lookup.is_alive():
+            return False
+        self._untried, failed, self._lookup = self._lookup.found, self._lookup.failed, None
+        if failed is not None:
+            raise failed
+        return True
 
     def _begin(self, family: socket.AddressFamily, address: tuple[object, ...]) -> None:
         self._give_up_ns = self.monotonic_ns() + round(CONNECT_TIMEOUT_S * 1e9)
@@ -179,6 +225,7 @@ class TcpChannel:
     def close(self) -> None:
         """See `Channel`."""
         self.shutdown()
+        self._give_up_ns = 0
         if self._sock is not None:
             self._sock.close()
             self._sock = None
@@ -196,7 +243,7 @@ def _is_writable(sock: socket.socket, timeout_s: float) -> bool:
     return bool(poll.poll(timeout_s * 1e3))
 
 
-def _reason(error: OSError | UnicodeError) -> str:
+def _reason(error: OSError | ValueError) -> str:
     """Why there is no connection, without numbers."""
     if isinstance(error, socket.gaierror):  # has numbers of its own
         return error.strerror or str(error)

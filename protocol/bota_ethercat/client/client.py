@@ -30,7 +30,7 @@ from bota_ethercat.client.real_time import Scheduling, make_real_time
 from bota_ethercat.client.session import ClientEvent, Session, check_granted
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, ProtocolError, UnreachableError
 from bota_ethercat.framing import DataMessage, TerminalMessage
-from bota_ethercat.health.sentences import did_not_read
+from bota_ethercat.health.sentences import did_not_read, no_server
 from bota_ethercat.pdo import ImuUnits, Sample
 from bota_ethercat.terminal import decode_terminal
 from bota_ethercat.text.json_text import JsonObject
@@ -192,7 +192,10 @@ class Client:
         deadline_ns = self.channel.monotonic_ns() + round(timeout_s * 1e9)
         left_s = 0.0
         while not self._closing.is_set():
-            self._gather(left_s)
+            try:
+                self._gather(left_s)
+            except ConnectionFailedError:  # the only connection has ended
+                self.channel.wait(self._closing, max(left_s, 0.0))
             self._take_items()
             left_s = (deadline_ns - self.channel.monotonic_ns()) * 1e-9
             if state.unread or left_s <= 0:
@@ -202,27 +205,39 @@ class Client:
     def receive(self, timeout_s: float | None = None) -> list[DataMessage]:
         """New, valid samples in the order of arrival, at least one; NoSampleError if none comes in time.
 
-        `timeout_s` is by default that of the client. Of several sensors each must have one in it.
+        `timeout_s` is by default that of the client; 0 takes those that have arrived. Of several sensors
+        each must have one in it, unless it is 0.
         """
         session = self.session
         if timeout_s is None:
             timeout_s = session.timeout_s if self._timeout_s is None else self._timeout_s
-        deadline_ns = self.channel.monotonic_ns() + round(timeout_s * 1e9)
+        timeout_ns = round(max(timeout_s, 0.0) * 1e9)
+        deadline_ns = self.channel.monotonic_ns() + timeout_ns
         left_s, frames = timeout_s, list[DataMessage]()
         self._looked_ns, self._unread_ns = self.channel.monotonic_ns(), 0  # what was before is its caller's
-        while not frames and left_s > 0:
+        while True:
             self._gather(left_s)
             frames = self._take_items()
             left_s = (deadline_ns - self.channel.monotonic_ns()) * 1e-9
-        silent = session.find_silent(round(timeout_s * 1e9)) if frames else session.first
-        if silent is None:
-            return frames
+            if frames or left_s <= 0:
+                break
+        silent = session.first
+        if frames:
+            found = session.find_silent(timeout_ns) if timeout_ns else None
+            if found is None:
+                return frames
+            silent = found
         session.items.extendleft(reversed(frames))
+        silence_ns = max(timeout_ns, round(session.timeout_s * 1e9))
         condition = session.state(silent).why_old(
-            round(timeout_s * 1e9), self.channel.monotonic_ns(), connected=session.connected
+            silence_ns, self.channel.monotonic_ns(), connected=session.connected
         )
-        why = f"{condition} ({session.problem})" if session.problem else str(condition)
-        if condition is Condition.SILENT and (unread_s := self._unread_ns * 1e-9) > timeout_s:
+        why = str(condition)
+        if session.problem:
+            why += f" ({self.address}: {session.problem})"
+        elif condition is Condition.LATE:
+            why = f"the one before came within the last {silence_ns * 1e-6:g} ms"
+        if condition is Condition.SILENT and (unread_s := self._unread_ns * 1e-9) > max(timeout_s, 0):
             why = f"late: {did_not_read(unread_s)[0]}"
         raise NoSampleError(condition, f"no new sample of sensor {silent} for {timeout_s * 1e3:g} ms: {why}")
 
@@ -241,9 +256,7 @@ class Client:
     def poll_all(self, timeout_s: float = 0.0) -> list[DataMessage | ClientEvent]:
         """As `poll`, with the events in their places between the frames."""
         self._gather(timeout_s)
-        items = list(self.session.items)
-        self.session.items.clear()
-        return items
+        return self.session.take_items()
 
     def frames(self) -> Iterator[DataMessage]:
         """The frames as they come; without end, or with `reconnect` False until the connection ends."""
@@ -300,7 +313,7 @@ class Client:
         ConnectionFailedError if there is no connection; also the future's, if it ends before the reply.
         """
         if not self.session.connected:
-            raise ConnectionFailedError(self.session.problem)
+            raise ConnectionFailedError(f"not connected to {self.address} ({self.session.problem})")
         future, data = self.session.ask(action, **values)
         try:
             self._send(data)
@@ -340,9 +353,8 @@ class Client:
 
     def _take_items(self) -> list[DataMessage]:
         """The frames among the items; `events` gets the others."""
-        items, frames = self.session.items, list[DataMessage]()
-        while items:
-            item = items.popleft()
+        frames = list[DataMessage]()
+        for item in self.session.take_items():
             if isinstance(item, DataMessage):
                 frames.append(item)
             else:
@@ -375,7 +387,7 @@ class Client:
             wait_s = (session.retry_at_ns - channel.monotonic_ns()) * 1e-9
             if wait_s > 0:
                 channel.wait(self._closing, min(wait_s, timeout_s))
-            elif channel.connect(timeout_s):
+            elif channel.connect(min(timeout_s, _AGAIN_S)):  # which `close` does not end
                 self._open = True
                 self._looked_ns = self._watched_ns = channel.monotonic_ns()
                 self._send(session.opened(channel.monotonic_ns(), is_near=channel.is_near))
@@ -390,9 +402,10 @@ class Client:
         return 0
 
     def _end(self, error: ProtocolError) -> None:
-        self._open, self._failed = False, error
-        self.channel.close()
         reachable = not isinstance(error, UnreachableError)
+        self._open = False
+        self._failed = error if reachable else UnreachableError(no_server(self.address, error))
+        self.channel.close()
         self.session.ended(str(error), self.channel.monotonic_ns(), reachable=reachable)
 
     def _send(self, data: bytes) -> None:

@@ -19,7 +19,6 @@ from bota_ethercat.text.untrusted import mapping, number
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
-_MOST_HZ: Final = 1e6  # a higher rate is no sensor's
 LONGEST_MS: Final = 1000  # a longer delay is no filter's
 _LEAST_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
@@ -119,10 +118,8 @@ class SensorState:
 
     def take_in_force(self, message: Mapping[str, object]) -> None:
         """The rate and the delays that a description or an event gives; others stay as they were."""
-        rate_hz, delay_ms = number(message.get("rate_hz")), message.get("delay_ms")
-        if rate_hz is not None and 0 < rate_hz <= _MOST_HZ:
-            self.accounting.rate_hz = rate_hz
-        if isinstance(delay_ms, dict):
+        self.accounting.take_rate(message.get("rate_hz"))
+        if isinstance(delay_ms := message.get("delay_ms"), dict):
             self.delay_ns = Delays.parse(delay_ms)
 
     def begin(self) -> None:

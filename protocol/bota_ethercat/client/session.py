@@ -99,7 +99,8 @@ class Session:
         self.terminal_frames: deque[TerminalMessage] = deque(maxlen=_MOST_ITEMS // 64)
         self.connected = self.same_machine = False
         self.description: JsonObject = {}
-        self.items: deque[DataMessage | ClientEvent] = deque(maxlen=_MOST_ITEMS)
+        self.items: deque[DataMessage | ClientEvent] = deque()
+        self._dropped: set[int] = set()  # sensors whose frames were dropped from `items`
         self.sensors: dict[int, SensorState] = {}
         self.connections = 0
         self.retry_at_ns = 0
@@ -144,6 +145,25 @@ class Session:
             if (future := self._replies.pop(identifier, None)) is not None:
                 future.set_exception(error)
         self.items.append(Disconnected(reason, reachable, was_connected))
+        self._drop_oldest()
+
+    def take_items(self) -> list[DataMessage | ClientEvent]:
+        """`items`, which are taken; GAP in the first frame of a sensor whose frames were dropped."""
+        items = list(self.items)
+        self.items.clear()
+        if self._dropped:
+            for at, item in enumerate(items):
+                if isinstance(item, DataMessage) and item.sensor in self._dropped:
+                    self._dropped.remove(item.sensor)
+                    items[at] = item._replace(flags=item.flags | DataFlag.GAP)
+        return items
+
+    def _drop_oldest(self) -> None:
+        """Nobody takes the items: their owner waits for a reply, say."""
+        while len(self.items) > _MOST_ITEMS:
+            item = self.items.popleft()
+            if isinstance(item, DataMessage):
+                self._dropped.add(item.sensor)
 
     def get_buffer(self) -> memoryview:
         """Where to read into; then call `received`."""
@@ -167,6 +187,7 @@ class Session:
                 if batch:
                     self._take(now_ns)
                 if message is None:
+                    self._drop_oldest()
                     return answer
                 if not isinstance(message, TerminalMessage):
                     answer += self._take_json(message)
@@ -191,7 +212,8 @@ class Session:
     def ask(self, action: str, **values: object) -> tuple[Future[JsonObject], bytes]:
         """A request: the future that gets its reply, and what to send; from any thread."""
         identifier = next(self._ids)
-        future = self._replies[identifier] = Future()
+        future = self._replies[identifier] = Future[JsonObject]()
+        future.set_running_or_notify_cancel()  # it cannot be cancelled: the request is sent
         return future, encode_json(request(action, identifier, **values))
 
     def forget(self, future: Future[JsonObject]) -> None:
@@ -203,7 +225,8 @@ class Session:
     def _take_json(self, message: JsonObject) -> bytes:
         """Take a JSON message; what to send."""
         if "event" in message:
-            self._take_event(message)
+            if isinstance(message["event"], str):
+                self._take_event(message)
             return b""
         identifier = message.get("id")
         future = self._replies.pop(identifier, None) if type(identifier) is int else None
@@ -276,7 +299,7 @@ class Session:
     def timeout_s(self) -> float:
         """After this time without a sample something is wrong: a few periods of the slowest sensor."""
         rates = [state.accounting.rate_hz for state in self.sensors.values() if state.accounting.rate_hz]
-        return max(_LEAST_TIMEOUT_S, *(_TIMEOUT_PERIODS * self._every / rate for rate in rates))
+        return max([_LEAST_TIMEOUT_S, *(_TIMEOUT_PERIODS * self._every / rate for rate in rates)])
 
     def state(self, sensor: int) -> SensorState:
         """What is known of a sensor, so far nothing of one that no description had."""

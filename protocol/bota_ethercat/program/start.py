@@ -2,7 +2,7 @@
 """Starts a program: Ctrl-C is never a traceback, whatever is being imported, and output never fails.
 
 Few imports, for Python's own handler raises KeyboardInterrupt in the middle of them. While a program loads,
-SIGINT and SIGTERM have their default action; what raises KeyboardInterrupt is installed when all is loaded.
+SIGINT and SIGTERM have their default action; `signals` is for when all is loaded.
 """
 
 import signal
@@ -25,5 +25,6 @@ def run(module: str) -> int:
         code: int = import_module(module).main()
     except KeyboardInterrupt:
         code = INTERRUPTED
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     return code

@@ -92,10 +92,10 @@ void conditions() {
 
 /// As Python's JSON has it.
 void print(double number) {
-    if (std::isfinite(number))
+    if (is_finite(number))
         std::printf("%.17g", number);
     else
-        std::printf("%s", std::isnan(number) ? "NaN" : number > 0.0 ? "Infinity" : "-Infinity");
+        std::printf("%s", is_nan(number) ? "NaN" : number > 0.0 ? "Infinity" : "-Infinity");
 }
 
 template <std::size_t Size>
@@ -252,7 +252,8 @@ int main(int argc, char** argv) {
             print(control, ok);
         } else if (command == "tare") {
             std::array<double, 6> target{};
-            for (double& value : target) words >> value;
+            for (double& value : target)  // also nan and inf
+                if (std::string word; words >> word) value = std::strtod(word.c_str(), nullptr);
             TareResult t;
             const bool ok = control.tare(t, 0, static_cast<unsigned>(number), target);
             std::printf("{\"done\":%s", yes(ok));

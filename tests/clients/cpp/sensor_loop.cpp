@@ -49,8 +49,8 @@ void keep(Level level, const std::string& text) {
 
 void number(const char* key, double value) {
     std::printf(",\"%s\":", key);
-    if (std::isnan(value)) std::printf("null");
-    else if (std::isinf(value)) std::printf("1e999");
+    if (bota_ethercat::is_nan(value)) std::printf("null");
+    else if (!bota_ethercat::is_finite(value)) std::printf("1e999");
     else std::printf("%.17g", value);
 }
 
@@ -193,7 +193,7 @@ int main() {
                 std::copy_n(numbers.begin() + 1, 3, sample.acceleration.begin());
                 std::copy_n(numbers.begin() + 4, 3, sample.angular_rate.begin());
                 for (const double value : tool.follow(sample, numbers[0]))
-                    std::isnan(value) ? std::printf("%snull", separator) : std::printf("%s%.17g", separator, value), separator = ",";
+                    bota_ethercat::is_nan(value) ? std::printf("%snull", separator) : std::printf("%s%.17g", separator, value), separator = ",";
             }
             std::printf("]");
         } else if (command == "log") {

@@ -78,7 +78,7 @@ public:
                               ",\"samples\":" + std::to_string(samples) + ",\"target\":";
         char separator = '[';
         for (const double value : target) {
-            if (!std::isfinite(value)) return fail("the target of a tare must be six finite numbers");
+            if (!is_finite(value)) return fail("the target of a tare must be six finite numbers");
             std::array<char, 40> digits{};
             const auto done = std::to_chars(digits.data(), digits.data() + digits.size(), value);
             request += separator;

@@ -44,6 +44,24 @@ enum class ImuUnits : std::uint8_t { g_dps, si };
 
 using Vector3 = std::array<double, 3>;
 
+namespace detail {
+
+/// The bits of a number. volatile, or else compilers may conclude from them what -ffast-math claims of the number.
+inline std::uint64_t bits_of(double value) noexcept {
+    std::uint64_t bits = 0;
+    std::memcpy(&bits, &value, sizeof bits);
+    const volatile std::uint64_t as_they_are = bits;
+    return as_they_are;
+}
+
+inline constexpr std::uint64_t infinity_bits = 0x7FFull << 52;
+
+}  // namespace detail
+
+/// Neither NaN nor infinite, and NaN: also in a program of -ffast-math, where std::isfinite is always true.
+inline bool is_finite(double value) noexcept { return (detail::bits_of(value) & detail::infinity_bits) != detail::infinity_bits; }
+inline bool is_nan(double value) noexcept { return detail::bits_of(value) << 1 > detail::infinity_bits << 1; }
+
 /// One decoded sample in SI units and the sensor's own frame: `protocol.pdo.Sample` in C++, to the bit.
 struct Sample {
     Vector3 force{};                      ///< N
@@ -66,7 +84,7 @@ struct Sample {
     }
 
     /// Whether every measured value is a finite number.
-    bool is_finite() const noexcept { return wrench_is_finite() && imu_is_finite() && std::isfinite(temperature); }
+    bool is_finite() const noexcept { return wrench_is_finite() && imu_is_finite() && bota_ethercat::is_finite(temperature); }
 
     bool wrench_is_finite() const noexcept { return are_finite(force) && are_finite(torque); }
     /// Acceleration, angular rate and orientation.
@@ -87,9 +105,7 @@ struct Sample {
 private:
     template <std::size_t Size>
     static bool are_finite(const std::array<double, Size>& values) noexcept {
-        double total = 0.0;  // a sum of float32 values cannot overflow a double
-        for (const double value : values) total += value;
-        return std::isfinite(total);
+        return std::all_of(values.begin(), values.end(), [](double value) { return bota_ethercat::is_finite(value); });
     }
 };
 
@@ -161,7 +177,7 @@ inline bool decode(const std::uint8_t* data, std::size_t size, ImuUnits units, S
         for (std::size_t i = 0; i < 4; ++i) {
             sample.orientation[i] = detail::real(data + detail::kOrientationAt + 4 * i);
             // NaN counts as an estimate, as in Python: it must not pass for "none".
-            if (!(std::fpclassify(sample.orientation[i]) == FP_ZERO)) sample.has_orientation = true;
+            if (detail::bits_of(sample.orientation[i]) << 1 != 0) sample.has_orientation = true;
         }
         if (!sample.has_orientation) sample.orientation = {};
     }

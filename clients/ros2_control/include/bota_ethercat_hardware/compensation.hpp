@@ -131,7 +131,7 @@ public:
     /// known. `time_s` is by a clock that nobody sets.
     Wrench follow(const bota_ethercat::Sample& sample, double time_s) {
         constexpr double kTurning = 0.05;  // rad/s: less is a gyroscope's offset
-        if (!sample.imu_is_finite()) time_s_ = -INFINITY;
+        if (!sample.imu_is_finite()) time_s_ = kNever;
         if (!sample.imu_is_finite() || sample.acceleration == Vector3{}) return none();
         take(row(sample), time_s - time_s_);
         time_s_ = time_s;
@@ -150,6 +150,7 @@ public:
 
 private:
     using Row = std::array<double, 6>;  // true acceleration, angular rate
+    static constexpr double kNever = -1e18;  // s; infinity is nothing that -ffast-math knows
 
     static Wrench none() noexcept { return {NAN, NAN, NAN, NAN, NAN, NAN}; }
 
@@ -202,7 +203,7 @@ private:
     std::size_t count_ = 0;    // of the samples that are kept
     std::deque<Row> history_;  // the newest first
     int known_ = 0;            // since the last gap
-    double time_s_ = -INFINITY;
+    double time_s_ = kNever;
 };
 
 }  // namespace bota_ethercat_hardware

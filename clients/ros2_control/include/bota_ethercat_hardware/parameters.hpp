@@ -62,7 +62,8 @@ template <typename Number>
 bool number(std::string_view text, Number least, Number most, Number& into) noexcept {
     Number found{};
     const auto done = std::from_chars(text.data(), text.data() + text.size(), found);
-    if (done.ec != std::errc() || done.ptr != text.data() + text.size() || !(found >= least && found <= most)) return false;
+    if (done.ec != std::errc() || done.ptr != text.data() + text.size()) return false;
+    if (bota_ethercat::is_nan(static_cast<double>(found)) || found < least || found > most) return false;
     into = found;
     return true;
 }

@@ -134,7 +134,7 @@ public:
             condition_ = static_cast<int>(received.is_connected ? Condition::late : Condition::disconnected);
         else if (!received.is_checked && reading.condition <= Condition::saturated)
             condition_ = kUnchecked;
-        else if (parameters_.wants_compensated && reading.condition <= Condition::saturated && std::isnan(received.tool[0]))
+        else if (parameters_.wants_compensated && reading.condition <= Condition::saturated && bota_ethercat::is_nan(received.tool[0]))
             condition_ = static_cast<int>(Condition::not_finite);
         values_[kAge] = sampled_ns_ == kNever ? kInfinity : seconds(now_ns - sampled_ns_);
         values_[kCondition] = condition_;

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What SIGINT and SIGTERM do once a program is loaded; before, `start` has them end it at once.
+
+Either they are remembered (`Signals`), by programs that have something to finish, or they raise
+KeyboardInterrupt (`interrupt_on_signals`).
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from types import FrameType
+
+
+class Signals:
+    """SIGINT, SIGTERM and, unless it is ignored as by nohup, SIGHUP: they ask the program to end.
+
+    Attributes:
+        asked: whether one has arrived; set it to stop without one.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._stop: Callable[[], object] = lambda: None
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows lacks the last one
+            if number and not (name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN):
+                signal.signal(number, self._on_signal)
+
+    def call(self, stop: Callable[[], object]) -> None:
+        """From now on a signal calls `stop`, also one that has arrived already."""
+        self._stop = stop
+        if self.asked:
+            stop()
+
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        self.asked = True
+        self._stop()
+
+
+def interrupt_on_signals() -> None:
+    """SIGINT and SIGTERM raise KeyboardInterrupt: for when everything is imported."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
