@@ -350,6 +350,10 @@ class Cycle:
                 self._bus.process_data.read_latched(stream.number, reads=False)
         self.every_second()
 
+    def trace(self, offset: int) -> dict[str, Any]:
+        """See `Tracing.part`."""
+        return self.tracing.part(offset)
+
     def status(self) -> dict[str, Any]:
         """The cycle's part of the `status` reply."""
         now_ns = self._bus.clock.monotonic_ns()

@@ -27,7 +27,7 @@ class Tracing:
         self.notes: list[Note] = []
         for stream in streams:
             stream.notes, stream.on_change = self.notes, self.snapshot
-        self._snapshot_in_s = 0
+        self._snapshot_in_s = self._size = 0
         self.snapshot()
 
     def pack(self) -> None:

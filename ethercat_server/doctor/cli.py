@@ -9,6 +9,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Final
 
 from bota_ethercat.health.verdict import Level
@@ -18,6 +19,7 @@ from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import visible
 from ethercat_server.access.adapters import find_holder, is_elsewhere, server_here
 from ethercat_server.daemon.options import SERVER_SETTINGS, VIRTUAL_INTERFACE
+from ethercat_server.doctor import trace
 from ethercat_server.doctor.bus_checks import examine_bus
 from ethercat_server.doctor.machine import Machine
 from ethercat_server.doctor.machine_checks import examine_machine
@@ -43,7 +45,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "iface", metavar="IFACE", nargs="?",
         help="interface the sensors are connected to ('virtual' for a virtual sensor); by default that of "
-        f"the server {server_choice.HELP}",
+        f"the server {server_choice.HELP}; a FILE{trace.SUFFIX} is shown",
     )  # fmt: skip
     parser.add_argument(
         "--seconds", type=number(0, _LONGEST_S), default=10.0, metavar="N",
@@ -56,6 +58,10 @@ def build_parser() -> argparse.ArgumentParser:
             default=setting.default, help=f"measure like a server with this option: {setting.meaning}",
         )  # fmt: skip
     parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
+    parser.add_argument(
+        "--trace", type=Path, metavar="FILE",
+        help="only write a trace of the server's last minute to FILE: which samples were late or lost",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     return parser
 
@@ -70,6 +76,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
+    if args.trace is not None:
+        print(trace.save(args.trace))
+        return 0
+    if args.iface is not None and args.iface.endswith(trace.SUFFIX):
+        print(*trace.show(Path(args.iface)), sep="\n")
+        return 0
     if args.iface is None:
         try:
             _, args.iface = server_here()

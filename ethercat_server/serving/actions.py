@@ -31,6 +31,9 @@ class Producer(Protocol):
     def status(self) -> dict[str, Any]:
         """Its part of the `status` reply."""
 
+    def trace(self, offset: int) -> dict[str, Any]:
+        """A part of a trace of its exchanges from `offset` on; RequestError if there is none."""
+
     def stop(self) -> None:
         """End soon."""
 
@@ -74,6 +77,7 @@ class Actions:
             "subscribe": self._subscribe,
             "unsubscribe": self._unsubscribe,
             "status": self._status,
+            "trace": self._trace,
             "shutdown": self._shutdown,
         }
 
@@ -139,6 +143,9 @@ class Actions:
             for c in self._hub.connections.values()
         ]
         return reply(request, **self._cycle.status(), clients=clients)
+
+    def _trace(self, _: Connection, request: Request) -> JsonObject:
+        return reply(request, **self._cycle.trace(request.values["offset"]))
 
     def _shutdown(self, _: Connection, request: Request) -> JsonObject:
         self._cycle.stop()

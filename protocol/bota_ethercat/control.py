@@ -25,6 +25,7 @@ MAX_SDO_BYTES: Final = 112  # largest SDO that fits a mailbox of 128 bytes unseg
 MAX_TARE_SAMPLES: Final = 20_000
 _LONGEST_NAME: Final = 80
 MAX_SII_WORDS: Final = 128
+MAX_TRACE_SIZE: Final = 64 << 20  # bytes of a trace file
 
 
 class ErrorCode(StrEnum):
@@ -222,6 +223,7 @@ ACTIONS: Final[Mapping[str, Action]] = {
         },
         controls=True,
     ),
+    "trace": Action({"offset": Parameter(whole_number(0, MAX_TRACE_SIZE), default=0)}, controls=True),
     "shutdown": Action({}, controls=True),
 }
 

@@ -235,6 +235,7 @@ def test_requests_are_answered_as_by_a_server_whose_sensors_are_lost(path: Path,
         ("sdo_read", {"index": 0x8010, "subindex": 1}),
         ("sdo_write", {"index": 0x8010, "subindex": 1, "hex": "00"}),
         ("sii_read", {"word": 0}),
+        ("trace", {}),
     ],
 )
 def test_what_needs_a_sensor_is_refused_in_a_sentence(

@@ -7,13 +7,16 @@ import itertools
 import json
 import random
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
+from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.sampling.trace import Kind, Trace, TraceError
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.simulation import Simulation, fresh
+from tests.ended import run_here
+from tests.simulation import MemoryChannel, SimulatedServer, Simulation, fresh, simulated_bus
 
 
 def trace_of(simulation: Simulation) -> bytes:
@@ -120,3 +123,28 @@ def test_a_file_is_hostile() -> None:
                 pass
         except TraceError:
             pass
+
+
+def test_the_doctor_keeps_a_trace_and_shows_what_was_lost_and_why(tmp_path: Path) -> None:
+    path = tmp_path / "a.trace"
+    with simulated_bus("--sinc", 64) as bus:
+        simulation = SimulatedServer(bus)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("bota_ethercat.client.client.TcpChannel", lambda *_: MemoryChannel(simulation))
+            simulation.run(1.0)
+            simulation.at(0.5, lambda: simulation.clock.stall(20e6))
+            simulation.at(1.0, "skip 3")
+            simulation.run(2.0)
+            saved = run_here(doctor, "--trace", path)
+        assert "ethercat-doctor" in saved.out
+    shown = run_here(doctor, path).out
+    assert "this computer sent nothing for 2" in shown
+    assert "lost though it was polled: the sensor gave none" in shown
+    path.write_bytes(b'{"format": "another"}\n')
+    assert "it is no trace of the sampling clocks" in run_here(doctor, path).err
+
+
+def test_who_may_not_control_the_server_gets_no_trace() -> None:
+    simulation = Simulation()
+    simulation.run(0.2)
+    assert simulation.connect(1234).refused("trace")["code"] == "denied"

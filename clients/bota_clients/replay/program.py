@@ -9,13 +9,13 @@ import sys
 import time
 from functools import partial
 from itertools import takewhile
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
 from bota_clients.recording.reader import Description, Event, Recording, open_recording
 from bota_clients.replay.cli import ReplayOptions
-from bota_clients.replay.sensors import ReplayedSensors
+from bota_clients.replay.sensors import ReplayedSensors, needs_sensor
 from bota_clients.replay.timeline import Timeline
 from bota_ethercat.control import Event as ServerEvent
 from bota_ethercat.control import event
@@ -77,6 +77,10 @@ class Player:
     def status(self) -> dict[str, Any]:
         """Its part of the `status` reply."""
         return self.sensors.status()
+
+    def trace(self, offset: int) -> NoReturn:  # noqa: ARG002
+        """There are no exchanges."""
+        raise needs_sensor("trace")
 
     def run(self) -> None:
         """Play from the first subscriber on."""

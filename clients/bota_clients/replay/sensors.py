@@ -89,6 +89,14 @@ class ReplayedSensor:
         }
 
 
+def needs_sensor(action: str) -> RequestError:
+    """What needs a real sensor is refused."""
+    return RequestError(
+        ErrorCode.NOT_READY,
+        f"{action} needs a sensor, but this is a replay of a recording: connect to the server",
+    )
+
+
 class ReplayedSensors:
     """All sensors, by position; also those without frames, so that positions are kept.
 
@@ -142,10 +150,7 @@ class ReplayedSensors:
 
     def handle(self, connection: Connection, request: Request) -> NoReturn:  # noqa: ARG002
         """Refuse what needs a real sensor."""
-        raise RequestError(
-            ErrorCode.NOT_READY,
-            f"{request.action} needs a sensor, but this is a replay of a recording: connect to the server",
-        )
+        raise needs_sensor(request.action)
 
     def _at(self, position: object) -> ReplayedSensor | None:
         number = whole(position)

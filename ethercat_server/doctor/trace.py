@@ -1,0 +1,172 @@
+"""A trace of a server's last minute, written and shown.
+
+It is replayed through the server's own sampling clocks: what was late or lost, when, and why.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from bota_ethercat.client import Client
+from bota_ethercat.errors import ConnectionFailedError, ProtocolError
+from bota_ethercat.program.server_choice import default_server
+from bota_ethercat.text.untrusted import printable
+from ethercat_server.errors import ServerError
+from ethercat_server.sampling.trace import Kind, Step, Trace, TraceError
+
+SUFFIX: Final = ".trace"
+_LATE: Final = 1.5  # periods between two exchanges, or in one, beyond which samples pass
+_MOST_SHOWN: Final = 20
+_CELL_S: Final = 0.1  # of the picture
+_CELLS: Final = 100  # in a line
+# Causes as they stand in the picture, the worst last.
+_MARKS: Final = {
+    "": ".",
+    "uncertain": "?",
+    "sensor": "s",
+    "card or slave": "c",
+    "machine": "m",
+    "not in the exchange": "i",
+}
+
+
+class Loss(NamedTuple):
+    """What was wrong with a sample, or before it."""
+
+    at_ns: int
+    sensor: int
+    cause: str  # of `_MARKS`
+    text: str
+
+
+def save(path: Path) -> str:
+    """Get the trace of the server; what was done. ServerError if it gives none."""
+    data, size, address = b"", 1, default_server()
+    try:
+        with Client(address.port, address.host, stream=False, reconnect=False).connect() as client:
+            while len(data) < size:
+                reply = client.ask("trace", offset=len(data))
+                part, size = base64.b64decode(reply["data"], validate=True), int(reply["size"])
+                if not part:
+                    raise ServerError(f"the server at {address} ended its trace early: ask again")
+                data += part
+        Trace(data)
+        path.write_bytes(data)
+    except (ConnectionFailedError, ProtocolError, TraceError) as error:
+        raise ServerError(f"no trace of the server at {address}: {error}") from None
+    except (KeyError, TypeError, ValueError, binascii.Error):
+        raise ServerError(f"the program at {address} is not a compatible ethercat-server") from None
+    except OSError as error:
+        raise ServerError(f"{path} cannot be written: {error.strerror}") from None
+    return f"{path}: {len(data) // 1024} KiB; 'ethercat-doctor {path}' shows it"
+
+
+def show(path: Path) -> Iterator[str]:
+    """The lines that show a trace file; ServerError if it is none."""
+    try:
+        trace = Trace(path.read_bytes())
+        steps = list(trace.replay())
+    except OSError as error:
+        raise ServerError(f"{path} cannot be read: {error.strerror}") from None
+    except TraceError as error:
+        raise ServerError(f"{path} cannot be replayed: {error}") from None
+    sensors = trace.about.get("sensors")
+    rows: Sequence[Any] = sensors if isinstance(sensors, list) else ()
+    yield f"written by {printable(trace.about.get('program'), 40)}, {len(trace.records)} records"
+    losses = []
+    for number in sorted({step.record.sensor for step in steps}):
+        own = [step for step in steps if step.record.sensor == number]
+        found = list(find_losses(number, own))
+        losses += found
+        row = rows[number] if number < len(rows) and isinstance(rows[number], dict) else {}
+        yield f"\nsensor {number} ({printable(row.get('model'), 40)})"
+        yield from _table(own)
+        yield from _picture(own, found)
+    losses.sort()
+    for loss in losses[:_MOST_SHOWN]:
+        at_s = (loss.at_ns - steps[0].record.sent_ns) * 1e-9
+        yield f"{at_s:9.4f} s  sensor {loss.sensor}: {loss.text}"
+    if len(losses) > _MOST_SHOWN:
+        yield f"({len(losses) - _MOST_SHOWN} more)"
+
+
+def find_losses(number: int, steps: Sequence[Step]) -> Iterator[Loss]:
+    """What was lost, re-associated or invalid of a sensor, and why."""
+    fresh_ns = [step.record.sent_ns for step in steps if step.record.kind is Kind.FRESH]
+    gaps = sorted(after - before for before, after in pairwise(fresh_ns))
+    period_ns = gaps[len(gaps) // 2] if gaps else 0
+    before_ns, invalid, was_uncertain = 0, 0, False
+    for step in steps:
+        record = step.record
+        sent_ns, back_ns = record.sent_ns, record.sent_ns + record.duration_ns
+        asleep_ns = sent_ns - before_ns if before_ns else 0
+        before_ns = back_ns
+        if record.kind is Kind.INVALID:
+            invalid += 1
+            if invalid == 1:
+                text = f"it took no part in an exchange (working counter {record.wkc})"
+                yield Loss(sent_ns, number, "not in the exchange", text)
+            continue
+        if record.kind is not Kind.FRESH:
+            continue
+        lost, took = step.steps - 1, f"{record.duration_ns / 1e6:.2f} ms"
+        if step.steps == 0:
+            yield Loss(sent_ns, number, "uncertain", "a sample that was counted as lost came late")
+        elif lost and invalid:
+            yield Loss(sent_ns, number, "not in the exchange", f"{lost} lost while it took no part")
+        elif lost and asleep_ns > _LATE * period_ns:
+            text = f"{lost} lost: this computer sent nothing for {asleep_ns / 1e6:.2f} ms"
+            yield Loss(sent_ns, number, "machine", text)
+        elif lost and record.duration_ns > _LATE * period_ns:
+            yield Loss(sent_ns, number, "card or slave", f"{lost} lost in an exchange that took {took}")
+        elif lost:
+            yield Loss(sent_ns, number, "sensor", f"{lost} lost though it was polled: the sensor gave none")
+        elif step.uncertain and not was_uncertain:
+            yield Loss(sent_ns, number, "uncertain", f"maybe one lost: the exchange took {took}")
+        invalid, was_uncertain = 0, step.uncertain
+
+
+def _table(steps: Sequence[Step]) -> Iterator[str]:
+    kinds = Counter(step.record.kind for step in steps)
+    new = [step for step in steps if step.record.kind is Kind.FRESH]
+    seconds = (steps[-1].record.sent_ns - steps[0].record.sent_ns) * 1e-9
+    yield (
+        f"  {seconds:.1f} s: {len(new)} samples, {sum(max(0, step.steps - 1) for step in new)} lost, "
+        f"{kinds[Kind.READ]} early polls, {kinds[Kind.INVALID]} invalid exchanges"
+    )
+    if new:
+        ages = [step.record.sent_ns + step.record.duration_ns - step.instant_ns for step in new]
+        yield f"  age when it was here {_points(ages)} µs"
+        events = 100 * sum(step.by_events for step in new) // len(new)
+        locked = 100 * sum(step.locked for step in new) // len(new)
+        yield f"  followed {locked} % of the time, dated by the slave controller {events} %"
+    yield f"  exchanges {_points([float(step.record.duration_ns) for step in steps])} µs"
+
+
+def _points(values_ns: Sequence[float]) -> str:
+    ordered = sorted(values_ns)
+    points = {"p50": 0.5, "p99": 0.99, "max": 1.0}
+    return ", ".join(
+        f"{name} {ordered[min(int(at * len(ordered)), len(ordered) - 1)] / 1e3:.0f}"
+        for name, at in points.items()
+    )
+
+
+def _picture(steps: Sequence[Step], losses: Sequence[Loss]) -> Iterator[str]:
+    """A mark for each tenth of a second: the worst that happened in it."""
+    begin_ns, order = steps[0].record.sent_ns, [*_MARKS]
+    cells = [0] * (1 + int((steps[-1].record.sent_ns - begin_ns) * 1e-9 / _CELL_S))
+    for loss in losses:
+        at = min(len(cells) - 1, max(0, int((loss.at_ns - begin_ns) * 1e-9 / _CELL_S)))
+        cells[at] = max(cells[at], order.index(loss.cause))
+    for begin in range(0, len(cells), _CELLS):
+        marks = "".join(_MARKS[order[cell]] for cell in cells[begin : begin + _CELLS])
+        yield f"  {begin * _CELL_S:5.0f} s {marks}"
+    if any(cells):
+        yield "  " + ", ".join(f"{mark} {cause}" for cause, mark in _MARKS.items() if cause)
