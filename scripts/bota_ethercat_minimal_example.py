@@ -7,9 +7,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # works from a 
 from ethercat_server.tool.cli import main
 
 COMMANDS = {
-    "find_ethernet_adapters": "adapters",  # III.1
-    "read_eeprom": "eeprom",  # III.3
-    "bota_ethercat_minimal_example": "watch",  # III.5
-    "sensor_configuration_SDO_reader": "objects",  # III.6
+    "find_ethernet_adapters": ("adapters",),  # III.1
+    "read_eeprom": ("eeprom",),  # III.3
+    "bota_ethercat_minimal_example": ("read", "0x6000"),  # III.5: one sample; ethercat-monitor shows the stream
+    "sensor_configuration_SDO_reader": ("objects",),  # III.6
 }
-sys.exit(main([COMMANDS[Path(__file__).stem], *sys.argv[1:]]))
+command, *names = COMMANDS[Path(__file__).stem]
+sys.exit(main([command, *sys.argv[1:], *names]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import os
 import re
 import shutil
@@ -68,7 +69,7 @@ class Desk:
     """Terminals of one user, whose machine has no network but the loopback interface."""
 
     def __init__(self, folder: Path, checkout: Path, wheels: str) -> None:
-        self.folder, self._count = folder, 0
+        self.folder, self.checkout, self._count = folder, checkout, 0
         (folder / "bin").mkdir()
         sudo = folder / "bin" / "sudo"
         sudo.write_text('#!/bin/sh\nexec "$@"\n')
@@ -162,8 +163,8 @@ def test_who_follows_the_page_without_hardware_gets_a_wrench_without_tool_and_bi
         assert code == 0 or any(name in typed for name in JUDGES), f"{typed}: {said[typed]}"
         assert not missing(shown, said[typed]), f"{typed}: {said[typed]}"
 
-    (watched,) = [text for command, text in said.items() if "-sensor watch" in command]
-    forces = [float(z) for z in re.findall(r"F \S+ \S+ (\S+) N", watched)]
+    with (desk.checkout / "push.csv").open(encoding="utf-8") as pushed:
+        forces = [float(row["force_z_N"]) for row in csv.DictReader(pushed)]
     assert min(forces) < statistics.median(forces) - 4, "a push towards the robot is negative"
     (printed,) = [text for command, text in said.items() if "python - <<" in command]
     measured, compensated = (

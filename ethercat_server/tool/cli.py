@@ -11,7 +11,7 @@ from typing import Any, Final, NoReturn
 from bota_ethercat.program.arguments import Parser
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server.process import command_line
-from ethercat_server.tool import bus, filters, objects, settings, watch
+from ethercat_server.tool import bus, filters, objects, settings
 from ethercat_server.tool.command import Command, say_json
 
 _PROGRAM: Final = "ethercat-sensor"
@@ -21,7 +21,7 @@ _EXIT_CODES: Final = (
 
 COMMANDS: Final[Mapping[str, Command]] = {
     command.name: command
-    for module in (bus, watch, objects, settings, filters)
+    for module in (bus, objects, settings, filters)
     for command in module.COMMANDS
 }
 

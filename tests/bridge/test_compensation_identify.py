@@ -163,15 +163,3 @@ def test_it_does_not_start_without_an_orientation(node: Node) -> None:
         node.refuse(f"identify/{service}", "call identify/start first")
 
 
-def test_a_tool_that_was_lost_is_a_warning_and_nothing_is_changed(node: Node, server: Server) -> None:
-    node.set("tool_mass", TOOL.mass)
-    Stages(node)
-    for up in AXES:
-        server.hold(up, payload=NO_PAYLOAD)
-        node.run(2.5)
-    words = "a tool of 0.00 kg would explain the measurements in"
-    node.until(f"{words} 6 orientations, but tool_mass is 0.80 kg", compensation="warn")
-    assert node.log.count(words) == 1
-    assert node.parameters("tool_mass") == [TOOL.mass]
-    node.set("tool_mass", 0.0)
-    node.until("nothing is subtracted", compensation="ok")

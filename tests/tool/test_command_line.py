@@ -96,7 +96,6 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
         (["tare", "ens5", "--samples", "0"], "from 1 to 20000"),
         (["tare", "ens5", "--undo", "--clear"], "exclude each other"),
         (["tare", "ens5", "--target", "1e300", "0", "0", "0", "0", "0"], "larger than a REAL32 can be"),
-        (["watch", "ens5", "--samples", "0"], "1 or more"),
         (["restore", "ens5", "/nonexistent.json"], "/nonexistent.json"),
     ],
 )
@@ -118,7 +117,7 @@ def test_a_snapshot_that_cannot_be_written_is_said_before_the_sensor_is_read(fil
 
 
 @needs_bus
-@pytest.mark.parametrize("command", ["eeprom", "watch", "objects", "save", "tare"])
+@pytest.mark.parametrize("command", ["eeprom", "objects", "save", "tare"])
 def test_no_such_interface(command: str) -> None:
     failed = tool_here(command, "nosuch0", "--json", code=1)
     assert "no network interface 'nosuch0'" in one_sentence(failed)
@@ -161,7 +160,7 @@ def test_a_server_of_another_user_is_asked_for_its_interface(monkeypatch: pytest
     [
         ("find_ethernet_adapters", "adapters"),
         ("read_eeprom", "eeprom"),
-        ("bota_ethercat_minimal_example", "watch"),
+        ("bota_ethercat_minimal_example", "read"),
         ("sensor_configuration_SDO_reader", "objects"),
     ],
 )
@@ -177,7 +176,7 @@ def test_the_notes_scripts_are_these_commands(
 @pytest.mark.parametrize(
     ("arguments", "guess"),
     [
-        (["wach", "ens5"], "did you mean 'watch'?"),
+        (["raed", "ens5"], "did you mean 'read'?"),
         (["apply", "ens5", "--set", "sinc_lenght=64"], "did you mean 'sinc_length'?"),
         (["apply", "ens5", "--set", "FIR_filter=on"], "fast, chop"),
         (["xyzzy"], "there are adapters, "),

@@ -1,4 +1,4 @@
-"""`eeprom`, `objects`, `read` and `watch` without a server, on simulated sensors."""
+"""`eeprom`, `objects`, and `read` without a server, on simulated sensors."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_foreign_slave_is_no_sensor_to_anybody(monkeypatch: pytest.MonkeyPatch
     foreign(monkeypatch)
     with simulated_bus() as bus:
         assert told("eeprom", bus.near)["slaves"][0]["vendor"] == FOREIGN_VENDOR
-        assert "no Bota Gen-0 sensor" in refused("watch", bus.near)
+        assert "no Bota Gen-0 sensor" in refused("objects", bus.near)
         assert bus.written() == []
 
 
@@ -110,52 +110,9 @@ def test_objects_of_a_chain_by_place_serial_and_name(chain: SimulatedBus) -> Non
     assert "no sensor matches" in refused("objects", chain.near, "--sensor", "7", code=2)
 
 
-def test_watch_fails_without_a_new_sample_and_writes_nothing(bench: SimulatedBus) -> None:
-    ended = tool_here("watch", bench.near, "--seconds", 0.6, "--interval", 0.2, code=1)
-    assert "No new sample for 0.6 s, the sensor repeats the same sample" in one_sentence(ended)
-    lines = [line for line in ended.out.splitlines() if "samples" in line and line.startswith("sensor 0  ")]
-    assert 2 <= len(lines) <= 4
-    assert "0 samples" in lines[1]
-    assert "repeated" in lines[1]
-    assert bench.written() == [], "it looks at the sensor as it is set"
-
-
-def test_watch_shows_means_on_a_line_for_each_sensor(chain: SimulatedBus) -> None:
-    lines = tool_here("watch", chain.near, "--seconds", 0.3, "--interval", 9).out.splitlines()
-    values = r"F( [+-]\d+\.\d{3}){3} N  M( [+-]\d\.\d{4}){3} Nm"
-    for sensor, line in enumerate(lines[-2:]):
-        assert re.fullmatch(rf"sensor {sensor} +\d+ samples +\d+\.\d Hz  {values}", line)
-
-
-def test_watch_gives_si_units_rate_and_warnings() -> None:
-    with simulated_bus("--signal", "ramp", "--pdo", "77", "--sinc", "128") as bus:
-        bus.command("warn 0x20")
-        ended = tool_here("watch", bus.near, "--samples", 200, "--interval", 10, "--json")
-    (row,) = map(json.loads, ended.out.splitlines())
-    assert row["samples"] == 200
-    assert row["rate_hz"] == pytest.approx(400, rel=0.01), "as the sensor is set, not the server's default"
-    assert row["warnings"][0]["meaning"] == "Overtemperature"
-
-
-def test_watch_counts_the_samples_that_the_bus_lost() -> None:
-    with simulated_bus("--sensors", "2") as bus:
-        bus.at(1.2, "deaf 0.02")
-        ended = tool_here("watch", bus.near, "--seconds", 0.9, "--interval", 10, "--json")
-    lost = [json.loads(line)["lost"] for line in ended.out.splitlines()]
-    assert lost == [pytest.approx(16, abs=2)] * 2, "of 20 ms at 800 Hz"
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_is_the_normal_end_of_watch(chain: SimulatedBus, number: signal.Signals) -> None:
-    chain.at(1.2, lambda: signal.raise_signal(number))
-    ended = tool_here("watch", chain.near, "--interval", 0.1)
-    assert complaints(ended.err) == []
-    assert "sensor 1 " in ended.out.splitlines()[-1]
-
-
 def test_a_bus_that_is_silent_is_one_sentence(bench: SimulatedBus) -> None:
     bench.command("deaf")
-    for command in ("eeprom", "objects", "watch", "save"):
+    for command in ("eeprom", "objects", "save"):
         assert "no EtherCAT slave answers on " in refused(command, bench.near)
 
 
@@ -163,7 +120,7 @@ SII_ACCESS = set(range(reg.SII_OWNER, reg.SII_OWNER + 8))
 """Registers that are written to read an SII; its owner gets it back."""
 
 
-@pytest.mark.parametrize("command", [("watch",), ("snapshot", "new"), ("apply", "--set", "chop=on")])
+@pytest.mark.parametrize("command", [("objects",), ("snapshot", "new"), ("apply", "--set", "chop=on")])
 def test_a_bus_without_a_sensor_is_not_touched(
     command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,20 +175,11 @@ def unsettled_at_first(bus: SimulatedBus) -> None:
     look()
 
 
-def test_watch_begins_with_settled_data(bus: SimulatedBus) -> None:
-    unsettled_at_first(bus)
-    for end in (("--samples", 20), ("--seconds", 0.2)):
-        shown = told("watch", bus.near, *end, "--interval", 9)
-        assert (*shown["force"], shown["samples"] >= 20) == (*FORCE, True)
-
-
-@pytest.mark.parametrize("command", ["watch", "tare", "read"])
+@pytest.mark.parametrize("command", ["tare", "read"])
 def test_through_a_server_that_has_just_started(bus: SimulatedBus, command: str) -> None:
     unsettled_at_first(bus)
     with simulated_server(bus):
-        if command == "watch":
-            shown = told("watch", *SERVER, "--samples", 20, "--interval", 9)["force"][2]
-        elif command == "tare":
+        if command == "tare":
             shown = -told("tare", *SERVER, "--samples", 20)["new_offset"][2]
         else:
             read = told("read", FORCE_Z, *SERVER)["sensors"][0]["objects"]
@@ -239,12 +187,3 @@ def test_through_a_server_that_has_just_started(bus: SimulatedBus, command: str)
     assert shown == FORCE[2]
 
 
-def test_watch_leaves_out_what_has_not_settled_after_a_recovery(bus: SimulatedBus) -> None:
-    unsettled_at_first(bus)
-    bus.at(1.5, "power cycle 0.2")
-    ended = tool_here("watch", bus.near, "--seconds", 3, "--interval", 0.1, "--json")
-    rows = [json.loads(line) for line in ended.out.splitlines()]
-    full = [row for row in rows if row["samples"]]
-    assert all(tuple(row["force"]) == FORCE for row in full)
-    assert len(full) < len(rows), "it was lost, and told so"
-    assert [row["lost"] > 0 for row in full].count(True) == 1, full

@@ -80,7 +80,7 @@ def test_a_server_that_holds_the_interface_is_found_and_said(bench: Bench) -> No
         held = {row["name"]: row["held_by"] for row in told("adapters")["adapters"]}
         assert f"process {running.process.pid}" in held[veth.near]
         where = ("--server", f"localhost:{running.port}")
-        assert "samples" in tool_here("watch", *where, "--sensor", 20, "--samples", 5).out
+        assert "Sampling rate" in tool_here("read", *where, "sampling rate", "--sensor", 20).out
 
 
 @pytest.mark.parametrize("where", ["localhost:1", "[::1]:1"])

@@ -109,16 +109,8 @@ def test_a_sensor_that_is_out_does_not_hide_the_other(bench: Bench) -> None:
         assert rows[0]["serial"] == 10
 
 
-def test_watch_tells_of_a_sensor_that_is_lost_and_comes_back(bench: Bench) -> None:
-    bus, _ = bench
-    bus.at(1.0, "power cycle 0.5 @1")
-    shown = tool_here("watch", *SERVER, "--seconds", 4)
-    assert re.search(r"^ethercat-sensor: .*sensor 1 is lost", shown.err, re.MULTILINE)
-    assert re.search(r"^ethercat-sensor: sensor 1 is back after [0-9.]+ s$", shown.err, re.MULTILINE)
-
-
 def test_a_server_that_does_not_reply_or_ends_is_one_sentence(bench: Bench) -> None:
     bus, server = bench
     bus.at(1.0, server.hub.close)
-    said = refused("watch", *SERVER)
+    said = refused("tare", "--sensor", 0, *SERVER)
     assert f"the server at {server.address} closed the connection" in said

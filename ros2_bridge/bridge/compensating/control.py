@@ -26,7 +26,6 @@ from ft_compensation.bias import BiasRamp, Taken, force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.motion_error import MotionError
 from ft_compensation.outputs import cutoff_problem
-from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
 
 _FROM_PARAMETER: Final = "parameter"
@@ -111,10 +110,8 @@ class CompensationControl:
         self.choice.check(parameters)
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
         self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
-        self._payload_watch: PayloadWatch | None = None
         # What the latest second of motion leaves, and when that was computed, s.
         self._motion: tuple[float, MotionError | None] = -math.inf, None
-        self._watched: object = None
         live.check = self._check
         self._setting = node.setting
         self._guard = node.create_guard_condition(self._follow_sensor)
@@ -182,7 +179,6 @@ class CompensationControl:
             doubtful=self.conflict()
             or self.own_offset.doubt()
             or self._ramp.taken.doubt(payload)
-            or (self._payload_watch.finding if self._payload_watch is not None else "")
             or _vibration(motion, bound),
             follows_imu=source.is_imu and payload.mass > 0.0,
             out_of_range=0.0 if motion is None else motion.out_of_range,
@@ -320,13 +316,8 @@ class CompensationControl:
             self._log.error(str(error))
 
     def _make_plan(self) -> None:
-        payload, rest = self.parameters.payload, self.parameters.rest
-        watched = payload, self.bias, self._serial
-        if watched != self._watched:
-            self._watched = watched
-            self._payload_watch = PayloadWatch(payload, self._log.warning, rest) if payload.mass else None
-        source, has_tool = self.choice.source, payload.mass > 0.0
-        self.output.plan = Plan(source, Compensator(payload), self._ramp, has_tool, self._payload_watch)
+        payload = self.parameters.payload
+        self.output.plan = Plan(self.choice.source, Compensator(payload), self._ramp, payload.mass > 0.0)
 
     def _is_same_sensor(self) -> bool:
         return not self.link.is_connected or self.link.info.serial == self._serial

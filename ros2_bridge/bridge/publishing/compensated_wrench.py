@@ -32,7 +32,6 @@ from bridge.stream.link import Clock
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.outputs import WrenchFilter, WrenchTransform
-from ft_compensation.payload_watch import PayloadWatch
 from ft_compensation.quantities import ZERO, CompensationError, StationaryLimits
 from ft_compensation.stationary import StationaryWindow, triple
 
@@ -314,8 +313,6 @@ class Plan(NamedTuple):
     compensator: Compensator
     ramp: BiasRamp
     has_tool: bool  # whether anything has weight
-    # Checks now and then whether the payload is still the one that is compensated.
-    watch: PayloadWatch | None = None
 
 
 class RestWindow(StationaryWindow):
@@ -434,9 +431,6 @@ class CompensatedOutput:
         for topic in self._wanted:
             topic.send(*stages[topic.index], frame)
         self.published += 1
-        if (watch := plan.watch) is not None and watch.is_due(time_s):
-            gravity = -specific_force[0], -specific_force[1], -specific_force[2]
-            watch.look(stages.final.force, gravity, sample.angular_rate, time_s)
 
     @staticmethod
     def _stages(plan: Plan, sample: Sample, specific_force: Vector3, time_s: float) -> Stages:
