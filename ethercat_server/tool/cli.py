@@ -20,9 +20,7 @@ _EXIT_CODES: Final = (
 )
 
 COMMANDS: Final[Mapping[str, Command]] = {
-    command.name: command
-    for module in (bus, objects, settings, filters)
-    for command in module.COMMANDS
+    command.name: command for module in (bus, objects, settings, filters) for command in module.COMMANDS
 }
 
 

@@ -53,7 +53,6 @@ class CompensationState(NamedTuple):
     withheld: int = 0  # samples since the node started that were not compensated
     why_withheld: str = ""  # the latest of them
     follows_imu: bool = False  # whether the tool's weight and inertia are from the sensor's IMU
-    out_of_range: float = 0.0  # N: the most that the IMU's range has made wrong in the latest second
 
 
 class Monitor:
@@ -364,8 +363,7 @@ class Monitor:
         elif c.stopped:
             problems.append((Level.TROUBLE, c.stopped))
         elif c.follows_imu and (flags.acceleration_saturated or flags.angular_rate_saturated):
-            size = f", by some {c.out_of_range:.2g} N" if c.out_of_range else ""
-            text = f"the IMU's range was exceeded, so wrench_compensated was wrong meanwhile{size}: set "
+            text = "the IMU's range was exceeded, so wrench_compensated was wrong meanwhile: set "
             text += "settings.acceleration_range_g and settings.angular_rate_range_dps higher"
             problems.append((Level.LOOK, text))
         elif count := self._new["withheld"]:

@@ -21,11 +21,9 @@ import numpy as np
 
 from bota_ethercat.pdo import Vector3
 from ft_compensation.alignment import Alignment, Array, align
-from ft_compensation.motion_error import MotionError, motion_error
 from ft_compensation.quantities import DEFAULT_GRAVITY, EXACT, STILL, ZERO, Accelerometer, Quaternion
 
 _TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
-_KEPT_S: Final = 1.0  # of samples, for `error`
 Row = tuple[float, ...]
 _MOST_RATES: Final = 4096  # remembered for orientations that come late: 2.5 s at 1600 Hz
 
@@ -33,8 +31,8 @@ _MOST_RATES: Final = 4096  # remembered for orientations that come late: 2.5 s a
 class ImuSpecificForce:
     """From the sensor's accelerometer and gyroscope, sample by sample.
 
-    Of the latest second it keeps the samples, with those that were lost interpolated, in a ring that has
-    every row twice, so that the newest are in one piece.
+    It keeps as many samples as the alignment needs, with those that were lost interpolated, in a ring that
+    has every row twice, so that the newest are in one piece.
     """
 
     def __init__(
@@ -50,8 +48,7 @@ class ImuSpecificForce:
     def align(self, alignment: Alignment) -> None:
         """Bring what follows to the instant of force and torque so."""
         self.alignment = alignment
-        self._count = alignment.taps.shape[1]
-        self._size = max(self._count, round(_KEPT_S / alignment.period_s))
+        self._size = alignment.taps.shape[1]
         self._ring = np.zeros((2 * self._size, 6))
         self._at = self._filled = 0
         self._time_s = -math.inf
@@ -80,8 +77,7 @@ class ImuSpecificForce:
             wx, wy, wz = angular_rate
             if wx * wx + wy * wy + wz * wz > _TURNING * _TURNING:
                 return None
-        end = self._at + self._size + 1
-        found = self.alignment.taps.dot(self._ring[end - self._count : end]).tolist()
+        found = self.alignment.taps.dot(self._ring[self._at + 1 : self._at + self._size + 1]).tolist()
         (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = found
         self.turning = (wx, wy, wz), (tx, ty, tz)
         vx, vy, vz = wy * dz - wz * dy, wz * dx - wx * dz, wx * dy - wy * dx
@@ -110,11 +106,6 @@ class ImuSpecificForce:
         self._filled += 1
         self._at = at = (self._at + 1) % self._size
         self._ring[at] = self._ring[at + self._size] = row
-
-    def error(self, mass: float) -> MotionError | None:
-        """What the latest second of motion leaves of this mass, kg, as far as that is known."""
-        end, count = self._at + self._size + 1, min(self._filled, self._size)
-        return motion_error(self._ring[end - count : end].copy(), self.alignment, self.lever, mass)
 
 
 class QuaternionGravity:

@@ -15,7 +15,6 @@ from rclpy.parameter import Parameter
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode, layout_for
-from bota_ethercat.settings import SettingValue
 from ft_compensation.bias import force_bound_95
 from ft_compensation.identification.weighted import Array
 from ft_compensation.quantities import Accelerometer, Payload
@@ -37,7 +36,7 @@ from tests.bridge.simulated_node import (
     weight,
 )
 from tests.compensation.making import BIAS, TOOL
-from tests.compensation.motion import Felt, feel, filtered, guided, shaken, waypoints
+from tests.compensation.motion import Felt, feel, guided, waypoints
 
 START: dict[str, Any] = {
     "tool_mass": TOOL.mass,
@@ -505,30 +504,6 @@ def test_what_the_accelerometers_own_errors_may_make_is_told_in_newtons(arm: Arm
         moved.set(f"accelerometer.{name}", [*getattr(known, name)])
     assert told() == pytest.approx(force_bound_95(HEAVY, known), abs=1e-3)
     assert force_bound_95(HEAVY, known) < 0.1 * force_bound_95(HEAVY, Accelerometer())
-
-
-def test_vibration_that_the_filters_pass_differently_is_told_in_newtons(arm: Arm, moved: Node) -> None:
-    """At SINC 512, of 31 Hz: force and torque have half of it."""
-    settings: dict[str, SettingValue] = {
-        "sinc_length": 512, "fir": False, "acceleration_filter": 1, "angular_rate_filter": 3,
-    }  # fmt: skip
-    arm.reconfigure(**settings)
-    for name, count in (("offset", 3), ("scale", 3), ("cross_axis", 6)):
-        moved.set(f"accelerometer.{name}_interval", [0.002] * count)
-    stages = Stages(moved)
-    arm.play(filtered(shaken(31.0, 6.0), HEAVY, 5.0, settings))
-    moved.run(2.0)
-    status = moved.until("vibration leaves ", " N (root mean square)", compensation="warn")["compensation"]
-    stages.forget()
-    moved.run(1.0)
-    left = math.sqrt(float((forces(stages) ** 2).mean()))
-    assert left > 0.5
-    assert float(values(status)["motion_force"]) == pytest.approx(left, rel=0.25)
-    arm.felt = None
-    arm.hold(UP)
-    moved.until(compensation="ok")
-    moved.run(2.0)
-    assert float(values(moved.statuses()["compensation"])["motion_force"]) < 0.1
 
 
 def test_numbers_that_are_not_finite_stop_only_what_needs_them(arm: Arm, moved: Node) -> None:

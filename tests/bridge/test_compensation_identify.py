@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
-from ft_compensation.quantities import NO_PAYLOAD
 from tests.bridge.simulated_node import OVER, QUICK, SIDE, UP, ZERO6, Node, Server, Stages, sensed
 from tests.compensation.making import AXES, BIAS, TOOL, written_parameters
 
@@ -161,5 +160,3 @@ def test_it_does_not_start_without_an_orientation(node: Node) -> None:
     node.refuse("identify/start", "gravity_source is none")
     for service in ("add_pose", "drop_pose", "solve"):
         node.refuse(f"identify/{service}", "call identify/start first")
-
-

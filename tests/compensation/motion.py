@@ -25,7 +25,6 @@ from bota_ethercat.sensor.response import (
 from bota_ethercat.settings import SettingValue
 from ft_compensation.alignment import Alignment
 from ft_compensation.compensator import Compensator
-from ft_compensation.motion_error import MotionError
 from ft_compensation.quantities import EXACT, OFFSET_PRIOR, SCALE_PRIOR, Accelerometer, Payload
 from ft_compensation.specific_force import ImuSpecificForce
 
@@ -173,7 +172,6 @@ class Left(NamedTuple):
     times: Array  # (n,) s
     force: Array  # (n, 3) N
     torque: Array  # (n, 3) Nm
-    error: MotionError | None  # what it says of the last second itself
 
     @property
     def size(self) -> Array:
@@ -207,7 +205,7 @@ def left_over(
             final = compensator.compensate((*force,), (*torque,), specific, imu.turning).final
             rows.append((time_s, *final.values))
     found = np.array(rows)
-    return Left(found[:, 0], found[:, 1:4], found[:, 4:], imu.error(tool.mass))
+    return Left(found[:, 0], found[:, 1:4], found[:, 4:])
 
 
 def rotations(angles: Array) -> Array:

@@ -20,7 +20,6 @@ from ft_compensation.outputs import WrenchTransform
 from ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
-    NORMAL_95,
     STILL,
     ZERO,
     Accelerometer,
@@ -48,7 +47,7 @@ def tool_of(seed: int) -> Payload:
 
 @pytest.mark.parametrize("seed", more_if_long([0], range(6)))
 @pytest.mark.parametrize("name", motion.moves(0))
-def test_with_the_default_filters_moves_leave_little_and_it_says_how_much(name: str, seed: int) -> None:
+def test_with_the_default_filters_moves_leave_little(name: str, seed: int) -> None:
     """An identified IMU with offset, scale and crossed axes; of the sensor's noise what the table has."""
     seed += 1000 * SEED
     tool, imu, chosen = tool_of(seed), imperfect(seed), settings()
@@ -58,12 +57,6 @@ def test_with_the_default_filters_moves_leave_little_and_it_says_how_much(name: 
     assert math.hypot(left.rms, SENSOR_NOISE_N) < 0.35
     assert math.hypot(left.percentile(0.99), 2 * SENSOR_NOISE_N) < 1.0
     assert float(np.linalg.norm(left.torque, axis=1).max()) < 0.15
-    assert left.error is not None
-    assert left.error.out_of_range < 0.1
-    last = left._replace(force=left.force[left.times > 3.0])
-    assert 0.8 < left.error.filters / last.rms < 1.3
-    # What is left changes slowly: of a single second nine tenths are below a bound of 95 % in all.
-    assert last.percentile(0.9) < math.hypot(force_bound_95(tool, imu.known), NORMAL_95 * left.error.filters)
 
 
 @pytest.mark.parametrize(
@@ -85,34 +78,6 @@ def test_a_vibration_under_a_long_filter_is_not_subtracted_twice() -> None:
     felt = motion.filtered(motion.moves(3)["vibration"], HEAVY, 3.0, chosen)
     assert left_over(felt, HEAVY, align({}, 100.0)).rms > 2.5
     assert left_over(felt, HEAVY, align(chosen, 100.0), settling_s=0.5).rms < 0.4
-
-
-@pytest.mark.parametrize("filter_and_hz", [(1, 31.0), (4, 31.0), (6, 60.0)])
-def test_a_vibration_beyond_the_imus_bandwidth_is_told_in_newtons(filter_and_hz: tuple[int, float]) -> None:
-    """41 and 10 Hz of bandwidth; in `motion` the IMU's filters delay only."""
-    number, hertz = filter_and_hz
-    chosen = settings(acceleration_filter=number)
-    path = motion.shaken(hertz, 5.0)
-    felt = motion.filtered(path, HEAVY, 3.0, chosen)
-    gain = 1 / math.hypot(1.0, hertz / {1: 460, 4: 41, 6: 10}[number])
-    acceleration = felt.acceleration - felt.acceleration.mean(axis=0)
-    felt = felt._replace(acceleration=felt.acceleration + (gain - 1.0) * acceleration)
-    left = left_over(felt, HEAVY, align(chosen, RATE_HZ), settling_s=1.0)
-    assert left.error is not None
-    assert left.error.filters == pytest.approx(left.rms, rel=0.25)
-
-
-@pytest.mark.parametrize("peak", [12.0, 25.0, 40.0])
-def test_what_exceeds_the_accelerometers_range_is_told_in_newtons(peak: float) -> None:
-    """Along x, 2 Hz: the axis reads up to 2 g = 19.6 m/s²."""
-    tool, chosen = Payload(1.0, motion.IMU), settings()
-    felt = motion.filtered(motion.shaken(2.0, peak), tool, 3.0, chosen)
-    limit = 2 * STANDARD_GRAVITY
-    left = left_over(
-        felt._replace(acceleration=felt.acceleration.clip(-limit, limit)), tool, align(chosen, RATE_HZ)
-    )
-    assert left.error is not None
-    assert left.error.out_of_range == pytest.approx(max(0.0, peak - limit), rel=0.5, abs=0.1)
 
 
 def test_the_inertia_of_a_tool_is_subtracted_too() -> None:
@@ -196,7 +161,6 @@ def test_what_is_unknown_is_used_as_it_comes() -> None:
         assert alignment.lag_s is None
         assert alignment.taps[0, -1] == 1.0
         assert not alignment.taps[0, :-1].any()
-        assert ImuSpecificForce(alignment=alignment).error(1.0) is None
     assert align(settings(128, chop=True), 400.0, lag_s=0.01).taps[0, -5:] == pytest.approx((1, 0, 0, 0, 0))
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +12,7 @@ from ethercat_server.sensor.objects.dictionary import KNOWN_OBJECTS
 from ethercat_server.virtual_sensor.foreign import ForeignSlave
 from tests.simulation import SimulatedBus, SimulatedServer, registers, simulated_bus, simulated_server
 from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign
-from tests.tool.running import complaints, one_sentence, refused, told, tool_here
+from tests.tool.running import refused, told, tool_here
 
 
 @pytest.fixture
@@ -185,5 +182,3 @@ def test_through_a_server_that_has_just_started(bus: SimulatedBus, command: str)
             read = told("read", FORCE_Z, *SERVER)["sensors"][0]["objects"]
             shown = read[0]["value"]
     assert shown == FORCE[2]
-
-

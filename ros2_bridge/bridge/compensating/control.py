@@ -24,16 +24,13 @@ from bridge.stream.link import Link
 from bridge.stream.reader import Reader
 from ft_compensation.bias import BiasRamp, Taken, force_bound_95
 from ft_compensation.compensator import Compensator
-from ft_compensation.motion_error import MotionError
 from ft_compensation.outputs import cutoff_problem
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
 
 _FROM_PARAMETER: Final = "parameter"
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
 _NOTHING_CURRENT: Final = "no current orientation"
-_MOTION_S: Final = 1.0  # how often it is looked up what motion leaves
 _LEAST_K: Final = 0.2  # change of temperature that shifts the bias; less is noise
-_LEAST_TOLD_N: Final = 0.2  # about the noise of a force
 _ANOTHER_SENSOR: Final = "the bias may be another sensor's"
 
 
@@ -110,8 +107,6 @@ class CompensationControl:
         self.choice.check(parameters)
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
         self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
-        # What the latest second of motion leaves, and when that was computed, s.
-        self._motion: tuple[float, MotionError | None] = -math.inf, None
         live.check = self._check
         self._setting = node.setting
         self._guard = node.create_guard_condition(self._follow_sensor)
@@ -147,10 +142,6 @@ class CompensationControl:
         output, source, parameters = self.output, self.choice.source, self.parameters
         payload, bias, has_subscribers = parameters.payload, self.bias, output.has_subscribers
         bound = force_bound_95(payload, parameters.accelerometer) if source.is_imu else None
-        now_s, (then_s, motion) = self.link.clock.monotonic(), self._motion
-        if now_s - then_s >= _MOTION_S:
-            motion = source.error(payload.mass) if payload.mass and has_subscribers else None
-            self._motion = now_s, motion
         age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
         parts = ["bias"] if bias != NO_WRENCH else []
         if payload.mass:
@@ -164,7 +155,6 @@ class CompensationControl:
                 "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
                 "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
                 "accelerometer_force": "" if bound is None else round(bound, 3),
-                "motion_force": "" if motion is None else round(motion.filters, 3),
                 "tool_mass": round(payload.mass, 4),
                 "tool_center_of_gravity": _numbers(payload.center),
                 "tared": bias != NO_WRENCH,
@@ -176,12 +166,8 @@ class CompensationControl:
                 "withheld": output.withheld,
             },
             stopped=self._why_stopped() or output.problem,
-            doubtful=self.conflict()
-            or self.own_offset.doubt()
-            or self._ramp.taken.doubt(payload)
-            or _vibration(motion, bound),
+            doubtful=self.conflict() or self.own_offset.doubt() or self._ramp.taken.doubt(payload),
             follows_imu=source.is_imu and payload.mass > 0.0,
-            out_of_range=0.0 if motion is None else motion.out_of_range,
             withheld=output.withheld,
             why_withheld=output.why_withheld or f"{_NOTHING_CURRENT} ({source.describe})",
         )
@@ -372,17 +358,6 @@ class CompensationControl:
             with self._shifting:
                 self._ramp.shift(change)
             self._guard.trigger()
-
-
-def _vibration(motion: MotionError | None, bound: float | None) -> str:
-    """That motion leaves more than the accelerometer's own errors, a sentence; empty if it does not."""
-    if motion is None or bound is None or motion.filters <= max(bound, _LEAST_TOLD_N):
-        return ""
-    return (
-        f"vibration leaves {motion.filters:.2g} N (root mean square) in wrench_compensated, because the "
-        "filters of force and acceleration pass it differently: set settings.acceleration_filter to 1, or a "
-        "longer settings.sinc_length, or damp it"
-    )
 
 
 def _numbers(values: tuple[float, ...]) -> str:

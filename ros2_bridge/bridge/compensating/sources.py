@@ -27,7 +27,6 @@ from bota_ethercat.settings import SettingValue
 from bridge.parameters.table import TOPIC_SOURCES, ParameterError, Parameters
 from bridge.stream.link import Link
 from ft_compensation.alignment import align
-from ft_compensation.motion_error import MotionError
 from ft_compensation.quantities import STILL, Quaternion, Turning, unit_quaternion, vector
 from ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
 
@@ -85,10 +84,6 @@ class Source:
         """How old the robot's orientation is; infinite where there is none."""
         return math.inf
 
-    def error(self, mass: float) -> MotionError | None:  # noqa: ARG002
-        """What the latest second of motion leaves of this mass, kg; None where it is not known."""
-        return None
-
 
 class ImuSource(Source):
     """The sensor's own accelerometer and gyroscope, at the instant of its force and torque."""
@@ -120,10 +115,6 @@ class ImuSource(Source):
         if not any(sample.acceleration):
             return IMU_IS_OFF
         return "" if sample.is_finite else "the IMU sends NaN or infinity: see the status stream"
-
-    def error(self, mass: float) -> MotionError | None:
-        """As far as it is known."""
-        return self._imu.error(mass)
 
 
 class Oriented(NamedTuple):
