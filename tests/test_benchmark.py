@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from scripts.benchmarks import contact, modes, statistics
+from scripts.benchmarks import modes, statistics
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.chain import ScriptError, Turn
 from scripts.benchmarks.records import Recording, began
 from scripts.benchmarks.statistics import Arrivals
 from tests.server.running import needs_bus
-from tests.simulation import more_if_long
 
 ROOT = Path(__file__).parent.parent
 PERIOD = 1_250_000
@@ -91,11 +90,6 @@ def test_a_repeated_sample_is_as_old_as_when_it_was_returned_first() -> None:
 AGES = {"p50": 80.0, "p99": 120.0, "p999": 150.0}
 ABOUT = {"rate_hz": 800, "sensors": 1}
 COUNTS = {"made": 200, "lost": 1}
-PRESSED = {
-    which: {"stiffest_wall": wall, "overshoot": above}
-    for which, wall, above in zip(contact.FILTERS, (200.0, 300.0, 40.0), (4.5, 2.5, None), strict=True)
-}
-PRESSING = ("this", contact.POLLING)
 RATIOS = dict(zip(modes.RATIOS, (2, 3, 4, 5), strict=True))
 ROWS: list[dict[str, Any]] = [
     {**ABOUT, "program": "this", **COUNTS, "age_us": AGES, "cpu_percent": {"server": 9.0}},
@@ -110,20 +104,17 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
     content = {
         "date": "2026-11-23T01:02:03", "cpus": 2, "kernel": "6.1.0-x", "python": "3.11.2",
         "idle_states": True, "comparison": ROWS, "load": [{**ABOUT, **COUNTS, **load}],
-        "contact": [{"program": each, "age_p50_us": 60, "filters": PRESSED} for each in PRESSING],
     }  # fmt: skip
     page = tmp_path / "page.md"
-    names = ("contact", "comparison", "load")
+    names = ("comparison", "load")
     blocks = "".join(f"<!-- measured: {name} -->\nold\n<!-- end -->\n" for name in names)
     page.write_text(f"above\n{blocks}below\n")
     for _ in range(2):
         benchmark.renew(page, content)
         text = page.read_text()
         assert text.startswith(
-            "above\n<!-- measured: contact -->\n**With SINC 64 contact is stable on walls 1.0"
+            "above\n<!-- measured: comparison -->\n**Your controller gets a sample 80 µs (p99 120)"
         )
-        assert "| this | 60 | 200 / 4.5 | 300 / 2.5 | 40 / unstable |" in text
-        assert "<!-- measured: comparison -->\n**Your controller gets a sample 80 µs (p99 120)" in text
         assert "A bare C program: 40 µs (p99 60)." in text
         assert "are of one run: 2026-11-23, 2 CPUs, Linux 6.1.0, Python 3.11.2, with idle states." in text
         assert "| 800 Hz, 1: this, C client | 1 of 200 | 80.0 (2.00) | 120 (3.00) | 150 (4.00) |" in text
@@ -131,34 +122,10 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
         assert text.endswith(f"{row}\n<!-- end -->\nbelow\n")
     for wrong in ("no place", text * 2, text.replace("load", "others")):
         page.write_text(wrong)
-        with pytest.raises(ScriptError, match="once for each of comparison, load, contact"):
+        with pytest.raises(ScriptError, match="once for each of comparison, load"):
             benchmark.renew(page, content)
         assert page.read_text() == wrong
     benchmark.check(ROOT / "docs" / "benchmark.md")
-
-
-# -- contact
-
-
-@pytest.mark.parametrize(
-    ("which", "periods", "age_s"),
-    more_if_long(
-        [("SINC 64", 1.5, 0.002)],
-        [
-            (*row, age_s)
-            for row in (("SINC 64", 1.5), ("SINC 32", 1.5), ("SINC 64, FIR", 12.0))
-            for age_s in (0.0, 0.002)
-        ],
-    ),
-)
-def test_contact_is_stable_up_to_where_theory_says(which: str, periods: float, age_s: float) -> None:
-    """An integrator with a lag and the delay of filter, age, and holding sample and command."""
-    sinc, fir = contact.FILTERS[which]
-    delay_s = (periods + 0.5) * sinc / 51200 + age_s + 0.5 * contact.CYCLE_S
-    omega = next(w for w in range(1, 2000) if w * delay_s + math.atan(w * contact.LAG_S) > math.pi / 2)
-    wall = omega * math.hypot(1.0, omega * contact.LAG_S) / contact.GAIN * 1e-3
-    delivery = contact.Delivery(np.full(1, age_s), 0.0)
-    assert contact.stiffest(sinc, fir, delivery) == pytest.approx(wall, rel=0.2)
 
 
 # -- its programs

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bota_ethercat.program.arguments import number
-from scripts.benchmarks import contact, path
+from scripts.benchmarks import path
 from scripts.benchmarks.chain import (
     OVERSAMPLING_HZ,
     Figures,
@@ -31,8 +31,7 @@ from scripts.benchmarks.chain import (
     loopback_up,
     stoppable,
 )
-from scripts.benchmarks.modes import TABLES as OTHER_TABLES
-from scripts.benchmarks.modes import answer, compare, load
+from scripts.benchmarks.modes import TABLES, answer, compare, load
 from scripts.benchmarks.records import may_be_real_time
 
 _WIDTH: Final = 108  # minimum width of the tables
@@ -40,9 +39,8 @@ _RATES_HZ: Final = [OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512)]
 _PRIORITY: Final = 80  # SCHED_FIFO of the server, or what is in its place
 _LATENCY: Final = Path("/dev/cpu_dma_latency")
 _BLOCK: Final = re.compile(r"(<!-- measured: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-_ON_PAGE: Final = ("comparison", "load", "contact")
+_ON_PAGE: Final = ("comparison", "load")
 _LOOPS_ON_PAGE: Final = 4
-TABLES: Final = {**OTHER_TABLES, "contact": contact.TABLE}
 
 
 def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> None:
@@ -87,9 +85,6 @@ def measure(name: str, options: argparse.Namespace, priority: int, *, ros: bool)
     seconds = options.seconds or (3.0 if options.quick else 6.0)
     if name == "path":
         return path.measure()
-    if name == "contact":
-        picture = options.page and options.page.with_name("contact.png")
-        return contact.measure(Setup(800, 1, seconds, priority, ros), options.vendor, picture)
     whole = name == "comparison" and not options.quick
     rows = []
     for rate in options.rates or ((800, 1600) if whole else (800,)):
@@ -147,8 +142,6 @@ def renew(path: Path, content: Mapping[str, Any]) -> None:
         text = markdown(name, content[name])
         if name == "comparison":
             text = "\n\n".join((answer(content[name]), text, where))
-        if name == "contact":
-            text = "\n\n".join((contact.answer(content[name]), text))
         return f"{match[1]}{text}\n{match[3]}"
 
     path.write_text(_BLOCK.sub(measured, path.read_text(encoding="utf-8")), encoding="utf-8")
@@ -174,10 +167,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
                       help="only ages beside N endless loops, ordinary and real-time")  # fmt: skip
     only.add_argument("--path", action="store_true",
                       help="only a sample's source lines, calls and system calls in the server")  # fmt: skip
-    only.add_argument("--contact", action="store_true",
-                      help="only what the ages are worth in contact with a wall")  # fmt: skip
     options = parser.parse_args(argv)
-    modes = {"load": options.load, "path": options.path, "contact": options.contact, "comparison": True}
+    modes = {"load": options.load, "path": options.path, "comparison": True}
     options.mode = next(mode for mode, wanted in modes.items() if wanted)
     here = Path(os.environ.get("CALLED_FROM") or Path.cwd())
     options.json, options.page = here / options.json, options.page and here / options.page

@@ -110,6 +110,6 @@ def test_a_sensor_that_is_out_does_not_hide_the_other(bench: Bench) -> None:
 
 def test_a_server_that_does_not_reply_or_ends_is_one_sentence(bench: Bench) -> None:
     bus, server = bench
-    bus.at(1.0, server.hub.close)
-    said = refused("tare", "--sensor", 0, *SERVER)
+    bus.at(0.1, server.hub.close)
+    said = refused("objects", *SERVER)
     assert f"the server at {server.address} closed the connection" in said
