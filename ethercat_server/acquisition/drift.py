@@ -1,4 +1,4 @@
-"""How far the zero of a sensor at rest has moved since its tare, and how that goes by temperature.
+"""How far the zero of a sensor at rest has moved since its tare.
 
 A change is believed only if nothing but drift explains it:
 
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from operator import add
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
@@ -42,11 +41,6 @@ _SUMS: Final = len(CHANNELS) + 4
 _CONE: Final = math.cos(math.radians(1.0))
 _LEAST_UP: Final = 0.5  # g, or m/s² of firmware that sends those: without an IMU it is 0
 _SLOW_S: Final = 20.0  # in this time drift stays steady
-_LEAST_SPREAD_K: Final = 1.0  # standard deviation of temperature in a run: a warm-up by 3.5 K
-_LEAST_WINDOWS: Final = 20
-_LONGEST_RUN_S: Final = 86400.0
-# With these on, force and torque are not the sensor's own.
-_NOT_PLAIN: Final = ("temperature_compensation", "coordinate_system", "inertia_compensation")
 
 
 class Drift:
@@ -55,31 +49,16 @@ class Drift:
     def __init__(self, sensor: Sensor, clock: Clock) -> None:
         self.history = History()
         self.sensor, self._clock = sensor, clock
-        self._begin_run()
         self.begin("start")
 
     def begin(self, cause: str) -> None:
         """All that was before is void: a `tare`, a `change` of settings, a `return`, the `start`."""
-        self.end_run()
         self._cause, self._since_s = cause, self._now_s()
         self._part, self._parts = Part(_SUMS), list[Part]()
         self._full, self._found = list[Part](), list[Found]()  # a window, and what of it is known
         self._first: list[Found] | None = None
         self._joined = False  # whether the last window was believed
         self._unusable = True  # until the next second, so that nothing is from before
-
-    def end_run(self) -> None:
-        """Keep what was learned until now: slopes of lines through the offsets, least squares."""
-        count, x, xx, *of_axes = self._run
-        below = count * xx - x * x
-        if count >= _LEAST_WINDOWS and below > (count * _LEAST_SPREAD_K) ** 2:
-            axes = zip(of_axes[:6], of_axes[6:], strict=True)
-            self.history.add_run([(count * xy - x * y) / below for y, xy in axes])
-        self._begin_run()
-
-    def _begin_run(self) -> None:
-        # How many windows, sums of K and K², of N and Nm, of their products with K.
-        self._run, self._run_began_s = [0.0] * 15, self._now_s()
 
     def _now_s(self) -> float:
         return self._clock.monotonic_ns() * 1e-9
@@ -131,12 +110,6 @@ class Drift:
     def _take(self, window: list[Found]) -> None:
         self._first = self._first or window
         self._last, self._last_s = window, self._now_s()
-        if self._last_s - self._run_began_s > _LONGEST_RUN_S:
-            self.end_run()
-        if not any(self.sensor.settings.get(name) for name in _NOT_PLAIN):
-            kelvin, wrench = self._moved()
-            row = (1.0, kelvin, kelvin * kelvin, *wrench, *(kelvin * value for value in wrench))
-            self._run = list(map(add, self._run, row))
 
     def _moved(self) -> tuple[float, list[float]]:
         """K, and N and Nm, since the first window."""
@@ -153,4 +126,4 @@ class Drift:
             kelvin, wrench = self._moved()
             ago_s = round(self._now_s() - self._since_s)
             drift = {"since": self._cause, "ago_s": ago_s, "kelvin": kelvin, "wrench": wrench}
-        return {"drift": drift, "temperature_line": self.history.line, "history": self.history.as_json()}
+        return {"drift": drift, "history": self.history.as_json()}

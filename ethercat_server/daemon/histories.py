@@ -39,7 +39,7 @@ def kept(drifts: Sequence[Drift]) -> Iterator[None]:
             if drift.history.changed:
                 drift.history.changed = False
                 try:
-                    state.write(path, drift.history.kept())
+                    state.write(path, drift.history.as_json())
                 except OSError as error:
                     drift.history.changed = True
                     log.warning("the history of sensor %d is not kept: %s", drift.sensor.number, error)
@@ -56,6 +56,4 @@ def kept(drifts: Sequence[Drift]) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
-        for drift in drifts:
-            drift.end_run()
         write()

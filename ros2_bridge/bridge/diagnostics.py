@@ -72,7 +72,6 @@ class Monitor:
         self._reader, self._link, self._clock = reader, reader.link, reader.link.clock
         self._compensation, self._outputs, self._stamps = compensation, outputs, stamps
         # Called once a second with the sensor's row of the server's `status` and its temperature.
-        self.on_status: Callable[[Mapping[str, Any], float], object] = lambda *_: None
         self._log = node.get_logger()
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
@@ -125,8 +124,6 @@ class Monitor:
             stamp.sec, stamp.nanosec = divmod(self._clock.time_ns(), 1_000_000_000)
             self._publisher.publish(message)
         if regular:
-            if (sample := self._reader.watch.sample) is not None:
-                self.on_status(self._row, sample.temperature)
             self._begin_interval(now_s)
 
     def _measure(self, now_s: float) -> None:

@@ -142,7 +142,6 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.monitor = Monitor(
             self, parameters.limits, self.reader, self.compensation.state, self.outputs, stamps, self.fail
         )
-        self.monitor.on_status = self.compensation.follow_temperature
         SensorServices(self, link, self.sensor_settings)
         BiasServices(self, self.compensation)
         IdentifyServices(self, self.compensation)

@@ -158,27 +158,6 @@ def test_a_zero_that_was_measured_is_a_bias(sensor: Sensor, node: Node, stages: 
     stages.settle(ZERO6)
 
 
-@pytest.mark.parametrize("asked", [False, True])
-def test_a_bias_follows_the_sensors_line_by_temperature_if_asked(sensor: Sensor, asked: bool) -> None:
-    line = {"slope": [0.1, 0.0, 0.3, 0.0, 0.0, 0.01], "interval": [0.2, 0.1, 0.1, 0.1, 0.1, 0.001], "runs": 3}
-    sensor.answers["status"] = lambda _: {"ok": True, "sensors": [{"temperature_line": line}]}
-    warmed = Wrench.of([0.0, 0.0, 1.5, 0.0, 0.0, 0.05])  # by 5 K, on the axes that differ from none
-    with Node(sensor, **QUICK, temperature_line=asked) as node:
-        stages = Stages(node)
-        node.run(0.1)
-        for _ in ("without a bias", "with one"):
-            left = stages.first()
-            node.run(3.0)
-            sensor.hold(UP, payload=NO_PAYLOAD, bias=BIAS.plus(warmed), temperature=5.0)
-            follows = asked and left == pytest.approx(ZERO6, abs=1e-3)
-            stages.settle(left if follows else [a + b for a, b in zip(left, warmed.values, strict=True)])
-            sensor.hold(UP, payload=NO_PAYLOAD, bias=BIAS, temperature=0.0)
-            stages.settle(left)
-            node.do("tare")
-            stages.settle(ZERO6)
-            stages.forget()
-
-
 # While a tare waits for its samples, as the executor, which would look at the sensor, does.
 
 

@@ -199,15 +199,14 @@ def test_the_last_emergency_is_told_until_it_is_over_or_reset(model: Model) -> N
     assert after(3, 0x0000, now(240)) == []
 
 
-def test_drift_and_the_line_by_temperature_are_told(model: Model) -> None:
+def test_drift_is_told(model: Model) -> None:
     reply, six = status(), [0.0, 0.0, 0.25, 0.0, 0.0, 0.0]
-    line = {"slope": six, "interval": [0.1] * 6, "runs": 3}
     drift = {"since": "tare", "ago_s": 2100, "kelvin": 6.0, "wrench": [5 * value for value in six]}
-    reply["sensors"][0].update(drift=drift, temperature_line=line)
+    reply["sensors"][0].update(drift=drift)
     model.take_status(reply, now(0))
     sensor = only(model, now(0))
     assert texts(sensor) == ["Fz has drifted 1.2 N since the tare 35 min ago, 6 K warmer"]
-    assert sensor.zero == f"{texts(sensor)[0]}; by temperature, of 3 runs: Fz +0.250 ± 0.100 N/K"
+    assert sensor.zero == texts(sensor)[0]
 
 
 def test_a_monitor_that_was_not_run_blames_neither_server_nor_sensor(model: Model) -> None:

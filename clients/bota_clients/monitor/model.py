@@ -115,7 +115,7 @@ class SensorState:
     lost_on_bus: int | None = None
     recoveries: int | None = None
     hand_out_us: Spread | None = None  # age when the server hands them out
-    zero: str = ""  # its drift, and its slope by temperature, in words
+    zero: str = ""  # its drift, in words
 
     @property
     def units(self) -> tuple[str, str]:
@@ -305,7 +305,7 @@ class _Sensor:
             lost_on_bus=whole(status.get("lost_samples")),
             recoveries=whole(status.get("recoveries")),
             hand_out_us=_spread(self._hand_out),
-            zero="; ".join(filter(None, (history.drift(status), history.temperature_line(status)))),
+            zero=history.drift(status),
             **self._stream(_ns(now_s)),
         )
 

@@ -75,7 +75,6 @@ class ReplayedSensor:
             "emergencies": self._emergencies,
             "emergency": self._emergency and {**self._emergency, "ago_s": ago_s},
             "drift": None,
-            "temperature_line": None,
             "history": {"since": None, "peak": [0.0] * 6, "saturations": 0, "saturated_at": None},
             "settling": False,
             "age_us": _NO_BUS,

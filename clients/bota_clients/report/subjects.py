@@ -189,6 +189,6 @@ def past(status: Mapping[str, Any], position: int) -> list[str]:
     """What the server knows of a sensor's past, from its reply to `status`: sentences."""
     row = next((row for row in rows(status.get("sensors")) if row.get("sensor") == position), {})
     overload, overloaded = history.overload(row)
-    texts = [history.drift(row), history.temperature_line(row), overload]
+    texts = [history.drift(row), overload]
     texts += ["have it checked for damage by overload"] if overloaded else []
     return [f"{text[0].upper()}{text[1:]}." for text in texts if text]

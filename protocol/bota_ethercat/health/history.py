@@ -35,27 +35,6 @@ def drift(row: Mapping[str, Any], limits: Limits | None = None) -> str:
     return f"{AXES[axis]} has drifted {size} since {since} {ago} ago{warmer}"
 
 
-def temperature_line(row: Mapping[str, Any]) -> str:
-    """The slope of the offset by temperature, with 95 % intervals; empty if that is not known."""
-    found, slope = mapping(row.get("temperature_line")), line_slope(row)
-    if slope is None:
-        return ""
-    each = zip(AXES, slope, found["interval"], _UNITS, strict=True)
-    axes = ", ".join(
-        f"{axis} {value:+.3f} ± {half:.3f} {unit}/K" for axis, value, half, unit in each if value
-    )
-    return f"by temperature, of {whole(found.get('runs'))} runs: {axes or 'nothing'}"
-
-
-def line_slope(row: Mapping[str, Any]) -> list[float] | None:
-    """N/K and Nm/K by axis, 0 where it is not significant; None if there is no line."""
-    found = mapping(row.get("temperature_line"))
-    slope, interval = known_six(found.get("slope")), known_six(found.get("interval"))
-    if slope is None or interval is None:
-        return None
-    return [value if abs(value) > half else 0.0 for value, half in zip(slope, interval, strict=True)]
-
-
 def overload(row: Mapping[str, Any]) -> tuple[str, bool]:
     """The largest wrench, and whether the sensor was ever overloaded; empty if that is not known."""
     found = mapping(row.get("history"))

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping
 from typing import Any, Final
 
 from rclpy.node import Node
 
-from bota_ethercat.health.history import line_slope
 from bridge.compensating.sources import IMU_IS_OFF, SourceChoice
 from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import LiveParameters
@@ -103,7 +101,6 @@ class CompensationControl:
         self.own_offset = OwnOffset(self.link)
         # Origin of the bias that is being put in force, and what it was taken with if by a tare.
         self._next: tuple[str, Taken | None] = (_FROM_PARAMETER, None)
-        self._celsius: float | None = None  # up to which temperature the bias follows the line
         self.choice.check(parameters)
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
         self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
@@ -345,18 +342,6 @@ class CompensationControl:
             self._log.info(
                 f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
             )
-            self._guard.trigger()
-
-    def follow_temperature(self, row: Mapping[str, Any], celsius: float) -> None:
-        """Shift a bias along the line in this row of `status`, if that is wanted; any thread."""
-        slope = line_slope(row) if self.parameters.temperature_line and self.own_offset.has_bias else None
-        if slope is None or self._celsius is None:
-            self._celsius = None if slope is None else celsius
-        elif abs(celsius - self._celsius) >= _LEAST_K:
-            change = Wrench.of([value * (celsius - self._celsius) for value in slope])
-            self._celsius = celsius
-            with self._shifting:
-                self._ramp.shift(change)
             self._guard.trigger()
 
 

@@ -161,8 +161,6 @@ PARAMETERS: Final = (
         "Gravity, m/s², in the base frame: that of the orientations", 0, 100),
     Row("bias", (0.0,) * 6,
         "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6),
-    Row("temperature_line", False,
-        "Shift the bias along the sensor's line of offset by temperature, once the server has learned it"),
     Row("bias_ramp_time", 0.5, "Seconds in which a new bias replaces the old one; 0 = at once", 0, 60),
     Row("imu_position", ZERO,
         "Position in frame_id of the IMU that gravity_source names, m; zeros = that of the sensor's model",
@@ -242,7 +240,6 @@ class Parameters(NamedTuple):
     payload: Payload
     gravity: Vector3
     bias: Wrench
-    temperature_line: bool
     bias_ramp_time: float
     imu_position: Vector3
     on_saturation: str
