@@ -24,34 +24,23 @@ _LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613  # DL status: ports 0 and 1 have a li
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fmmu:
-    """One active FMMU: which logical bits are which bits of the slave's memory.
-
-    Nearly always it maps whole bytes; then a mapping is one copy.
-    """
+    """One active FMMU: which logical bytes are which bytes of the slave's memory."""
 
     logical: int  # first logical byte
-    length: int  # logical bytes that it touches
-    first_bit: int
-    last_bit: int
+    length: int
     physical: int
-    physical_bit: int
     reads: bool
     writes: bool
-    bitwise: bool  # it maps anything but whole bytes onto whole bytes
 
     @classmethod
     def decode(cls, memory: bytearray, number: int) -> Fmmu | None:
-        """FMMU `number` from the registers; None if it is not active or maps nothing."""
+        """FMMU `number` from the registers; None if it is not active, or maps nothing, or single bits."""
         logical, length, first, last, physical, bit, kind, active = reg.FMMU_LAYOUT.unpack_from(
             memory, reg.FMMU + number * reg.FMMU_SIZE
         )
-        if not active & 1 or length == 0 or not kind & 3:
+        if not active & 1 or length == 0 or not kind & 3 or (first & 7, last & 7, bit & 7) != (0, 7, 0):
             return None
-        first, last, bit = first & 7, last & 7, bit & 7
-        reads, writes = bool(kind & reg.FMMU_READ), bool(kind & reg.FMMU_WRITE)
-        return cls(
-            logical, length, first, last, physical, bit, reads, writes, (first, last, bit) != (0, 7, 0)
-        )
+        return cls(logical, length, physical, bool(kind & reg.FMMU_READ), bool(kind & reg.FMMU_WRITE))
 
     def overlap(self, address: int, length: int) -> tuple[int, int, int] | None:
         """The part of a logical command that it maps; None if none.
@@ -60,26 +49,9 @@ class Fmmu:
         """
         start = max(address, self.logical)
         end = min(address + length, self.logical + self.length)
-        # A bit-wise unit is small: it is always taken whole, or not at all.
-        if start >= end or (self.bitwise and end - start != self.length):
+        if start >= end:
             return None
         return start - address, end - start, self.physical + start - self.logical
-
-    @property
-    def _bits(self) -> int:
-        return max((self.length - 1) * 8 + self.last_bit + 1 - self.first_bit, 0)
-
-    def span(self, length: int) -> int:
-        """Physical bytes touched for `length` logical bytes."""
-        return (self.physical_bit + self._bits + 7) // 8 if self.bitwise else length
-
-    def put(self, source: bytes | bytearray, from_bit: int, current: bytes | bytearray, to_bit: int) -> bytes:
-        """`current` with the mapped bits of `source` put in, logical ones into physical ones or back."""
-        mask = (1 << self._bits) - 1
-        value = int.from_bytes(source, "little") >> from_bit & mask
-        kept = int.from_bytes(current, "little") & ~(mask << to_bit)
-        inside = (1 << len(current) * 8) - 1  # the end of memory cuts it off
-        return ((kept | value << to_bit) & inside).to_bytes(len(current), "little")
 
 
 class SyncManager:
@@ -259,10 +231,9 @@ class Esc:
         # What each logical command copies, by address and length; emptied when an FMMU changes.
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
         self.has_lrw = True
-        self.station = self.event_mask = 0  # as the registers have them
+        self.station = 0  # as the register has it
         self.into_ns = 0  # from the start of a datagram until the bytes that are being copied pass
         self.record: Callable[[int, bytes], None] | None = None  # gets all that a master writes, and where
-        self._events = 0
 
     def count(self, counter: int) -> None:
         """Add one to the error counter at this register; it stays at 255."""
@@ -277,7 +248,6 @@ class Esc:
             self.count(reg.LOST_LINKS + 1)
         if was != status:
             _U16.pack_into(self.memory, reg.DL_STATUS, status)
-            self._events |= reg.EVENT_DL_STATUS
 
     def set_al_status(self, status: int, code: int) -> bool:
         """Show AL status (state and error bit) and AL status code; False if they are as before."""
@@ -285,17 +255,7 @@ class Esc:
         if (was, code_was) == (status, code):
             return False
         _AL_STATUS.pack_into(self.memory, reg.AL_STATUS, status, 0, code)
-        self._events |= reg.EVENT_AL_STATUS
         return True
-
-    @property
-    def events(self) -> int:
-        """The event request register, before the mask."""
-        events = self._events
-        for manager in self.sync_managers:
-            if manager.mailbox and manager.full and not manager.master_writes:
-                events |= reg.EVENT_SYNC_MANAGER << manager.number
-        return events
 
     def read(self, address: int, current: bytes | bytearray) -> bytes | bytearray | None:
         """`len(current)` bytes from `address` on, as a master reads them; None if it may read none of them.
@@ -376,16 +336,9 @@ class Esc:
                 clock.events.update(self._pdi.clock() + clock.way_ns, starts=start < _DC_CHANGE_EVENT)
         if start > _DC_RECEIVE_TIMES:
             return self.memory[start:end]
-        if start <= reg.EVENT_REQUEST + 1 and end > reg.EVENT_REQUEST:
-            _U16.pack_into(self.memory, reg.EVENT_REQUEST, self.events)
         if start < reg.SII_DATA and end > reg.SII_CONTROL:
             self.sii.advance()
-        data = bytes(self.memory[start:end])
-        if start <= reg.AL_STATUS < end:
-            self._events &= ~reg.EVENT_AL_STATUS
-        if start <= reg.DL_STATUS < end:
-            self._events &= ~reg.EVENT_DL_STATUS
-        return data
+        return bytes(self.memory[start:end])
 
     def _write_registers(self, address: int, data: bytes) -> bool:
         end = address + len(data)
@@ -411,8 +364,6 @@ class Esc:
 
         if touched(reg.STATION_ADDRESS, 2):
             (self.station,) = _U16.unpack_from(self.memory, reg.STATION_ADDRESS)
-        if touched(reg.EVENT_MASK, 2):
-            (self.event_mask,) = _U16.unpack_from(self.memory, reg.EVENT_MASK)
         if touched(reg.SII_CONTROL, 2):
             self.sii.command()
         if touched(reg.FMMU, reg.FMMU_COUNT * reg.FMMU_SIZE):
@@ -450,10 +401,7 @@ _FPRD: Final = int(Command.FPRD)
 
 
 def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> None:
-    """Process one datagram in place as it passes these slaves, in their order.
-
-    Those that it is not meant for only show their events, if they have a mask for them.
-    """
+    """Process one datagram in place as it passes these slaves, in their order."""
     command, _, station, address, _, start, length = datagram
     end = address + length
     if command != _FPRD or end > _REGISTERS_END or not length:
@@ -462,9 +410,7 @@ def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> N
         return
     # Masters read the times of a sensor's clock with every frame: the same as `execute`, in less time.
     for esc in escs:
-        if esc.event_mask:
-            execute(esc, frame, datagram)
-        elif esc.station == station:
+        if esc.station == station:
             counter = start + length
             frame[start:counter] = esc.read_registers(address, end)
             _U16.pack_into(frame, counter, (_U16.unpack_from(frame, counter)[0] + 1) & 0xFFFF)
@@ -476,9 +422,6 @@ def execute(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
     if command not in _KNOWN:
         return
     counted = (_logical if command in _LOGICAL else _physical)(esc, frame, datagram)
-    if esc.event_mask and (events := esc.events & esc.event_mask):
-        at = datagram.data - 2
-        _U16.pack_into(frame, at, _U16.unpack_from(frame, at)[0] | events)
     if counted:
         at = datagram.end
         _U16.pack_into(frame, at, (_U16.unpack_from(frame, at)[0] + counted) & 0xFFFF)
@@ -530,16 +473,10 @@ def _logical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
         start, end = base + offset, base + offset + size
         esc.into_ns = (start - datagram.header) * BYTE_NS
         if writes and fmmu.writes:
-            data = incoming[offset : offset + size]
-            if fmmu.bitwise:
-                physical = esc.memory[at : at + fmmu.span(size)]
-                data = fmmu.put(data, fmmu.first_bit, physical, fmmu.physical_bit)
-            written |= esc.write(at, data)
+            written |= esc.write(at, incoming[offset : offset + size])
         if reads and fmmu.reads:
-            current = esc.read(at, bytes(fmmu.span(size)) if fmmu.bitwise else frame[start:end])
+            current = esc.read(at, frame[start:end])
             if current is not None:
-                if fmmu.bitwise:
-                    current = fmmu.put(current, fmmu.physical_bit, frame[start:end], fmmu.first_bit)
                 frame[start:end] = current
                 read = True
     esc.into_ns = 0

@@ -21,9 +21,6 @@ MEMORY_END: Final = REGISTERS_END + MEMORY_KB * 1024
 REPEAT: Final = 0x02
 DC_SYNC_START: Final = 0x0990
 DC_SYNC_CYCLES: Final = 0x09A0  # of SYNC0, then SYNC1, four bytes each
-EVENT_DL_STATUS: Final = 1 << 2
-EVENT_AL_STATUS: Final = 1 << 3
-EVENT_SYNC_MANAGER: Final = 1 << 4  # of sync manager 0; shifted left by n for n
 PDI_TYPE: Final = 0x05  # SPI slave, as word 0 of the SII says too
 
 # Counters: a write of any value to one of a group sets the whole group to zero.
@@ -37,7 +34,7 @@ CLEARED_BY_WRITE: Final = (
 _SYNC_MANAGERS = range(SYNC_MANAGER, SYNC_MANAGER + SYNC_MANAGER_COUNT * SYNC_MANAGER_SIZE, SYNC_MANAGER_SIZE)
 # Register, bytes, and which bits of each a master may write.
 _WRITABLE: Final = (
-    (STATION_ADDRESS, 2, 0xFF), (DL_CONTROL, 4, 0xFF), (AL_CONTROL, 2, 0xFF), (EVENT_MASK, 2, 0xFF),
+    (STATION_ADDRESS, 2, 0xFF), (DL_CONTROL, 4, 0xFF), (AL_CONTROL, 2, 0xFF),
     *((counters.start, len(counters), 0xFF) for counters in CLEARED_BY_WRITE),
     (WATCHDOG_DIVIDER, 2, 0xFF), (WATCHDOG_TIME_PDI, 2, 0xFF), (WATCHDOG_TIME, 2, 0xFF),
     (SII_OWNER, 1, 0x03), (SII_CONTROL, 1, 0x01), (SII_CONTROL + 1, 1, 0x07), (SII_ADDRESS, 8, 0xFF),
@@ -61,11 +58,11 @@ def write_mask() -> bytearray:
 def power_on_values() -> bytearray:
     """Registers and memory of a controller that has just been switched on."""
     memory = bytearray(MEMORY_END)
-    # Type, revision, build, FMMUs, sync managers, RAM in KB, ports 0 and 1 MII, features: bit-wise FMMUs,
+    # Type, revision, build, FMMUs, sync managers, RAM in KB, ports 0 and 1 MII, features: FMMUs of bytes,
     # distributed clock, of 64 bits, separate counting of check sum errors.
     struct.pack_into(
         "<BBHBBBBH", memory, DL_INFORMATION,
-        0xC0, 2, 0, FMMU_COUNT, SYNC_MANAGER_COUNT, MEMORY_KB, 0x0F, 0x008C,
+        0xC0, 2, 0, FMMU_COUNT, SYNC_MANAGER_COUNT, MEMORY_KB, 0x0F, 0x008D,
     )  # fmt: skip
     memory[DL_CONTROL] = memory[AL_CONTROL] = memory[AL_STATUS] = memory[WATCHDOG_STATUS] = 1
     memory[PDI_CONTROL] = PDI_TYPE

@@ -20,9 +20,8 @@ def sync_manager(start: int, length: int, control: int, active: int = 1) -> byte
     return struct.pack("<HHBBBB", start, length, control, 0, active, 0)
 
 
-def fmmu(logical: int, length: int, physical: int, kind: int, *bits: int) -> bytes:
-    first, last, physical_bit = bits or (0, 7, 0)
-    return struct.pack("<IHBBHBBB3x", logical, length, first, last, physical, physical_bit, kind, 1)
+def fmmu(logical: int, length: int, physical: int, kind: int) -> bytes:
+    return struct.pack("<IHBBHBBB3x", logical, length, 0, 7, physical, 0, kind, 1)
 
 
 class Abort(Exception):  # noqa: N818

@@ -4,7 +4,6 @@ import struct
 
 import pytest
 
-from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.options import ForeignOptions
@@ -61,24 +60,6 @@ def test_read_multiple_write() -> None:
     assert [master.read(0x0F80, 1, position) for position in range(3)] == [b"\x11", b"\xaa", b"\xaa"]
 
 
-def test_interrupt_field_shows_masked_events() -> None:
-    master = RawMaster().go(PREOP)
-
-    def interrupt() -> int:
-        frame = wire.build((Command.BRD, 0, 0x0000, b"\0"))
-        assert master.bus.process(frame, len(frame), master.now)
-        return int.from_bytes(frame[wire.FIRST_DATA - 2 : wire.FIRST_DATA], "little")
-
-    master.read(0x0130, 2)
-    assert master.read16(0x0210) & 0x08 == 0
-    assert master.write(0x0200, b"\x08\0") == 1
-    assert interrupt() == 0
-    master.write(0x0120, b"\1\0")
-    assert (interrupt(), master.read16(0x0210) & 0x08) == (0x08, 0x08), "the AL status has changed"
-    master.read(0x0130, 2)
-    assert interrupt() == 0
-
-
 def test_process_data_by_fmmu() -> None:
     master = RawMaster(*chain(2, signal="constant")).go(OP)
     data, counter = master.cycle()
@@ -92,23 +73,6 @@ def test_process_data_by_fmmu() -> None:
     shared, counter = master.one(Command.LRW, 0, 0, b"\x07" + bytes(60))
     assert (shared[1:], counter) == (data[2:62], 3), "inputs and outputs may share logical addresses"
     assert master.upload(0x7000, 0) == b"\x07"
-
-
-def test_single_bits_by_fmmu() -> None:
-    master = RawMaster().go(PREOP)
-    # Bit 3 of SM1's status (mailbox full) to bit 5 of logical byte 0x200.
-    master.write(0x0620, fmmu(0x200, 1, 0x080D, 1, 5, 5, 3))
-    assert master.one(Command.LRD, 0x200, 0, b"\x81") == (b"\x81", 1)
-    master.send_mailbox(3, struct.pack("<HBHBI", 0x2000, 0x40, 0x1000, 0, 0))
-    assert master.one(Command.LRD, 0x200, 0, b"\x81") == (b"\xa1", 1)
-    master.write(0x0F80, b"\xff\xff")
-    master.write(0x0600, fmmu(0, 1, 0x0F80, 2, 0, 3, 6))
-    assert master.one(Command.LWR, 0, 0, b"\x05")[1] == 1
-    # Bits 6 to 9 become 0101 (lowest first: 1, 0, 1, 0), and the others stay.
-    assert master.read16(0x0F80) == 0xFFFF & ~(0xF << 6) | 5 << 6
-    master.write(0x0600, fmmu(0, 4, 0x1FFE, 3, 0, 7, 5))  # at the end of memory
-    assert master.one(Command.LRW, 0, 0, b"\xff" * 4)[1] == 3
-    assert master.read(0x1FFE, 2) == b"\xe0\xff"
 
 
 def test_process_data_needs_the_state() -> None:
