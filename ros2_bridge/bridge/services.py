@@ -293,7 +293,8 @@ class IdentifyServices:
         try:
             path = self._path()
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_yaml(path, result, "\n".join(comment), self._control.parameters.gravity)
+            control = self._control
+            write_yaml(path, result, "\n".join(comment), control.parameters.gravity, control.offset)
         except (CompensationError, FileError, OSError) as error:
             self._log.warning(f"the result of the identification is not written: {error}")
             return f"Not written: {error}"

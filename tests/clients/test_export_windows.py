@@ -20,7 +20,7 @@ from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.bags import imu, write_bag
-from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
+from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
 from tests.clients.simulated import Script, described, simulate
 from tests.ended import run_here
 
@@ -150,6 +150,58 @@ def test_the_compensated_wrench_is_the_nodes() -> None:
     made = windows.at(np.array([8, 130, 131]) * PERIOD_NS - 1_880_000)
     assert made["force_torque_compensated"][0, 0] == pytest.approx([5, 0, 0, 0, 0.6, 0], abs=1e-3)
     assert made["force_torque_compensated_valid"].ravel().tolist() == [True, False, True]
+
+
+def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
+    """A second at each of these forces along x, of which the sensor tells that its own offset is so."""
+    made, row = writer(path), describe(0, **SETTINGS)
+    row["sensors"][0] |= {} if told[0] is None else {"offset": [told[0], 0, 0, 0, 0, 0]}
+    made.describe(START_NS, row)
+    for part, (offset, force) in enumerate(zip(told, steps, strict=True)):
+        if part:
+            six = None if offset is None else [offset, 0, 0, 0, 0, 0]
+            made.event(START_NS, {"event": "offset_changed", "sensor": 0, "offset": six})
+        for number in range(800 * part, 800 * (part + 1)):
+            values: Any = {"force.x": force}
+            made.frame(frame(number, **values))
+    made.finish({})
+    return path
+
+
+def test_a_bias_goes_with_the_sensors_own_offset(tmp_path: Path) -> None:
+    """Tared before the recording and in it; then nobody knows the offset, and then it is known again."""
+    tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0], "bias": [3.0, 0, 0, 0, 0, 0]}
+    path = tared(tmp_path / "run.mcap", (-1.0, -9.3, None, 4.0), (1.0, -7.3, 5.0, 6.0))
+    with open_recording(path) as recording:
+        windows = Windows(3200, tool=tool | {"sensor_offset": [1.0, 0, 0, 0, 0, 0]})
+        made = joined(windows_of(recording, Stamped(stamps(3196)), windows))
+    valid = made["force_torque_compensated_valid"][0]
+    assert abs(made["force_torque_compensated"][0][valid]).max() < 1e-5
+    assert made["force_torque_valid"][0].sum() == 3198, "all that were measured before that"
+    parts = [int(part.sum()) for part in np.split(valid, [802, 1602, 2402])]
+    # In doubt are 0.1 s before a change is told, in which it is written, and two samples after it.
+    assert parts == [pytest.approx(720, abs=4), pytest.approx(797, abs=3), 0, pytest.approx(797, abs=3)]
+
+
+def test_a_bias_is_not_guessed(tmp_path: Path) -> None:
+    run, path, frames = tmp_path / "run.mcap", tmp_path / "tool.yaml", tmp_path / "frames.csv"
+    frames.write_text(f"timestamp\n{START_NS + 10**8}\n")
+    bias, offset = "bias: [3, 0, 0, 0, 0, 0]", "sensor_offset: [0, 0, 0, 0, 0, 0]"
+
+    def said(told: float | None, *parameters: str) -> str:
+        tared(run, [told], [3.0])
+        rows = ("tool_mass: 0", "tool_center_of_gravity: [0, 0, 0]", *parameters)
+        path.write_text("\n".join(["/**:", " ros__parameters:", *(f"  {row}" for row in rows)]))
+        ended = run_here(main, run, tmp_path / "out.npz", "--at", frames, "--tool", path, "--force")
+        assert ended.code == int("out.npz: " not in ended.err)
+        return ended.err
+
+    assert f"{path} does not say with which offset of the sensor its bias was measured" in said(0.0, bias)
+    assert f"{run} does not have the sensor's own offset" in said(None, bias, offset)
+    assert "a recording does not have that line" in said(0.0, bias, offset, "temperature_line: true")
+    assert "does not have a tool's parameters" in said(0.0, bias, "sensor_offset: [1, 2]")
+    for fine in ([0.0, bias, offset], [None]):
+        assert "out.npz: windows" in said(*fine)
 
 
 def test_every_format_has_the_same(tmp_path: Path) -> None:

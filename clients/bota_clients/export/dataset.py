@@ -18,7 +18,7 @@ import math
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -26,11 +26,11 @@ import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import DATASETS, PROGRAM, Advance
-from bota_clients.export.windows import Array, Arrays, Windows, read_tool
+from bota_clients.export.windows import Array, Arrays, Windows, offset_of, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
-from bota_clients.recording.reader import Recording
+from bota_clients.recording.reader import Offset, Recording
 from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
@@ -206,19 +206,23 @@ def windows_of(
     RecordingError for the first frame without a window.
     """
     done, clocks, waiting = 0, np.zeros((2, 0), np.int64), np.zeros((2, 0), np.int64)
-    for settings, batch in recording.batches(sensor):
-        windows.configure(settings.values, settings.rate_hz, settings.identity.name)
-        samples = windows.take(batch)
-        clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
-        if clocks.size:
-            waiting = np.hstack([waiting, frames.exposed(*clocks)])
-        ready = waiting[:, : np.searchsorted(waiting[1], windows.until_ns, "right")]
+    for settings, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
+        until_ns = windows.until_ns
+        if settings is not None:
+            windows.configure(settings.values, settings.rate_hz, settings.identity.name, settings.offset)
+            samples = windows.take(batch)
+            clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
+            if clocks.size:
+                waiting = np.hstack([waiting, frames.exposed(*clocks)])
+            # What comes next may put the latest samples in doubt.
+            until_ns = windows.until_ns - windows.doubt_ns
+        ready = waiting[:, : np.searchsorted(waiting[1], until_ns, "right")]
         if (ready[1, :1] < windows.begin_ns).any():
             break
         if ready.size:
             yield {"stamp_ns": ready[0], "monotonic_ns": ready[1], **windows.at(ready[1])}
         done, waiting = done + len(ready[0]), waiting[:, len(ready[0]) :]
-        windows.forget(min([windows.until_ns, *waiting[1, :1].tolist()]))
+        windows.forget(min([until_ns, *waiting[1, :1].tolist()]))
         advance(len(batch))
     if not clocks.size:
         raise RecordingError(f"{recording.path} has no new and valid samples")
@@ -240,6 +244,8 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         frames = Periodic(options.fps)
     else:
         frames = Stamped(read_stamps(options.at, options.column), str(options.at), options.latency, clock)
+    if tool and any(tool.get("bias", ())):
+        _check_offsets(options.tool, tool, recording, sensor.offsets)
     windows = Windows(length, hold=options.hold, tool=tool, imu_units=options.imu_units)
     about = {
         "program": f"{PROGRAM} {VERSION}",
@@ -248,11 +254,12 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         # In force from `stamp_ns` on, with delays of the filters; null: unknown, and taken to be 0.
         "settings": [
             {
-                **row._asdict(), "identity": row.identity._asdict(),
+                **row._asdict(), "offset": None, "identity": row.identity._asdict(),
                 "delay_ms": delays_ms(known_settings(row.values), row.rate_hz),
             }
             for row in sensor.history
         ],
+        "offsets": [row._asdict() for row in sensor.offsets],
         "units": _UNITS,
         "frames": {"force_torque": "ft_sensor", "imu": "ft_sensor_imu"},
         "clock": clock and clock._asdict(),
@@ -267,6 +274,26 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
             shutil.rmtree(path)
         made.replace(path)
     return f"windows of {count(length, 'sample')}"
+
+
+def _check_offsets(
+    path: Path, tool: Mapping[str, Any], recording: Recording, offsets: Sequence[Offset]
+) -> None:
+    """RecordingError unless it is known what the bias is with the sensor's own offset in the recording."""
+    if tool.get("temperature_line"):
+        raise RecordingError(
+            f"{path} has temperature_line, but a recording does not have that line: set it to false"
+        )
+    if offset_of(tool) is None:
+        raise RecordingError(
+            f"{path} does not say with which offset of the sensor its bias was measured: identify the tool "
+            "again, add sensor_offset if you know it, or leave the bias out"
+        )
+    if all(row.offset is None for row in offsets):
+        raise RecordingError(
+            f"{recording.path} does not have the sensor's own offset, so the bias of {path} is not known: "
+            "record with a newer server, or leave the bias out"
+        )
 
 
 def _in_chunks(blocks: Iterable[Arrays]) -> Iterator[Arrays]:

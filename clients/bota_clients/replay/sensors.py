@@ -26,7 +26,7 @@ class ReplayedSensor:
 
     def __init__(self, recorded: RecordedSensor) -> None:
         self.row: dict[str, Any] = {**recorded._asdict(), "state": "OP"}
-        for name in ("history", "frames"):
+        for name in ("history", "frames", "offsets"):
             del self.row[name]
         if recorded.rate_hz.is_integer():
             self.row["rate_hz"] = int(recorded.rate_hz)
@@ -44,7 +44,9 @@ class ReplayedSensor:
             self._emergency = {key: said.get(key) for key in ("code", "text", "register", "data")}
             self._emergency_at = time.monotonic()
         if isinstance(said.get("settings"), dict):
-            self.row |= {key: said[key] for key in ("settings", "rate_hz") if key in said}
+            self.row |= {key: said[key] for key in ("settings", "rate_hz", "delay_ms") if key in said}
+        if "offset" in said:
+            self.row["offset"] = said["offset"]
         if event.name in _STATES:
             self.row["state"] = _STATES[event.name]
 
