@@ -175,7 +175,9 @@ class BiasServices:
                 raise
             specific_force = None  # not needed without a tool_mass
         bias = estimate_bias(means, payload, specific_force or ZERO).plus(target, -1.0)
-        control.set_bias(bias, "tare", Taken(payload, specific_force))
+        by_imu = specific_force is not None and window.source.is_imu
+        accelerometer = control.parameters.accelerometer if by_imu else None
+        control.set_bias(bias, "tare", Taken(payload, specific_force, accelerometer))
         if payload.mass:
             weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
         else:

@@ -109,7 +109,9 @@ class CompensationControl:
         """How things are, for the diagnostics' thread."""
         output, source, parameters = self.output, self.choice.source, self.parameters
         payload, bias, has_subscribers = parameters.payload, self.bias, output.has_subscribers
-        bound = force_bound_95(payload, parameters.accelerometer) if source.is_imu else None
+        bound = None
+        if source.is_imu:
+            bound = force_bound_95(payload, parameters.accelerometer, self._ramp.taken)
         now_s, (then_s, motion) = self.link.clock.monotonic(), self._motion
         if now_s - then_s >= _MOTION_S:
             motion = source.error(payload.mass) if payload.mass and has_subscribers else None
