@@ -159,7 +159,13 @@ def run(options: IdentifyOptions) -> int:
     if options.yaml is not None:
         who = f"{sensor.name}, serial number {sensor.serial}, from {options.path.name}"
         gravity = None if options.gravity is None else (0.0, 0.0, -options.gravity)
-        write_yaml(options.yaml, result, f"{who}\n{summary(result)}", gravity, offset and Wrench.of(offset))
+        write_yaml(
+            options.yaml,
+            result,
+            f"{who}\n{summary(result)}",
+            gravity,
+            None if offset is None else Wrench.of(offset),
+        )
         _say(f"written to {options.yaml}")
     return 0
 
