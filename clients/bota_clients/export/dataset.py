@@ -12,6 +12,7 @@ with open_recording(Path("run.mcap")) as recording:
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
 import json
 import math
@@ -19,6 +20,7 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -42,6 +44,10 @@ _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
 _CHUNK: Final = 1024  # frames, in a file
 _UNITS: Final = {"force": "N", "torque": "Nm", "acceleration": "m/s^2", "angular_rate": "rad/s", "age": "s"}
 _SECOND: Final = 1_000_000_000
+_PER_SECOND: Final = {"s": _SECOND, "ms": 1_000_000, "us": 1000, "ns": 1}
+_FIRST: Final = -(1 << 63)
+_COARSEST_S: Final = 0.001
+_NEAR_NS: Final = 366 * 86400 * _SECOND
 
 
 class Clock(NamedTuple):
@@ -126,9 +132,14 @@ class Stamped:
             )
         which, bound = ("first", begin_ns) if stamps[row] < begin_ns else ("last", end_ns)
         taken, limit = np.array([stamps[row], bound]).astype("datetime64[ns]")
+        what = "leave the row out, or find the offset of its clock with 'ethercat-export align'"
+        if not stamps[row]:
+            what = "its time was not set (0): leave the row out"
+        for unit, per_unit in _PER_SECOND.items():
+            if unit != "ns" and abs(int(stamps[row]) * per_unit - bound) < _NEAR_NS:
+                what = f"it seems to be {unit} since 1970: give integers in ns, or numbers with a point in s"
         return RecordingError(
-            f"{source} is of {taken}Z, and the {which} sample was measured at {limit}Z: leave the row out, "
-            "or find the offset of its clock with 'ethercat-export align'"
+            f"{source} is of {taken}Z, and the {which} sample was measured at {limit}Z: {what}"
         )
 
 
@@ -149,6 +160,16 @@ def read_stamps(path: Path, name: str = "timestamp") -> Ints:
         stamps = np.array([stamp for stamp, _ in messages(path, name)], np.int64)
     if not len(stamps):
         raise RecordingError(f"{path} has no frames")
+    if len(stamps) > 1 and not stamps.any():
+        raise RecordingError(
+            f"the times of {name} in {path} are all 0: what wrote them, a camera's driver or a simulation "
+            "without a clock, set none; have it stamp its frames and record again"
+        )
+    if (again := np.flatnonzero(np.diff(stamps) == 0)).size:
+        raise RecordingError(
+            f"row {again[0] + 1} of {path} (counted from 0) has the time of the row above it: its times are "
+            "too coarse for the frames, or the row is there twice; give times of at least 1 ms resolution"
+        )
     return stamps
 
 
@@ -156,18 +177,67 @@ def _read_column(path: Path, column: str) -> Ints:
     import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
     from pyarrow import csv, parquet  # noqa: PLC0415
 
+    def refused(why: object) -> RecordingError:
+        return RecordingError(f"{path} has no times in a column {column} (choose one with --column): {why}")
+
     try:
-        table = parquet.read_table(path) if path.suffix == ".parquet" else csv.read_csv(path)
-        found = table[column]
-        if pa.types.is_timestamp(found.type):
-            found = found.cast(pa.timestamp("ns", found.type.tz)).cast("int64")
-        elif not pa.types.is_integer(found.type):
-            found = pa.array(np.rint(found.cast("float64").to_numpy() * _SECOND).astype(np.int64))
-        return np.asarray(found.to_numpy().astype(np.int64))
-    except (OSError, KeyError, pa.ArrowInvalid) as error:
-        raise RecordingError(
-            f"{path} has no times in a column {column} (choose one with --column): {error}"
-        ) from None
+        if path.suffix == ".parquet":
+            found = parquet.read_table(path)[column].combine_chunks()
+        else:  # an empty line may be a row, but for those at the end
+            options = csv.ParseOptions(ignore_empty_lines=False)
+            table = csv.read_csv(path, parse_options=options)
+            nulls = [each.is_null().to_numpy() for each in table.columns]
+            ends = np.flatnonzero(~np.logical_and.reduce(nulls))[-1:].max(initial=-1) + 1
+            found = table[column].combine_chunks()[:ends]
+        if pa.types.is_dictionary(found.type):
+            found = found.dictionary_decode()
+    except (OSError, KeyError, ValueError) as error:  # ArrowInvalid among them
+        raise refused(error) from None
+    kind, types = found.type, pa.types
+    is_text = types.is_string(kind) or types.is_large_string(kind) or types.is_string_view(kind)
+    per_unit = 1
+    if found.null_count:
+        raise refused(
+            f"row {found.is_null().to_numpy(False).argmax()} (counted from 0) is empty or no number"
+        )
+    if types.is_timestamp(kind):
+        values, per_unit = found.cast("int64").to_pylist(), _PER_SECOND[kind.unit]
+    elif types.is_integer(kind):
+        values = found.to_pylist()
+    elif is_text or types.is_decimal(kind) or types.is_floating(kind):
+        values = [_nanoseconds(value) for value in found.to_pylist()]
+    else:
+        raise refused(f"it has {kind}, and times have a date and a time of day, or are numbers since 1970")
+    for row, value in enumerate(values):
+        if not isinstance(value, int) or not _FIRST < value * per_unit < -_FIRST:
+            text = value if isinstance(value, str) else f"{found[row]}, which is too far from now"
+            raise refused(
+                f"row {row} (counted from 0) is {text}; integers are ns, other numbers s since 1970, and "
+                "texts ISO 8601"
+            )
+    if types.is_float16(kind) or types.is_float32(kind):
+        off_s = np.spacing(np.abs(found.to_numpy(False)).astype(kind.to_pandas_dtype()))
+        if (coarse := off_s.astype(float) > _COARSEST_S).any():
+            row = int(coarse.argmax())
+            raise refused(
+                f"row {row} (counted from 0) is known to {off_s[row]:g} s only: write float64, or ns"
+            )
+    return np.array(values, np.int64) * per_unit
+
+
+def _nanoseconds(value: Any) -> int | str:
+    """Of s since 1970, or of ISO 8601; a text: of what it is instead."""
+    import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
+
+    if isinstance(value, str):
+        for zone in ("UTC", None):
+            with contextlib.suppress(pa.ArrowInvalid):
+                taken = pa.scalar(value.strip()).cast(pa.timestamp("ns", zone))
+                return int(taken.value) if ":" in value else f"{value[:40]}, without a time of day"
+        return f"{value[:40]!r}"
+    if not math.isfinite(value):
+        return str(value)
+    return round(Decimal(str(value)) * _SECOND)  # the number as it was written
 
 
 def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
@@ -178,8 +248,11 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
     from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 - of the extra `dataset`
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
+    paths = [path]
+    if path.is_dir() and not (path / "metadata.yaml").exists():  # whose recorder was killed
+        paths = sorted(each for each in path.iterdir() if each.suffix in (".mcap", ".db3")) or paths
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        with AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
             chosen = [each for each in bag.connections if each.topic == topic]
             if not chosen:
                 there = ", ".join(sorted({each.topic for each in bag.connections}))
@@ -191,7 +264,10 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
     except AttributeError:
         raise RecordingError(f"messages of {topic} in {path} have no header, so no time") from None
     except (AnyReaderError, FileNotFoundError) as error:
-        raise RecordingError(f"{path} cannot be read as a bag: {error}") from None
+        which, what = ", ".join(map(str, paths)), ""
+        if paths != [path]:
+            what = "; its folder has no metadata.yaml, so its recorder was killed: try 'mcap recover'"
+        raise RecordingError(f"{which} cannot be read as a bag: {error}{what}") from None
 
 
 def windows_of(
