@@ -67,6 +67,23 @@ def test_with_the_default_filters_moves_leave_little_and_it_says_how_much(name: 
     assert last.percentile(0.9) < math.hypot(force_bound_95(tool, imu.known), NORMAL_95 * left.error.filters)
 
 
+@pytest.mark.parametrize("sinc_length", more_if_long([64], (32, 64)))
+def test_an_imu_that_is_sampled_at_its_own_rate_is_no_fast_turn(sinc_length: int) -> None:
+    """At 1 kHz: its samples are up to 1 ms older than the force.
+
+    Not of vibrations: their error is by that age, which nobody knows.
+    """
+    seed, chosen = 1000 * SEED, settings(sinc_length)
+    for name, path in motion.moves(seed).items():
+        if name == "vibration":
+            continue
+        felt = motion.held(motion.filtered(path, HEAVY, 3.0, chosen), path, chosen, motion.HEALTHY, 1000.0)
+        left = left_over(felt, HEAVY, align(chosen, 51200 / sinc_length), settling_s=1.0)
+        last = left._replace(force=left.force[left.times > 2.0])
+        assert left.error is not None
+        assert 1 / 1.6 < left.error.filters / last.rms < 1.6, name
+
+
 @pytest.mark.parametrize(
     ("sinc_length", "fir"),
     more_if_long([(64, True), (512, False)], itertools.product((32, 51, 64, 128, 205, 512), (False, True))),
