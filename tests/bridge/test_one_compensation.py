@@ -7,7 +7,6 @@ the recorder writes them, and node and ros2_control plugin get what the server s
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -211,15 +210,13 @@ class Reading(Loop):
 @needs_gxx
 @patient
 def test_the_plugins_wrench_is_the_exported_one(heard: Recorded, tool: Path) -> None:
-    """A process and sockets: the plugin has no other input. It sees a stream that was some seconds ago."""
+    """A process and sockets: the plugin has no other input, and takes the server for another machine's."""
     stamps, wrench = exported(heard.run, tool)
     wanted = dict(zip(stamps, wrench.tolist(), strict=True))
     with open_recording(heard.run) as recording:
         items = [*recording.everything(0)]
-    first_ns, last_ns = (item.monotonic_ns for item in (items[2], items[-1]) if isinstance(item, DataMessage))
     loop, played = Reading(program()), PlayedSensor()
-    played.description = described(items)
-    earlier_ns = time.monotonic_ns() - last_ns - 10**8
+    played.description = described(items) | {"boot_id": "another"}
     try:
         loop.opened(played.port, payload_file=tool)
         checked = 0
@@ -228,14 +225,13 @@ def test_the_plugins_wrench_is_the_exported_one(heard: Recorded, tool: Path) -> 
                 played.send(item.event)
             if not isinstance(item, DataMessage):
                 continue
-            played.send(encode_data(*item._replace(monotonic_ns=item.monotonic_ns + earlier_ns)))
+            played.send(encode_data(*item))
             if item.stamp_ns in wanted:
                 seen = loop.until_force(columns([item]).force[0, 0])
                 names = [f"compensated.{name}.{axis}" for name in ("force", "torque") for axis in "xyz"]
                 assert [seen[name] for name in names] == pytest.approx(wanted[item.stamp_ns], abs=1e-4)
                 checked += 1
         assert checked == len(wanted)
-        assert last_ns - first_ns < 8e9
     finally:
         loop.do("stop")
         played.close()
