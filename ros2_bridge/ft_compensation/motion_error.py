@@ -3,8 +3,11 @@
 
 - Filters: by the spectrum of acceleration and angular rate, what force and torque have of them (magnitude and
   delay of their filter, over that of the IMU's) less what the alignment has made of them, and the noise that
-  it lets through. It grows with vibrations that one filter passes and the other does not. What is faster than
-  half of the sampling rate cannot be seen.
+  it lets through. It grows with vibrations that one filter passes and the other does not. It holds for what
+  is slower than half of the sampling rate (50 Hz at SINC 512): what is faster looks like something slower, of
+  which the force has another share. The IMU is assumed to be sampled together with the force: the samples of
+  one that has its own 1 kHz are up to 1 ms older, which shows as fast turns that are none, and is an error
+  in fast vibrations that is not told.
 - Range: while an axis reads its limit, the acceleration is taken for a parabola that leaves the limit as
   steeply as it came there.
 """
@@ -26,6 +29,7 @@ FEWEST: Final = 64  # samples
 _NEAR_LIMIT: Final = 0.95  # of the range: offset and scale shift where an axis ends
 _ABOVE_NOISE: Final = 16.0  # times the noise's power: so much has one of ten million bins of noise
 _GAINS: Final = 65  # frequencies at which the filters' magnitudes are computed
+_FASTEST_TURN_HZ: Final = 150.0  # no tool turns faster: what the gyroscope has of that is not in the force
 _FLAT: Final = 0.002  # of the range: noise of what reads the limit
 
 
@@ -61,6 +65,7 @@ def _mismatched(rows: Array, alignment: Alignment, lever: Vector3) -> float:
         * np.exp(-turns * (lag_s - by_s))
         for each, by_s in zip(imu, (0.0, later_s), strict=True)
     ]
+    passed[1][hertz > _FASTEST_TURN_HZ] = 0.0
     ages_s = alignment.period_s * np.arange(alignment.taps.shape[1])[::-1]
     used = alignment.taps @ np.exp(-ages_s[:, np.newaxis] * turns)
     window = np.hanning(len(rows))[:, np.newaxis]

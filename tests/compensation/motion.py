@@ -149,6 +149,17 @@ def filtered(
     return Felt(gyroscope.times, load[:, :3], load[:, 3:], accelerometer.acceleration, gyroscope.rate)
 
 
+def held(felt: Felt, path: Path, settings: Mapping[str, SettingValue], imu: Imperfection, hz: float) -> Felt:
+    """The same with an IMU that is sampled at its own rate: each time its latest sample is sent."""
+    parts = []
+    for response in (acceleration_response, angular_rate_response):
+        late_s = response(settings).delay_s or 0.0
+        own = feel(later(path, late_s), Payload(), float(felt.times[-1]) + 2 / hz, hz, seed=99, imu=imu)
+        latest = np.floor(felt.times * hz + 1e-6).astype(int)
+        parts.append((own.acceleration[latest], own.rate[latest]))
+    return felt._replace(acceleration=parts[0][0], rate=parts[1][1])
+
+
 def later(path: Path, by_s: float) -> Path:
     """The same motion, so much later."""
     return lambda t: path(t - by_s)
