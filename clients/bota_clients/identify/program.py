@@ -167,6 +167,11 @@ def run(options: IdentifyOptions) -> int:
             None if offset is None else Wrench.of(offset),
         )
         _say(f"written to {options.yaml}")
+        if offset is None:
+            _say(
+                f"{options.path} has no offset of the sensor's own, so the bias is right only until that is "
+                "changed: record with a newer server"
+            )
     return 0
 
 
