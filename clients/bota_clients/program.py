@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shlex
 import signal
 import sys
@@ -35,10 +34,6 @@ def start(program: str, module: str, *arguments: object) -> int:
     """
     try:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        discard_output()
-        code = 1
     except ImportError as error:
         code = not_installed(program, error)
     except (ClientError, ProtocolError) as error:
@@ -54,12 +49,6 @@ def not_installed(program: str, error: ImportError) -> int:
     command = shlex.join([sys.executable, "-m", "pip", "install", f".[{extra}]"])
     say(program, f"{package} is not installed: in this project's folder run {command}")
     return 1
-
-
-def discard_output() -> None:
-    """The reader of standard output has gone: avoid another error when Python flushes it at exit."""
-    with contextlib.suppress(OSError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def interrupt_on_signals() -> None:
