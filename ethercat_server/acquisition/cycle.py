@@ -89,7 +89,7 @@ class Cycle:
         self._round_trip = round_trip
         self._cost_ns = _FIRST_COST_NS  # what an exchange and its samples keep the loop busy
         self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
-        self._round_trip_health = RoundTripHealth(round_trip, bus.ifname)
+        self._round_trip_health = RoundTripHealth(round_trip, bus)
         # By frame of the exchange: where it carries what of which sensor.
         self._carried = [
             [

@@ -47,7 +47,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         hub.permissions.control_uids = control_uids | {os.geteuid()}
         hub.permissions.names = names
         hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
-        server = Server(bus, hub, options, signals.check, watchdog=notifier, extra={"interface": ifname})
+        server = Server(bus, hub, options, signals.check, watchdog=notifier)
         server.cycle.every_second = lambda: notifier.update(server)
         signals.call(server.stop)
         for sensor in server.sensors:
@@ -59,7 +59,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         for host in options.server["hosts"]:
             if not ipaddress.ip_address(host).is_loopback:
                 log.warning("listening on %s: every machine that can reach it may read the sensors", host)
-        log.info("streaming %s on port %d", ifname, options.port)
+        log.info("streaming %s on port %d", bus.ifname, options.port)
         notifier.send("READY=1")
         notifier.update(server)
         try:

@@ -185,7 +185,10 @@ def test_the_notes_scripts_are_these_commands(
             "did you mean 'acceleration_filter' or 'angular_rate_filter'?",
         ),
         (["apply", "ens5", "--set", "IMU=1"], "did you mean 'imu_active'?"),
-        (["read", "ens5", "sinc"], "did you mean sinc_length or Force/torque filter SINC length?"),
+        (
+            ["read", "ens5", "sinc"],
+            "did you mean SINC length or Force/torque filter SINC length?",
+        ),
         (["apply", "ens5", "--set", "FIR_filter=on"], "fast, chop"),
         (["xyzzy"], "there are adapters, "),
         (["filters", "--loop", "abc"], "'abc': it must be from 0.1 to 100000"),

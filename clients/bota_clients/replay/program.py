@@ -79,7 +79,7 @@ class Player:
         hub, options, recording = self.hub, self._options, self._recording
         hub.permissions.control_uids = controlling_uids((), ())
         hub.permissions.names = local_names()
-        hub.start(Actions(hub, self, self.sensors, {"replay": self._about()}).handle)
+        hub.start(Actions(hub, self, self.sensors, lambda: {"replay": self._about()}).handle)
         name = f"{recording.path.name}, {recording.frame_count} frames,"
         _say(f"replaying {name} on port {options.port}, waiting for a subscriber; Ctrl-C ends it")
         try:

@@ -345,7 +345,7 @@ def _entry(index: int, subindex: int) -> list[ObjectEntry]:
 
 def _names() -> Iterable[tuple[str, Sequence[ObjectEntry]]]:
     for row in KNOWN_OBJECTS:
-        for name in {row.name, full_name(row), row.setting or row.name}:
+        for name in (row.name, full_name(row), row.setting or row.name):
             yield name, [row]
     for index, title in TITLES.items():
         yield title, _parts(index)
