@@ -79,12 +79,18 @@ class Server:
             self.jobs,
             watchdog or NoWatchdog(),
         )
-        extra = {"others": self.others.rows, **(extra or {})}
         if isinstance(self.cycle, CycleWithTerminals):
             self.cycle.terminals = terminals
-            extra["terminals"] = [terminal.row for terminal in terminals]
         self.actions = SensorActions(bus, hub, self.recovery, self.jobs, self.sensors, self.streams)
-        hub.start(Actions(hub, self.cycle, self.actions, extra).handle)
+        rows = [terminal.row for terminal in terminals]
+        described = {
+            "others": self.others.rows,
+            **({"terminals": rows} if terminals else {}),
+            **(extra or {}),
+        }
+        hub.start(
+            Actions(hub, self.cycle, self.actions, lambda: {"interface": bus.ifname, **described}).handle
+        )
 
     def run(self) -> None:
         """Stream until `stop`; then tell the clients."""

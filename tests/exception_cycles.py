@@ -1,6 +1,6 @@
 """Finds exceptions that keep themselves alive: such as are in a variable of a frame of their own traceback.
 
-The server's loop runs without a garbage collector, other programs pause for theirs.
+The server's loop runs without a garbage collector, so what it is made of is looked at.
 """
 
 from __future__ import annotations
@@ -12,8 +12,15 @@ from pathlib import Path
 from types import FrameType, TracebackType
 
 _ROOT = Path(__file__).parents[1]
-_PACKAGES = tuple(f"{_ROOT / name}/" for name in ("ethercat_server", "protocol", "ros2_bridge", "clients"))
-_EXCEPT = f"{_ROOT / 'protocol/bota_ethercat/client'}/"  # a client keeps why it failed
+_PACKAGES = tuple(f"{_ROOT / name}/" for name in ("ethercat_server", "protocol"))
+# Where a collector runs: what ended a client or a program is kept, once.
+_EXCEPT = tuple(
+    f"{_ROOT / name}/"
+    for name in (
+        *(f"ethercat_server/{room}" for room in ("access", "doctor", "tool")),
+        "protocol/bota_ethercat/client",
+    )
+)
 
 
 @contextlib.contextmanager

@@ -65,7 +65,7 @@ from scripts.benchmarks.records import ClockReading, decode_clock
 from tests.server.running import OLD, Commanded, FramedClient
 
 PATIENCE_S = 60.0  # simulated time that anything may take
-AT_REST = SensorOptions(signal="rest")
+AT_REST = SensorOptions(signal="rest", last_bit=False)
 _EXCUSE = int(DataFlag.GAP | DataFlag.REPEATED)
 
 

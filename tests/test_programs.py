@@ -7,8 +7,10 @@ import os
 import re
 import shlex
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -51,6 +53,42 @@ def interrupted(name: str, number: int, at: str, arguments: str) -> tuple[int, s
         env={**os.environ, "TERM": "xterm"}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     return done.returncode, done.stderr, done.stdout
+
+
+def unread(name: str, *arguments: str) -> tuple[int, str]:
+    """Exit code and standard error of a program whose output nobody reads any more."""
+    read, write = os.pipe()
+    os.close(read)
+    package, _, entry = PROGRAMS[name].partition(":")
+    script = f"import sys; sys.argv[0] = {name!r}; from {package} import {entry}; sys.exit({entry}())"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", script, *arguments],
+            env={key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"},
+            stdout=write, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    finally:
+        os.close(write)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_nobody_reads_the_output(name: str) -> None:
+    assert unread(name, "--help") == (1, "")
+
+
+def test_nobody_reads_what_the_virtual_sensor_answers(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sensor:
+        sensor.bind(path := str(tmp_path / "control"))
+
+        def answer() -> None:
+            _, asker = sensor.recvfrom(100)
+            sensor.sendto(b"ok " + b"." * 100_000, asker)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        assert unread("ethercat-virtual-sensor", "--control", path, "--send", "stats") == (1, "")
+        thread.join()
 
 
 @pytest.mark.parametrize("number", more_if_long([signal.SIGINT], [signal.SIGINT, signal.SIGTERM]))

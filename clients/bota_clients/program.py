@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
 
 __all__ = [
-    "Signals", "call_on", "discard_output", "interrupt_on_signals", "not_installed", "say", "start",
+    "Signals", "call_on", "interrupt_on_signals", "not_installed", "say", "start",
 ]  # fmt: skip
 
 _OF_DATASETS: Final = ("pyarrow", "zarr", "rosbags", "yaml")
@@ -41,10 +41,6 @@ def start(program: str, module: str, *arguments: object) -> int:
         sys.stderr = _standard_error()
     try:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        discard_output()
-        code = 1
     except ImportError as error:
         code = not_installed(program, error)
     except (ClientError, ProtocolError) as error:
@@ -78,12 +74,6 @@ def not_installed(program: str, error: ImportError) -> int:
     command = shlex.join([sys.executable, "-m", "pip", "install", f".[{extra}]"])
     say(program, f"{package} is not installed: in this project's folder run {command}")
     return 1
-
-
-def discard_output() -> None:
-    """The reader of standard output has gone: avoid another error when Python flushes it at exit."""
-    with contextlib.suppress(OSError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def call_on(loop: AbstractEventLoop, stop: Callable[[], object], *names: str) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
-import socket
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,8 +19,16 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.errors import ProtocolError, UnreachableError
 from bota_ethercat.program.server_choice import default_server
-from ethercat_server.errors import ServerError
-from ethercat_server.ethercat.nic import Routes, find_routes, master_sockets, table, users_of
+from ethercat_server.errors import InterfaceError, ServerError
+from ethercat_server.ethercat.nic import (
+    Routes,
+    find_routes,
+    look_up,
+    master_sockets,
+    own_name,
+    table,
+    users_of,
+)
 from ethercat_server.process.signals import signals_held_back
 
 _IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
@@ -86,7 +93,7 @@ def adapters() -> list[Adapter]:
     found = []
     for row in links():
         with contextlib.suppress(OSError):  # it has just gone
-            found.append(row._replace(routes=find_routes(row.name), holder=find_holder(row.name)))
+            found.append(row._replace(routes=find_routes(row.ifindex), holder=find_holder(row.name)))
     return found
 
 
@@ -144,13 +151,17 @@ def find_holder(ifname: str) -> Holder | None:
     if inodes or is_elsewhere(ifname):
         with contextlib.suppress(ServerError):
             address, its = server_here()
-            address = address if its == ifname else None
+            address = address if its == own_name(ifname) else None
     return Holder(None, "ethercat-server", address) if inodes or address else None
 
 
 def is_elsewhere(ifname: str) -> bool:
     """Whether this network namespace has no such interface; that of a server's virtual bus may."""
-    return ifname not in dict(socket.if_nameindex()).values()
+    try:
+        look_up(ifname)
+    except InterfaceError:
+        return True
+    return False
 
 
 def server_here() -> tuple[Address, str]:

@@ -19,7 +19,9 @@ from typing import Final
 
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
 from ethercat_server.acquisition.start_up import AsFound
+from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.nic import look_up
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.server import Server
@@ -42,18 +44,21 @@ def open_interface(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
     with contextlib.ExitStack() as cleanup:
         if ifname == VIRTUAL_INTERFACE:
             ifname = cleanup.enter_context(VirtualBus()).ifname
-        if not change_flags(ifname) & _IFF_PROMISC:
-            cleanup.callback(change_flags, ifname, off=_IFF_PROMISC)
+        with contextlib.suppress(InterfaceError):  # said when it is to be opened
+            index = look_up(ifname).ifindex
+            if not change_flags(index) & _IFF_PROMISC:
+                cleanup.callback(change_flags, index, off=_IFF_PROMISC)
         yield cleanup.enter_context(open_bus(ifname, allow_ip=allow_ip))
 
 
-def change_flags(ifname: str, *, on: int = 0, off: int = 0) -> int:
+def change_flags(index: int, *, on: int = 0, off: int = 0) -> int:
     """Change the flags of an interface (linux/if.h), if it is there and that is allowed; what they were."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket, contextlib.suppress(OSError):
-        answer = fcntl.ioctl(any_socket, _SIOCGIFFLAGS, _IFREQ.pack(ifname.encode(), 0))
+        name = socket.if_indextoname(index).encode()
+        answer = fcntl.ioctl(any_socket, _SIOCGIFFLAGS, _IFREQ.pack(name, 0))
         flags: int = _IFREQ.unpack(answer)[1]
         if (wanted := (flags | on) & ~off) != flags:
-            fcntl.ioctl(any_socket, _SIOCSIFFLAGS, _IFREQ.pack(ifname.encode(), wanted))
+            fcntl.ioctl(any_socket, _SIOCSIFFLAGS, _IFREQ.pack(name, wanted))
         return flags
     return 0
 
@@ -88,7 +93,7 @@ class PrivateServer:
             cleanup.callback(hub.close)
             self.channel = _PairChannel(own)
             self.error: Exception | None = None
-            self._server = Server(bus, hub, AsFound(force=force), extra={"interface": ifname})
+            self._server = Server(bus, hub, AsFound(force=force))
             self._rt_priority, self._cpu = rt_priority, cpu
             self.real_time = False
             self._cleanup = cleanup.pop_all()

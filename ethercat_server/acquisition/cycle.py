@@ -30,7 +30,6 @@ _SERVE_EVERY_NS: Final = 10_000_000
 _SERVE_IN_FLIGHT_NS: Final = 2_000_000  # and, without waiting, while an exchange is on its way
 _CHORES_EVERY_NS: Final = 20_000_000  # interval between chores, such as whether CLOCK_REALTIME was set
 _RECOVERY_STEP_NS: Final = 500_000  # time between two exchanges while all sensors are lost
-_MOST_UNANSWERED: Final = 40  # unanswered exchanges beyond which that interval grows no more
 # Interval between summaries of the distributions, which take some 100 µs each.
 _SUMMARY_NS: Final = 200_000_000
 _COST_GAIN: Final = 1 / 64
@@ -92,7 +91,7 @@ class Cycle:
         self._cost_ns = _FIRST_COST_NS  # what an exchange and its samples keep the loop busy
         self._wire_ns, self._most_wkc = bus.process_data.wire_ns, bus.process_data.most_wkc
         self.tracing = Tracing(round_trip, streams)
-        self._round_trip_health = RoundTripHealth(round_trip, bus.ifname)
+        self._round_trip_health = RoundTripHealth(round_trip, bus)
         # By frame of the exchange: where it carries what of which sensor.
         self._carried = [
             [
@@ -170,8 +169,7 @@ class Cycle:
         streams, sent_ns = self._streams, self._sent_ns
         unanswered, in_flight = self._unanswered, self._in_flight
         if self._recovery.all_lost:
-            # Slaves, or a driver, that cannot keep up get time to answer.
-            return sent_ns + _RECOVERY_STEP_NS * min(1 + unanswered, _MOST_UNANSWERED)
+            return sent_ns + _RECOVERY_STEP_NS
         if len(streams) == 1:
             poll_ns = streams[0].clock.next_poll_ns(sent_ns, unanswered, in_flight=in_flight)
         else:

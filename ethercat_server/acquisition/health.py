@@ -14,6 +14,7 @@ from typing import Final
 
 from bota_ethercat.health.sentences import STOOD_STILL
 from bota_ethercat.pdo import is_finite, layout_for
+from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import FIRST_INDEX
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
 from ethercat_server.sampling.round_trip import RoundTrip
@@ -34,11 +35,11 @@ def cost(usual_us: float) -> str:
 
 
 class RoundTripHealth:
-    """Logs once that round trips on `ifname` are slow; call `check` once a second."""
+    """Logs once that round trips on `bus` are slow; call `check` once a second."""
 
-    def __init__(self, round_trip: RoundTrip, ifname: str) -> None:
+    def __init__(self, round_trip: RoundTrip, bus: Bus) -> None:
         self._round_trip = round_trip
-        self._ifname = ifname
+        self._bus = bus
         self._slow_s = 0
 
     def check(self) -> None:
@@ -47,7 +48,7 @@ class RoundTripHealth:
         if self._slow_s < _SLOW_SECONDS:
             self._slow_s = self._slow_s + 1 if usual_us > SLOW_US else 0
             if self._slow_s == _SLOW_SECONDS:
-                log.info("frames take %.0f µs through %s: %s", usual_us, self._ifname, cost(usual_us))
+                log.info("frames take %.0f µs through %s: %s", usual_us, self._bus.ifname, cost(usual_us))
 
 
 # Frames of others in a second that are a master's; fewer may be late answers from before the loop.
@@ -59,10 +60,10 @@ _STALL_NS: Final = 20_000_000
 
 
 class Causes:
-    """What may explain the loss of a sensor on `ifname`; call `check` once a second."""
+    """What may explain the loss of a sensor on `bus`; call `check` once a second."""
 
-    def __init__(self, ifname: str) -> None:
-        self._ifname = ifname
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
         self._frames = self._frames_checked = 0  # of other masters
         # When the last one came, when this computer stood still last.
         self._frame_ns = self._stall_ns = -_RECENT_NS
@@ -90,7 +91,7 @@ class Causes:
     def explain(self, reason: str, now_ns: int, otherwise: str = "") -> str:
         """Why a sensor is lost, with what explains it; `otherwise` if nothing does."""
         if now_ns - self._frame_ns < _RECENT_NS:
-            otherwise = f"check for another EtherCAT master, whose frames arrive on {self._ifname}"
+            otherwise = f"check for another EtherCAT master, whose frames arrive on {self._bus.ifname}"
         elif now_ns - self._stall_ns < _RECENT_NS and self._stalled_ns > _STALL_NS:
             otherwise = f"this {STOOD_STILL.format(f' for {self._stalled_ns / 1e6:.0f} ms')}"
         return f"{reason}: {otherwise}" if otherwise else reason
@@ -103,13 +104,13 @@ class Causes:
                 log.warning(
                     "another EtherCAT master is sending on %s (%d frames in a second): stop it, for two "
                     "masters disturb each other's slaves",
-                    self._ifname, frames,
+                    self._bus.ifname, frames,
                 )  # fmt: skip
             self._gone_s = 0
         elif self._gone_s < _GONE_S and not frames:
             self._gone_s += 1
             if self._gone_s == _GONE_S:
-                log.info("the other EtherCAT master on %s has stopped sending", self._ifname)
+                log.info("the other EtherCAT master on %s has stopped sending", self._bus.ifname)
 
 
 # Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment.

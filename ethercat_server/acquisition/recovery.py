@@ -357,7 +357,7 @@ class Recovery:
     ) -> None:
         self.bus, self.announce = bus, announce
         self._all, self._others = sensors, others
-        self.causes = Causes(bus.ifname)
+        self.causes = Causes(bus)
         self.sensors = [
             SensorRecovery(self, sensor, stream) for sensor, stream in zip(sensors, streams, strict=True)
         ]

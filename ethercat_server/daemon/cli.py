@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Sequence
 
+from bota_ethercat.program.output import ends_with_its_reader
 from ethercat_server.errors import ServerError, StopRequestedError
 from ethercat_server.process.logs import set_up_logging
 from ethercat_server.process.signals import Signals
@@ -14,6 +15,7 @@ from ethercat_server.process.signals import Signals
 log = logging.getLogger(__name__)
 
 
+@ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the server; returns its exit code."""
     signals = Signals()

@@ -50,7 +50,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
         _give_up_root(user, options)
         hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
-        server = Server(bus, hub, options, signals.check, watchdog=notifier, extra={"interface": ifname})
+        server = Server(bus, hub, options, signals.check, watchdog=notifier)
         server.cycle.every_second = partial(every_second, server, notifier)
         signals.call(server.stop)
         for sensor in server.sensors:
@@ -62,7 +62,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         for host in options.server["hosts"]:
             if not ipaddress.ip_address(host).is_loopback:
                 log.warning("listening on %s: every machine that can reach it may read the sensors", host)
-        log.info("streaming %s on port %d", ifname, options.port)
+        log.info("streaming %s on port %d", bus.ifname, options.port)
         notifier.send("READY=1")
         every_second(server, notifier)
         try:

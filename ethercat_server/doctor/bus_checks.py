@@ -41,6 +41,7 @@ from ethercat_server.doctor.report import (
 from ethercat_server.errors import InterfaceError, ServerError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor import scan
@@ -96,10 +97,14 @@ def _read_errors(bus: Bus, position: int) -> bytes:
     return bus.read_surely_at(position, reg.RX_ERRORS, reg.ERROR_COUNTERS_SIZE)
 
 
-def answers(ifname: str, count: int) -> Finding:
-    """Whether any slave answers."""
+def answers(ifname: str, count: int, silent: str = CHECK_CABLE) -> Finding:
+    """Whether any slave answers; `silent` is the interface's part if none does, as of a `Backend`."""
     text = "no EtherCAT slave answers" if not count else f"{count} slave{'s' if count > 1 else ''} answer"
-    why = "check the sensor's power, that it is on the injector's LAN side, and that this is its interface"
+    why = silent
+    if silent == CHECK_CABLE:
+        why = (
+            "check the sensor's power, that it is on the injector's LAN side, and that this is its interface"
+        )
     return graded(
         text + "s" * (count == 1),
         (not count, bad, why, f"ethercat-sensor eeprom {ifname}"),
@@ -526,7 +531,8 @@ def _card_counters(ifname: str) -> Mapping[str, int]:
 def _slaves(machine: Machine, bus: Bus, found: list[Slave]) -> Generator[Finding, None, int]:
     """Those that answer, which are added to `found`; returns how many there are."""
     count = max(0, *(bus.count_slaves(_PROBE_SIZE, _FIND_TIMEOUT_S) for _ in range(_FIND_ATTEMPTS)))
-    yield from examine("bus", "slaves", answers, machine.shown, count)
+    silent = CHECK_CABLE if count else bus.backend.why_silent()
+    yield from examine("bus", "slaves", answers, machine.shown, count, silent)
     in_use = any(scan.look_at(bus, position).at_work for position in range(count))
     for position in range(count):
 

@@ -15,6 +15,7 @@ from typing import Final
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.program import server_choice
 from bota_ethercat.program.arguments import Parser, number
+from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import visible
 from ethercat_server.access.adapters import find_holder, is_elsewhere, server_here
@@ -25,7 +26,7 @@ from ethercat_server.doctor.machine import Machine
 from ethercat_server.doctor.machine_checks import examine_machine
 from ethercat_server.doctor.report import CannotLookError, Finding, Report, as_json, worst
 from ethercat_server.errors import ServerError, UsageError
-from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP, MAX_NAME_LENGTH
+from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP, name_trouble, own_name
 from ethercat_server.process import command_line
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 
@@ -66,6 +67,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+@ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the doctor; returns the exit code. argparse exits with 2."""
     command_line.begin(_PROGRAM)
@@ -87,11 +89,9 @@ def _run(args: argparse.Namespace) -> int:
             _, args.iface = server_here()
         except ServerError as error:
             raise UsageError(f"{error}: name the interface, or start ethercat-server on it") from None
-    if not 0 < len(os.fsencode(args.iface)) <= MAX_NAME_LENGTH or "/" in args.iface:
-        raise UsageError(
-            f"{args.iface!r} is not an interface name: it must have 1 to {MAX_NAME_LENGTH} characters; "
-            "'ethercat-sensor adapters' lists them"
-        )
+    if problem := name_trouble(args.iface):
+        raise UsageError(problem)
+    args.iface = own_name(args.iface)
     last = (os.cpu_count() or 1) - 1
     if args.cpu is not None and args.cpu > last:
         raise UsageError(f"--cpu {args.cpu}: this machine has the processors 0 to {last}")

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from ethercat_server.access.adapters import Adapter, links
 from ethercat_server.doctor.report import CannotLookError
-from ethercat_server.ethercat.nic import find_routes
+from ethercat_server.ethercat.nic import find_routes, look_up
 
 NOT_SUPPORTED: Final = "the driver does not support it"
 _UNKNOWN_SPEEDS: Final = frozenset({0, 0xFFFF, 0xFFFFFFFF})
@@ -64,7 +64,7 @@ def _driver(ifname: str) -> tuple[str, ...]:
 FACTS: Final[Mapping[str, Callable[[str], Any]]] = {
     "link": lambda ifname: next((row for row in links() if row.name == ifname), None),
     "names": lambda _: [name for _, name in socket.if_nameindex()],
-    "routes": find_routes,
+    "routes": lambda ifname: find_routes(look_up(ifname).ifindex),
     "settings": _settings,  # speed in Mbit/s and duplex
     "driver": _driver,  # its name, and the bus the card is on
     "coalescing": lambda ifname: dict(_ethtool(ifname, lambda asked: asked.get_coalesce())),

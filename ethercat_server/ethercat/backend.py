@@ -32,7 +32,9 @@ class Master(Protocol):
 class Backend(Protocol):
     """One wire: frames and time. Errors are BusErrors, each one sentence. Used by one thread."""
 
-    ifname: str
+    @property
+    def ifname(self) -> str:
+        """Name of the interface, for people; it may be renamed."""
 
     @property
     def master(self) -> Master | None:

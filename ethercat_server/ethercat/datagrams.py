@@ -93,7 +93,6 @@ class Datagrams:
     def __init__(self, backend: Backend) -> None:
         self.backend = backend
         self.clock = backend.clock
-        self.ifname = backend.ifname
         self._send, self._receive = backend.send, backend.receive
         self._monotonic_ns = backend.clock.monotonic_ns
         self._index = 0
@@ -103,6 +102,11 @@ class Datagrams:
         # it by one that continues to exchange process data.
         self.next_frame = self.next_on_wire
         self.stations: list[int] = []  # configured station addresses of the sensors, by number
+
+    @property
+    def ifname(self) -> str:
+        """Name of the interface, for people."""
+        return self.backend.ifname
 
     def next_on_wire(self, until_ns: int) -> bytes | None:
         """The next frame that arrives before `until_ns`; None if none does."""

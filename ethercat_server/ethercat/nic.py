@@ -18,6 +18,7 @@ import socket
 import struct
 import sys
 import time
+from array import array
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -45,8 +46,8 @@ class Process(NamedTuple):
 def master_sockets(ifname: str) -> set[int]:
     """Inodes of the EtherCAT sockets on `ifname`; empty if there is none, or no such interface."""
     try:
-        index = socket.if_nametoindex(ifname)
-    except OSError:
+        index = look_up(ifname).ifindex
+    except InterfaceError:
         return set()
     return {row.inode for row in packet_sockets() if (row.protocol, row.ifindex) == (ETHERTYPE, index)}
 
@@ -116,7 +117,9 @@ _ATTRIBUTE: Final = struct.Struct("=HH")
 _TYPE: Final = 0x3FFF
 _BUFFER: Final = 65536
 _LINK: Final = struct.Struct("=BxHiII")  # family, type, index, flags, change mask
-_IFLA_ADDRESS, _IFLA_MTU, _IFLA_MASTER, _IFLA_CARRIER = 1, 4, 10, 33
+_IFLA_ADDRESS, _IFLA_NAME, _IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_INFO = 1, 3, 4, 5, 10, 18
+_IFLA_CARRIER, _IFLA_LINK_NAMESPACE, _IFLA_NAMESPACE, _IFLA_ALTERNATIVE_NAME = 33, 37, 46, 53
+_INFO_KIND: Final = 1
 _IFF_UP, _IFF_LOOPBACK, _IFF_RUNNING = 0x1, 0x8, 0x40
 _ADDRESS: Final = struct.Struct("=BBBBI")  # family, length of the prefix, flags, scope, interface
 _IFA_ADDRESS, _IFA_LOCAL = 1, 2
@@ -127,88 +130,172 @@ _RTA_DST, _RTA_OIF = 1, 4
 _MAIN_TABLE: Final = 254
 _MADE_BY_KERNEL: Final = 2
 _LINK_SCOPE: Final = 253
+_SIOCETHTOOL, _GET_SETTINGS = 0x8946, 0x1
+_IFREQ: Final = struct.Struct("16sP16x")
+_SETTINGS: Final = struct.Struct("=I8xH14xH14x")  # command; the speed's low and high half
+_UNKNOWN_MBITS: Final = frozenset({0, 0xFFFF, 0xFFFFFFFF})
+_ETHERCAT_MBITS: Final = 100
+_BRIDGE: Final = "bridge"
+_DROPS: Final = "a bridge, which drops EtherCAT frames because their source address is a group's"
 _FAMILIES: Final = (socket.AF_INET, socket.AF_INET6)
 
 
 class Interface(NamedTuple):
-    """An interface as it is now."""
+    """An interface as it is now; the index stays while it is there, its names may change."""
 
     ifindex: int
+    name: str  # the one that is no alternative
     is_up: bool
     is_loopback: bool
     has_carrier: bool  # it is linked, and ready to send
     mtu: int
     master: int  # index of the bridge or bond that it is part of, 0 if none
     address: bytes  # of the hardware
+    kind: str  # of a virtual one, such as veth or bridge; empty for a network card
+    link: int  # index of what it stands on, or of a veth pair's other end
+    namespace: bytes  # of that, as the kernel numbers namespaces; empty if it is this one
 
 
-def look_up(ifname: str) -> Interface:
-    """The interface named `ifname`; InterfaceError if there is none."""
+def look_up(interface: str | int) -> Interface:
+    """The interface with this index, or name: any that the kernel takes; InterfaceError if there is none."""
     try:
-        (_, _, index, flags, _), found = next(
-            _ask(_GET_LINK, _LINK, 0, 0, socket.if_nametoindex(ifname), 0, 0)
-        )
+        return _look_up(interface)
     except (OSError, struct.error):
         names = [name for _, name in socket.if_nameindex()]
-        close = difflib.get_close_matches(ifname, [*names, "virtual"], n=1)
+        close = difflib.get_close_matches(str(interface), [*names, "virtual"], n=1)
         raise InterfaceError(
-            f"no network interface {ifname!r} on this machine: there are {', '.join(names)}, and 'virtual' "
-            f"for a virtual sensor{f'; did you mean {close[0]!r}?' if close else ''}"
+            f"no network interface {interface!r} on this machine: there are {', '.join(names)}, and "
+            f"'virtual' for a virtual sensor{f'; did you mean {close[0]!r}?' if close else ''}"
         ) from None
-    mtu, master, carrier = (
+
+
+def _look_up(interface: str | int, namespace: bytes = b"") -> Interface:
+    """As `look_up`, in another network `namespace` if one is given; OSError or struct.error."""
+    index, attributes = (interface, b"") if isinstance(interface, int) else (0, _named(interface))
+    if namespace:
+        attributes += _attribute(_IFLA_NAMESPACE, namespace)
+    (_, _, index, flags, _), found = next(_ask(_GET_LINK, _LINK, 0, 0, index, 0, 0, attributes=attributes))
+    mtu, link, master, carrier = (
         int.from_bytes(found.get(name, b""), sys.byteorder)
-        for name in (_IFLA_MTU, _IFLA_MASTER, _IFLA_CARRIER)
+        for name in (_IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_CARRIER)
     )
     return Interface(
         index,
+        _text(found.get(_IFLA_NAME, b"")),
         is_up=bool(flags & _IFF_UP),
         is_loopback=bool(flags & _IFF_LOOPBACK),
         has_carrier=bool(carrier and flags & _IFF_RUNNING),  # the flag may follow the driver a second later
         mtu=mtu,
         master=master,
         address=found.get(_IFLA_ADDRESS, b""),
+        kind=_text(_attributes(found.get(_IFLA_INFO, b"")).get(_INFO_KIND, b"")),
+        link=link,
+        namespace=found.get(_IFLA_LINK_NAMESPACE, namespace),
     )
 
 
-def trouble(ifname: str) -> str | None:
-    """What prevents frames from passing `ifname`, and what to do; None if nothing does."""
-    found = look_up(ifname)
+def _named(name: str) -> bytes:
+    """The attribute that asks for a name; the kernel compares it with both sorts."""
+    return _attribute(_IFLA_ALTERNATIVE_NAME, os.fsencode(name) + b"\0")
+
+
+def _text(name: bytes) -> str:
+    return os.fsdecode(name.partition(b"\0")[0])
+
+
+def own_name(interface: str | int, otherwise: str = "") -> str:
+    """The interface's name that is no alternative one; `otherwise`, or what was given, if there is none."""
+    try:
+        return look_up(interface).name
+    except InterfaceError:
+        return otherwise or str(interface)
+
+
+def name_trouble(ifname: str) -> str | None:
+    """Why no interface can be called so; None if one can, or is, by an alternative name."""
+    if (0 < len(os.fsencode(ifname)) <= _MAX_NAME_LENGTH and "/" not in ifname) or own_name(ifname) != ifname:
+        return None
+    return (
+        f"{ifname!r} is not an interface name: it must have 1 to {_MAX_NAME_LENGTH} characters; "
+        "'ethercat-sensor adapters' lists them"
+    )
+
+
+def trouble(interface: str | int) -> str | None:
+    """What prevents frames from passing an interface, and what to do; None if nothing does."""
+    found = look_up(interface)
+    name = found.name
+    if found.kind == _BRIDGE:
+        return f"{name} is {_DROPS}: name the interface that the sensor is connected to"
     if not found.is_up:
-        return f"{ifname} is down: bring it up with 'sudo ip link set {ifname} up'"
+        return f"{name} is down: bring it up with 'sudo ip link set {name} up'"
     if found.master:
+        master = own_name(found.master, f"interface {found.master}")
         return (
-            f"{ifname} is part of {_name(found.master)} (a bridge or bond), which takes its frames: remove "
-            f"it with 'sudo ip link set {ifname} nomaster', or use another interface"
+            f"{name} is part of {master} (a bridge or bond), which takes its frames: remove it with "
+            f"'sudo ip link set {name} nomaster', or use another interface"
         )
     if found.mtu < LEAST_MTU:
         return (
-            f"{ifname} has an MTU of {found.mtu} bytes, too few for EtherCAT: "
-            f"'sudo ip link set {ifname} mtu {LEAST_MTU}'"
+            f"{name} has an MTU of {found.mtu} bytes, too few for EtherCAT: "
+            f"'sudo ip link set {name} mtu {LEAST_MTU}'"
         )
     if not found.has_carrier:
-        return f"{ifname} has no carrier: check the cable, the PoE injector and its power supply"
+        return f"{name} has no carrier: check the cable, the PoE injector and its power supply"
     return None
 
 
-def why_silent(ifname: str) -> str:
+def in_between(interface: str | int) -> str | None:
+    """What an interface is connected to, and what to do, if that is no slave; None if that is not known.
+
+    A slave has 100 Mbit/s; a bridge is found behind a veth pair, or below a VLAN or the like.
+    """
+    found = look_up(interface)
+    if found.link and (found.namespace or found.link != found.ifindex):
+        with contextlib.suppress(OSError, struct.error):  # it may not look into the other's namespace
+            other = _look_up(found.link, found.namespace)
+            if other.kind != _BRIDGE and other.master:
+                other = _look_up(other.master, found.namespace)
+            if other.kind == _BRIDGE:
+                return (
+                    f"{found.name} is connected to {other.name}, {_DROPS}: connect the sensor to "
+                    f"{found.name} itself"
+                )
+    elif not found.kind and (mbits := _link_mbits(found.name)) > _ETHERCAT_MBITS:
+        return (
+            f"{found.name} is linked at {mbits} Mbit/s, so it is connected to no EtherCAT slave but to a "
+            "switch or a computer: connect the sensor, or its PoE injector, directly, for managed switches "
+            "drop EtherCAT frames"
+        )
+    return None
+
+
+def _link_mbits(name: str) -> int:
+    """Speed of a card's link; 0 if the driver does not say."""
+    settings = array("B", _SETTINGS.pack(_GET_SETTINGS, 0, 0))
+    request = _IFREQ.pack(os.fsencode(name), settings.buffer_info()[0])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        try:
+            fcntl.ioctl(asked, _SIOCETHTOOL, request)
+        except OSError:
+            return 0
+    _, low, high = _SETTINGS.unpack(settings)
+    mbits: int = low | high << 16
+    return 0 if mbits in _UNKNOWN_MBITS else mbits
+
+
+def why_silent(interface: str | int) -> str:
     """The interface's part in frames not coming back, and what to do."""
     try:
-        return trouble(ifname) or CHECK_CABLE
+        return trouble(interface) or in_between(interface) or CHECK_CABLE
     except InterfaceError as error:
         return str(error)
 
 
-def check_present(ifname: str, ifindex: int) -> None:
-    """Raise InterfaceError unless `ifname` is still the interface that was opened."""
-    if (ifindex, ifname) not in socket.if_nameindex():
+def check_present(index: int, ifname: str) -> None:
+    """Raise InterfaceError unless the interface that was opened is still there; `ifname` was its name."""
+    if index not in dict(socket.if_nameindex()):
         raise InterfaceError(f"the interface {ifname} has disappeared: connect it and start the server again")
-
-
-def _name(index: int) -> str:
-    try:
-        return socket.if_indextoname(index)
-    except OSError:
-        return f"interface {index}"
 
 
 class Routes(NamedTuple):
@@ -226,9 +313,8 @@ class Routes(NamedTuple):
         return ", ".join(("default route",) * self.default + self.addresses)
 
 
-def find_routes(ifname: str) -> Routes:
-    """What is on `ifname` now; OSError if the kernel does not say."""
-    index = socket.if_nametoindex(ifname)
+def find_routes(index: int) -> Routes:
+    """What is on the interface now; OSError if the kernel does not say."""
     try:
         addresses = [
             (f"{ipaddress.ip_address(found.get(_IFA_LOCAL) or found[_IFA_ADDRESS])}/{length}", scope, flags)
@@ -269,11 +355,12 @@ def network_trouble(ifname: str, routes: Routes) -> str | None:
 
 
 def _ask(
-    kind: int, layout: struct.Struct, *values: int
+    kind: int, layout: struct.Struct, *values: int, attributes: bytes = b""
 ) -> Iterator[tuple[tuple[int, ...], dict[int, bytes]]]:
     """The kernel's answers: fixed part and attributes, by type. OSError or struct.error if it refuses."""
     flags = _REQUEST if kind == _GET_LINK else _REQUEST | _DUMP
-    request = _HEADER.pack(_HEADER.size + layout.size, kind, flags, 0, 0) + layout.pack(*values)
+    request = layout.pack(*values) + attributes
+    request = _HEADER.pack(_HEADER.size + len(request), kind, flags, 0, 0) + request
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as asked:
         asked.setblocking(False)  # the kernel answers before send returns
         asked.send(request)
@@ -291,6 +378,11 @@ def _ask(
                 at += size + 3 & ~3
             if kind == _GET_LINK:
                 return
+
+
+def _attribute(kind: int, value: bytes) -> bytes:
+    size = _ATTRIBUTE.size + len(value)
+    return (_ATTRIBUTE.pack(size, kind) + value).ljust(size + 3 & ~3, b"\0")
 
 
 def _attributes(data: bytes) -> dict[int, bytes]:
@@ -372,8 +464,7 @@ def _in_use(ifname: str, process: int = 0) -> InterfaceError:
     return InterfaceError(f"{ifname} is in use by {who}: stop that one first")
 
 
-MAX_NAME_LENGTH: Final = 15  # Linux's limit; a longer name would overflow SOEM's buffer
-
+_MAX_NAME_LENGTH: Final = 15  # of a name that is no alternative one
 _CARRIER_TIMEOUT_S: Final = 5.0
 NEEDED_CAPABILITIES: Final = {12: "CAP_NET_ADMIN", 13: "CAP_NET_RAW"}
 
@@ -395,17 +486,14 @@ def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
 
 
 def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
-    if not 0 < len(ifname.encode()) <= MAX_NAME_LENGTH or "/" in ifname:
-        raise InterfaceError(
-            f"{ifname!r} is not an interface name: it must have 1 to {MAX_NAME_LENGTH} characters; "
-            "'ip link' lists them"
-        )
+    if problem := name_trouble(ifname):
+        raise InterfaceError(problem)
     found = look_up(ifname)
     if found.is_loopback:
         raise InterfaceError(f"{ifname} is the loopback interface: name the one the sensor is connected to")
     if not allow_ip:
         try:
-            routes = find_routes(ifname)
+            routes = find_routes(found.ifindex)
         except OSError as error:
             raise InterfaceError(
                 f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "

@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import pysoem
 
-from ethercat_server.errors import BusError, SetUpError
+from ethercat_server.errors import BusError, InterfaceError, SetUpError
 from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.backend import CheckInterrupt, Master
 from ethercat_server.ethercat.bus import Bus
@@ -48,7 +48,7 @@ class SoemBackend:
     """See `Backend` and `Master`: pysoem on an interface that `nic.claimed` has checked."""
 
     def __init__(self, ifname: str) -> None:
-        self.ifname = ifname
+        self._ifname = ifname  # any of its names, and then the last that it had
         self.clock = SYSTEM_CLOCK
         self.master: Master = self
         self._ifindex = 0
@@ -58,11 +58,18 @@ class SoemBackend:
         self._fd: int  # SOEM's AF_PACKET socket, and a second handle to it
         self._socket: socket.socket
 
+    @property
+    def ifname(self) -> str:
+        """See `Backend`: the name that it has now."""
+        if self._ifindex:
+            self._ifname = nic.own_name(self._ifindex, self._ifname)
+        return self._ifname
+
     def open(self) -> None:
         """See `Backend`."""
         before = packet_sockets()
         try:
-            self._master.open(self.ifname)
+            self._master.open(nic.own_name(self._ifname))
         except ConnectionError:
             for fd in packet_sockets() - before:
                 os.close(fd)
@@ -74,8 +81,8 @@ class SoemBackend:
         self._fd = (packet_sockets() - before).pop()
         self._socket = socket.socket(fileno=os.dup(self._fd))
         try:
-            self._ifindex = socket.if_nametoindex(self.ifname)
-        except OSError:
+            self._ifindex = nic.look_up(self._ifname).ifindex
+        except InterfaceError:
             raise BusError(f"the interface {self.ifname} went away: connect it and start again") from None
         # Until SOEM had bound it to the interface, it received the EtherCAT frames of all others.
         while self.receive(0) is not None:
@@ -104,7 +111,7 @@ class SoemBackend:
 
     def check_present(self) -> None:
         """See `Backend`."""
-        nic.check_present(self.ifname, self._ifindex)
+        nic.check_present(self._ifindex, self._ifname)
 
     def why_silent(self) -> str:
         """See `Backend`."""

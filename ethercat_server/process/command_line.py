@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import sys
 from collections.abc import Callable
 from typing import Final
@@ -35,10 +34,8 @@ def run(program: str, work: Callable[[], int], *, as_json: bool) -> int:
         return work()
     except (ServerError, ProtocolError) as error:
         text, exit_code = str(error), getattr(error, "exit_code", FAILED)
-    except BrokenPipeError:
-        # The reader of the output has closed it; Python would report that again at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
+    except BrokenPipeError:  # for `ends_with_its_reader`
+        raise
     except OSError as error:
         text = f"{error.filename or 'the operating system'}: {error.strerror or error}"
         exit_code = FAILED

@@ -17,6 +17,7 @@ from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.datagrams import ByPosition
+from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave import sii
 from ethercat_server.ethercat.slave.al import STATE_S, AlState, AlStatus
@@ -106,10 +107,12 @@ def look_safely(
         check_interrupt()
         slaves.append(look_at(bus, position))
     if not slaves:
-        raise NoSlaveError(
-            f"no EtherCAT slave answers on {bus.ifname}: check the cable, that the sensor has power and "
-            "that this is the interface it is connected to"
-        )
+        why = bus.backend.why_silent()
+        if why == CHECK_CABLE:
+            why = (
+                "check the cable, that the sensor has power and that this is the interface it is connected to"
+            )
+        raise NoSlaveError(f"no EtherCAT slave answers on {bus.ifname}: {why}")
     at_work = [
         slave for slave in slaves
         if slave.at_work and not (slave.position in ours and _is_ours(bus, slave, ours[slave.position]))

@@ -63,13 +63,16 @@ class Actions:
     """Answers requests: one method for each action."""
 
     def __init__(
-        self, hub: Hub, cycle: Producer, on_sensors: OnSensors, extra: Mapping[str, Any] | None = None
+        self, hub: Hub, cycle: Producer, on_sensors: OnSensors, extra: Callable[[], Mapping[str, Any]] = dict
     ) -> None:
-        """`extra` is added to the reply of `describe`."""
+        """What `extra` returns is added to the reply of `describe`."""
         self._hub = hub
         self._cycle = cycle
         boot = boot_id()
-        self._extra = {**({} if boot is None else {"boot_id": boot}), **(extra or {})}
+        self._extra: Callable[[], dict[str, Any]] = lambda: {
+            **({} if boot is None else {"boot_id": boot}),
+            **extra(),
+        }
         self._on_sensors = on_sensors
         self._sensors = on_sensors.sensors
         self._handlers: dict[str, Callable[[Connection, Request], JsonObject]] = {
@@ -115,11 +118,11 @@ class Actions:
         rows = [sensor.describe() for sensor in self._sensors]
         if len(rows) > _MOST_EXPLAINED:
             rows = [{key: value for key, value in row.items() if key != "meaning"} for row in rows]
-        return reply(request, protocol=PROTOCOL_VERSION, version=VERSION, sensors=rows, **self._extra)
+        return reply(request, protocol=PROTOCOL_VERSION, version=VERSION, sensors=rows, **self._extra())
 
     def _subscribe(self, connection: Connection, request: Request) -> JsonObject:
         wanted: list[bool] = []
-        for kind, rows in ("sensor", self._sensors), ("terminal", self._extra.get("terminals", ())):
+        for kind, rows in ("sensor", self._sensors), ("terminal", self._extra().get("terminals", ())):
             numbers = request.values[f"{kind}s"]
             if absent := [number for number in numbers or () if number >= len(rows)]:
                 raise RequestError(

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NoReturn
 
 from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server.process import command_line
 from ethercat_server.tool import bus, filters, objects, settings
@@ -57,6 +58,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+@ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; returns its exit code. argparse exits with 2 for what it finds."""
     command_line.begin(_PROGRAM)

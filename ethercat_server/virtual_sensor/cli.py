@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
 from bota_ethercat.program.arguments import Parser, number
+from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import look_up
@@ -91,7 +92,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
     parser.add_argument("--world", metavar="PATH", help="measure what datagrams to this Unix socket say")
     parser.add_argument("--world-lost", choices=LOST, default=FAULT, help="when it stops (default fault)")
-    parser.add_argument("--noise", choices=("on", "off"), default="on", help="noise of scene and world")
+    parser.add_argument(
+        "--noise", choices=("on", "off", "none"), default="on",
+        help="off: scene, poses and world have but that of the converters' last bits, as constant and rest; "
+        "none: not even that, so where nothing changes no sample is new",
+    )  # fmt: skip
     parser.add_argument(
         "--control", metavar="PATH", help=f"Unix socket for commands (default {link.own_socket()})"
     )
@@ -137,6 +142,7 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
             signal=args.signal,
             world=ExternalWorld(args.world_lost) if args.world else None,
             noise=args.noise == "on",
+            last_bit=args.noise != "none",
             seed=position,
         )
         for position in range(count)
@@ -153,6 +159,7 @@ def _get_priority() -> None:
         _say(f"not granted: real-time priority {priority} (CAP_SYS_NICE); samples may come late")
 
 
+@ends_with_its_reader
 def main(
     argv: Sequence[str] | None = None, on_open: Callable[[], None] = _get_priority, number: int = 0
 ) -> int:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Final, TextIO
 
 from bota_ethercat.world import DATAGRAM, decode
+from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import arrived_ns, look_up, master_sockets
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import Bus
@@ -57,9 +58,11 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
 
     The kernel removes VLAN tags; what they were it says only to sockets for all protocols.
     """
-    if ifname not in dict(socket.if_nameindex()).values():
-        raise LinkError(f"no network interface {ifname!r}: see `ip link`")
-    if not look_up(ifname).is_up:
+    try:
+        found = look_up(ifname)
+    except InterfaceError as error:
+        raise LinkError(str(error)) from None
+    if not found.is_up:
         raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
     try:
         # No protocol yet: with one, it would receive frames of all interfaces until it is bound.
@@ -70,7 +73,7 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
         ) from None
     try:
         raw.setsockopt(_SOL_PACKET, _PACKET_AUXDATA, 1)
-        raw.bind((ifname, protocol))
+        raw.bind((found.name, protocol))
         raw.setblocking(False)
     except OSError as error:
         raw.close()
@@ -124,7 +127,7 @@ def run(
         gc.collect()
         gc.freeze()
         on_ready()
-        answers, index, up = _Answers(raw, bus, ifname), socket.if_nametoindex(ifname), True
+        answers, index, up = _Answers(raw, bus, ifname), look_up(ifname).ifindex, True
         while not stop.is_set() and not bus.quit:
             ready = [descriptor for descriptor, _ in poller.poll(_IDLE_MS)]
             for descriptor in ready:

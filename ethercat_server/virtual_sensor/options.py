@@ -33,7 +33,8 @@ class SensorOptions:
     dc: str = ""  # its distributed clock, in `distributed_clock.CLOCK_WORDS`: `32-bit+ppm=20+late=50`
     signal: str = "scene"
     world: World | None = None  # instead of the signal
-    noise: bool = True
+    noise: bool = True  # of a healthy sensor, in scenes and worlds
+    last_bit: bool = True  # noise of the converters where there is no other: no two samples are the same
     seed: int = 0
     state: AlState = AlState.INIT  # in which another master has left it
     eeprom_ms: float = EEPROM_MS  # time that reading from its EEPROM takes

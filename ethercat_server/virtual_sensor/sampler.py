@@ -73,6 +73,9 @@ _SKIP_STEPS: Final = 1 << 32
 # Raw counts without the calibration matrix, per N and per Nm. A real sensor mixes its channels; this one
 # only scales.
 _COUNTS: Final = (10_000.0,) * 3 + (500_000.0,) * 3
+_STEPS: Final = 1 << 64 // len(CHANNELS)  # by chance, of 64 bits of it
+# What the last bit of a converter is worth; of those of the IMU, which have 16 bits, in its narrowest ranges.
+_LAST_BITS: Final = (*(1 / counts for counts in _COUNTS), *(2 / 2**15,) * 3, *(250 / 2**15,) * 3)
 _LARGEST_REAL32 = 3.4e38
 
 
@@ -132,6 +135,8 @@ class Sampler:
         self._signal: Measured | Formula = (
             FORMULAS[options.signal] if world is None else Measured(world, options.seed, options.noise)
         )
+        is_noisy = FORMULAS[options.signal].is_exact if world is None else options.noise
+        self._has_last_bit = options.last_bit and not is_noisy
         self.settings_changed()
 
     def number_at(self, instant: int) -> int:
@@ -167,9 +172,20 @@ class Sampler:
         self.made += 1
         instant = self.clock.instant(number)
         reading = self._signal.reading(number, instant, (instant - self._signal_start) * 1e-9)
+        if self._has_last_bit:
+            reading = self._with_last_bit(reading, number)
         reading, saturated = self._disturb(reading)
         warnings = self._warnings if number < self._warnings_until else 0
         return self._pack(reading, warnings, saturated)
+
+    def _with_last_bit(self, reading: Reading, number: int) -> Reading:
+        """The reading of sample `number` with up to the last bit of each converter added or subtracted."""
+        values = [*reading.force_torque, *reading.acceleration, *reading.angular_rate]
+        chance = _scattered(number, self._seed)
+        for position, bit in enumerate(_LAST_BITS):
+            values[position] += bit * ((chance % _STEPS + 0.5) / _STEPS * 2 - 1)
+            chance //= _STEPS
+        return reading_of(values, reading.temperature, reading.orientation)
 
     def _disturb(self, reading: Reading) -> tuple[Reading, int]:
         """The reading with every fault in it, and which channels are saturated, as bits."""

@@ -40,6 +40,7 @@ class Formula:
 
     load: Callable[[int, int], Iterable[float]]
     temperature: Callable[[int], float] = lambda _: 35.0
+    is_exact: bool = False  # noise would make its numbers unreadable
 
     def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
         """The reading of sample `number`, taken at `instant` ns, `seconds` after power-on."""
@@ -59,8 +60,8 @@ def _clock(number: int, instant: int) -> Iterable[float]:
 
 
 FORMULAS: Final = {
-    "clock": Formula(_clock),
-    "ramp": Formula(lambda k, _: (((k + 100 * i) % 1024) / 64 - 8 for i in range(6))),
+    "clock": Formula(_clock, is_exact=True),
+    "ramp": Formula(lambda k, _: (((k + 100 * i) % 1024) / 64 - 8 for i in range(6)), is_exact=True),
     "constant": Formula(lambda *_: CONSTANT),
     # The sample number in the temperature: steps of 2**-18 °C, from 32 to 48 °C, are exact in REAL32.
     "rest": Formula(lambda *_: CONSTANT, lambda k: 32 + k % 2**22 / 2**18),

@@ -175,7 +175,9 @@ class BiasServices:
                 raise
             specific_force = None  # not needed without a tool_mass
         bias = estimate_bias(means, payload, specific_force or ZERO).plus(target, -1.0)
-        control.set_bias(bias, "tare", Taken(payload, specific_force))
+        by_imu = specific_force is not None and window.source.is_imu
+        accelerometer = control.parameters.accelerometer if by_imu else None
+        control.set_bias(bias, "tare", Taken(payload, specific_force, accelerometer))
         if payload.mass:
             weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
         else:
@@ -293,7 +295,8 @@ class IdentifyServices:
         try:
             path = self._path()
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_yaml(path, result, "\n".join(comment), self._control.parameters.gravity)
+            control = self._control
+            write_yaml(path, result, "\n".join(comment), control.parameters.gravity, control.offset)
         except (CompensationError, FileError, OSError) as error:
             self._log.warning(f"the result of the identification is not written: {error}")
             return f"Not written: {error}"

@@ -28,8 +28,10 @@ from ft_compensation.quantities import (
 )
 from ft_compensation.stationary import StationaryMeans
 
-# From half of an interval of one axis to the radius that holds as often for three (chi, 3 degrees).
+# From half of an interval of one axis to the radius that holds as often for three (chi, 3 degrees), ...
 _ABOUT_THREE_AXES: Final = 2.80 / NORMAL_95
+# ... and for three times the distance between the directions of gravity in two poses, which are any.
+_BETWEEN_POSES: Final = 4.39 / NORMAL_95
 
 
 def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.5) -> None:
@@ -42,12 +44,16 @@ def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.
         )
 
 
-def force_bound_95(payload: Payload, accelerometer: Accelerometer) -> float:
-    """N: in 95 % of cases what is not known of the accelerometer shows as less force.
+def force_bound_95(payload: Payload, accelerometer: Accelerometer, taken: Taken | None = None) -> float:
+    """N: in 95 % of cases what is not known of the accelerometer shows as less force, in any pose.
 
-    A tare with the tool on takes the part of the accelerometer's offset off.
+    A bias `taken` by a tare that went by this accelerometer has the part of its offset in it, and what its
+    scale and crossed axes did in that pose.
     """
     cross = accelerometer.cross_axis_interval
+    largest = STANDARD_GRAVITY * max(*accelerometer.scale_interval, *cross)
+    if taken is not None and taken.accelerometer == accelerometer:
+        return payload.mass * _BETWEEN_POSES * largest
     per_axis = zip(
         accelerometer.offset_interval, accelerometer.scale_interval, cross[::2], cross[1::2], strict=True
     )
@@ -74,13 +80,14 @@ class Taken(NamedTuple):
     payload: Payload = NO_PAYLOAD  # whose weight is not part of it
     # During the tare, in the sensor's frame, m/s². None: unknown. Zero: of no tare, it holds for any.
     specific_force: Vector3 | None = ZERO
+    accelerometer: Accelerometer | None = None  # as it was corrected, where that is by the sensor's own
 
     def weighed(self, payload: Payload) -> tuple[Wrench, Taken]:
         """By how much the bias is another for this payload; nothing if the specific force is unknown."""
         if self.specific_force is None or payload == self.payload:
             return NO_WRENCH, self
         before, now = (_weight(each, self.specific_force) for each in (self.payload, payload))
-        return before.plus(now, -1.0), Taken(payload, self.specific_force)
+        return before.plus(now, -1.0), self._replace(payload=payload)
 
     def warning(self, change: Wrench, payload: Payload) -> str:
         """What `weighed`, and its `change`, mean for a user, a sentence; empty if nothing."""

@@ -6,6 +6,7 @@ import contextlib
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -248,7 +249,7 @@ def own_cpus() -> tuple[int, int]:
 
 def loopback_up() -> None:
     """Set the new namespace's loopback interface up, as `ip link set lo up` does."""
-    change_flags("lo", on=1)  # IFF_UP
+    change_flags(socket.if_nametoindex("lo"), on=1)  # IFF_UP
 
 
 def stoppable(run: Callable[[], int], program: str, sentence: str, code: int) -> int:

@@ -116,6 +116,29 @@ def test_a_parameter_that_the_shift_has_not_reached_is_no_wish(
     assert max(abs(value) for message in stages.final for value in six(message)) < 1e-3
 
 
+def test_a_bias_of_a_file_is_of_the_offset_that_the_file_names(sensor: Sensor) -> None:
+    """Identified, written, and started with again after the sensor was tared, or lost its offset."""
+    new = [1.0, 2.0, -8.0, 0.1, 0.2, 0.3]
+    sensor.set_offset(new)
+    given = {"bias": [*BIAS.values], "sensor_offset": ZERO6}
+    with Node(sensor, **QUICK, **given) as node:
+        stages = Stages(node)
+        assert stages.first() == pytest.approx(ZERO6, abs=1e-3)
+        shown = [list(value) for value in node.parameters("bias", "sensor_offset")]
+        assert shown == [pytest.approx([b + n for b, n in zip(BIAS.values, new, strict=True)]), new]
+        node.until(compensation="ok")
+        # A bias that is given or taken while it runs goes with the offset of now, unless another is given.
+        node.do("tare")
+        sensor.set_offset(ZERO6, tell=True)
+        stages.settle(ZERO6)
+        assert list(node.parameters("sensor_offset")[0]) == ZERO6
+        node.set("bias", [1.0] * 6)
+        stages.settle([b - 1.0 for b in BIAS.values])
+        node.set("sensor_offset", [-1.0] * 6)
+        stages.settle([b - 2.0 for b in BIAS.values])
+        assert [list(value) for value in node.parameters("bias", "sensor_offset")] == [[2.0] * 6, ZERO6]
+
+
 def test_an_offset_that_was_not_known_puts_the_bias_in_doubt(sensor: Sensor, node: Node) -> None:
     """As of a server that was too old to tell it."""
     sensor.set_offset(None, tell=True)

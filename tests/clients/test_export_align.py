@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.align import find_offset
+from bota_clients.export.align import _robot_rates, find_offset
 from bota_clients.export.cli import main
 from bota_clients.export.dataset import Clock
 from tests.clients.bags import imu, joint_states, write_bag
@@ -80,12 +80,18 @@ def test_the_offset_and_drift_of_a_robots_clock(tmp_path: Path, topic: str) -> N
         at_s = zip(stamps_ns.tolist(), joints(instants).tolist(), strict=True)
         messages = [joint_states(at, gripper=0.1, second=row[1], first=row[0]) for at, row in at_s]
         messages.insert(100, joint_states(int(stamps_ns[100]), another=1.0))
+        messages[200].position = messages[200].position[:0]  # velocities only
+        messages[300].position[1] = math.nan
     bag = write_bag(tmp_path / "bag", topic, messages)
     (tmp_path / "arm.urdf").write_text(URDF)
     given = ["--topic", topic, "--urdf", tmp_path / "arm.urdf", "--link", "tool"]
     ended = run_here(main, "align", tmp_path / "run.mcap", bag, *given)
     assert ended.code == 0, ended.err
     assert not problems("export-align", ended.json)
+    left_out = 0 if topic == "/imu" else 2
+    assert ended.json["left_out"] == left_out
+    assert (f"{left_out} messages left out, without finite angles or rates" in ended.err) is bool(left_out)
+    assert ended.json["bend_ms"] == 0.0
     found = Clock(ended.json["stamp_ns"], ended.json["monotonic_ns"], ended.json["drift_ppm"])
     exact_ns = START_NS + np.rint(1e9 * stamps).astype(np.int64)
     error_ms = found.instants(exact_ns) * 1e-6 - instants * 1e3
@@ -115,3 +121,162 @@ def test_a_motion_that_says_nothing_is_refused(sensor: Motion, robot: Motion, sa
     stamps = np.rint(times * 1e9).astype(np.int64)
     with pytest.raises(RecordingError, match=said):
         find_offset(stamps[: len(felt)], felt, stamps, turned)
+
+
+def straight(share: Array) -> Array:
+    return 0.0 * share
+
+
+def slewed(share: Array) -> Array:
+    return np.asarray(1e-3 * np.clip(2 * share - 1, 0, 1))
+
+
+def warmed(share: Array) -> Array:
+    return np.asarray(4e-3 * (share - 0.5) ** 2)
+
+
+def stepped(share: Array) -> Array:
+    return np.asarray(1e-3 * (share > 0.6))
+
+
+@pytest.mark.parametrize("seed", more_if_long([0, 1], range(20)))
+@pytest.mark.parametrize("bend", [straight, slewed, warmed, stepped])
+def test_a_clock_that_is_not_straight_is_told_and_the_interval_holds(bend: Motion, seed: int) -> None:
+    """A robot's clock that bends by 1 ms against a line; its stamps jitter by 0.5 ms, as the page has it."""
+    noise = np.random.default_rng(seed)
+    times, begin_s = np.arange(0, 40, 0.00125), noise.uniform(0, 20)
+    instants = np.arange(1, 39, 0.008)
+    stamps = (instants - OFFSET_S) / (1 + DRIFT) + bend((instants - 1) / 38)
+    stamps_ns = np.rint(1e9 * np.sort(stamps + noise.normal(0, 5e-4, len(stamps)))).astype(np.int64)
+    felt = rates(times + begin_s) @ about(0, 0.7) + noise.normal(0, 0.005, (len(times), 3))
+    turned = rates(instants + begin_s) + noise.normal(0, 0.01, (len(instants), 3))
+    clock, found = find_offset(np.rint(1e9 * times).astype(np.int64), felt, stamps_ns, turned)
+    error_ms = clock.instants(np.rint(1e9 * stamps).astype(np.int64)) * 1e-6 - instants * 1e3
+    assert (found["bend_ms"] > 0) is (bend is not straight)
+    assert abs(error_ms[len(error_ms) // 2]) < (1 if found["bend_ms"] else 2) * found["interval_ms"]
+
+
+# Arms as xacro expands their makers' descriptions: what follows the flange, and what else is in the file.
+# Each joint: name, type, rpy, axis; "": left out, of a joint that does not turn some have zeros.
+PI_2 = "1.5707963267948966"
+ARMS: dict[str, list[tuple[str, str, str, str]]] = {
+    "ur": [
+        ("base_link-base_link_inertia", "fixed", "0 0 3.141592653589793", ""),
+        ("shoulder_pan_joint", "revolute", "0 0 0", "0 0 1"),
+        ("shoulder_lift_joint", "revolute", f"{PI_2} 0 0", "0 0 1"),
+        ("wrist_3_joint", "continuous", f"{PI_2} 3.141592653589793 3.14", "0 0 1"),
+        ("wrist_3-flange", "fixed", f"0 -{PI_2} -{PI_2}", "0 0 0"),
+        ("flange-tool0", "fixed", f"{PI_2} 0 {PI_2}", "0 0 0"),
+    ],
+    "franka": [
+        ("fr3_joint1", "revolute", "0 0 0", "0 0 1"),
+        ("fr3_joint2", "revolute", f"-{PI_2} 0 0", "0 0 1"),
+        ("fr3_joint8", "fixed", "0 0 0", "0 0 0"),
+        ("fr3_hand_joint", "fixed", "0 0 -0.7853981633974483", ""),
+        ("fr3_finger_joint1", "prismatic", "0 0 0", "0 1 0"),
+        ("fr3_finger_tip", "fixed", "", "0 0 0"),
+    ],
+    "kuka": [
+        ("joint_a1", "revolute", "", "0 0 -1"),
+        ("joint_a2", "revolute", "0 0 0", "0 2 0"),
+        ("joint_a6-flange", "fixed", "0 0 0", "0 0 0"),
+        ("flange-tool0", "fixed", f"0 {PI_2} 0", ""),
+    ],
+    "xarm": [
+        ("world_joint", "fixed", "0 0 0", ""),
+        ("left_joint1", "revolute", "0 0 0", "0 0 1"),
+        ("left_joint2", "revolute", f"-{PI_2} 0 0", ""),
+        ("left_joint_eef", "fixed", "0 0 0", ""),
+        ("left_drive_joint", "revolute", "0 0 0", "1 0 0"),
+        ("left_finger_joint", "revolute", "0 0 0.5", "-1 0 0"),
+        ("left_link_tcp", "fixed", "0 0 0", "0 0 0"),
+    ],
+}  # fmt: skip
+
+
+def described(arm: str) -> tuple[str, list[str]]:
+    """The file, and its links in a chain from the root on."""
+    joints = ARMS[arm]
+    links = [f"{arm}_link{number}" for number in range(len(joints) + 1)]
+    parts = [f'<link name="{link}"><inertial><origin rpy="0 0 0"/></inertial></link>' for link in links]
+    for (name, kind, rpy, axis), parent, child in zip(joints, links, links[1:], strict=False):
+        origin = f'<origin rpy="{rpy}" xyz="0 0 0.1"/>' if rpy else '<origin xyz="0 0 0.1"/>'
+        along = f'<axis xyz="{axis}"/>' if axis else ""
+        mimic = '<mimic joint="left_drive_joint" multiplier="-0.5" offset="0.1"/>' * ("finger_joint" in name)
+        mimic *= kind == "revolute"
+        parts.append(
+            f'<joint name="{name}" type="{kind}"><!-- of {arm} --><parent link="{parent}"/>'
+            f'<child link="{child}"/>{origin}{along}{mimic}'
+            '<limit lower="-3" upper="3" effort="1" velocity="1"/><dynamics damping="0"/></joint>'
+        )
+    inner = "".join(
+        f'<joint name="{name}"><command_interface name="position"/></joint>' for name, *_ in joints
+    )
+    parts.append(f'<ros2_control name="{arm}" type="system">{inner}</ros2_control>')
+    parts.append(f'<transmission name="t"><joint name="{joints[1][0]}"/></transmission><gazebo/>')
+    xml = '<?xml version="1.0" ?><!-- by xacro --><robot name="{}" xmlns:xacro="http://wiki.ros.org/xacro">'
+    return "".join([xml.format(arm), *parts, "</robot>"]), links
+
+
+def size_of_rate(arm: str, t: Array) -> Array:
+    """(n,) rad/s, of what is behind the last joint that turns: by the angles of `angle`, and their slopes."""
+    turned, total = np.tile(np.eye(3), (len(t), 1, 1)), np.zeros((len(t), 3))
+    for name, kind, rpy, axis in ARMS[arm]:
+        roll, pitch, yaw = map(float, (rpy or "0 0 0").split())
+        turned = turned @ about(2, yaw) @ about(1, pitch) @ about(0, roll)
+        if kind in ("fixed", "prismatic"):
+            continue
+        unit = np.array((axis or "1 0 0").split(), float)
+        unit /= np.linalg.norm(unit)
+        follows, factor = (name, 1.0) if name != "left_finger_joint" else ("left_drive_joint", -0.5)
+        plus = 0.1 * (factor != 1.0)
+        slope = factor * (angle(arm, follows, t + 1e-4) - angle(arm, follows, t - 1e-4)) / 2e-4
+        total += slope[:, np.newaxis] * (turned @ unit)
+        which, sign = int(np.abs(unit).argmax()), float(unit.sum())
+        now = sign * (factor * angle(arm, follows, t) + plus)
+        turned = turned @ np.stack([about(which, each) for each in now.tolist()])
+    return np.asarray(np.linalg.norm(total, axis=1))
+
+
+def angle(arm: str, joint: str, t: Array) -> Array:
+    """rad"""
+    number = [name for name, *_ in ARMS[arm]].index(joint)
+    return np.asarray(0.5 * np.sin((1 + 0.3 * number) * t + number))
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_arms_as_their_makers_describe_them(tmp_path: Path, arm: str) -> None:
+    """Every link behind the last joint that turns is one body; the other joints' axes may be zeros."""
+    text, links = described(arm)
+    path = tmp_path / "arm.urdf"
+    path.write_text(text)
+    t = np.arange(0.0, 2.0, 0.01)
+    names = [name for name, kind, *_ in ARMS[arm] if kind != "fixed" and name != "left_finger_joint"]
+    columns = {name: angle(arm, name, t).tolist() for name in names}
+    messages = [
+        joint_states(START_NS + 10_000_000 * row, **{name: columns[name][row] for name in names[::-1]})
+        for row in range(len(t))
+    ]
+    bag = write_bag(tmp_path / "bag", "/joint_states", messages)
+    last = max(n for n, (_, kind, *_) in enumerate(ARMS[arm]) if kind not in ("fixed", "prismatic"))
+    for link in links[last + 1 :]:
+        _, found, left_out = _robot_rates(bag, "/joint_states", path, link)
+        assert left_out == 0
+        assert np.linalg.norm(found, axis=1) == pytest.approx(size_of_rate(arm, t[:-1] + 0.005), abs=2e-4)
+    for link, said in (
+        (links[0], "has no joint that turns link"),
+        ("tool9", f"has no link 'tool9'; it has {arm}"),
+    ):
+        with pytest.raises(RecordingError, match=said):
+            _robot_rates(bag, "/joint_states", path, link)
+    path.write_text(text.replace('rpy="0 0 0"', 'rpy="0 0 ${pi/2}"'))
+    with pytest.raises(RecordingError, match="cannot be read as URDF, as xacro writes it: could not convert"):
+        _robot_rates(bag, "/joint_states", path, links[-1])
+
+
+def test_messages_that_say_nothing_are_refused_with_their_number(tmp_path: Path) -> None:
+    messages = [joint_states(START_NS + number, first=0.0, second=math.inf) for number in range(30)]
+    (tmp_path / "arm.urdf").write_text(URDF)
+    bag = write_bag(tmp_path / "bag", "/joint_states", messages)
+    with pytest.raises(RecordingError, match="but for 30 that do not tell how the link turned, are too few"):
+        _robot_rates(bag, "/joint_states", tmp_path / "arm.urdf", "tool")

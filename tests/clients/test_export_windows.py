@@ -7,20 +7,23 @@ import json
 import math
 import random
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bota_clients.errors import RecordingError
 from bota_clients.export.cli import main
 from bota_clients.export.dataset import Periodic, Stamped, read_stamps, windows_of
 from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.bags import imu, write_bag
-from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
+from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
 from tests.clients.simulated import Script, described, simulate
 from tests.ended import run_here
 
@@ -152,6 +155,57 @@ def test_the_compensated_wrench_is_the_nodes() -> None:
     assert made["force_torque_compensated_valid"].ravel().tolist() == [True, False, True]
 
 
+def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
+    """A second at each of these forces along x, of which the sensor tells that its own offset is so."""
+    made, row = writer(path), describe(0, **SETTINGS)
+    row["sensors"][0] |= {} if told[0] is None else {"offset": [told[0], 0, 0, 0, 0, 0]}
+    made.describe(START_NS, row)
+    for part, (offset, force) in enumerate(zip(told, steps, strict=True)):
+        if part:
+            six = None if offset is None else [offset, 0, 0, 0, 0, 0]
+            made.event(START_NS, {"event": "offset_changed", "sensor": 0, "offset": six})
+        for number in range(800 * part, 800 * (part + 1)):
+            values: Any = {"force.x": force}
+            made.frame(frame(number, **values))
+    made.finish({})
+    return path
+
+
+def test_a_bias_goes_with_the_sensors_own_offset(tmp_path: Path) -> None:
+    """Tared before the recording and in it; then nobody knows the offset, and then it is known again."""
+    tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0], "bias": [3.0, 0, 0, 0, 0, 0]}
+    path = tared(tmp_path / "run.mcap", (-1.0, -9.3, None, 4.0), (1.0, -7.3, 5.0, 6.0))
+    with open_recording(path) as recording:
+        windows = Windows(3200, tool=tool | {"sensor_offset": [1.0, 0, 0, 0, 0, 0]})
+        made = joined(windows_of(recording, Stamped(stamps(3196)), windows))
+    valid = made["force_torque_compensated_valid"][0]
+    assert abs(made["force_torque_compensated"][0][valid]).max() < 1e-5
+    assert made["force_torque_valid"][0].sum() == 3198, "all that were measured before that"
+    parts = [int(part.sum()) for part in np.split(valid, [802, 1602, 2402])]
+    # In doubt are 0.1 s before a change is told, in which it is written, and two samples after it.
+    assert parts == [pytest.approx(720, abs=4), pytest.approx(797, abs=3), 0, pytest.approx(797, abs=3)]
+
+
+def test_a_bias_is_not_guessed(tmp_path: Path) -> None:
+    run, path, frames = tmp_path / "run.mcap", tmp_path / "tool.yaml", tmp_path / "frames.csv"
+    frames.write_text(f"timestamp\n{START_NS + 10**8}\n")
+    bias, offset = "bias: [3, 0, 0, 0, 0, 0]", "sensor_offset: [0, 0, 0, 0, 0, 0]"
+
+    def said(told: float | None, *parameters: str) -> str:
+        tared(run, [told], [3.0])
+        rows = ("tool_mass: 0", "tool_center_of_gravity: [0, 0, 0]", *parameters)
+        path.write_text("\n".join(["/**:", " ros__parameters:", *(f"  {row}" for row in rows)]))
+        ended = run_here(main, run, tmp_path / "out.npz", "--at", frames, "--tool", path, "--force")
+        assert ended.code == int("out.npz: " not in ended.err)
+        return ended.err
+
+    assert f"{path} does not say with which offset of the sensor its bias was measured" in said(0.0, bias)
+    assert f"{run} does not have the sensor's own offset" in said(None, bias, offset)
+    assert "does not have a tool's parameters" in said(0.0, bias, "sensor_offset: [1, 2]")
+    for fine in ([0.0, bias, offset], [None]):
+        assert "out.npz: windows" in said(*fine)
+
+
 def test_every_format_has_the_same(tmp_path: Path) -> None:
     zarr, parquet = pytest.importorskip("zarr"), pytest.importorskip("pyarrow.parquet")
     path = tmp_path / "run.mcap"
@@ -225,6 +279,87 @@ def test_stamps_are_read_from_tables_and_bags(tmp_path: Path) -> None:
         assert abs(read_stamps(path, "exposed") - STAMPS).max() < 1000
     bag = write_bag(tmp_path / "bag", "/camera", [imu(stamp) for stamp in STAMPS])
     assert read_stamps(bag, "/camera").tolist() == STAMPS
+    (bag.parent / "metadata.yaml").unlink()  # as a recorder leaves it that was killed
+    assert read_stamps(bag.parent, "/camera").tolist() == STAMPS
+    bag.write_bytes(bag.read_bytes()[:-100])
+    with pytest.raises(RecordingError, match=f"^{bag} cannot be read as a bag: .* try 'mcap recover'$"):
+        read_stamps(bag.parent, "/camera")
+    unset = write_bag(tmp_path / "unset", "/camera", [imu(0), imu(0)])
+    with pytest.raises(RecordingError, match=r"times of /camera in .* are all 0"):
+        read_stamps(unset, "/camera")
+
+
+def columns_of_times() -> Iterator[tuple[str, Any, list[Any], bool | None]]:
+    """Name, type or none for a CSV file, cells, and whether they are two times; None: nearly STAMPS."""
+    pa = pytest.importorskip("pyarrow")
+    cells: list[Any]
+    exact = [datetime.fromtimestamp(stamp // 10**9, UTC) for stamp in STAMPS]
+    one_by_one = [START_NS, START_NS + 10**9]
+    for unit, per_unit in {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}.items():
+        cells = [stamp // per_unit for stamp in one_by_one]
+        for zone in (None, "UTC", "Europe/Zurich"):
+            yield f"{unit} {zone}", pa.timestamp(unit, zone), cells, True
+        yield f"duration {unit}", pa.duration(unit), cells, False
+        whole = [stamp // per_unit for stamp in STAMPS]
+        yield f"too coarse {unit}", pa.timestamp(unit), whole, None if per_unit < 10**9 else False
+    for kind in (pa.int64(), pa.uint64()):
+        yield str(kind), kind, STAMPS, None
+    for kind in (pa.int8(), pa.uint8(), pa.int16(), pa.uint16(), pa.int32(), pa.uint32()):
+        yield str(kind), kind, [1, 1], False
+    for kind in (pa.float64(), pa.decimal128(28, 9), pa.decimal256(60, 9)):
+        cells = [Decimal(stamp).scaleb(-9) for stamp in STAMPS]
+        yield str(kind), kind, [*map(float, cells)] if pa.types.is_floating(kind) else cells, None
+    for kind in (pa.float16(), pa.float32()):
+        yield str(kind), kind, [np.float16(1e4) if kind == pa.float16() else 1.7e9, 0.0], False
+    texts = [f"{moment:%Y-%m-%dT%H:%M:%S}" for moment in exact]
+    for kind in (pa.string(), pa.large_string(), pa.string_view()):
+        yield str(kind), kind, ["2023-11-14T22:13:20.123456789Z", "2023-11-14T23:13:20.223456+01:00"], None
+    yield "dates", pa.date32(), [each.date() for each in exact], False
+    yield "dates in ms", pa.date64(), [each.date() for each in exact], False
+    yield "texts of dates", pa.string(), ["2023-11-14", "2023-11-15"], False
+    for kind in (pa.time32("s"), pa.time32("ms"), pa.time64("us"), pa.time64("ns")):
+        yield str(kind), kind, [each.time() for each in exact], False
+    for kind in (pa.list_(pa.int64()), pa.large_list(pa.int64()), pa.list_(pa.int64(), 1)):
+        yield str(kind), kind, [[stamp] for stamp in STAMPS], False
+    yield "struct", pa.struct([("sec", pa.int64())]), [{"sec": 1}, {"sec": 2}], False
+    yield "map", pa.map_(pa.string(), pa.int64()), [[("sec", 1)], [("sec", 2)]], False
+    yield "dictionary", pa.dictionary(pa.int32(), pa.int64()), STAMPS, None
+    yield "dictionary of texts", pa.dictionary(pa.int32(), pa.string()), texts, False  # the same second
+    for kind in (pa.binary(), pa.large_binary(), pa.binary(1)):
+        yield str(kind), kind, [b"1", b"2"], False
+    yield "bool", pa.bool_(), [True, False], False
+    yield "null", pa.null(), [None, None], False
+    for cells in (
+        ["22:13:20", "22:13:21"], ["2023-11-14", "2023-11-15"], ["true", "false"], ["", ""], ["nan", "nan"],
+        ["1.7e12", "1.8e12"], ["1.7e18", "1.8e18"], ["99999999999999999999"] * 2, ["1;2", "3;4"],
+        ["NaT", "NaT"], ["now", "today"], ["-9223372036854775808", "1"], ["inf", "1"], ["0", "0"],
+    ):  # fmt: skip
+        yield f"CSV {cells[0]}", None, cells, False
+    yield "CSV s", None, [f"{stamp * 1e-9:.6f}" for stamp in STAMPS], None
+
+
+@pytest.mark.parametrize("empty", [None, 1, 0])
+def test_every_type_that_a_table_can_hold(tmp_path: Path, empty: int | None) -> None:
+    """It is read, or refused in a sentence; a cell that is empty is refused by its own row."""
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    for name, kind, given, good in columns_of_times():
+        cells = [None if row == empty else cell for row, cell in enumerate(given)]
+        path = tmp_path / ("frames.csv" if kind is None else "frames.parquet")
+        if kind is None:
+            lines = ["timestamp,frame", *(f"{'' if cell is None else cell},1" for cell in cells)]
+            path.write_text("\n".join(lines))
+        else:
+            parquet.write_table(pa.table({"timestamp": pa.array(cells, kind)}), path)
+        if good is not False and empty is None:
+            wanted = np.array([START_NS, START_NS + 10**9] if good else STAMPS)
+            assert abs(read_stamps(path) - wanted).max() <= (0 if good else 10**6), name
+            continue
+        with pytest.raises(RecordingError) as refused:
+            read_stamps(path)
+        said = str(refused.value)
+        assert str(path) in said, name
+        assert "\n" not in said, name
+        assert good is False or f"row {empty} (counted from 0) is empty" in said, name
 
 
 @pytest.mark.parametrize(
@@ -237,6 +372,14 @@ def test_stamps_are_read_from_tables_and_bags(tmp_path: Path) -> None:
         ([-1.7e9], (), "is of 1970-01-01T00:00:00.000000000Z, and the first sample was measured at 2023-11-"),
         (["0.1", "soon"], (), "{} has no times in a column timestamp (choose one with --column"),
         ([], (), "{} has no times in a column timestamp "),
+        ([1.0, 2.0, 2.0], (), "row 2 of {} (counted from 0) has the time of the row above it"),
+        (["1700000000", "1700000001"], (), "row 0 of {} (counted from 0) is of 1970-01-01T00:00:01.7"),
+        (["1700000000", "1700000001"], (), "it seems to be s since 1970: give integers in ns"),
+        (["1700000000100"], (), "it seems to be ms since 1970: give integers in ns"),
+        (["1700000000100000"], (), "it seems to be us since 1970: give integers in ns"),
+        (["0", "0"], (), "the times of timestamp in {} are all 0: what wrote them, a camera's driver or"),
+        (["0", f"{START_NS + 10**8}"], (), "its time was not set (0): leave the row out"),
+        ([0.1, ""], (), "row 1 (counted from 0) is empty"),
         ([1.0], ("--column", "t"), "{} has no times in a column t (choose"),
         ([1.0], ("--tool", "{}"), "{} does not have a tool's parameters"),
         ([1.0], ("--clock", "{}"), "{} is not what 'ethercat-export align' prints"),

@@ -275,6 +275,21 @@ def test_what_happened_happens_again(path: Path) -> None:
         assert events == ["sensor_lost", "reconfigured", "shutting_down"]
 
 
+def test_the_offset_of_a_replay_is_that_of_the_recording(path: Path) -> None:
+    """What compensates a replay goes by it, as what compensates the stream did."""
+    made, row = writer(path), describe(0)
+    row["sensors"][0]["offset"] = [1.0] * 6
+    made.describe(START_NS, row)
+    made.frame(frame(0))
+    made.finish({})
+    with open_recording(path) as recording:
+        sensors = ReplayedSensors(recording.sensors)
+    (sensor,) = sensors.sensors
+    assert sensor.describe()["offset"] == (1.0,) * 6
+    sensors.take(Event(0, {"event": "offset_changed", "sensor": 0, "offset": [2.0] * 6}))
+    assert sensor.describe()["offset"] == [2.0] * 6
+
+
 def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
     with open_recording(path) as recording:
         sensors = ReplayedSensors(recording.sensors)

@@ -190,7 +190,7 @@ def test_the_share_of_lost_samples_is_told() -> None:
 
 
 def test_a_sensor_that_never_gave_anything_new_is_no_healthy_one() -> None:
-    examination = Examination(sensor(5, signal="constant", sinc_length=SLOW))
+    examination = Examination(sensor(5, signal="constant", last_bit=False, sinc_length=SLOW))
     assert examination.level is TROUBLE
     assert "No new sample for 5.0 s" in check_of(examination, SILENT).found
     assert check_of(examination, FORCE_TORQUE).level is NOT_POSSIBLE

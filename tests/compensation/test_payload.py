@@ -295,6 +295,14 @@ def test_a_pose_in_which_something_touched_the_tool_is_named() -> None:
         poses = timed([pose(up, noise=noise) for up in AXES])
         found = identify(pushed(poses, number, (0.0, 0.3, 1.0)))
         assert (found.touched, found.drift) == (number - 1, None)
+        rest = identify([each for each in poses if each.up != poses[number - 1].up])
+        assert [*found.bias.values, found.payload.mass] == pytest.approx(
+            [*rest.bias.values, rest.payload.mass]
+        )
+        assert math.dist(found.bias.force, BIAS.force) < 0.1
+        off = found.residuals[number - 1]
+        assert off.force == pytest.approx((0.0, 0.3, 1.0), abs=0.3)
+        assert found.force_fit.verdict != "large"
         assert f"pose {number} does not fit the others, by 1" in found.notes[0]
 
 

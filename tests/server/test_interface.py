@@ -13,7 +13,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -28,7 +28,14 @@ from ethercat_server.process.signals import Signals
 from tests import rights
 from tests.doctor.running import doctor_here
 from tests.rights import NOBODY, as_user, needs_another_user
-from tests.server.running import Veth, needs_bus, steady_addresses, wait_until
+from tests.server.running import (
+    Veth,
+    VirtualSensor,
+    another_machine,
+    needs_bus,
+    steady_addresses,
+    wait_until,
+)
 from tests.tool.running import tool_here
 
 pytestmark = [pytest.mark.bus, needs_bus]
@@ -106,6 +113,76 @@ def test_an_interface_that_is_down_or_gone_is_why_nothing_comes_back(veth: Veth)
     wait_until(lambda: look_up(veth.near).has_carrier, "the carrier")
     assert "no network interface 'nothing0'" in why_silent("nothing0")
     assert why_silent("virtaul").endswith("; did you mean 'virtual'?")
+
+
+def test_tool_and_doctor_take_every_name(veth: Veth) -> None:
+    for other in ("short0", "a-name-that-is-longer-than-fifteen"):
+        veth.ip("link", "property", "add", "dev", veth.near, "altname", other)
+        with another(other):
+            assert refusal(veth.near).startswith(f"{veth.near} is in use by")
+            assert f"{other} is in use by" in tool_here("eeprom", other, code=1).err
+        found = doctor_here(other, "--seconds", 0, "--json")
+        assert found.json["interface"] == veth.near
+        assert found.findings("interface")["link"]["found"] == "up, with carrier (veth)"
+        assert "no EtherCAT slave answers" in found.findings("bus")["slaves"]["found"]
+
+
+# -- what is in between
+
+
+@contextlib.contextmanager
+def bridged(there: Sequence[str], veth: Veth) -> Iterator[str]:
+    """A bridge where the far end of `veth` is, with a virtual sensor on another of its ports."""
+    name = f"br{os.getpid()}"
+    port, sensor = f"p{name}", f"s{name}"
+    for command in (
+        f"link add {name} type bridge", f"link add {port} type veth peer name {sensor}",
+        f"link set {port} master {name}", f"link set {veth.far} master {name}",
+        *(f"link set {each} up" for each in (name, port, sensor, veth.far)),
+    ):  # fmt: skip
+        subprocess.run([*there, "ip", *command.split()], check=True)
+    program = VirtualSensor("ethercat_server.virtual_sensor.cli", [sensor], under=there)
+    try:
+        program.wait_for("ready")
+        yield name
+    finally:
+        program.close()
+        for each in (port, name):
+            subprocess.run([*there, "ip", "link", "del", each], check=True)
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_bridge_on_the_way_is_why_no_slave_answers(elsewhere: bool) -> None:
+    """The kernel drops the frames; where the bridge is in another network namespace, too."""
+    with contextlib.ExitStack() as stack:
+        veth = stack.enter_context(Veth())
+        there = stack.enter_context(another_machine(veth)) if elsewhere else []
+        assert why_silent(veth.near) == "check cable and power"
+        bridge = stack.enter_context(bridged(there, veth))
+        why = f"{veth.near} is connected to {bridge}, a bridge, which drops EtherCAT frames"
+        wait_until(lambda: look_up(veth.near).has_carrier, "the carrier")
+        assert (
+            f"no EtherCAT slave answers on {veth.near}: {why}" in tool_here("eeprom", veth.near, code=1).err
+        )
+        found = doctor_here(veth.near, "--seconds", 0, "--json").findings("bus")["slaves"]
+        assert found["found"] == "no EtherCAT slave answers"
+        assert found["why"].startswith(why)
+        if not elsewhere:
+            assert f"{bridge} is a bridge, which drops EtherCAT frames" in refusal(bridge)
+            veth.ip("link", "add", "link", bridge, "name", f"m{bridge}", "up", "type", "macvlan")
+            assert f"m{bridge} is connected to {bridge}, a bridge" in why_silent(f"m{bridge}")
+
+
+def test_a_link_that_is_too_fast_for_a_slave_ends_in_a_switch(
+    veth: Veth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a card: a pair of interfaces has a speed that means nothing."""
+    card = look_up(veth.near)._replace(kind="", link=0)
+    assert (mbits := nic._link_mbits(veth.near)) > 100, "as the driver of a pair says"
+    monkeypatch.setattr(nic, "look_up", lambda _: card)
+    assert f"{veth.near} is linked at {mbits} Mbit/s" in why_silent(veth.near)
+    monkeypatch.setattr(nic, "_link_mbits", lambda _: 100)
+    assert why_silent(veth.near) == "check cable and power"
 
 
 # -- an interface of the machine's network

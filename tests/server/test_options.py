@@ -121,6 +121,7 @@ def test_tables_that_contradict_one_another_for_one_sensor_are_named(configured:
     [
         ("[sensor]\nfir = 1\n", "fir is 1"),
         ("[sensor]\ncolour = 1\n", "no setting 'colour'"),
+        ("[sensor.0]\nsinc = 128\n", "did you mean 'sinc_length'?"),
         ("[other]\n", "unexpected 'other'"),
         ("[server]\ncolour = 1\n", "no 'colour'"),
         ("[server]\nrt_priority = 100\n", "from 0 to 99"),

@@ -33,6 +33,7 @@ from tests.server.running import (
     Server,
     Veth,
     VirtualSensor,
+    free_port,
     needs_bus,
     server,
     starved,
@@ -132,6 +133,38 @@ def test_an_interface_that_disappears_ends_the_server_with_a_sentence(bench: Ben
     assert running.wait() == 1
     assert f"the interface {veth.near} has disappeared" in running.said()
     assert "Traceback" not in running.said()
+
+
+# -- an interface has several names, and may get others
+
+
+def test_a_server_outlives_losses_by_every_name_of_its_interface() -> None:
+    """Names are the kernel's; one that is longer than its own may be, and given while all runs."""
+    other, renamed = "alternative-name-of-the-interface", f"er{free_port()}"
+    with virtual_sensor("--signal", "clock") as (veth, sensor):
+        veth.ip("link", "property", "add", "dev", veth.near, "altname", other)
+        with server(other) as running, running.connect() as client:
+            assert client.ask("subscribe")["interface"] == veth.near
+            assert f"streaming {veth.near} on port" in running.said()
+            pull_cable(Bench(veth, sensor, running), client)
+            client.wait_event("sensor_back")
+            assert len(client.fresh(20)) == 20
+
+            veth.ip("link", "set", veth.near, "down")
+            assert f"{veth.near} is down" in client.wait_event("sensor_lost")["reason"]
+            veth.ip("link", "set", veth.near, "name", renamed)
+            was, veth.near = veth.near, renamed
+            veth.ip("link", "set", renamed, "up")
+            client.wait_event("sensor_back")
+            assert len(client.fresh(20)) == 20
+            assert client.ask("describe")["interface"] == renamed
+            for name in (renamed, other):
+                assert f"which uses {name}" in tool("eeprom", name).err
+            assert f"no network interface {was!r}" in tool("eeprom", was, code=1).err
+            pull_cable(Bench(veth, sensor, running), client)
+            client.wait_event("sensor_back")
+            running.signal(signal.SIGTERM)
+            assert running.wait() == 0
 
 
 # -- beside other devices

@@ -92,7 +92,7 @@ def test_a_stuck_sensor_stays_visible_as_repeated() -> None:
     simulation.command("unstick")
     assert len(client.fresh(50)) == 50
     assert state(client) == "OP"
-    from_the_start = Simulation(SensorOptions(signal="constant", noise=False)).subscribe()
+    from_the_start = Simulation(SensorOptions(signal="constant", last_bit=False)).subscribe()
     assert all(f.flags & DataFlag.REPEATED for f in from_the_start.collect(10))
 
 

@@ -148,6 +148,7 @@ def test_a_setting_that_is_written_as_an_object_is_told_to_all(bench: Bench) -> 
         ("configure", {"settings": {"fir": 1}}, "fir is 1"),
         ("configure", {"settings": {"sinc_length": 50000}}, "sinc_length is 50000: it must be"),
         ("configure", {"settings": {"colour": 1}}, "no setting 'colour': the settings are calib"),
+        ("configure", {"settings": {"sinc": 128}}, "did you mean 'sinc_length'?"),
         ("configure", {"settings": {"fast": True}}, "fast is true but fir is false"),
         ("configure", {"settings": {"fir": True, "acceleration_range_g": 3}}, "must be one of 2, 4, 8, 16"),
         ("tare", {"samples": 20, "target": [1e300, 0, 0, 0, 0, 0]}, "'target' cannot be"),
@@ -305,7 +306,7 @@ def test_a_sensor_does_one_change_at_a_time(bench: Bench) -> None:
 
 
 def test_a_long_job_of_one_sensor_does_not_hold_up_those_of_another() -> None:
-    bench = Bench(AT_REST, SensorOptions(signal="rest", serial=2))
+    bench = Bench(AT_REST, SensorOptions(signal="rest", serial=2, last_bit=False))
     tare = bench.asking.send("tare", sensor=0, samples=400)
     assert bench.connect().ask("sdo_read", sensor=1, index=RATE)["ok"]
     assert bench.asking.replies == []

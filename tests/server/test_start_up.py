@@ -212,6 +212,21 @@ def test_a_sensor_wrong_in_one_way(monkeypatch: pytest.MonkeyPatch, way: Way | s
     assert re.search(said, refused(backend, Asked({"acceleration_range_g": 8})))
 
 
+@pytest.mark.parametrize("blank", [b"\0", b"\xff"])
+def test_a_blank_eeprom_beside_the_sensor_takes_no_longer_than_another(blank: bytes) -> None:
+    def took_ns(image: bytes) -> int:
+        backend = chain("BOTA,EK1100")
+        life = backend.sensors.slaves[1].life
+        assert life is not None
+        life.esc.sii.image, life.esc.sii._read_ns = image or life.esc.sii.image, 2_000_000
+        bus, began_ns = Bus(backend), backend.clock.now_ns
+        bring_up(bus, Asked(), lambda: None)
+        bus.close()
+        return backend.clock.now_ns - began_ns
+
+    assert took_ns(blank * 0x4000) <= 1.1 * took_ns(b"")
+
+
 @pytest.mark.parametrize("size", [0, 8, 1487, 0xFFFF])
 def test_mailboxes_that_no_frame_can_carry(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
     """pysoem would write beyond its buffers."""

@@ -21,6 +21,7 @@ from ethercat_server.daemon.options import EMPTY, SERVER_SETTINGS, parse_options
 from ethercat_server.ethercat import nic
 from ethercat_server.process import realtime
 from tests.rights import needs_another_user
+from tests.server.running import Veth, on_a_bus
 
 ROOT = Path(__file__).parent.parent.parent
 UNITS = ROOT / "systemd"
@@ -113,6 +114,22 @@ def test_a_dry_run_says_what_would_be_done() -> None:
         "install-service: next: systemctl enable --now 'ethercat-server@ens5' ethercat-bridge "
     )
     assert "then: journalctl -fu 'ethercat-server@ens5'" in watch
+
+
+def test_a_dry_run_says_too_that_there_is_no_such_interface() -> None:
+    said = "there is no interface nosuch yet: check its name with 'ip link'"
+    assert said in install_service("--dry-run", "nosuch").stderr
+    assert "there is no interface" not in install_service("--dry-run", "virtual").stderr
+
+
+@on_a_bus
+def test_an_alternative_name_is_installed_as_the_interfaces_own() -> None:
+    with Veth() as veth:
+        for other in ("short1", "a-name-too-long-for-linux"):
+            veth.ip("link", "property", "add", "dev", veth.near, "altname", other)
+            done = install_service("--dry-run", "--keep-environment", other)
+            assert f"'ethercat-server@{veth.near}'" in done.stderr
+            assert other not in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,16 @@ def test_the_notes_scripts_are_these_commands(
     [
         (["raed", "ens5"], "did you mean 'read'?"),
         (["apply", "ens5", "--set", "sinc_lenght=64"], "did you mean 'sinc_length'?"),
+        (["apply", "ens5", "--set", "sinc=128"], "did you mean 'sinc_length'?"),
+        (
+            ["apply", "ens5", "--set", "Filter=3"],
+            "did you mean 'acceleration_filter' or 'angular_rate_filter'?",
+        ),
+        (["apply", "ens5", "--set", "IMU=1"], "did you mean 'imu_active'?"),
+        (
+            ["read", "ens5", "sinc"],
+            "did you mean SINC length or Force/torque filter SINC length?",
+        ),
         (["apply", "ens5", "--set", "FIR_filter=on"], "fast, chop"),
         (["xyzzy"], "there are adapters, "),
         (["filters", "--loop", "abc"], "'abc': it must be from 0.1 to 100000"),
@@ -224,6 +234,19 @@ def test_an_erased_eeprom_has_nothing() -> None:
     found = decode(read)
     assert (found["name"], found["sync_managers"], found["categories"]) == ("", [], {})
     assert raw_lines(read)[0] == "0000: ff|ff|ff|ff"
+
+
+@pytest.mark.parametrize("blank", [b"\0", b"\xff"])
+def test_blank_memory_ends_an_image_as_the_end_mark_does(blank: bytes) -> None:
+    whole = reader(build_image(sensor_device("BFT-ROKS-ECAT-M8", 7, 61)))
+    for kept in (0, 0x80, len(whole) - 4):
+        read = reader(whole[:kept].ljust(0x8000, blank))
+        assert len(read) == max(0x100, kept + 4)
+        assert decode(read)["categories"] == (decode(whole)["categories"] if kept > 0x80 else {})
+
+
+def test_a_category_that_no_eeprom_has_room_for_is_not_read() -> None:
+    assert len(reader(b"\xaa" * 0x8000)) == 0x100
 
 
 @given(st.binary(max_size=600))

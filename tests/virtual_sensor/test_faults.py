@@ -124,7 +124,7 @@ def samples(master: RawMaster, count: int) -> list[Sample]:
 
 
 def test_noise_on_one_channel_only() -> None:
-    master = RawMaster(SensorOptions(signal="constant")).go(OP)
+    master = RawMaster(SensorOptions(signal="constant", last_bit=False)).go(OP)
     do(master, "noise torque.y 0.5")
     found = samples(master, 2000)
     torque = [sample.torque for sample in found]
@@ -136,7 +136,7 @@ def test_noise_on_one_channel_only() -> None:
 
 
 def test_a_channel_saturates_before_the_offset_is_added() -> None:
-    master = RawMaster(SensorOptions(signal="constant")).go(OP)
+    master = RawMaster(SensorOptions(signal="constant", last_bit=False)).go(OP)
     master.download(0x8000, 3, struct.pack("<f", 100.0))
     for limit in ("force.z 4", "torque.x 4", "acceleration.z 0.5"):
         do(master, f"limit {limit}")

@@ -80,7 +80,7 @@ def test_the_same_sample_is_the_same_bytes_also_if_computed_ahead() -> None:
 
 def test_formulas() -> None:
     for signal in ("ramp", "rest"):
-        master = RawMaster(SensorOptions(signal=signal)).go(OP)
+        master = RawMaster(SensorOptions(signal=signal, last_bit=False)).go(OP)
         for _ in range(30):
             master.wait(37 * PERIOD)
             k = (master.now - 5_000_000_123) // PERIOD
@@ -91,7 +91,7 @@ def test_formulas() -> None:
             }[signal]
             assert (*sample.force, *sample.torque) == pytest.approx(expected, abs=1e-4)
             assert sample.temperature == (32 + k / 2**18 if signal == "rest" else 35)
-    master = RawMaster(SensorOptions(signal="constant", pdo_size=77)).go(OP)
+    master = RawMaster(SensorOptions(signal="constant", pdo_size=77, last_bit=False)).go(OP)
     fields = ("force.x", "force.y", "force.z", "torque.x", "torque.y", "torque.z")
     values = {**dict(zip(fields, CONSTANT, strict=True)), "acceleration.z": 1.0, "temperature": 35.0}
     assert master.inputs() == encode(77, values), "byte for byte"
@@ -261,7 +261,7 @@ def test_noise_is_that_of_a_healthy_sensor(
 
 
 def test_offsets_are_added_and_ranges_saturate_and_wider_ones_do_not() -> None:
-    master = RawMaster(SensorOptions(signal="constant")).go(OP)
+    master = RawMaster(SensorOptions(signal="constant", last_bit=False)).go(OP)
     for axis, value in enumerate(CONSTANT, 1):
         master.download(0x8000, axis, struct.pack("<f", -value))
     master.download(0x8001, 1, struct.pack("<f", -3.0))

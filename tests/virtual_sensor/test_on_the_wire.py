@@ -111,7 +111,7 @@ def test_to_op_with_the_clock_signal(size: int, bench: Bench) -> None:
 @pytest.mark.parametrize("state", ["", ":OP"])
 def test_a_chain_with_foreign_slaves(state: str, bench: Bench) -> None:
     chain = ",".join(kind + state for kind in ("EK1100", "BOTA", "EL3102", "DRIVE", "BOTA"))
-    models = ("--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--signal", "constant")
+    models = ("--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--signal", "constant", "--noise", "none")
     sensor, master = bench("--chain", chain, *models)
     assert sensor.said().endswith(", beside EK1100, EL3102, DRIVE\n")
     bring_up(master, 5)

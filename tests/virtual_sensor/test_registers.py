@@ -61,7 +61,7 @@ def test_read_multiple_write() -> None:
 
 
 def test_process_data_by_fmmu() -> None:
-    master = RawMaster(*chain(2, signal="constant")).go(OP)
+    master = RawMaster(*chain(2, signal="constant", last_bit=False)).go(OP)
     data, counter = master.cycle()
     assert counter == 6
     assert data[1:62] == data[63:124]

@@ -24,9 +24,9 @@ def abort_of(master: RawMaster, index: int, subindex: int, data: bytes | None = 
 
 
 def test_identity_and_mapping() -> None:
-    master = RawMaster(SensorOptions(model="BFT-MEGS-ECAT-M8", serial=77, pdo_size=77, signal="constant")).go(
-        PREOP
-    )
+    master = RawMaster(
+        SensorOptions(model="BFT-MEGS-ECAT-M8", serial=77, pdo_size=77, signal="constant", last_bit=False)
+    ).go(PREOP)
     assert master.upload(0x1000, 0) == struct.pack("<I", 5001)
     assert master.upload(0x1008, 0) == b"BFT-MEGS-ECAT-M8".ljust(20, b"\0")
     assert master.upload(0x100A, 0) == b"1.3.8-dirty-R"

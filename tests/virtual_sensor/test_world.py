@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import re
 import socket
@@ -18,7 +19,8 @@ from typing import Any
 import pytest
 
 from bota_ethercat.client import Client, World, connect
-from bota_ethercat.pdo import SampleDecoder
+from bota_ethercat.framing import DataFlag
+from bota_ethercat.pdo import STANDARD_GRAVITY, SampleDecoder
 from bota_ethercat.world import Felt, decode, encode
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.link import LinkError, bound
@@ -69,11 +71,22 @@ def test_a_moment_holds_until_the_next_and_comes_in_order() -> None:
     assert [world(t).wrench[0] for t in (9.999, 10.0, 10.0009, 10.001, 11.0)] == [0.0, 1.0, 1.0, 2.0, 2.0]
 
 
+@pytest.mark.parametrize("away_s", [-3600.0, -LOST_AFTER_S - 0.001, LOST_AFTER_S + 0.001, 3600.0])
+def test_a_stamp_that_is_old_or_to_come_is_refused(away_s: float) -> None:
+    """By another clock, or from a queue: nothing was felt then that a sample could have in it."""
+    world, now_s = ExternalWorld(), 10_000.0
+    world.take(now_s + away_s, push(5.0), now_s)
+    assert world.counts == {"taken": 0, "refused": 1}
+    assert world(now_s) == push(0.0), "at rest still"
+    world.take(now_s + math.copysign(LOST_AFTER_S - 0.001, away_s), push(5.0), now_s)
+    assert world.counts == {"taken": 1, "refused": 1}
+
+
 @pytest.mark.parametrize(("lost", "newtons"), [("hold", 8.0), ("zero", 0.0), ("fault", None)])
 def test_a_world_that_stops(lost: str, newtons: float | None) -> None:
     """None: the sensor gives nothing new, until the world goes on."""
     world = ExternalWorld(lost)
-    master = RawMaster(SensorOptions(world=world, noise=False)).go(OP)
+    master = RawMaster(SensorOptions(world=world, noise=False, last_bit=False)).go(OP)
 
     def go_on(count: int) -> bytes:
         for _ in range(count):
@@ -92,6 +105,49 @@ def test_a_world_that_stops(lost: str, newtons: float | None) -> None:
         assert RAW.decode(master.inputs()).force[0] == pytest.approx(newtons)
     assert RAW.decode(go_on(50)).force[0] == pytest.approx(8.0)
     assert master.bus.statistics()["sensors"][0]["world"] == {"taken": 100, "refused": 0}
+
+
+STILL: tuple[dict[str, Any], ...] = ({"noise": False}, {"signal": "constant"}, {"signal": "rest"})
+
+
+@pytest.mark.parametrize("still", STILL)
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_where_nothing_moves_every_sample_is_new_and_no_channel_stands_still(
+    still: dict[str, Any], calibrated: bool
+) -> None:
+    """As from a real converter, whose last bit is never still."""
+    world = None if "signal" in still else lambda _: push(-7.0)
+    simulation = Simulation(SensorOptions(**still), world=world, settings={"calibration_matrix": calibrated})
+    simulation.run(2.0)
+    samples = [RAW.decode(frame.process_data) for frame in simulation.frames[100:]]
+    assert len(samples) > 1400
+    assert not [frame for frame in simulation.frames[100:] if frame.flags]
+    per_newton, per_newton_meter = (1.0, 1.0) if calibrated else (10_000.0, 500_000.0)
+    for axis in range(3):
+        for values, bit in (
+            ([sample.force[axis] for sample in samples], 1e-4 * per_newton),
+            ([sample.torque[axis] for sample in samples], 2e-6 * per_newton_meter),
+            ([sample.acceleration[axis] for sample in samples], 2 / 2**15 * STANDARD_GRAVITY),
+            ([sample.angular_rate[axis] for sample in samples], math.radians(250 / 2**15)),
+        ):
+            assert max(values) - min(values) == pytest.approx(2 * bit, rel=0.1)
+            assert max(sum(1 for _ in run) for _, run in itertools.groupby(values)) < 30
+
+
+def test_where_nothing_moves_and_nobody_wants_a_last_bit_no_sample_is_new() -> None:
+    simulation = Simulation(SensorOptions(noise=False, last_bit=False), world=lambda _: push(-7.0))
+    simulation.run(0.5)
+    assert {frame.flags for frame in simulation.frames[100:]} == {DataFlag.REPEATED}
+
+
+def test_the_last_bit_is_the_same_in_every_run() -> None:
+    def run(seed: int) -> list[bytes]:
+        options = SensorOptions(noise=False, seed=seed)
+        simulation = Simulation(options, world=lambda _: push(-7.0))
+        simulation.run(0.5)
+        return [frame.process_data for frame in simulation.frames]
+
+    assert run(1) == run(1) != run(2)
 
 
 def rising(t: float) -> Felt:

@@ -5,6 +5,10 @@ first looked for by their cross-correlation, then in each of eight parts by leas
 rotation and the gyroscope's offset. A line through the eight has the drift, and how far they are off it tells
 the interval, which so covers residuals that are correlated; it is found twice, the second time with the drift
 of the first taken out of each part.
+
+Two clocks may not be straight against each other: one is slewed or set, or warms up. Then a polynomial or a
+step fits halves of the parts better than the line by more than noise explains (F test), and by how much the
+two differ is part of the interval.
 """
 
 from __future__ import annotations
@@ -13,16 +17,18 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
+from bota_clients.export.cli import PROGRAM
 from bota_clients.export.dataset import Clock, messages
 from bota_clients.identify.program import choose
-from bota_clients.program import interrupt_on_signals
+from bota_clients.numbers import count
+from bota_clients.program import interrupt_on_signals, say
 from bota_clients.recording.columns import Ints, columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import angular_rate_response
@@ -41,6 +47,11 @@ _EXPLAINED: Final = 0.5
 _APART_S: Final = 0.5
 _OTHER: Final = 0.9  # of the highest correlation: another so far apart may be right, too
 _WIDEST_S: Final = 0.005
+_MOST_NAMED: Final = 40  # links
+# What a clock's course is compared with: polynomials by their degree, and a step wherever it fits best; with
+# the 99.7 % quantiles of F for 16 offsets.
+_BENDING: Final = {2: 13.2, 3: 9.8, 5: 8.5}
+_STEPPING: Final = 25.0
 
 
 def find_offset(
@@ -48,15 +59,16 @@ def find_offset(
 ) -> tuple[Clock, dict[str, float]]:
     """From (n,), (n, 3) rad/s of the sensor and (m,), (m, 3) of the robot, each by its own clock.
 
-    The robot's clock, and half of the 95 % intervals. RecordingError if the motion does not show it.
+    The robot's clock, half of the 95 % intervals, and `bend_ms`, by how much the clocks are off the line if
+    they are not straight against each other, else 0. RecordingError if the motion does not show it.
     """
     sensor, robot = _smooth("sensor", times_ns, rates), _smooth("robot", robot_ns, robot_rates)
 
     def left(looks: Array, offset: float | Array) -> float:
-        """The part of the sensor's rates that no rotation of the robot's explains."""
+        """The squares of the sensor's rates that no rotation of the robot's explains, (rad/s)²."""
         basis = np.linalg.qr(np.column_stack([at_times(looks, *robot), np.ones(len(looks))]))[0]
         felt = at_times(looks + offset, *sensor)
-        return float(((felt - basis @ (basis.T @ felt)) ** 2).sum() / (felt.var(axis=0).sum() * len(looks)))
+        return float(((felt - basis @ (basis.T @ felt)) ** 2).sum())
 
     sizes = [at_times(np.arange(0, times[-1], _STEP_S), times, turned) for times, turned in (sensor, robot)]
     size = sum(map(len, sizes))
@@ -68,7 +80,9 @@ def find_offset(
     coarse = float(lags[best]) * _STEP_S
     begin, end = max(0.0, -coarse), min(robot[0][-1], sensor[0][-1] - coarse)
     looks = np.arange(begin + _AROUND_S, end - _AROUND_S, _STEP_S / 2)
-    rest = left(looks, coarse) if end - begin > _SHORTEST_S / 2 else 1.0
+    rest = 1.0
+    if end - begin > _SHORTEST_S / 2:
+        rest = left(looks, coarse) / float(len(looks) * at_times(looks + coarse, *sensor).var(axis=0).sum())
     if rest > 1 - _EXPLAINED:
         raise RecordingError(
             f"the robot's motion explains only {100 * (1 - rest):.0f} % of the sensor's: record both "
@@ -77,9 +91,11 @@ def find_offset(
     if agree[abs(lags - lags[best]) * _STEP_S > _APART_S].max() > _OTHER * agree[best]:
         raise RecordingError("the motion repeats itself, so several offsets fit: move without a rhythm")
     middle, line = float(looks.mean()), np.array([0.0, coarse])
-    for around in (np.arange(-_AROUND_S, _AROUND_S, _STEP_S), np.zeros(1)):
+
+    def offsets_of(parts: int, around: Array) -> tuple[Array, Array, Array]:
+        """Of so many parts: instants, offsets from the line, and weights, each (count,)."""
         rows = []
-        for part in np.array_split(looks, _PARTS):
+        for part in np.array_split(looks, parts):
             expected = np.polyval(line, part - middle)
 
             def missed(offset: float, part: Array = part, expected: Array = expected) -> float:
@@ -89,6 +105,10 @@ def find_offset(
             curve = missed(fits - _STEP_S) - 2 * missed(fits) + missed(fits + _STEP_S)
             rows.append((part.mean() - middle, fits, max(curve, 1e-12) ** 0.5))
         at, offsets, weights = np.array(rows).T
+        return at, offsets, weights
+
+    for around in (np.arange(-_AROUND_S, _AROUND_S, _STEP_S), np.zeros(1)):
+        at, offsets, weights = offsets_of(_PARTS, around)
         change, covariance = np.polyfit(at, offsets, 1, w=weights, cov=True)
         line = line + change
     drift_interval, interval = (_T_95 * np.sqrt(np.diag(covariance))).tolist()
@@ -96,9 +116,33 @@ def find_offset(
         raise RecordingError(
             f"the motion is too slow to tell (± {interval * 1e3:.0f} ms): turn faster, and about several axes"
         )
+    bend = _bend(*offsets_of(2 * _PARTS, np.zeros(1)))
+    interval, drift_interval = interval + bend, drift_interval + 2 * bend / (at[-1] - at[0])
     stamp_ns, monotonic_ns = (round(at_s * 1e9) for at_s in (middle, middle + line[1]))
     clock = Clock(int(robot_ns[0]) + stamp_ns, int(times_ns[0]) + monotonic_ns, float(line[0]) * 1e6)
-    return clock, {"interval_ms": interval * 1e3, "drift_interval_ppm": drift_interval * 1e6}
+    intervals = {"interval_ms": interval * 1e3, "drift_interval_ppm": drift_interval * 1e6}
+    return clock, intervals | {"bend_ms": bend * 1e3}
+
+
+def _bend(at: Array, offsets: Array, weights: Array) -> float:
+    """By how much the clocks are off a line, s; 0 if noise explains that."""
+    basis = np.polynomial.legendre.legvander(at / np.abs(at).max(), max(_BENDING))
+    others = [(basis[:, : degree + 1], quantile) for degree, quantile in _BENDING.items()]
+    for first in range(2, len(at) - 1):
+        others.append((np.column_stack([basis[:, :2], np.arange(len(at)) >= first]), _STEPPING))
+
+    def fitted(rows: Array) -> tuple[Array, float]:
+        """The offsets as these explain them, and the squares that they leave."""
+        found = rows @ np.linalg.lstsq(rows * weights[:, None], offsets * weights, rcond=None)[0]
+        return found, float((((offsets - found) * weights) ** 2).sum())
+
+    (line, straight), bend = fitted(basis[:, :2]), 0.0
+    for rows, quantile in others:
+        course, rest = fitted(rows)
+        more = rows.shape[1] - 2
+        if (straight - rest) / more > quantile * rest / (len(at) - 2 - more):
+            bend = max(bend, float(np.abs(course - line).max()))
+    return bend
 
 
 def _smooth(which: str, stamps_ns: Ints, rates: Array) -> tuple[Array, Array]:
@@ -113,60 +157,107 @@ def _smooth(which: str, stamps_ns: Ints, rates: Array) -> tuple[Array, Array]:
     return even, smoothed(at_times(even, times, rates), hann_window(_SMOOTH_S, period))
 
 
-def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[Ints, Array]:
-    """Stamps (n,), ns, and angular rates (n, 3), rad/s: as an IMU has them, or of a link in its own frame."""
+def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[Ints, Array, int]:
+    """Stamps (n,), ns, and angular rates (n, 3), rad/s: as an IMU has them, or of a link in its own frame.
+
+    Also how many messages were left out, because they do not tell that.
+    """
     joints = [] if urdf is None else _chain(urdf, link)
-    turning = [name for name, _, axis in joints if axis.any()]
-    stamps, rows = list[int](), list[list[float]]()
+    turning = list(dict.fromkeys(joint.follows for joint in joints if joint.axis.any()))
+    stamps, rows, left_out = list[int](), list[list[float]](), 0
     for stamp, message in messages(path, topic):
         if hasattr(message, "angular_velocity"):
             rate, joints = message.angular_velocity, []
-            row = [rate.x, rate.y, rate.z]
+            row = [rate.x, rate.y, rate.z] if message.angular_velocity_covariance[0] != -1 else []
         elif not joints or not hasattr(message, "position"):
             raise RecordingError(f"{topic} is no sensor_msgs/Imu, and no JointState with --urdf and --link")
         else:
-            at = dict(zip(message.name, message.position, strict=True))
+            if not {*turning} & {*message.name}:
+                continue  # of another part of the robot, a gripper say
+            # Positions may be left out, of all joints.
+            at = dict(zip(message.name, message.position, strict=False))
             row = [at[name] for name in turning if name in at]
-        if len(row) == len(turning) or not joints:  # else of another part of the robot, a gripper say
+        if len(row) == (len(turning) if joints else 3) and np.isfinite(row).all():
             stamps.append(stamp)
             rows.append(row)
+        else:
+            left_out += 1
     if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
+        which = f", but for {left_out} that do not tell how the link turned," if left_out else ""
         raise RecordingError(
-            f"the messages of {topic} in {path} are too few, or not in the order of their stamps"
+            f"the messages of {topic} in {path}{which} are too few, or not in the order of their stamps"
         )
     times, values = np.array(stamps, np.int64), np.array(rows)
     if not joints:
-        return times, values
+        return times, values, left_out
     angles = dict(zip(turning, values.T, strict=True))
     pose = np.eye(3)
-    for name, origin, axis in joints:
-        pose = pose @ origin @ _turned(np.outer(angles.get(name, 0.0), axis))
+    for joint in joints:
+        angle = joint.times * angles.get(joint.follows, 0.0) + joint.plus
+        pose = pose @ joint.origin @ _turned(np.outer(angle, joint.axis))
     step, passed = pose[:-1].swapaxes(1, 2) @ pose[1:], np.diff(times)
     twice = step - step.swapaxes(1, 2)  # the sine of a small angle
-    return times[:-1] + passed // 2, twice[:, (2, 0, 1), (1, 2, 0)] / (2e-9 * passed[:, np.newaxis])
+    return times[:-1] + passed // 2, twice[:, (2, 0, 1), (1, 2, 0)] / (2e-9 * passed[:, np.newaxis]), left_out
 
 
-def _chain(urdf: Path, link: str) -> list[tuple[str, Array, Array]]:
-    """Name, rotation (3, 3) and axis of each joint from the root to `link`; axis zeros: it does not turn."""
-    chain = list[tuple[str, Array, Array]]()
+class _Joint(NamedTuple):
+    """One of a chain; its angle is that of the joint that it follows, itself or another, times and plus."""
+
+    origin: Array  # (3, 3), rotation in its parent
+    axis: Array  # (3,); zeros: it does not turn
+    follows: str
+    times: float
+    plus: float  # rad
+
+
+def _chain(urdf: Path, link: str) -> list[_Joint]:
+    """Of each joint from the root to `link`; RecordingError."""
     try:
-        joints: Any = ElementTree.parse(urdf).iterfind("joint")  # noqa: S314 - a file of the user's
-        above, at = {joint.find("child").get("link"): joint for joint in joints}, link
+        root = ElementTree.parse(urdf).getroot()  # noqa: S314 - a file of the user's
+        links = [each.get("name") for each in root.iterfind("{*}link")]
+        if link not in links:
+            there = ", ".join(map(str, links[:_MOST_NAMED])) or "none: expand it with xacro"
+            raise RecordingError(f"{urdf} has no link {link!r}; it has {there}")
+        joints: Any = {joint.get("name"): joint for joint in root.iterfind("{*}joint")}
+        above = {joint.find("{*}child").get("link"): joint for joint in joints.values()}
+        chain, at = list[_Joint](), link
         while (joint := above.pop(at, None)) is not None:
-            at = joint.find("parent").get("link")
-            tags = {each.tag: each for each in joint}
-            rpy, axis = (
-                np.array(tags[tag].get(key, given).split() if tag in tags else given.split(), float)
-                for tag, key, given in (("origin", "rpy", "0 0 0"), ("axis", "xyz", "1 0 0"))
-            )
-            roll, pitch, yaw = _turned(np.diag(rpy))
-            turns = joint.get("type") in ("revolute", "continuous")
-            chain.insert(0, (joint.get("name"), yaw @ pitch @ roll, turns * axis / np.linalg.norm(axis)))
+            at = joint.find("{*}parent").get("link")
+            chain.insert(0, _joint(joint, joints))
     except (OSError, ElementTree.ParseError, AttributeError, ValueError) as error:
-        raise RecordingError(f"{urdf} cannot be read as URDF: {error}") from None
-    if not any(axis.any() for _, _, axis in chain):
+        raise RecordingError(f"{urdf} cannot be read as URDF, as xacro writes it: {error}") from None
+    if not any(joint.axis.any() for joint in chain):
         raise RecordingError(f"{urdf} has no joint that turns link {link}")
     return chain
+
+
+def _joint(joint: Any, joints: Any) -> _Joint:
+    """Of its element; ValueError."""
+    origin, axis = joint.find("{*}origin"), joint.find("{*}axis")
+    roll, pitch, yaw = _turned(np.diag(_numbers("0 0 0" if origin is None else origin.get("rpy", "0 0 0"))))
+    direction = np.zeros(3)
+    if joint.get("type") in ("revolute", "continuous"):  # the axis of others may be zeros
+        direction = _numbers("1 0 0" if axis is None else axis.get("xyz", "1 0 0"))
+        if not direction.any():
+            raise ValueError(f"the axis of joint {joint.get('name')} is zero")
+        direction = direction / np.linalg.norm(direction)
+    follows, times, plus = joint.get("name"), 1.0, 0.0
+    for _ in joints:  # one that mimics another may be followed itself
+        if (mimic := joints[follows].find("{*}mimic")) is None:
+            break
+        factor, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+        follows, times, plus = mimic.get("joint"), times * factor, times * offset + plus
+        if follows not in joints:
+            raise ValueError(f"joint {joint.get('name')} follows {follows}, which is not there")
+    return _Joint(yaw @ pitch @ roll, direction, follows, times, plus)
+
+
+def _numbers(text: str) -> Array:
+    """Three; ValueError."""
+    found = np.array(text.split(), float)
+    if found.shape != (3,) or not np.isfinite(found).all():
+        raise ValueError(f"{text!r} is not three numbers")
+    return found
 
 
 def _turned(vectors: Array) -> Array:
@@ -189,11 +280,19 @@ def run(options: argparse.Namespace) -> int:
     instants, rates = map(np.concatenate, zip(*rows, strict=True))
     if (np.diff(instants) <= 0).any():
         raise RecordingError("the server's machine was restarted during the recording: record again")
-    stamps, robot_rates = _robot_rates(options.bag, options.topic, options.urdf, options.link)
+    stamps, robot_rates, left_out = _robot_rates(options.bag, options.topic, options.urdf, options.link)
+    if left_out:
+        say(PROGRAM, f"{count(left_out, 'message')} left out, without finite angles or rates")
     clock, intervals = find_offset(instants, rates, stamps, robot_rates)
+    if bend_ms := intervals["bend_ms"]:
+        say(
+            PROGRAM,
+            f"the two clocks are off a line by up to {bend_ms:.2g} ms, so one was set, slewed or warmed up: "
+            "the interval includes that; align shorter recordings one by one",
+        )
     # The server's clocks are as far apart as at the end of the recording.
     apart_ns = frames[-1].stamp_ns - frames[-1].monotonic_ns
     offset_ms = (clock.monotonic_ns + apart_ns - clock.stamp_ns) * 1e-6
-    values = clock._asdict() | {"offset_ms": offset_ms} | intervals
+    values = clock._asdict() | {"offset_ms": offset_ms} | intervals | {"left_out": left_out}
     sys.stdout.write(json.dumps(values, indent=1) + "\n")
     return 0

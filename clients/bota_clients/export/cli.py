@@ -13,6 +13,7 @@ from bota_clients.arguments import add_force, add_imu_units, position
 from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.errors import FileError
 from bota_ethercat.program.arguments import Parser, number
+from bota_ethercat.program.output import ends_with_its_reader
 
 PROGRAM: Final = "ethercat-export"
 DATASETS: Final = (".parquet", ".zarr", ".npz")
@@ -119,6 +120,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+@ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Export; returns the exit code."""
     given = sys.argv[1:] if argv is None else argv

@@ -12,13 +12,15 @@ with open_recording(Path("run.mcap")) as recording:
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
 import json
 import math
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -26,11 +28,11 @@ import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import DATASETS, PROGRAM, Advance
-from bota_clients.export.windows import Array, Arrays, Windows, read_tool
+from bota_clients.export.windows import Array, Arrays, Windows, offset_of, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
-from bota_clients.recording.reader import Recording
+from bota_clients.recording.reader import Offset, Recording
 from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
@@ -42,6 +44,10 @@ _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
 _CHUNK: Final = 1024  # frames, in a file
 _UNITS: Final = {"force": "N", "torque": "Nm", "acceleration": "m/s^2", "angular_rate": "rad/s", "age": "s"}
 _SECOND: Final = 1_000_000_000
+_PER_SECOND: Final = {"s": _SECOND, "ms": 1_000_000, "us": 1000, "ns": 1}
+_FIRST: Final = -(1 << 63)
+_COARSEST_S: Final = 0.001
+_NEAR_NS: Final = 366 * 86400 * _SECOND
 
 
 class Clock(NamedTuple):
@@ -126,9 +132,14 @@ class Stamped:
             )
         which, bound = ("first", begin_ns) if stamps[row] < begin_ns else ("last", end_ns)
         taken, limit = np.array([stamps[row], bound]).astype("datetime64[ns]")
+        what = "leave the row out, or find the offset of its clock with 'ethercat-export align'"
+        if not stamps[row]:
+            what = "its time was not set (0): leave the row out"
+        for unit, per_unit in _PER_SECOND.items():
+            if unit != "ns" and abs(int(stamps[row]) * per_unit - bound) < _NEAR_NS:
+                what = f"it seems to be {unit} since 1970: give integers in ns, or numbers with a point in s"
         return RecordingError(
-            f"{source} is of {taken}Z, and the {which} sample was measured at {limit}Z: leave the row out, "
-            "or find the offset of its clock with 'ethercat-export align'"
+            f"{source} is of {taken}Z, and the {which} sample was measured at {limit}Z: {what}"
         )
 
 
@@ -149,6 +160,16 @@ def read_stamps(path: Path, name: str = "timestamp") -> Ints:
         stamps = np.array([stamp for stamp, _ in messages(path, name)], np.int64)
     if not len(stamps):
         raise RecordingError(f"{path} has no frames")
+    if len(stamps) > 1 and not stamps.any():
+        raise RecordingError(
+            f"the times of {name} in {path} are all 0: what wrote them, a camera's driver or a simulation "
+            "without a clock, set none; have it stamp its frames and record again"
+        )
+    if (again := np.flatnonzero(np.diff(stamps) == 0)).size:
+        raise RecordingError(
+            f"row {again[0] + 1} of {path} (counted from 0) has the time of the row above it: its times are "
+            "too coarse for the frames, or the row is there twice; give times of at least 1 ms resolution"
+        )
     return stamps
 
 
@@ -156,18 +177,67 @@ def _read_column(path: Path, column: str) -> Ints:
     import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
     from pyarrow import csv, parquet  # noqa: PLC0415
 
+    def refused(why: object) -> RecordingError:
+        return RecordingError(f"{path} has no times in a column {column} (choose one with --column): {why}")
+
     try:
-        table = parquet.read_table(path) if path.suffix == ".parquet" else csv.read_csv(path)
-        found = table[column]
-        if pa.types.is_timestamp(found.type):
-            found = found.cast(pa.timestamp("ns", found.type.tz)).cast("int64")
-        elif not pa.types.is_integer(found.type):
-            found = pa.array(np.rint(found.cast("float64").to_numpy() * _SECOND).astype(np.int64))
-        return np.asarray(found.to_numpy().astype(np.int64))
-    except (OSError, KeyError, pa.ArrowInvalid) as error:
-        raise RecordingError(
-            f"{path} has no times in a column {column} (choose one with --column): {error}"
-        ) from None
+        if path.suffix == ".parquet":
+            found = parquet.read_table(path)[column].combine_chunks()
+        else:  # an empty line may be a row, but for those at the end
+            options = csv.ParseOptions(ignore_empty_lines=False)
+            table = csv.read_csv(path, parse_options=options)
+            nulls = [each.is_null().to_numpy() for each in table.columns]
+            ends = np.flatnonzero(~np.logical_and.reduce(nulls))[-1:].max(initial=-1) + 1
+            found = table[column].combine_chunks()[:ends]
+        if pa.types.is_dictionary(found.type):
+            found = found.dictionary_decode()
+    except (OSError, KeyError, ValueError) as error:  # ArrowInvalid among them
+        raise refused(error) from None
+    kind, types = found.type, pa.types
+    is_text = types.is_string(kind) or types.is_large_string(kind) or types.is_string_view(kind)
+    per_unit = 1
+    if found.null_count:
+        raise refused(
+            f"row {found.is_null().to_numpy(False).argmax()} (counted from 0) is empty or no number"
+        )
+    if types.is_timestamp(kind):
+        values, per_unit = found.cast("int64").to_pylist(), _PER_SECOND[kind.unit]
+    elif types.is_integer(kind):
+        values = found.to_pylist()
+    elif is_text or types.is_decimal(kind) or types.is_floating(kind):
+        values = [_nanoseconds(value) for value in found.to_pylist()]
+    else:
+        raise refused(f"it has {kind}, and times have a date and a time of day, or are numbers since 1970")
+    for row, value in enumerate(values):
+        if not isinstance(value, int) or not _FIRST < value * per_unit < -_FIRST:
+            text = value if isinstance(value, str) else f"{found[row]}, which is too far from now"
+            raise refused(
+                f"row {row} (counted from 0) is {text}; integers are ns, other numbers s since 1970, and "
+                "texts ISO 8601"
+            )
+    if types.is_float16(kind) or types.is_float32(kind):
+        off_s = np.spacing(np.abs(found.to_numpy(False)).astype(kind.to_pandas_dtype()))
+        if (coarse := off_s.astype(float) > _COARSEST_S).any():
+            row = int(coarse.argmax())
+            raise refused(
+                f"row {row} (counted from 0) is known to {off_s[row]:g} s only: write float64, or ns"
+            )
+    return np.array(values, np.int64) * per_unit
+
+
+def _nanoseconds(value: Any) -> int | str:
+    """Of s since 1970, or of ISO 8601; a text: of what it is instead."""
+    import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
+
+    if isinstance(value, str):
+        for zone in ("UTC", None):
+            with contextlib.suppress(pa.ArrowInvalid):
+                taken = pa.scalar(value.strip()).cast(pa.timestamp("ns", zone))
+                return int(taken.value) if ":" in value else f"{value[:40]}, without a time of day"
+        return f"{value[:40]!r}"
+    if not math.isfinite(value):
+        return str(value)
+    return round(Decimal(str(value)) * _SECOND)  # the number as it was written
 
 
 def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
@@ -178,8 +248,11 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
     from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 - of the extra `dataset`
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
+    paths = [path]
+    if path.is_dir() and not (path / "metadata.yaml").exists():  # whose recorder was killed
+        paths = sorted(each for each in path.iterdir() if each.suffix in (".mcap", ".db3")) or paths
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
+        with AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
             chosen = [each for each in bag.connections if each.topic == topic]
             if not chosen:
                 there = ", ".join(sorted({each.topic for each in bag.connections}))
@@ -191,7 +264,10 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
     except AttributeError:
         raise RecordingError(f"messages of {topic} in {path} have no header, so no time") from None
     except (AnyReaderError, FileNotFoundError) as error:
-        raise RecordingError(f"{path} cannot be read as a bag: {error}") from None
+        which, what = ", ".join(map(str, paths)), ""
+        if paths != [path]:
+            what = "; its folder has no metadata.yaml, so its recorder was killed: try 'mcap recover'"
+        raise RecordingError(f"{which} cannot be read as a bag: {error}{what}") from None
 
 
 def windows_of(
@@ -206,19 +282,23 @@ def windows_of(
     RecordingError for the first frame without a window.
     """
     done, clocks, waiting = 0, np.zeros((2, 0), np.int64), np.zeros((2, 0), np.int64)
-    for settings, batch in recording.batches(sensor):
-        windows.configure(settings.values, settings.rate_hz, settings.identity.name)
-        samples = windows.take(batch)
-        clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
-        if clocks.size:
-            waiting = np.hstack([waiting, frames.exposed(*clocks)])
-        ready = waiting[:, : np.searchsorted(waiting[1], windows.until_ns, "right")]
+    for settings, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
+        until_ns = windows.until_ns
+        if settings is not None:
+            windows.configure(settings.values, settings.rate_hz, settings.identity.name, settings.offset)
+            samples = windows.take(batch)
+            clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
+            if clocks.size:
+                waiting = np.hstack([waiting, frames.exposed(*clocks)])
+            # What comes next may put the latest samples in doubt.
+            until_ns = windows.until_ns - windows.doubt_ns
+        ready = waiting[:, : np.searchsorted(waiting[1], until_ns, "right")]
         if (ready[1, :1] < windows.begin_ns).any():
             break
         if ready.size:
             yield {"stamp_ns": ready[0], "monotonic_ns": ready[1], **windows.at(ready[1])}
         done, waiting = done + len(ready[0]), waiting[:, len(ready[0]) :]
-        windows.forget(min([windows.until_ns, *waiting[1, :1].tolist()]))
+        windows.forget(min([until_ns, *waiting[1, :1].tolist()]))
         advance(len(batch))
     if not clocks.size:
         raise RecordingError(f"{recording.path} has no new and valid samples")
@@ -240,6 +320,8 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         frames = Periodic(options.fps)
     else:
         frames = Stamped(read_stamps(options.at, options.column), str(options.at), options.latency, clock)
+    if tool and any(tool.get("bias", ())):
+        _check_offsets(options.tool, tool, recording, sensor.offsets)
     windows = Windows(length, hold=options.hold, tool=tool, imu_units=options.imu_units)
     about = {
         "program": f"{PROGRAM} {VERSION}",
@@ -248,11 +330,12 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         # In force from `stamp_ns` on, with delays of the filters; null: unknown, and taken to be 0.
         "settings": [
             {
-                **row._asdict(), "identity": row.identity._asdict(),
+                **row._asdict(), "offset": None, "identity": row.identity._asdict(),
                 "delay_ms": delays_ms(known_settings(row.values), row.rate_hz),
             }
             for row in sensor.history
         ],
+        "offsets": [row._asdict() for row in sensor.offsets],
         "units": _UNITS,
         "frames": {"force_torque": "ft_sensor", "imu": "ft_sensor_imu"},
         "clock": clock and clock._asdict(),
@@ -267,6 +350,22 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
             shutil.rmtree(path)
         made.replace(path)
     return f"windows of {count(length, 'sample')}"
+
+
+def _check_offsets(
+    path: Path, tool: Mapping[str, Any], recording: Recording, offsets: Sequence[Offset]
+) -> None:
+    """RecordingError unless it is known what the bias is with the sensor's own offset in the recording."""
+    if offset_of(tool) is None:
+        raise RecordingError(
+            f"{path} does not say with which offset of the sensor its bias was measured: identify the tool "
+            "again, add sensor_offset if you know it, or leave the bias out"
+        )
+    if all(row.offset is None for row in offsets):
+        raise RecordingError(
+            f"{recording.path} does not have the sensor's own offset, so the bias of {path} is not known: "
+            "record with a newer server, or leave the bias out"
+        )
 
 
 def _in_chunks(blocks: Iterable[Arrays]) -> Iterator[Arrays]:

@@ -1,7 +1,7 @@
 """The last samples that were measured before an instant: of a recording, or of a stream with the same result.
 
     windows = Windows(32)
-    windows.configure(description["settings"], description["rate_hz"])  # again whenever they change
+    windows.configure(row["settings"], row["rate_hz"], row["name"], row["offset"])  # whenever they change
     windows.take(frames)  # DATA messages of one sensor, in order
     arrays = windows.at(np.array([windows.until_ns]))
 
@@ -22,18 +22,20 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.recording.columns import Columns, Ints, columns
+from bota_clients.recording.own_offset import DOUBT_AFTER, doubt_ns
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.client.reading import Delays
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.sensor.response import delays_ms
-from bota_ethercat.settings import SettingValue, known_settings
+from bota_ethercat.settings import known_settings
 from ft_compensation.alignment import align
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import EXACT, NO_WRENCH, STILL, ZERO, Accelerometer, Payload, Turning, Wrench
 from ft_compensation.specific_force import ImuSpecificForce
 from ft_compensation.stationary import BAD_WRENCH
+from ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
 
 Array = npt.NDArray[Any]
 Arrays = dict[str, Array]
@@ -45,6 +47,12 @@ _SLOT: Final = np.dtype([
     ("valid", "?", 3),  # by channel
     ("compensated", "f4", 6),  # N, Nm; NaN: not known
 ])  # fmt: skip
+
+
+def offset_of(tool: Mapping[str, Any]) -> Wrench | None:
+    """The sensor's own offset that the bias of a tool's parameters goes with; None if they do not say."""
+    found = tool.get("sensor_offset")
+    return Wrench.of(found) if found is not None and np.isfinite(found).all() else None
 
 
 def read_tool(path: Path) -> Mapping[str, Any]:
@@ -86,17 +94,33 @@ class Windows:
         self._slots = np.zeros(0, _SLOT)
         self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._in_force: tuple[Mapping[str, object], float] | None = None
+        self._doubted_until_ns = -1
         if tool is None:
             return
         center, inertia = tuple(tool["tool_center_of_gravity"]), tuple(tool.get("tool_inertia", (0.0,) * 6))
         self._payload = Payload(float(tool["tool_mass"]), center, inertia)
-        self._compensator = Compensator(self._payload, Wrench.of(tool.get("bias", NO_WRENCH.values)))
+        self._bias, offset = Wrench.of(tool.get("bias", NO_WRENCH.values)), offset_of(tool)
+        self._compensator, self._own_offset = Compensator(self._payload, self._bias), OwnOffset()
+        self._own_offset.begin(self._bias, offset, is_measured=offset is not None)
+        self._offset: Wrench | None = None
         rows = {name: tool.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
         self._accelerometer = Accelerometer(**{name: tuple(row) for name, row in rows.items()})
         self._imu_position: Vector3 = tuple(tool.get("imu_position", ZERO))
 
-    def configure(self, settings: Mapping[str, object], rate_hz: float, name: str = "") -> None:
-        """Settings and rate of what follows, as `describe` has them; the sensor's `name`; RecordingError."""
+    def configure(
+        self,
+        settings: Mapping[str, object],
+        rate_hz: float,
+        name: str = "",
+        offset: Sequence[float] | None = None,
+    ) -> None:
+        """Settings and rate of what follows, as `describe` has them; the sensor's `name`; RecordingError.
+
+        Also the sensor's own `offset`, N and Nm, which a bias is shifted with; where only one of this and the
+        tool's `sensor_offset` is known there is no compensated wrench.
+        """
+        if self._compensator is not None:
+            self._follow(None if offset is None else Wrench.of(offset), rate_hz)
         if (settings, rate_hz) == self._in_force:
             return
         if not rate_hz:
@@ -110,11 +134,29 @@ class Windows:
         x, y, z = position if any(position) else (0.0, 0.0, IMU_HEIGHTS.get(name[4:8], 0.0))
         alignment = align(self._known, rate_hz)
         self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), self._accelerometer, alignment)
-        wrong: dict[str, SettingValue] = {"calibration_matrix": False}
-        if self._payload.mass:
-            wrong |= {"inertia_compensation": True, "coordinate_system": True, "imu_active": 0}
-        if found := [setting for setting, value in wrong.items() if self._known.get(setting) == value]:
-            raise RecordingError(f"the wrench cannot be compensated by how {found[0]} was set: omit --tool")
+        has_tool = self._payload.mass > 0
+        why = not_newtons(self._known, has_tool=has_tool) or (has_tool and hides_gravity(self._known))
+        if why:
+            raise RecordingError(f"the wrench cannot be compensated: {why}; or omit --tool")
+
+    def _follow(self, offset: Wrench | None, rate_hz: float) -> None:
+        """The sensor's own offset of what follows."""
+        self._offset = offset
+        if (shift := self._own_offset.follow(offset)) is None:
+            return
+        self._bias = self._bias.plus(shift)
+        newest_ns = self._newest[0]
+        if self.begin_ns >= 0:
+            since_ns = newest_ns - self.doubt_ns - self._delay_ns[0]
+            self._slots["compensated"][self._slots["measured_ns"][:, 0] >= since_ns] = math.nan
+            self._doubted_until_ns = newest_ns + round(DOUBT_AFTER * 1e9 / (rate_hz or self._rate_hz))
+
+    @property
+    def doubt_ns(self) -> int:
+        """How long before an offset was reported samples may have part of it; 0 without a tool."""
+        if self._compensator is None or self._in_force is None:
+            return 0
+        return doubt_ns(self._rate_hz)
 
     @property
     def until_ns(self) -> int:
@@ -174,8 +216,13 @@ class Windows:
             felt = np.array(rows)
             if any(self._payload.inertia):
                 turning = np.moveaxis(np.array(turned), 0, 2)
+        self._compensator.bias = self._bias
         compensate = cast(Any, self._compensator.compensate)  # of arrays as of numbers
-        return np.vstack(compensate(samples.force.T, samples.torque.T, felt.T, turning).final).T
+        found = np.vstack(compensate(samples.force.T, samples.torque.T, felt.T, turning).final).T
+        if self._own_offset.doubt(self._offset):
+            return math.nan
+        found[samples.monotonic_ns <= self._doubted_until_ns] = math.nan
+        return found
 
     def at(self, instants_ns: Ints) -> Arrays:
         """Windows of these f instants; the last sample of each is the newest.

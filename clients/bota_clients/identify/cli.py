@@ -11,6 +11,7 @@ from bota_clients.arguments import add_force, add_imu_units, position
 from bota_clients.program import start
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from bota_ethercat.program.arguments import Parser, number
+from bota_ethercat.program.output import ends_with_its_reader
 
 
 class IdentifyOptions(argparse.Namespace):
@@ -65,6 +66,7 @@ def _add_recording(made: argparse.ArgumentParser) -> None:
     add_imu_units(made)
 
 
+@ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Identify; returns the exit code."""
     given = sys.argv[1:] if argv is None else argv

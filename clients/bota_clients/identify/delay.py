@@ -12,7 +12,8 @@ from bota_clients.errors import RecordingError
 from bota_clients.identify.cli import IdentifyOptions
 from bota_clients.identify.program import choose
 from bota_clients.program import say
-from bota_clients.recording.columns import Columns, columns
+from bota_clients.recording.columns import Columns
+from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, force_lag_s
 from bota_ethercat.settings import SettingValue, known_settings
@@ -24,7 +25,7 @@ def run(options: IdentifyOptions) -> int:
     """Find it; returns the exit code."""
     with open_recording(options.path) as recording:
         sensor = choose(recording, options.sensor)
-        data = columns(recording.frames(sensor.sensor), options.imu_units)
+        data, _ = at_last_offset(recording, sensor, options.imu_units)
     if any(row.values != sensor.settings for row in sensor.history):
         raise RecordingError(f"{options.path}: settings were changed during it: record without that")
     settings, found, error = known_settings(sensor.settings), None, ""

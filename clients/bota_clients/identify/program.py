@@ -15,15 +15,17 @@ from bota_clients.errors import RecordingError
 from bota_clients.identify.cli import IdentifyOptions
 from bota_clients.identify.stationary_periods import LEAST_S, StationaryPeriod, find_stationary_periods
 from bota_clients.program import say
-from bota_clients.recording.columns import columns
+from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
+from bota_ethercat.settings import known_settings
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
 from ft_compensation.identification.weighted import CONFIDENCE
-from ft_compensation.quantities import CROSS_AXES, CompensationError, length
+from ft_compensation.quantities import CROSS_AXES, CompensationError, Wrench, length
+from ft_compensation.stream import hides_gravity, not_newtons
 
 _WIDTH: Final = 80  # every table fits
 Poses = Sequence[tuple[StationaryPeriod, Pose]]
@@ -130,7 +132,11 @@ def run(options: IdentifyOptions) -> int:
         sensor = choose(recording, options.sensor)
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
-        data = columns(recording.frames(sensor.sensor), options.imu_units)
+        for row in sensor.history:
+            known = known_settings(row.values)
+            if why := not_newtons(known, has_tool=True) or hides_gravity(known):
+                raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")
+        data, offset = at_last_offset(recording, sensor, options.imu_units)
     periods, rejected = find_stationary_periods(data)
     if len(periods) > MOST_POSES:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
@@ -153,8 +159,19 @@ def run(options: IdentifyOptions) -> int:
     if options.yaml is not None:
         who = f"{sensor.name}, serial number {sensor.serial}, from {options.path.name}"
         gravity = None if options.gravity is None else (0.0, 0.0, -options.gravity)
-        write_yaml(options.yaml, result, f"{who}\n{summary(result)}", gravity)
+        write_yaml(
+            options.yaml,
+            result,
+            f"{who}\n{summary(result)}",
+            gravity,
+            None if offset is None else Wrench.of(offset),
+        )
         _say(f"written to {options.yaml}")
+        if offset is None:
+            _say(
+                f"{options.path} has no offset of the sensor's own, so the bias is right only until that is "
+                "changed: record with a newer server"
+            )
     return 0
 
 

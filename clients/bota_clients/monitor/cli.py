@@ -20,12 +20,13 @@ from bota_clients.monitor.model import Model
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.web.hub import is_loopback
 from bota_clients.monitor.words import json_line, verdict
-from bota_clients.program import discard_output, interrupt_on_signals, not_installed
+from bota_clients.program import interrupt_on_signals, not_installed
 from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.health.sentences import no_server
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.arguments import Parser, seconds
+from bota_ethercat.program.output import discard_output, ends_with_its_reader
 
 DEFAULT_WEB: Final = Address(DEFAULT_HOST, 12080)
 _PERIOD_S: Final = 1.0
@@ -44,6 +45,7 @@ class Options(argparse.Namespace):
     web: Address | None
 
 
+@ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the monitor; returns its exit code."""
     options = parse(argv)

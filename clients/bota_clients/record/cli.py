@@ -13,6 +13,7 @@ from bota_clients.arguments import add_force, add_server, position, server_of
 from bota_clients.program import Signals, start
 from bota_ethercat.address import Address
 from bota_ethercat.program.arguments import Parser, typed
+from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.server_choice import is_address
 
 _UNITS_S: Final = {"": 1, "s": 1, "m": 60, "h": 3600}  # by their first letter
@@ -72,6 +73,7 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     return options
 
 
+@ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Record; returns the exit code."""
     signals = Signals()

@@ -19,6 +19,7 @@ from typing import Any, Final, NamedTuple, cast
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_clients.recording.container import McapFile
+from bota_ethercat.control import known_six
 from bota_ethercat.errors import SettingError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.settings import SETTINGS, sampling_rate_hz
@@ -65,12 +66,20 @@ class Identity(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """Settings, sampling rate and identity of a sensor from a time on."""
+    """Settings, sampling rate and identity of a sensor from a time on, and its latest own offset."""
 
     stamp_ns: int = 0
     values: Mapping[str, Any] = {}
     rate_hz: float = 0.0  # 0 if unknown
     identity: Identity = Identity()
+    offset: tuple[float, ...] | None = None  # that it adds (0x8000), N and Nm; None if unknown
+
+
+class Offset(NamedTuple):
+    """What a sensor itself adds to every sample (object 0x8000) from a time on."""
+
+    stamp_ns: int
+    offset: tuple[float, ...] | None  # N and Nm; None if unknown
 
 
 class RecordedSensor(NamedTuple):
@@ -86,6 +95,7 @@ class RecordedSensor(NamedTuple):
     settings: Mapping[str, Any]
     history: tuple[Settings, ...]  # over time, oldest first; the first are the ones here
     frames: int  # number of its frames in the recording
+    offsets: tuple[Offset, ...] = ()  # over time, oldest first
 
 
 class Histories:
@@ -93,16 +103,17 @@ class Histories:
 
     def __init__(self) -> None:
         self._of: dict[int, list[Settings]] = {}
+        self._offsets: dict[int, list[Offset]] = {}
 
     def take(self, note: Description | Event) -> None:
         """Take the next description or event of the file."""
         described = isinstance(note, Description)
         for row in rows(note.reply.get("sensors")) if isinstance(note, Description) else [note.event]:
-            position, values = whole(row.get("sensor")), row.get("settings")
+            position = whole(row.get("sensor"))
             if position is None or not 0 <= position <= file_format.MAX_SENSOR:
                 continue
-            if isinstance(values, dict):
-                self._learn(position, note.stamp_ns, row, values, described=described)
+            if isinstance(row.get("settings"), dict) or (not described and "offset" in row):
+                self._learn(position, note.stamp_ns, row, described=described)
 
     def of(self, position: int) -> Sequence[Settings]:
         """The history so far of the sensor at this position."""
@@ -115,15 +126,18 @@ class Histories:
             history = tuple(self.of(position))
             first = history[0] if history else Settings()
             about = (*first.identity, first.rate_hz, first.values, history)
-            found.append(RecordedSensor(position, *about, frames.get(position, 0)))
+            offsets = tuple(self._offsets.get(position, ()))
+            found.append(RecordedSensor(position, *about, frames.get(position, 0), offsets))
         return tuple(found)
 
-    def _learn(
-        self, position: int, stamp_ns: int, row: JsonObject, values: dict[str, Any], *, described: bool
-    ) -> None:
-        known = self._of.setdefault(position, [])
+    def _learn(self, position: int, stamp_ns: int, row: JsonObject, *, described: bool) -> None:
+        known, offsets = self._of.setdefault(position, []), self._offsets.setdefault(position, [])
         last = known[-1] if known else Settings()
-        identity = last.identity
+        identity, values = last.identity, row.get("settings")
+        values = values if isinstance(values, dict) else last.values
+        offset = known_six(row["offset"]) if "offset" in row else last.offset
+        if not offsets or offsets[-1].offset != offset:
+            offsets.append(Offset(stamp_ns, offset))
         if described:
             name, hardware, firmware = (_text(row.get(key)) for key in ("name", "hardware", "firmware"))
             serial, size = (int(_number(row.get(key))) for key in ("serial", "pdo_size"))
@@ -131,9 +145,9 @@ class Histories:
         rate = _number(row.get("rate_hz"))
         if known and last.values == values and last.identity in (identity, Identity()):
             # The description that follows an event completes the same entry.
-            known[-1] = last._replace(rate_hz=rate or last.rate_hz, identity=identity)
+            known[-1] = last._replace(rate_hz=rate or last.rate_hz, identity=identity, offset=offset)
         else:
-            known.append(Settings(stamp_ns, values, rate or _rate(values, last), identity))
+            known.append(Settings(stamp_ns, values, rate or _rate(values, last), identity, offset))
 
 
 def _rate(values: Mapping[str, Any], last: Settings) -> float:
@@ -213,10 +227,12 @@ class Recording(McapFile):
         return self._read(self._channels(sensor) | self._noted)
 
     def batches(self, sensor: int) -> Iterator[tuple[Settings, list[DataMessage]]]:
-        """Frames of the sensor at this position, a few thousand at once, with the settings in force."""
+        """Frames of the sensor at this position, a few thousand at once, with what was in force."""
         histories = Histories()
-        known = [each.history[0] for each in self.sensors if each.sensor == sensor and each.history]
-        settings = known[0] if known else Settings()
+        known = [each for each in self.sensors if each.sensor == sensor and each.history]
+        settings = Settings()
+        for each in known:
+            settings = each.history[0]._replace(offset=each.offsets[0].offset)
         for kind, items in itertools.groupby(self.everything(sensor), type):
             while batch := cast(Any, [*itertools.islice(items, _BATCH)]):
                 if kind is DataMessage:

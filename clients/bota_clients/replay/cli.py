@@ -13,6 +13,7 @@ from bota_clients.arguments import address
 from bota_clients.program import Signals, start
 from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.program.arguments import Parser, number, typed
+from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.server_choice import own_server
 
 _HOSTS: Final = ["127.0.0.1", "::1"]
@@ -60,6 +61,7 @@ def _speed(text: str) -> float:
 _host = typed(lambda text: str(ipaddress.ip_address(text)), "an IP address of this machine")
 
 
+@ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Replay; returns the exit code."""
     signals = Signals()

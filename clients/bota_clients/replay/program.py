@@ -85,7 +85,7 @@ class Player:
     def run(self) -> None:
         """Play from the first subscriber on."""
         hub, options, recording = self.hub, self._options, self._recording
-        hub.start(Actions(hub, self, self.sensors, {"replay": self._about()}).handle)
+        hub.start(Actions(hub, self, self.sensors, lambda: {"replay": self._about()}).handle)
         name = f"{recording.path.name}, {recording.frame_count} frames,"
         _say(f"replaying {name} on port {options.port}, waiting for a subscriber; Ctrl-C ends it")
         try:

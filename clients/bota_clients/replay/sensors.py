@@ -27,8 +27,10 @@ class ReplayedSensor:
 
     def __init__(self, recorded: RecordedSensor) -> None:
         self.row: dict[str, Any] = {**recorded._asdict(), "state": "OP"}
-        for name in ("history", "frames"):
+        for name in ("history", "frames", "offsets"):
             del self.row[name]
+        if recorded.offsets and recorded.offsets[0].offset is not None:
+            self.row["offset"] = recorded.offsets[0].offset
         if recorded.rate_hz.is_integer():
             self.row["rate_hz"] = int(recorded.rate_hz)
         self._frames = Counter[int]()  # by the flags that say that they are not new

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bota_clients.arguments import add_force, add_imu_units, add_server, server_of
-from bota_clients.program import discard_output, interrupt_on_signals, say, start
+from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.address import Address
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.arguments import Parser, number, typed
 from bota_ethercat.program.new_file import NewFile
+from bota_ethercat.program.output import discard_output, ends_with_its_reader
 from bota_ethercat.program.server_choice import is_address
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor_choice import MEANING, SensorChoice
@@ -80,6 +81,7 @@ def parse_options(argv: Sequence[str] | None) -> ReportOptions:
     return options
 
 
+@ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a report; returns the exit code."""
     return start(_PROGRAM, "report.cli", parse_options(argv))

@@ -51,7 +51,12 @@ def of_recording(
         recorded = [s for s in recording.sensors if not recording.chosen or s.sensor in recording.chosen]
         found = [sensor for sensor in recorded if _meant(sensor, choice)]
         if not found:
-            there = [(s.sensor, who.name, who.serial) for s in recorded for *_, who in s.history]
+            there = [
+                (s.sensor, who.name, who.serial)
+                for s in recorded
+                for row in s.history
+                for who in [row.identity]
+            ]
             raise _no_sensor(source or str(path), choice, dict.fromkeys(there))
         remarks = [f"The recording was cut off: {recording.cut_off}."] if recording.cut_off else []
         if others := [str(sensor.sensor) for sensor in recording.sensors if sensor not in recorded]:
@@ -130,6 +135,11 @@ def _subject(
             changing = frames.monotonic_ns > frames.monotonic_ns[-1:] - _LONGEST_CHANGE_NS
             frames = frames.where(~changing | (np.arange(len(frames)) <= last))
         remarks = _remarks(history, kept, frames)
+    if (tared := len(sensor.offsets) - 1) > 0:
+        remarks.append(
+            f"The sensor's own offset was changed {count(tared, 'time')} (by a tare, say): forces before and "
+            "after differ by that."
+        )
     made = subject(row, values, frames, source, sensor.sensor)
     return made.with_remarks(remarks)
 

@@ -79,7 +79,10 @@ def checksum(data: bytes | bytearray) -> int:
 
 
 def read_image(read: Callable[[int, int], bytes]) -> bytes:
-    """The SII up to the end of its categories; `read(word, count)` returns `count` words from `word` on."""
+    """The SII up to the end of its categories; `read(word, count)` returns `count` words from `word` on.
+
+    Reading is slow, so a blank EEPROM, and what no EEPROM has room for, end them as the end mark does.
+    """
     image = bytearray()
 
     def have(words: int) -> None:
@@ -91,11 +94,16 @@ def read_image(read: Callable[[int, int], bytes]) -> bytes:
     while word < _MOST_WORDS:
         have(word + 2)
         kind, length = CATEGORY_HEADER.unpack_from(image, word * 2)
-        if kind == Category.END:
+        if _is_end(kind, length) or word + 2 + length > _MOST_WORDS:
             break
         word += 2 + length
-        have(min(word, _MOST_WORDS))
+        have(word)
     return bytes(image)
+
+
+def _is_end(kind: int, length: int) -> bool:
+    """Whether there are no more categories: the end mark, which is blank memory, or the other blank."""
+    return kind == Category.END or kind == length == 0
 
 
 def raw_lines(image: bytes) -> list[str]:
@@ -152,7 +160,7 @@ def _categories(image: bytes) -> dict[int, bytes]:
     at = CATEGORIES_WORD * 2
     while at + 4 <= len(image):
         kind, words = CATEGORY_HEADER.unpack_from(image, at)
-        if kind == Category.END:
+        if _is_end(kind, words):
             break
         found[kind] = image[at + 4 : at + 4 + words * 2]
         at += 4 + words * 2

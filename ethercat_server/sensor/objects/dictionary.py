@@ -18,6 +18,7 @@ from typing import Final
 from bota_ethercat.pdo import AXES, INPUT_OBJECT, PDO_FIELDS, PdoType
 from bota_ethercat.sensor.meaning import value_meaning
 from bota_ethercat.settings import SETTINGS, SettingValue
+from bota_ethercat.text.did_you_mean import names_with
 
 VENDOR_ID: Final = 0x0000B07A
 PRODUCT_CODE: Final = 1  # all Gen-0 EtherCAT models have product code 1; the name identifies the model
@@ -313,7 +314,9 @@ def find_objects(text: str) -> list[ObjectEntry]:
 
 
 def similar_names(text: str) -> list[str]:
-    """Names that are spelled much like `text`. Takes milliseconds: not for the server's loop."""
+    """Names that have `text` in them, or are spelled much like it. Takes ms: not for the server's loop."""
+    if having := names_with(text, _SPELLED.values()):
+        return having
     return [_SPELLED[name] for name in difflib.get_close_matches(_plain(text), _SPELLED, n=3)]
 
 
@@ -342,7 +345,7 @@ def _entry(index: int, subindex: int) -> list[ObjectEntry]:
 
 def _names() -> Iterable[tuple[str, Sequence[ObjectEntry]]]:
     for row in KNOWN_OBJECTS:
-        for name in {row.name, full_name(row), row.setting or row.name}:
+        for name in (row.name, full_name(row), row.setting or row.name):
             yield name, [row]
     for index, title in TITLES.items():
         yield title, _parts(index)

@@ -16,7 +16,7 @@ ethercat-server virtual 12001                              # a simulated sensor
 sudo ethercat-server ens5 12001                            # the sensors on an interface
 sudo ethercat-server ens5 12001 --set sinc_length=128      # with another filter
 sudo ethercat-sensor find                                  # on which interface is a sensor?
-ethercat-sensor watch                                      # force and torque, of the server on this computer
+ethercat-sensor objects                                    # all objects, of the server on this computer
 sudo ethercat-sensor apply ens5 --set sinc_length=128      # change a setting
 ethercat-doctor                                            # of the server on this computer, its interface
 sudo ethercat-doctor ens5                                  # everything, on an interface

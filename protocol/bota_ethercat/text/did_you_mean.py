@@ -4,10 +4,25 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
+from typing import Final
+
+_LONGEST: Final = 80
+_SHORTEST_PART: Final = 3
+_MOST: Final = 3
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """The question to go on with after "no such name", such as "; did you mean 'fir'?"; may be empty."""
-    close = difflib.get_close_matches(word.lower()[:80], list(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    names, word = list(known), word.lower()[:_LONGEST]
+    close = names_with(word, names) or difflib.get_close_matches(word, names, n=1)
+    return f"; did you mean {' or '.join(map(repr, close))}?" if close else ""
+
+
+def names_with(word: str, known: Iterable[str]) -> list[str]:
+    """The first few names of which `word` is a part, as `sinc` is of `sinc_length` and `SINC length`."""
+    if len(word) < _SHORTEST_PART:
+        return []
+    part = re.compile(rf"(?<![^\W_]){re.escape(word)}(?![^\W_])", re.IGNORECASE)
+    return list(filter(part.search, known))[:_MOST]

@@ -13,70 +13,22 @@ from typing import Any, Final
 
 from rclpy.node import Node
 
-from bridge.compensating.sources import IMU_IS_OFF, SourceChoice
+from bridge.compensating.sources import SourceChoice
 from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import LiveParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.publishing.compensated_wrench import CompensatedOutput, Plan
-from bridge.stream.link import Link
 from bridge.stream.reader import Reader
 from ft_compensation.bias import BiasRamp, Taken, force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.outputs import cutoff_problem
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
+from ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
 
 _FROM_PARAMETER: Final = "parameter"
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
 _NOTHING_CURRENT: Final = "no current orientation"
-_LEAST_K: Final = 0.2  # change of temperature that shifts the bias; less is noise
 _ANOTHER_SENSOR: Final = "the bias may be another sensor's"
-
-
-class OwnOffset:
-    """The offset (object 0x8000) that the sensor itself adds to every sample, and how it affects the bias.
-
-    Follows what the server reports; used by the executor's thread and the reader's.
-    """
-
-    def __init__(self, link: Link) -> None:
-        self._link = link
-        # The offset that the bias was taken with; None if it was never known.
-        self._of_bias: Wrench | None = None
-        self._appeared = False  # whether the offset became known only after the bias was taken
-        # Whether there is a bias. Zero may be one: what a tare finds where the sensor reads nothing.
-        self.has_bias = False
-
-    @property
-    def now(self) -> Wrench | None:
-        """The sensor's current offset; None if unknown."""
-        offset = self._link.info.offset
-        return None if offset is None else Wrench.of(offset)
-
-    def begin(self, bias: Wrench, *, is_measured: bool = False) -> None:
-        """`bias` goes with the current offset. Zero is no bias, unless it was measured."""
-        self.has_bias = is_measured or bias != NO_WRENCH
-        self._of_bias, self._appeared = self.now, False
-
-    def follow(self) -> Wrench | None:
-        """The shift of the bias that the current offset requires, once; None: no shift."""
-        now, before = self.now, self._of_bias
-        if now is None or now == before:
-            return None
-        self._of_bias = now
-        if not self.has_bias:
-            return None
-        self._appeared = self._appeared or before is None
-        return None if before is None else now.plus(before, -1.0)
-
-    def doubt(self) -> str:
-        """Why the bias may no longer fit the sensor, a sentence; empty if it does."""
-        if not self.has_bias or not self._link.is_connected:
-            return ""
-        if self._appeared:
-            return "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare"
-        if self._of_bias is not None and self._link.info.offset is None:
-            return "the sensor's own offset is no longer known: the bias may be wrong, tare"
-        return ""
 
 
 class CompensationControl:
@@ -98,9 +50,10 @@ class CompensationControl:
         self.choice = SourceChoice(node, self.link)
         # Of the sensor that the bias in force is for, for any thread; None until there was one.
         self._serial: str | None = None
-        self.own_offset = OwnOffset(self.link)
+        self.own_offset = OwnOffset()
         # Origin of the bias that is being put in force, and what it was taken with if by a tare.
         self._next: tuple[str, Taken | None] = (_FROM_PARAMETER, None)
+        self._is_following = False  # whether parameters are being made what is in force
         self.choice.check(parameters)
         self._ramp = BiasRamp(parameters.bias, parameters.bias_ramp_time)
         self._shifting = threading.Lock()  # guards shifts of the ramp, and its replacement
@@ -130,6 +83,12 @@ class CompensationControl:
         return self._ramp.target
 
     @property
+    def offset(self) -> Wrench | None:
+        """The sensor's own, as it is now; None if it is not known."""
+        offset = self.link.info.offset
+        return None if offset is None else Wrench.of(offset)
+
+    @property
     def _sample_s(self) -> float:
         """The newest sample's time, by the server's monotonic clock, also while nobody has subscribed."""
         return self.reader.accounting.new_ns * 1e-9
@@ -138,7 +97,9 @@ class CompensationControl:
         """How things are, for the diagnostics' thread."""
         output, source, parameters = self.output, self.choice.source, self.parameters
         payload, bias, has_subscribers = parameters.payload, self.bias, output.has_subscribers
-        bound = force_bound_95(payload, parameters.accelerometer) if source.is_imu else None
+        bound = None
+        if source.is_imu:
+            bound = force_bound_95(payload, parameters.accelerometer, self._ramp.taken)
         age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
         parts = ["bias"] if bias != NO_WRENCH else []
         if payload.mass:
@@ -163,7 +124,9 @@ class CompensationControl:
                 "withheld": output.withheld,
             },
             stopped=self._why_stopped() or output.problem,
-            doubtful=self.conflict() or self.own_offset.doubt() or self._ramp.taken.doubt(payload),
+            doubtful=self.conflict()
+            or (self.own_offset.doubt(self.offset) if self.link.is_connected else "")
+            or self._ramp.taken.doubt(payload),
             follows_imu=source.is_imu and payload.mass > 0.0,
             withheld=output.withheld,
             why_withheld=output.why_withheld or f"{_NOTHING_CURRENT} ({source.describe})",
@@ -172,30 +135,12 @@ class CompensationControl:
     def conflict(self, *, needs_tool: bool = False) -> str:
         """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
         specific force in the frame of the wrench, a sentence that says what to do."""
-        settings = self.link.info.settings
-        if settings.get("calibration_matrix") is False:
-            return (
-                "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: "
-                "switch it on"
-            )
-        if settings.get("inertia_compensation") is True and self.parameters.payload.mass:
-            return (
-                "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, "
-                "or set tool_mass to 0"
-            )
-        return self._why_unknown() if needs_tool else ""
+        settings, has_tool = self.link.info.settings, self.parameters.payload.mass > 0
+        return not_newtons(settings, has_tool=has_tool) or (self._why_unknown() if needs_tool else "")
 
     def _why_unknown(self) -> str:
         """Why these settings of the sensor hide the specific force, a sentence; empty if they do not."""
-        if self.parameters.gravity_source != "imu":
-            return ""
-        if self.link.info.settings.get("coordinate_system") is True:
-            return (
-                "settings.coordinate_system is on, so the wrench is in a frame configured in the sensor, and "
-                "the rotation from the IMU to it is unknown: switch it off, or take the orientation of that "
-                "frame from the robot (gravity_source)"
-            )
-        return IMU_IS_OFF if self.link.info.settings.get("imu_active") == 0 else ""
+        return hides_gravity(self.link.info.settings) if self.parameters.gravity_source == "imu" else ""
 
     def _hold(self) -> None:
         """Publish nothing while the specific force is needed and cannot be known."""
@@ -220,7 +165,7 @@ class CompensationControl:
             if taken is not None:  # the tool may have been set since
                 change, taken = taken.weighed(self.parameters.payload)
                 bias = bias.plus(change)
-            self.own_offset.begin(bias, is_measured=origin in _MEASURED)
+            self.own_offset.begin(bias, self.offset, is_measured=origin in _MEASURED)
             self._put(origin, taken, bias=[*bias.values])
 
     def undo_bias(self) -> Wrench:
@@ -254,7 +199,7 @@ class CompensationControl:
         with self._setting:
             self._next = origin, taken
             try:
-                self._live.put(**values)
+                self._live.put(sensor_offset=_offset_values(self.offset), **values)
             finally:
                 self._next = _FROM_PARAMETER, None
 
@@ -273,7 +218,12 @@ class CompensationControl:
         self._ramp.seconds = wanted.bias_ramp_time
         before, (origin, taken) = self.bias, self._next
         # A parameter that the shift of the bias has not reached yet is no wish.
-        is_wish = taken is not None or wanted.bias not in (was.bias, before)
+        given = None if wanted.sensor_offset == was.sensor_offset else wanted.sensor_offset
+        is_wish = not self._is_following and (
+            taken is not None
+            or wanted.bias not in (was.bias, before)
+            or given not in (None, self.own_offset.of_bias)
+        )
         with self._shifting:
             if wanted.payload != was.payload:
                 self._ramp = self._ramp.weighed(wanted.payload)
@@ -281,8 +231,10 @@ class CompensationControl:
                 self._ramp.go(
                     wanted.bias, self._sample_s, taken or Taken(), may_undo=origin != _FROM_PARAMETER
                 )
-                self.own_offset.begin(wanted.bias, is_measured=origin in _MEASURED)
+                is_measured = origin in _MEASURED or given is not None
+                self.own_offset.begin(wanted.bias, given or self.offset, is_measured=is_measured)
                 self.origin = origin
+                self._guard.trigger()  # the parameter `sensor_offset` follows, or the bias does
             self._make_plan()
         if wanted.payload != was.payload and not is_wish:
             # The bias of a tare is another one with it.
@@ -309,7 +261,7 @@ class CompensationControl:
         """The bias, and what was before it, are not another sensor's; a fixed one stays."""
         with self._setting:
             while not self._is_same_sensor():
-                serial = self.link.info.serial
+                serial, given = self.link.info.serial, None
                 if self._serial is not None:
                     bias = self.bias
                     if self.origin != _FROM_PARAMETER:
@@ -319,23 +271,29 @@ class CompensationControl:
                         )
                         bias, self.origin = NO_WRENCH, _FROM_PARAMETER
                     self._ramp = BiasRamp(bias, self.parameters.bias_ramp_time)
-                self.own_offset.begin(self.bias)
+                elif self.origin == _FROM_PARAMETER:
+                    given = self.parameters.sensor_offset
+                self.own_offset.begin(self.bias, given or self.offset, is_measured=given is not None)
                 self._serial = serial
                 self._open_source()
                 self._make_plan()
             self._follow_offset()
-            if self.bias != self.parameters.bias:
-                try:
-                    self._live.put(bias=[*self.bias.values])  # shifted, or zero again
+            offset = self.own_offset.of_bias if self.own_offset.has_bias else None
+            if (self.bias, offset) != (self.parameters.bias, self.parameters.sensor_offset):
+                self._is_following = True
+                try:  # shifted, or zero again
+                    self._live.put(bias=[*self.bias.values], sensor_offset=_offset_values(offset))
                 except ParameterError as error:
                     self._log.error(str(error))
+                finally:
+                    self._is_following = False
             self._hold()
             if not self._is_same_sensor():
                 self.link_changed()
 
     def _follow_offset(self) -> None:
         """Shift the bias by the change of the sensor's own offset, from the next sample on; any thread."""
-        change = self.own_offset.follow()
+        change = self.own_offset.follow(self.offset)
         if change is not None:
             with self._shifting:
                 self._ramp.shift(change)
@@ -343,6 +301,11 @@ class CompensationControl:
                 f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
             )
             self._guard.trigger()
+
+
+def _offset_values(offset: Wrench | None) -> list[float]:
+    """As the parameter has it."""
+    return [math.inf] * 6 if offset is None else [*offset.values]
 
 
 def _numbers(values: tuple[float, ...]) -> str:

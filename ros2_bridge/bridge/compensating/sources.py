@@ -29,8 +29,8 @@ from bridge.stream.link import Link
 from ft_compensation.alignment import align
 from ft_compensation.quantities import STILL, Quaternion, Turning, unit_quaternion, vector
 from ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
+from ft_compensation.stream import IMU_IS_OFF
 
-IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 _TF_PERIOD_S: Final = 0.005
 _NS_PER_S: Final = 1_000_000_000
 # How long an executor may take to release the previous subscription: DDS has one type per topic.

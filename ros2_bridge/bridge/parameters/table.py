@@ -161,6 +161,9 @@ PARAMETERS: Final = (
         "Gravity, m/s², in the base frame: that of the orientations", 0, 100),
     Row("bias", (0.0,) * 6,
         "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6),
+    Row("sensor_offset", (math.inf,) * 6,
+        "The sensor's own offset (0x8000) that bias goes with, N and Nm; infinite = that at the start; "
+        "~/identify finds it", 0, math.inf),
     Row("bias_ramp_time", 0.5, "Seconds in which a new bias replaces the old one; 0 = at once", 0, 60),
     Row("imu_position", ZERO,
         "Position in frame_id of the IMU that gravity_source names, m; zeros = that of the sensor's model",
@@ -240,6 +243,7 @@ class Parameters(NamedTuple):
     payload: Payload
     gravity: Vector3
     bias: Wrench
+    sensor_offset: Wrench | None
     bias_ramp_time: float
     imu_position: Vector3
     on_saturation: str
@@ -286,7 +290,7 @@ def gather(given: Mapping[str, Any]) -> Parameters:
     def group(prefix: str) -> dict[str, Any]:
         return {name.removeprefix(prefix): values.pop(name) for name in given if name.startswith(prefix)}
 
-    rest = group("rest.")
+    rest, offset = group("rest."), values.pop("sensor_offset")
     groups: dict[str, Any] = {
         "limits": LIMITS._replace(**group("diagnostics.")),
         "imu_units": ImuUnits(values.pop("imu_raw_units")),
@@ -295,6 +299,7 @@ def gather(given: Mapping[str, Any]) -> Parameters:
             *(values.pop(f"tool_{name}") for name in ("mass", "center_of_gravity", "inertia"))
         ),
         "bias": Wrench.of(values.pop("bias")),
+        "sensor_offset": Wrench.of(offset) if all(map(math.isfinite, offset)) else None,
         "accelerometer": Accelerometer(**group("accelerometer.")),
         "rest_duration": rest.pop("duration"),
         "rest": StationaryLimits(**rest),

@@ -44,6 +44,10 @@ class Value(NamedTuple):
     value: Array
     half: Array  # half the width of the interval, of `CONFIDENCE`
 
+    def problem(self, which: int) -> Value:
+        """Of one of several independent problems."""
+        return Value(self.value[which], self.half[which])
+
 
 class Estimate(NamedTuple):
     """The answer; shapes without the leading axes."""
@@ -57,6 +61,18 @@ class Estimate(NamedTuple):
     gravity: Array  # (n, 3), m/s²: as far as known now
     residuals: Array  # (n, 6), N and Nm: measured minus modelled
     degrees: Array  # (6,): degrees of freedom of the residuals of each axis
+
+    def problem(self, which: int) -> Estimate:
+        """The answer to one of several independent problems."""
+        calibration = None
+        if self.calibration is not None:
+            offset, scale, cross = self.calibration
+            calibration = offset.problem(which), scale.problem(which), cross.problem(which)
+        return Estimate(
+            self.mass.problem(which), self.center.problem(which), self.bias.problem(which), calibration,
+            None if self.shift is None else self.shift.problem(which),
+            self.gravity[which], self.residuals[which].copy(), self.degrees[which],
+        )  # fmt: skip
 
 
 def estimate(

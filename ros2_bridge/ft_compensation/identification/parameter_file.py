@@ -9,10 +9,19 @@ from pathlib import Path
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.program.new_file import NewFile
 from ft_compensation.identification.payload import Identified
+from ft_compensation.quantities import Wrench
 
 
-def write_yaml(path: Path, result: Identified, comment: str = "", gravity: Vector3 | None = None) -> None:
+def write_yaml(
+    path: Path,
+    result: Identified,
+    comment: str = "",
+    gravity: Vector3 | None = None,
+    offset: Wrench | None = None,
+) -> None:
     """Write what was identified, or replace it, with `comment` on top; FileError if that fails.
+
+    `offset` is the sensor's own, with which the bias was measured; None: not known.
 
     `gravity` is in the base frame, m/s²; without it the file does not say how the base stands. Where the
     accelerometer was not identified, the file leaves it alone.
@@ -21,6 +30,8 @@ def write_yaml(path: Path, result: Identified, comment: str = "", gravity: Vecto
         ("tool_center_of_gravity", result.payload.center, "m, in the sensor's frame"),
         ("bias", result.bias.values, "N, Nm: Fx Fy Fz Mx My Mz, subtracted"),
     ]
+    if offset is not None:
+        rows.append(("sensor_offset", offset.values, "N, Nm: the sensor's own, part of the bias"))
     if gravity is not None:
         rows.append(("gravity", gravity, "m/s², in the base frame"))
     if result.accelerometer is not None:

@@ -3,8 +3,8 @@
 
 Checks what is given, has `estimation` solve it, and judges how well the poses fit one payload. Two things are
 looked for that no noise explains: a bias that drifts, linear in the time of the poses, and a single pose in
-which something touched the tool. Each shifts the axes of force and torque, and so it is found: by Student's
-t of these shifts, once that time or the pose's indicator is one more regressor.
+which something touched the tool, which is left out then. Each shifts the axes of force and torque, and so it
+is found: by an F test, once that time or the pose's indicator is one more regressor.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Identified(NamedTuple):
     accelerometer: OffsetFit | None  # None where the poses do not have what it read: it is not touched then
     # Of the bias, a minute; None if time explains nothing. `bias` is that of the last pose then.
     drift: Wrench | None = None
-    touched: int | None = None  # index of the pose that does not fit the others
+    touched: int | None = None  # index of the pose that does not fit the others, and is left out
 
 
 def identify(poses: Sequence[Pose]) -> Identified:
@@ -115,9 +115,12 @@ def identify(poses: Sequence[Pose]) -> Identified:
         raise IdentificationError(f"the poses do not suffice: {seen.missing}; {seen.next_pose}")
     equations = _Equations(poses)
     try:
-        found, drift, touched = _explained(equations)
+        whole, drift, touched = _explained(equations)
     except np.linalg.LinAlgError:
         raise IdentificationError("the poses do not suffice: their equations leave an unknown open") from None
+    found, kept = whole, np.ones(len(poses), bool)
+    if touched is not None:
+        found, kept[touched.pose] = touched.rest, False
     mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
     _check_mass(mass, mass_interval)
     payload = Payload(mass, triple(found.center.value))
@@ -125,18 +128,26 @@ def identify(poses: Sequence[Pose]) -> Identified:
     gravity = float(np.linalg.norm(equations.gravity, axis=1).mean())
     weight = mass * gravity
     moment = weight * max(ARM, length(payload.center))
-    forces, torques = found.residuals[:, :3], found.residuals[:, 3:]
-    force = judge(poses, forces, found.degrees[:3], "force", weight)
-    torque = judge(poses, torques, found.degrees[3:], "torque", moment)
+    fits = []
+    for made, chosen in ((whole, np.ones(len(poses), bool)), (found, kept)):
+        few = [pose for pose, is_chosen in zip(poses, chosen, strict=True) if is_chosen]
+        forces, torques = made.residuals[chosen, :3], made.residuals[chosen, 3:]
+        fits.append(
+            (
+                judge(few, forces, made.degrees[:3], "force", weight),
+                judge(few, torques, made.degrees[3:], "torque", moment),
+            )
+        )
+    (of_all_force, of_all_torque), (force, torque) = fits
     most_force = _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight
     most_torque = _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment
-    _check_fit(force, touched, most_force, "N")
+    _check_fit(of_all_force, touched, most_force, "N")
     if length(payload.center) > LARGEST_CENTRE:
         raise IdentificationError(
             f"the center of gravity would be {length(payload.center):.2g} m from the sensor with a mass of "
             f"{mass:.3g} kg, which cannot be: something held or touched the tool, or there is no tool"
         )
-    _check_fit(torque, touched, most_torque, "Nm")
+    _check_fit(of_all_torque, touched, most_torque, "Nm")
     if mass_interval * gravity > most_force or length(centre_interval) * weight > most_torque:
         raise IdentificationError(
             f"the poses do not suffice: mass {mass:.2g} ± {mass_interval:.2g} kg, center of gravity "
@@ -206,12 +217,13 @@ class _Touched(NamedTuple):
     pose: int  # its index
     force: float  # N: by which it is off
     torque: float  # Nm
+    rest: Estimate  # by the others; the residuals are those of all
 
     def __str__(self) -> str:
         """For people."""
         return (
-            f"pose {self.pose + 1} does not fit the others, by {self.force:.2g} N and {self.torque:.2g} Nm: "
-            "if something touched the tool, take it again"
+            f"pose {self.pose + 1} does not fit the others, by {self.force:.2g} N and {self.torque:.2g} Nm, "
+            "and is left out: if something touched the tool, take it again"
         )
 
 
@@ -235,7 +247,10 @@ def _explained(equations: _Equations) -> tuple[Estimate, Wrench | None, _Touched
     force, torque = float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
     weight = float(found.mass.value[0]) * STANDARD_GRAVITY
     if chances[which] < _CHANCE and force + torque / ARM > _NEGLIGIBLE * weight:
-        return found, None, _Touched(int(suspects[which]), force, torque)
+        pose = int(suspects[which])
+        rest = without.problem(which)
+        rest.residuals[pose] += off
+        return found, None, _Touched(pose, force, torque, rest)
     return found, None, None
 
 

@@ -21,19 +21,6 @@ struct TareResult {
     std::array<double, 6> deviation{};  ///< standard deviation of a sample meanwhile
 };
 
-namespace detail {
-
-inline bool read(json::Value six, std::array<double, 6>& into) noexcept {
-    std::size_t count = 0;
-    six.for_each([&](json::Value, json::Value each) {
-        if (count < into.size() && each.get(into[count])) ++count;
-        else count = into.size() + 1;
-    });
-    return count == into.size();
-}
-
-}  // namespace detail
-
 /// Requests to a server, each on a connection of its own, so that no stream is disturbed and another thread may ask (a tare
 /// takes half a second). Waits and allocates: not for a control loop. Who may do what: docs/protocol.md.
 class Control {

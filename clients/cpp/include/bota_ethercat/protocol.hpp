@@ -318,6 +318,7 @@ struct SensorInfo {
     std::optional<bool> calibration_matrix, coordinate_system, inertia_compensation, orientation_estimation;
     std::optional<int> imu_active;
     std::optional<bool> fir;
+    std::optional<std::array<double, 6>> offset;  ///< that the sensor itself adds (object 0x8000), N and Nm; none: not known
 };
 
 /// What `describe` and `subscribe` answer.
@@ -335,6 +336,24 @@ struct Description {
 };
 
 namespace detail {
+
+inline bool read(json::Value six, std::array<double, 6>& into) noexcept {
+    std::size_t count = 0;
+    six.for_each([&](json::Value, json::Value each) {
+        if (count < into.size() && each.get(into[count])) ++count;
+        else count = into.size() + 1;
+    });
+    return count == into.size();
+}
+
+/// What a description or an event says of a sensor's own offset, if it does.
+inline void read_offset(json::Value of, SensorInfo& into) noexcept {
+    if (const json::Value offset = of["offset"]) {
+        std::array<double, 6> six{};
+        into.offset.reset();
+        if (read(offset, six)) into.offset = six;
+    }
+}
 
 /// What a description or an event says of a sensor's rate, delays and settings; what it does not say stays as it was.
 inline void read_in_force(json::Value of, SensorInfo& into) noexcept {
@@ -360,6 +379,7 @@ inline void read_in_force(json::Value of, SensorInfo& into) noexcept {
     get("orientation_estimation", into.orientation_estimation);
     get("imu_active", into.imu_active);
     get("fir", into.fir);
+    read_offset(of, into);
 }
 
 /// False if this is no description, or one of another protocol version.

@@ -114,8 +114,8 @@ public:
     bool connected() const noexcept { return link() == Link::up; }
     /// Whether the server refused the last subscription asked for.
     bool refused() const noexcept { return refused_; }
-    /// The server's sensors, as it described them last: when the subscription was made, and a sensor's rate and settings
-    /// when it came back or was reconfigured.
+    /// The server's sensors, as it described them last: when the subscription was made, and a sensor's rate, settings and
+    /// offset when it came back, was reconfigured or tared.
     const Description& description() const noexcept { return description_; }
     Counters counters(std::uint8_t place = 0) const noexcept {
         return {sensors_[place].accounting.counts, sensors_[place].all_passed_over};
@@ -189,6 +189,9 @@ private:
             for (std::size_t i = 0; i < description_.sensor_count; ++i)
                 if (description_.sensors[i].sensor == place) detail::read_in_force(message, description_.sensors[i]);
             take_in_force();
+        } else if (event.is("offset_changed")) {
+            for (std::size_t i = 0; i < description_.sensor_count; ++i)
+                if (description_.sensors[i].sensor == place) detail::read_offset(message, description_.sensors[i]);
         }
     }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Weight and inertia of the tool, to be subtracted from force and torque, at their instant. docs/compensation.md has the model.
-// As ros2_bridge/ft_compensation: alignment, specific_force, compensator.
+// As ros2_bridge/ft_compensation: alignment, specific_force, compensator, stream.
 #pragma once
 
 #include <algorithm>
@@ -31,6 +31,29 @@ struct Payload {
 inline Vector3 cross(const Vector3& a, const Vector3& b) noexcept {
     return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
 }
+
+/// How the offset that the sensor itself adds (object 0x8000) changes a bias.
+class OwnOffset {
+public:
+    using Known = std::optional<Wrench>;
+
+    /// There is a bias, and it goes with this offset.
+    void begin(const Known& of_bias) noexcept { has_bias_ = true, of_bias_ = of_bias, change_ = {}; }
+
+    /// What is to be added to the bias of a sample that has this offset.
+    const Wrench& follow(const Known& now) noexcept {
+        if (!has_bias_ || !now || now == of_bias_) return change_;
+        if (of_bias_)
+            for (std::size_t i = 0; i < change_.size(); ++i) change_[i] += (*now)[i] - (*of_bias_)[i];
+        of_bias_ = now;
+        return change_;
+    }
+
+private:
+    bool has_bias_ = false;
+    Known of_bias_;
+    Wrench change_{};
+};
 
 /// By a model's name, such as BFT-SENS-ECAT-M8: z of the IMU from the wrench origin, m; 0 if it is not known.
 inline double imu_height(std::string_view model) noexcept {

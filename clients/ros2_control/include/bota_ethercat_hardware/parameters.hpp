@@ -43,6 +43,7 @@ struct Parameters {
     bool has_payload = false;                ///< then `payload` is known, and the compensated wrench
     Payload payload;
     Wrench bias{};                           ///< subtracted from the compensated wrench until the sensor is tared
+    std::optional<Wrench> sensor_offset;     ///< the sensor's own, which goes with `bias`; none: that when configured
     // From the <sensor> tags, or as the payload needs it:
     bool wants_imu = false, wants_orientation = false, wants_compensated = false;
 
@@ -126,8 +127,9 @@ inline constexpr Row kRows[] = {
     {"accelerometer.scale", "three numbers, about 1", [](S t, P& p) { return numbers(t, p.payload.accelerometer_scale, 0.1); }},
     {"accelerometer.cross_axis", "six numbers", [](S t, P& p) { return numbers(t, p.payload.accelerometer_cross_axis); }},
     {"bias", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.bias); }},
+    {"sensor_offset", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.sensor_offset.emplace()); }},
 };
-inline constexpr std::size_t kOfTool = 7;  // the last rows
+inline constexpr std::size_t kOfTool = 8;  // the last rows
 
 /// Parameters of the ROS 2 node in a YAML file, a line each; false if they are wrong, or tool_mass is not among them.
 inline bool read_payload(const std::string& path, Parameters& into) {

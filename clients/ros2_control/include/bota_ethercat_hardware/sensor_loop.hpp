@@ -67,6 +67,7 @@ inline std::size_t signal(std::string_view name) noexcept {
 struct Received {
     bota_ethercat::Reading reading;
     Wrench tool{};  ///< load of the tool in the sample
+    Wrench bias_change{};  ///< by how much the sensor's own offset has changed the bias
     bool is_checked = true;  ///< false: sensor or settings may be others than when they were accepted
     bool is_connected = true;
     std::int64_t at_ns = 0;  ///< CLOCK_MONOTONIC of the reading
@@ -140,7 +141,7 @@ public:
         values_[kCondition] = condition_;
         const Reaction doing = reaction(parameters_, condition_);
         if (doing == Reaction::use) {
-            fill(reading.sample, received.tool);
+            fill(reading.sample, received.tool, received.bias_change);
             trouble_ns_ = kNever;
             return true;
         }
@@ -163,13 +164,13 @@ private:
     static constexpr std::int64_t kNever = INT64_MAX;
 
     /// All that is measured.
-    void fill(const bota_ethercat::Sample& sample, const Wrench& tool) noexcept {
+    void fill(const bota_ethercat::Sample& sample, const Wrench& tool, const Wrench& change) noexcept {
         const auto twelve = sample.array();
         std::copy(twelve.begin(), twelve.end(), values_.begin());
         for (std::size_t i = 0; i < sample.orientation.size(); ++i)
             values_[kOrientation + i] = sample.has_orientation ? sample.orientation[i] : kNaN;
         values_[kTemperature] = sample.temperature;
-        for (std::size_t i = 0; i < tool.size(); ++i) values_[kCompensated + i] = twelve[i] - bias_[i] - tool[i];
+        for (std::size_t i = 0; i < tool.size(); ++i) values_[kCompensated + i] = twelve[i] - (bias_[i] + change[i]) - tool[i];
     }
 
     const Parameters& parameters_;
@@ -272,6 +273,9 @@ public:
         bota_ethercat::TareResult result;
         if (!control.tare(result, parameters_.sensor(), 400, load))
             return why = std::string("the sensor could not be tared: ") + control.error(), false;
+        tared_offset_ = result.new_offset;
+        is_tared_.store(true, std::memory_order_release);
+        while (is_tared_ && !stopping_) std::this_thread::sleep_for(std::chrono::milliseconds(1));  // the other thread knows
         gate_.clear_bias();
         log_(Level::info, parameters_.has_payload
                               ? "tared to the load of the tool in this pose: right in every pose"
@@ -344,12 +348,19 @@ private:
     /// Read all that has arrived, or take a step towards a connection, and hand it over.
     void receive() noexcept {
         Received& received = latest_.next();
+        if (is_tared_.load(std::memory_order_acquire)) {
+            own_offset_.begin(tared_offset_);
+            is_tared_ = false;
+        }
         for (int left = kMostSamples; left > 0; --left) {  // the load of the tool needs every sample
             received.reading = client_.next({});
             if (!received.reading.is_new) break;
             if (tool_) load_ = tool_->follow(received.reading.sample, seconds(static_cast<std::int64_t>(received.reading.monotonic_ns)));
+            if (const SensorInfo* const found = client_.description().find(parameters_.sensor()))
+                bias_change_ = own_offset_.follow(found->offset);
         }
         received.tool = load_;
+        received.bias_change = bias_change_;
         received.at_ns = monotonic_now_ns();
         received.is_connected = client_.connected();
         const std::pair news(client_.connections(), client_.reconfigurations());
@@ -373,8 +384,10 @@ private:
             if (sensor_) log_(Level::error, objection_);
             return;
         }
-        if (!sensor_) sensor_ = *found;
-        else log_(Level::info, is_new_connection ? "connected again to " + detail::named(*found)
+        if (!sensor_) {
+            sensor_ = *found;
+            if (parameters_.sensor_offset || parameters_.bias != Wrench{}) begin_bias();
+        } else log_(Level::info, is_new_connection ? "connected again to " + detail::named(*found)
                                                  : "the sensor's settings were changed, and are accepted");
         max_age_ns_ = std::llround(bota_ethercat_hardware::max_age(parameters_, *found) * 1e9);
         client_.set_max_age(std::chrono::nanoseconds(max_age_ns_));
@@ -385,6 +398,16 @@ private:
         const double gyroscope_s = seconds(rate_ns.value_or(0) - acceleration_ns.value_or(0));
         const double rate_hz = found->rate_hz > 0.0 ? found->rate_hz : 1600.0;
         tool_.emplace(parameters_.payload, found->name.view(), Alignment(lag_s, gyroscope_s, found->fir.value_or(false), rate_hz));
+    }
+
+    /// The bias of the parameters goes with an offset of the sensor.
+    void begin_bias() {
+        own_offset_.begin(parameters_.sensor_offset ? parameters_.sensor_offset : sensor_->offset);
+        if (!parameters_.sensor_offset)
+            log_(Level::warning, "it is not known with which offset of the sensor the bias was measured, and taken for that of now: "
+                                 "give sensor_offset, or use the file of an identification");
+        else if (!sensor_->offset)
+            log_(Level::warning, "the server does not tell the sensor's own offset: the bias is right only while it is sensor_offset");
     }
 
     /// Log why there is no connection, and what the controllers see, when it changes and has been quiet for a while.
@@ -410,7 +433,8 @@ private:
     bota_ethercat::Client client_;
     std::optional<SensorInfo> sensor_;  // of `open`, unchanged since
     std::optional<Tool> tool_;
-    Wrench load_{};                     // of the tool, in the newest sample
+    OwnOffset own_offset_;
+    Wrench load_{}, bias_change_{};     // of the tool, and of the bias, in the newest sample
     std::string objection_, trouble_;   // why the sensor is not used; why there is no connection
     std::pair<std::uint32_t, std::uint32_t> checked_{};  // connections and reconfigurations
     std::int64_t checked_ns_ = 0, max_age_ns_ = 0, quiet_until_ns_ = 0;
@@ -418,7 +442,8 @@ private:
     // Of both:
     Latest latest_;
     std::atomic<int> condition_{0};
-    std::atomic<bool> stopping_{false};
+    std::atomic<bool> stopping_{false}, is_tared_{false};
+    Wrench tared_offset_{};  // while `is_tared_`: the receiving thread is to go by it
     Gate gate_;  // the control thread's
     std::thread thread_;
 };
