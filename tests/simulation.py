@@ -326,6 +326,7 @@ class Simulation(SimulatedBus):
 
     def close(self) -> None:
         """The server ends, as by SIGTERM: the sensors go to INIT, the clients are disconnected."""
+        self.cycle.stopping = False  # else nothing is served, and simulated time stands still
         self.hub.close()
         self.bus.close()
 
