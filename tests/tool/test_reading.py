@@ -18,7 +18,7 @@ from tests.tool.running import refused, told, tool_here
 @pytest.fixture
 def bench() -> Iterator[SimulatedBus]:
     """One sensor with 61 bytes of process data that gives the same numbers for ever."""
-    with simulated_bus("--signal", "constant", "--serial", "4711", "--sinc", "512") as bus:
+    with simulated_bus("--signal", "constant", "--noise", "none", "--serial", "4711", "--sinc", "512") as bus:
         yield bus
 
 
@@ -153,7 +153,7 @@ FORCE_Z = "0x6000:6"
 
 @pytest.fixture
 def bus() -> Iterator[SimulatedBus]:
-    with simulated_bus("--signal", "rest") as found:
+    with simulated_bus("--signal", "rest", "--noise", "none") as found:
         yield found
 
 

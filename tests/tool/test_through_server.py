@@ -23,7 +23,19 @@ SERVER = ("--server", SimulatedServer.address)
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    options = ["--sensors", "2", "--serial", "10,20", "--pdo", "77", "--signal", "rest", "--sinc"]
+    options = [
+        "--sensors",
+        "2",
+        "--serial",
+        "10,20",
+        "--pdo",
+        "77",
+        "--signal",
+        "rest",
+        "--noise",
+        "none",
+        "--sinc",
+    ]
     with simulated_bus(*options, SINC_LENGTH) as bus, simulated_server(bus) as server:
         yield bus, server
 

@@ -31,7 +31,7 @@ def chain() -> Iterator[SimulatedBus]:
 
 @pytest.fixture
 def single() -> Iterator[SimulatedBus]:
-    with simulated_bus("--signal", "rest") as bus:
+    with simulated_bus("--signal", "rest", "--noise", "none") as bus:
         yield bus
 
 
