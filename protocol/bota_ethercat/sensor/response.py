@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the sensor's filters do to a signal: delay and magnitude of each channel, and how that is known.
+"""What the sensor's filters do to a signal: the delay of each channel, and how it is known.
 
 Force and torque: Bota publishes rate and -3 dB point (`filters`), no delay. With the FIR filter off the
 point is 0.262 of the rate, that of a third-order sinc filter, which delays by 1.5 sample periods. With FIR
@@ -9,8 +9,7 @@ filter has 22 taps and linear phase: their settling time is 22 periods where tha
 dB from 0.140 on. A Kaiser window of 22 taps with beta 8.8 behind a third-order sinc filter has -3 dB at
 0.0390 and 65 dB from 0.140 on.
 
-Accelerometer and gyroscope: bandwidth and delay are Bota's tables, which are those of an MPU-9250. Their
-magnitude is that of a first-order low-pass filter of this bandwidth, which is an approximation.
+Accelerometer and gyroscope: bandwidth and delay are Bota's tables, which are those of an MPU-9250.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from __future__ import annotations
 import cmath
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from enum import Enum
 from typing import Final, NamedTuple
 
@@ -46,7 +45,6 @@ class Response(NamedTuple):
 
     delay_s: float | None  # group delay, the same at all frequencies that pass; None: unknown
     source: Source
-    gain: Callable[[float], float]  # magnitude at a frequency in Hz; 1 at 0
 
     @property
     def delay_ms(self) -> float | None:
@@ -67,18 +65,14 @@ def force_torque_response(settings: Mapping[str, SettingValue], rate_hz: float |
     length = settings.get("sinc_length") or 0
     rate = rate_hz or (BASE_SAMPLING_RATE_HZ / length if length else 0.0)
     if not rate:
-        return Response(None, Source.UNKNOWN, lambda _: 1.0)
+        return Response(None, Source.UNKNOWN)
     chop, fir, fast = settings.get("chop"), settings.get("fir"), settings.get("fast")
-
-    def gain(hz: float) -> float:
-        return sinc_gain(hz / rate) * (fir_gain(hz / rate) if fir else 1.0)
-
     if chop or fir is None:
-        return Response(None, Source.CHOP if chop else Source.UNKNOWN, gain)
+        return Response(None, Source.CHOP if chop else Source.UNKNOWN)
     if fir and fast:
-        return Response(None, Source.FAST, gain)
+        return Response(None, Source.FAST)
     periods = SINC_ORDER / 2 + ((FIR_TAPS - 1) / 2 if fir else 0.0)
-    return Response(periods / rate, Source.FIR if fir else Source.DERIVED, gain)
+    return Response(periods / rate, Source.FIR if fir else Source.DERIVED)
 
 
 def acceleration_response(settings: Mapping[str, SettingValue]) -> Response:
@@ -110,9 +104,8 @@ def delays_ms(settings: Mapping[str, SettingValue], rate_hz: float | None = None
 
 def _imu(row: ImuFilter | None) -> Response:
     if row is None:
-        return Response(None, Source.UNKNOWN, lambda _: 1.0)
-    cutoff_hz = row.bandwidth_hz
-    return Response(row.delay_ms * 1e-3, Source.PUBLISHED, lambda hz: 1 / math.hypot(1.0, hz / cutoff_hz))
+        return Response(None, Source.UNKNOWN)
+    return Response(row.delay_ms * 1e-3, Source.PUBLISHED)
 
 
 def sinc_gain(share: float) -> float:
