@@ -50,7 +50,7 @@ class SoemBackend:
     def __init__(self, ifname: str) -> None:
         self.ifname = ifname
         self.clock = SYSTEM_CLOCK
-        self.master: Master = self
+        self.master: Master | None = self
         self._ifindex = 0
         self._master: Any = pysoem.Master()
         self._opened = False
