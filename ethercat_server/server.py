@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bota_ethercat.control import Event, event
+from ethercat_server.acquisition.acyclic import Acyclic
 from ethercat_server.acquisition.cycle import Cycle, Watchdog
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery
@@ -66,21 +67,24 @@ class Server:
         self.sensors, slaves, terminals = bring_up(bus, wanted, check_interrupt)
         round_trip = RoundTrip(max(bus.process_data.wire_ns))
         self.streams = make_streams(bus, self.sensors, round_trip)
-        self.others = OtherSlaves(bus, slaves)
-        self.recovery = Recovery(bus, self.sensors, self.streams, hub.broadcast, self.others)
-        self.jobs = Jobs(bus, self.sensors)
+        self.others, acyclic = OtherSlaves(bus, slaves), Acyclic(bus)
+        self.recovery = Recovery(bus, acyclic, self.sensors, self.streams, hub.broadcast, self.others)
+        self.jobs = Jobs(acyclic, self.sensors)
         self.cycle = (CycleWithTerminals if terminals else Cycle)(
             bus,
             self.sensors,
             self.streams,
             round_trip,
             hub,
+            acyclic,
             self.recovery,
             self.jobs,
             watchdog or NoWatchdog(),
         )
         if isinstance(self.cycle, CycleWithTerminals):
             self.cycle.terminals = terminals
+            for terminal in terminals:
+                acyclic.start(terminal.steps)
         self.actions = SensorActions(bus, hub, self.recovery, self.jobs, self.sensors, self.streams)
         rows = [terminal.row for terminal in terminals]
         described = {

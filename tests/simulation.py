@@ -45,7 +45,6 @@ from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import ByPosition
 from ethercat_server.ethercat.slave import registers as reg
-from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import read_sii
 from ethercat_server.process import realtime
 from ethercat_server.sensor import scan
@@ -504,7 +503,7 @@ _READ_IMAGE = scan.read_image
 
 def _read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda: None) -> bytes:
     """The SII, on which most of a start would be spent; nothing else reads it like this."""
-    finish(read_sii(ByPosition(bus), position, 0, 4), clock=bus.clock)
+    bus.finish(read_sii(ByPosition(bus), position, 0, 4))
     assert isinstance(bus.backend, MemoryBackend)
     life = bus.backend.sensors.slaves[position].life
     return _READ_IMAGE(bus, position, check_interrupt) if life is None else life.esc.sii.image

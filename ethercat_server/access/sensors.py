@@ -26,7 +26,7 @@ from ethercat_server.access.adapters import find_holder
 from ethercat_server.access.private_server import PrivateServer
 from ethercat_server.errors import BusError, InterfaceError, SdoAbortError, ServerError, UsageError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
-from ethercat_server.ethercat.slave.coe import Steps, finish
+from ethercat_server.ethercat.datagrams import Steps, finish
 from ethercat_server.process.signals import signals_call, signals_held_back
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.sensor import Found, Identity, Sensor

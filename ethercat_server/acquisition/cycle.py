@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import cycle
+from math import inf
 from typing import Any, Final, Protocol
 
+from ethercat_server.acquisition.acyclic import Acyclic
 from ethercat_server.acquisition.distribution import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.health import RoundTripHealth
 from ethercat_server.acquisition.jobs import Jobs
@@ -73,13 +75,14 @@ class Cycle:
         streams: Sequence[SensorStream],
         round_trip: RoundTrip,
         hub: Outlet,
+        acyclic: Acyclic,
         recovery: Recovery,
         jobs: Jobs,
         watchdog: Watchdog,
     ) -> None:
         self.stopping = False
         self.every_second: Callable[[], None] = lambda: None  # called once a second
-        self._jobs = jobs
+        self._acyclic, self._jobs = acyclic, jobs
         self._watchdog = watchdog
         self._bus = bus
         self._sensors = sensors
@@ -127,33 +130,29 @@ class Cycle:
 
     def run(self) -> None:
         """The loop."""
-        self._bus.next_frame = self._next_frame
-        try:
-            self._run()
-        finally:
-            self._bus.next_frame = self._bus.next_on_wire
-
-    def _run(self) -> None:
-        bus, hub, recovery, jobs = self._bus, self._hub, self._recovery, self._jobs
-        monotonic_ns, serve_by, slept = bus.clock.monotonic_ns, 0, self._slept
+        hub, acyclic, recovery = self._hub, self._acyclic, self._recovery
+        monotonic_ns, serve_by, slept = self._bus.clock.monotonic_ns, 0, self._slept
         self._feed_at_ns = 0
         while True:
-            due = self._due_ns()
-            if jobs.waiting:
-                jobs.step(due)
-                due = self._due_ns()
-            now = monotonic_ns()
-            slept = slept or (due > now and not self._in_flight)
+            due, now = self._due_ns(), monotonic_ns()
+            if now >= acyclic.due_ns:
+                self._jobs.check()
+                # While exchanges are short, or all sensors are lost, no sample is to be in time for.
+                acyclic.go_on(due if recovery.polled and not recovery.short else inf, now)
+                due, now = self._due_ns(), monotonic_ns()
+            in_flight = self._in_flight or acyclic.asking is not None
+            slept = slept or (due > now and not in_flight)
             if slept or now > serve_by:
-                hub.serve(now if self._in_flight else due)
-                serve_by = now + (_SERVE_IN_FLIGHT_NS if self._in_flight else _SERVE_EVERY_NS)
+                hub.serve(now if in_flight else due)
+                serve_by = now + (_SERVE_IN_FLIGHT_NS if in_flight else _SERVE_EVERY_NS)
             if self.stopping:
                 break
-            self._step(due, (now if self._in_flight else due) + _SERVE_EVERY_NS, slept=slept)
+            self._step(due, (now if in_flight else due) + _SERVE_EVERY_NS, slept=slept)
             now, slept = monotonic_ns(), False
             if self._answer is not None:
-                if now >= recovery.attend_at_ns or not self._complete:
-                    recovery.attend(self._complete, now)
+                acyclic.turn += 1
+                if recovery.short or not self._complete:
+                    recovery.attend(complete=self._complete)
             elif self._unanswered > 1:
                 recovery.miss(now - self._unanswered_since_ns, now)
             if now >= self._chores_at_ns:
@@ -166,9 +165,9 @@ class Cycle:
         Polls that lie close together are merged: the earlier one waits for the later, by no more than the
         time that four exchanges cost this machine, as measured. So three quarters of its time are left.
         """
-        streams, sent_ns = self._streams, self._sent_ns
+        streams, sent_ns = self._recovery.polled, self._sent_ns
         unanswered, in_flight = self._unanswered, self._in_flight
-        if self._recovery.all_lost:
+        if not streams:
             return sent_ns + _RECOVERY_STEP_NS
         if len(streams) == 1:
             poll_ns = streams[0].clock.next_poll_ns(sent_ns, unanswered, in_flight=in_flight)
@@ -190,29 +189,19 @@ class Cycle:
         # Whether the answer to an exchange is usually back before the next one is due.
         self._one_by_one = all(stream.clock.one_by_one for stream in self._streams)
 
-    def _next_frame(self, until_ns: int) -> bytes | None:
-        """The next frame before `until_ns` that answers no exchange; the exchanges go on meanwhile."""
-        while True:
-            in_time = self._bus.clock.monotonic_ns() < until_ns
-            if (frame := self._step(self._due_ns(), until_ns)) is not None:
-                return frame
-            if not (in_time or self._answer):  # what had arrived by then is taken though this is late
-                return None
-
-    def _step(self, due: int, until_ns: int, *, slept: bool = False) -> bytes | None:
+    def _step(self, due: int, until_ns: int, *, slept: bool) -> None:
         """Hand out what arrives until the next exchange is `due`, then send it; return by `until_ns`.
 
-        After it is sent its answer is awaited, until yet another one is due. Returns a frame that answers no
-        exchange. `slept`: the loop has slept until it was due.
+        After it is sent its answer is awaited, until yet another one is due. `slept`: the loop has slept
+        until it was due.
         """
-        self._answer = frame = None
-        bus, monotonic_ns = self._bus, self._bus.clock.monotonic_ns
+        self._answer, bus, monotonic_ns = None, self._bus, self._bus.clock.monotonic_ns
         now = monotonic_ns()
         wait = (due if due < until_ns else until_ns) - now
         if wait > 0 or bus.process_data.in_flight or until_ns <= now:
-            frame = self._receive(wait, now)
+            self._receive(wait, now)
             if self._answer or (now := monotonic_ns()) < due:
-                return frame
+                return
             slept = slept or wait > 0
         if now - due > self._shortest_ns:
             self._count_missed(due, now)
@@ -228,33 +217,28 @@ class Cycle:
             self._wake.record(sent - due)
             if self._woke_late_ns is None:
                 self._woke_late_ns = sent - due
-        if frame is None:
-            most = int(self._round_trip.patience_ns) if self._one_by_one else self._due_ns() - monotonic_ns()
-            if (wait := min(most, until_ns - now)) > 0:
-                return self._receive(wait, sent)
-        return frame
+        most = int(self._round_trip.patience_ns) if self._one_by_one else self._due_ns() - monotonic_ns()
+        if (wait := min(most, until_ns - now)) > 0:
+            self._receive(wait, sent)
 
-    def _receive(self, wait: int, since_ns: int) -> bytes | None:
-        """Wait for a frame, `wait` ns from `since_ns` at most, and hand it out.
-
-        Returns one that answers no exchange.
-        """
+    def _receive(self, wait: int, since_ns: int) -> None:
+        """Wait for a frame, `wait` ns from `since_ns` at most, and hand it out."""
         bus = self._bus
         frame, back = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0), bus.clock.monotonic_ns()
         if frame is None:
-            return None
+            return
         while (exchange := bus.process_data.take(frame, back)) is DUPLICATE:
             # The answer may be behind duplicates of others: they must not pile up.
             if back > self._sent_ns + _SERVE_EVERY_NS:
-                return None
+                return
             frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
             if frame is None:
-                return None
+                return
         if exchange is None:
             self._recovery.causes.stray(frame, back)
-            return frame
-        self._take(exchange, since_ns)
-        return None
+            self._acyclic.take(frame)
+        else:
+            self._take(exchange, since_ns)
 
     def _take(self, exchange: Exchange, since_ns: int) -> None:
         """Hand out what an exchange brought, which was awaited since then; then learn from it."""

@@ -1,8 +1,4 @@
-"""Work on the sensors that clients asked for, in steps between two exchanges, so that no sample waits for it.
-
-A step is one or two datagrams. It is taken when there is time for it before the next exchange is due. Each
-sensor does one job at a time, in the order asked.
-"""
+"""Work on the sensors that clients asked for. Each sensor does one job at a time, in the order asked."""
 
 from __future__ import annotations
 
@@ -12,14 +8,11 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import ErrorCode
 from bota_ethercat.errors import RequestError
+from ethercat_server.acquisition.acyclic import Acyclic, Task
 from ethercat_server.errors import BusError, CutOffError, SdoAbortError
-from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.slave.coe import Steps
+from ethercat_server.ethercat.datagrams import Steps
 from ethercat_server.sensor.sensor import Sensor
 
-_STEP_NS: Final = 300_000  # a step is begun only with this much time left: an exchange and a margin
-# A step is taken at least this often, even on a bus that leaves no time.
-_AT_LEAST_EVERY_NS: Final = 20_000_000
 _MOST_WAITING: Final = 32
 _AWAY: Final = "is lost, or was taken out of OP to be set up"
 
@@ -40,12 +33,12 @@ class _Job(NamedTuple):
 class Jobs:
     """The jobs of all sensors of the bus; `waiting` are those that are not done."""
 
-    def __init__(self, bus: Bus, sensors: Sequence[Sensor]) -> None:
-        self._bus = bus
+    def __init__(self, acyclic: Acyclic, sensors: Sequence[Sensor]) -> None:
+        self._acyclic = acyclic
         self._sensors = sensors
         self.waiting: list[_Job] = []
-        self._turn = 0
-        self._stepped_ns = 0
+        self._under_way: dict[int, Task] = {}  # by sensor
+        self._cut_off: set[int] = set()  # sensors whose job knows that nothing more can be done
         self._interrupted = ""
 
     def start(
@@ -68,6 +61,7 @@ class Jobs:
                 ErrorCode.BUSY, f"sensor {number} has {most} requests to do already: ask again later"
             )
         self.waiting.append(_Job(number, steps, done, changes))
+        self._begin(number)
 
     def interrupt(self, reason: str) -> None:
         """Raise BusError with this text in the job that is under way, if there is one; from any thread."""
@@ -82,46 +76,43 @@ class Jobs:
         if not self._sensors[number].streams:
             raise RequestError(ErrorCode.NOT_READY, f"sensor {number} {_AWAY}: ask again when it is back")
 
-    def step(self, until_ns: int) -> None:
-        """Take a step if there is time for one before `until_ns`. To be called only while jobs wait."""
-        now = self._bus.clock.monotonic_ns()
-        if until_ns - now < _STEP_NS and now - self._stepped_ns < _AT_LEAST_EVERY_NS:
-            return
-        self._stepped_ns = now
-        numbers = sorted({job.number for job in self.waiting})
-        self._turn = next((number for number in numbers if number > self._turn), numbers[0])
-        self._step(next(job for job in self.waiting if job.number == self._turn))
+    def check(self) -> None:
+        """To be called while jobs wait: raise in them what has happened meanwhile."""
+        for number, task in tuple(self._under_way.items()):
+            if not self._sensors[number].streams and number not in self._cut_off:
+                self._cut_off.add(number)
+                self._acyclic.throw(task, CutOffError(f"sensor {number} {_AWAY}"))
+            elif reason := self._interrupted:
+                self._interrupted = ""
+                self._acyclic.throw(task, BusError(reason))
 
-    def _step(self, job: _Job) -> None:
+    def _begin(self, number: int) -> None:
+        """Begin the next job on the sensor `number`, if there is one and none is under way."""
+        job = next((job for job in self.waiting if job.number == number), None)
+        if job is not None and number not in self._under_way:
+            self._under_way[number] = self._acyclic.start(self._do(job))
+
+    def _do(self, job: _Job) -> Steps[None]:
         # No variable of this frame may hold what is raised in it: with its traceback, that would keep itself
         # alive, and the loop runs without a garbage collector.
-        number, steps, done, _ = job
         result: Any = None
         error: RequestError | None = None
         try:
-            if not self._sensors[number].streams:
-                steps.throw(CutOffError(f"sensor {number} {_AWAY}"))
-                raise CutOffError(f"sensor {number} {_AWAY}")
-            if not (reason := self._interrupted):
-                next(steps)
-            else:
-                self._interrupted = ""
-                steps.throw(BusError(reason))
-            return
-        except StopIteration as stop:
-            result = stop.value
+            result = yield from job.steps
         except RequestError as refused:
             error = RequestError(refused.code, str(refused), **refused.extra)
         except BusError as failed:
             error = refusal(failed)
         except Exception:  # a defect in one request must not stop the acquisition
-            log.exception("a request to sensor %d failed", number)
+            log.exception("a request to sensor %d failed", job.number)
             error = RequestError(
                 ErrorCode.INTERNAL, "the request failed by a fault of this program: see its log"
             )
-        steps.close()
         self.waiting.remove(job)
-        done(result, error)
+        del self._under_way[job.number]
+        self._cut_off.discard(job.number)
+        job.done(result, error)
+        self._begin(job.number)
 
 
 def refusal(error: BusError) -> RequestError:

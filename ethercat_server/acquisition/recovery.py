@@ -1,11 +1,11 @@
 """Notices that a sensor no longer takes part, tells the clients, and brings it back step by step.
 
-`SensorRecovery` does that for one sensor; `Recovery` watches all of a bus and has one step taken after each
-exchange, so that neither the other sensors nor the clients wait.
+`SensorRecovery` does that for one sensor; `Recovery` watches all of a bus.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import struct
 from collections.abc import Callable, Sequence
@@ -15,18 +15,20 @@ from typing import Final, NamedTuple
 from bota_ethercat.control import Event, event
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
+from ethercat_server.acquisition.acyclic import Acyclic, Task
 from ethercat_server.acquisition.health import Causes
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, extended
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.clock import Clock, Deadline
-from ethercat_server.ethercat.datagrams import ByPosition
+from ethercat_server.ethercat.clock import Deadline
+from ethercat_server.ethercat.datagrams import ByPosition, Steps, repeat
 from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import STATE_S, AlState, AlStatus
-from ethercat_server.ethercat.slave.coe import Emergency, Steps
+from ethercat_server.ethercat.slave.coe import Emergency
 from ethercat_server.ethercat.slave.controller import GoneError
 from ethercat_server.ethercat.slave.sii import read_sii
+from ethercat_server.sampling.observation import DistributedClock
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import is_sensor
 from ethercat_server.sensor.scan import OtherSlaves
@@ -59,6 +61,10 @@ class DifferentSensorError(Exception):
         self.found = found
 
 
+class _GivenUpError(Exception):
+    """A sensor does not come back from its change of settings; the text says why."""
+
+
 class _Change(NamedTuple):
     """A change of settings under way: the former settings, whom to answer, why it failed if it did."""
 
@@ -69,38 +75,30 @@ class _Change(NamedTuple):
     until: Deadline | None = None  # once it has failed: when it is answered even if the sensor is not back
 
 
-def pause(clock: Clock, seconds: float) -> Steps[None]:
-    """Steps that take at least `seconds`."""
-    deadline = Deadline(clock, seconds)
-    while not deadline.passed:
-        yield
-
-
 def restore_station(bus: Bus, number: int, position: int, is_kind: Callable[[int, int], bool]) -> Steps[bool]:
     """Give a slave that lost its station address with its power the address again; whether it has it.
 
     One that has another slave's address, is not in INIT, or whose vendor and product are of another kind, is
     left alone; which one of its kind it is remains to be asked.
     """
-    data = bus.read_at(position, reg.STATION_ADDRESS, 2)
-    if data is None:
+    data = yield from bus.read_at(position, reg.STATION_ADDRESS, 2)
+    if not data:
         return False
     if (station := int.from_bytes(data, "little")) in bus.stations:
         return station == bus.stations[number]
-    yield
-    status = bus.read_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
-    owner = bus.read_at(position, reg.SII_OWNER, 1)
-    if status is None or owner is None or AlStatus.parse(status).state is not AlState.INIT:
+    status = yield from bus.read_at(position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
+    owner = yield from bus.read_at(position, reg.SII_OWNER, 1)
+    if not status or not owner or AlStatus.parse(status).state is not AlState.INIT:
         return False
-    yield
     try:
         words = yield from read_sii(ByPosition(bus), position, _SII_IDENTITY, 4, owner)
     except BusError:
         return False
     if not is_kind(*struct.unpack("<II", words)):
-        yield from pause(bus.clock, _STRANGER_PAUSE_S)
+        yield _STRANGER_PAUSE_S
         return False
-    return bus.write_at(position, reg.STATION_ADDRESS, bus.stations[number].to_bytes(2, "little"))
+    address = bus.stations[number].to_bytes(2, "little")
+    return (yield from bus.write_at(position, reg.STATION_ADDRESS, address))
 
 
 class SensorRecovery:
@@ -112,7 +110,7 @@ class SensorRecovery:
 
     Attributes:
         sdo: transfers to it, while it is not lost.
-        steps: what is under way to bring it back, one or two datagrams a step; None while it streams.
+        task: what is under way to bring it back; None while it streams.
     """
 
     def __init__(self, recovery: Recovery, sensor: Sensor, stream: SensorStream) -> None:
@@ -120,7 +118,7 @@ class SensorRecovery:
         self._bus, self._announce, self._number = recovery.bus, recovery.announce, sensor.number
         self._slave = self._bus.slaves[sensor.number]
         self.sdo = GuardedSdo(self._slave.sdo)
-        self.steps: Steps[bool] | None = None
+        self.task: Task | None = None
         self._left_op = False  # since it was back last: also if the steps began anew
         self._lost_at_ns: int | None = None
         self._change: _Change | None = None
@@ -141,30 +139,30 @@ class SensorRecovery:
         sensor.wanted, sensor.asked = change.wanted, sensor.asked | set(change.names)
         self._take_out(SensorState.CHANGING, self._reconfigure())
 
-    def look(self, *, counted: bool) -> None:
+    def look(self, *, counted: bool) -> Steps[None]:
         """Find out whether the sensor is in OP; `counted`: the working counter says that it takes part."""
         if not self._sensor.streams:
             return
-        status = self._slave.status()
-        if status is None and counted:
-            return  # as long as the working counter is right, one datagram got lost
-        if status is None and (status := self._slave.status()) is None:
+        # As long as the working counter is right, one datagram got lost.
+        status = yield from repeat(1 if counted else 2, self._slave.status)
+        if status is None and not counted:
             self.lose(self._recovery.explain("it does not answer"))
-        elif not status.is_op:
+        elif status is not None and not status.is_op:
             self.lose(self._recovery.explain(f"it is in {status}"))
 
-    def look_at_mailbox(self) -> None:
+    def look_at_mailbox(self) -> Steps[None]:
         """Read a message that is there: nobody else does while the sensor is asked for nothing."""
         if self._sensor.streams:
-            self._slave.sdo.look()
+            yield from self._slave.sdo.look()
 
-    def check_events(self) -> None:
+    def check_events(self) -> Steps[None]:
         """Try refused event times again when it is time: another master may have changed what they need."""
         events = self._stream.clock.events
         if events and self._sensor.streams and events.trust.is_due(self._bus.clock.monotonic_ns()):
-            self._slave.latch_events()
-            if (clock := self._bus.read_clock(self._number)) is not None:
-                self._stream.retry_events(clock)
+            with contextlib.suppress(GoneError):
+                yield from self._slave.latch_events()
+                if (clock := (yield from self._bus.read_clock(self._number))) is not None:
+                    self._stream.retry_events(clock)
 
     def lose(self, reason: str) -> None:
         """The sensor does not take part any more, if it did."""
@@ -172,8 +170,26 @@ class SensorRecovery:
             self._take_out(SensorState.LOST, self._bring_back())
             self._report_lost(reason)
 
-    def lose_in_change(self, reason: str) -> None:
-        """The sensor has gone, or refuses its former settings too: the request is answered now."""
+    def give_up(self, reason: str) -> None:
+        """A change does not come to an end: the request is answered now."""
+        if self.task is not None:
+            self._recovery.acyclic.throw(self.task, _GivenUpError(reason))
+
+    def check_change(self) -> None:
+        """To be called regularly: a sensor whose change failed has a limited time to be back."""
+        change = self._change
+        if change is not None and change.until is not None and change.until.passed:
+            self.give_up(self._recovery.explain("it does not come back to OP"))
+
+    # -- changes of its state
+
+    def _take_out(self, state: SensorState, steps: Steps[bool]) -> None:
+        self._sensor.enter(state)
+        self.task = self._recovery.acyclic.start(self._come_back(steps))
+        self._recovery.count_alive()
+
+    def _lose_in_change(self, reason: str) -> None:
+        """The sensor has gone, or refuses its former settings too."""
         if (change := self._change) is None:
             return
         if change.failed is None:
@@ -183,42 +199,8 @@ class SensorRecovery:
             error = extended(change.failed, f"; {reason}")
         self._change = None
         self._sensor.enter(SensorState.LOST)
-        self.steps = self._bring_back(_FAILED_PAUSE_S)
         self._report_lost(reason)
         change.done(extended(error, LATER))
-
-    def step(self) -> None:
-        """Take the next of the `steps`."""
-        assert self.steps is not None
-        change = self._change
-        try:
-            next(self.steps)
-            if change is not None and change.until is not None and change.until.passed:
-                self.lose_in_change(self._recovery.explain("it does not come back to OP"))
-        except StopIteration as stop:
-            self._stream_again(left_op=stop.value)
-        except GoneError:
-            self.steps = self._bring_back()
-            self.lose_in_change(f"sensor {self._number} went away while its settings were changed")
-        except BusError as error:
-            self.steps = self._bring_back(0.0 if change else _FAILED_PAUSE_S)
-            if change is None:
-                log.warning("sensor %d is not back yet: %s", self._number, error)
-            elif change.failed is not None:
-                self.lose_in_change(f"restoring the former settings failed too: {error}")
-            else:
-                self._revert(error)
-                if self._slave.status() is None:
-                    self.lose_in_change(self._recovery.explain("it does not answer any more"))
-        except DifferentSensorError as error:
-            self._refuse(error.found)
-
-    # -- changes of its state
-
-    def _take_out(self, state: SensorState, steps: Steps[bool]) -> None:
-        self._sensor.enter(state)
-        self.steps = steps
-        self._recovery.count_alive()
 
     def _report_lost(self, reason: str) -> None:
         self._lost_at_ns = self._bus.clock.monotonic_ns()
@@ -235,11 +217,9 @@ class SensorRecovery:
         sensor.enter(SensorState.REVERTING)
         sensor.wanted, sensor.asked = change.wanted, change.asked
 
-    def _stream_again(self, *, left_op: bool) -> None:
+    def _stream_again(self, latching: DistributedClock | None, *, left_op: bool) -> None:
         sensor, lost_at_ns = self._sensor, self._lost_at_ns
-        self.steps = self._lost_at_ns = None
-        # Exchanges go on while the clock is read: none may bring a sample before the stream begins anew.
-        latching = self._bus.read_clock(self._number) if left_op else None
+        self.task = self._lost_at_ns = None
         period_ns = sensor.period_ns if left_op else None
         self._stream.recover(period_ns, lost=lost_at_ns is not None, latching=latching)
         sensor.enter(SensorState.STREAMING)
@@ -259,7 +239,6 @@ class SensorRecovery:
     def _refuse(self, found: Identity) -> None:
         number, sensor = self._number, self._sensor
         sensor.enter(SensorState.REFUSED)
-        self.steps = self._wait_for_removal()
         self._lost_at_ns = self._lost_at_ns or self._bus.clock.monotonic_ns()
         if (change := self._change) is not None:
             self._change = None
@@ -276,40 +255,76 @@ class SensorRecovery:
 
     # -- the steps
 
+    def _come_back(self, steps: Steps[bool]) -> Steps[None]:
+        """Do `steps`, and what follows if they fail, until it streams."""
+        while True:
+            change = self._change
+            try:
+                left_op = yield from steps
+                # None of the exchanges meanwhile may bring a sample before the stream begins anew.
+                latching = (yield from self._bus.read_clock(self._number)) if left_op else None
+            except GoneError:
+                steps = self._bring_back(_FAILED_PAUSE_S if change else 0.0)
+                self._lose_in_change(f"sensor {self._number} went away while its settings were changed")
+            except _GivenUpError as error:
+                steps = self._bring_back(_FAILED_PAUSE_S)
+                self._lose_in_change(str(error))
+            except BusError as error:
+                steps = self._bring_back(_FAILED_PAUSE_S)
+                if change is None:
+                    log.warning("sensor %d is not back yet: %s", self._number, error)
+                elif change.failed is not None:
+                    self._lose_in_change(f"restoring the former settings failed too: {error}")
+                else:
+                    self._revert(error)
+                    steps = self._go_back()
+            except DifferentSensorError as error:
+                self._refuse(error.found)
+                steps = self._wait_for_removal()
+            else:
+                self._stream_again(latching, left_op=left_op)
+                return
+
+    def _go_back(self) -> Steps[bool]:
+        """After a change that failed; returns as `_bring_back`."""
+        if (yield from self._slave.status()) is None:
+            raise _GivenUpError(self._recovery.explain("it does not answer any more"))
+        return (yield from self._bring_back())
+
     def _bring_back(self, pause_s: float = 0.0) -> Steps[bool]:
         """Returns once the sensor is in OP: True if it had left it, False if it had only been out of reach.
 
         Raises GoneError, DifferentSensorError, or BusError if the sensor refuses something.
         """
-        yield from pause(self._bus.clock, pause_s)
+        yield pause_s
         while True:
-            status = self._slave.status()
+            status = yield from self._slave.status()
             if status is None:
                 where = self._bus, self._number, self._sensor.position
                 if not (yield from restore_station(*where, is_sensor)):
-                    yield from pause(self._bus.clock, _ABSENT_PAUSE_S)
+                    yield _ABSENT_PAUSE_S
             elif status.is_op:
                 if not self._left_op:
-                    self._slave.latch_events()
+                    yield from self._slave.latch_events()
                 if self._sensor.change_interrupted:
                     yield from set_up_in_op(self.sdo, self._sensor)
                 left_op, self._left_op = self._left_op, False
                 return left_op
             elif status.state is AlState.SAFEOP:
                 self._left_op = True
-                self._slave.latch_events()
+                yield from self._slave.latch_events()
                 yield from self._slave.go(AlState.OP)
             else:
                 self._left_op = True
                 yield from self._set_up_anew()
-            yield
+            yield None
 
     def _wait_for_removal(self) -> Steps[bool]:
         """Leave a refused sensor in INIT until it is taken away, then bring back the one that comes."""
         unanswered = 0
         while unanswered < _REMOVED_READS:
-            unanswered = 0 if self._slave.status() is not None else unanswered + 1
-            yield from pause(self._bus.clock, _REFUSED_PAUSE_S)
+            unanswered = 0 if (yield from self._slave.status()) is not None else unanswered + 1
+            yield _REFUSED_PAUSE_S
         return (yield from self._bring_back())
 
     def _reconfigure(self) -> Steps[bool]:
@@ -333,7 +348,7 @@ class SensorRecovery:
         """From PREOP to OP."""
         asked = self._change is not None and self._change.failed is None
         yield from set_up(self.sdo, self._sensor, asked=asked)
-        self._slave.map()
+        yield from self._slave.map()
         yield from self._slave.enter_op()
 
 
@@ -342,57 +357,49 @@ class Recovery:
 
     Attributes:
         sensors: the recovery of each, by number.
-        attend_at_ns: `attend` need not be called before if all sensors took part.
+        acyclic: the access to their registers.
+        short: while it is 0 `attend` need not be called for an exchange in which all sensors took part.
         alive_wkc: the working counter of each frame if all sensors take part that are not lost.
-        all_lost: whether no sensor is left to be read.
+        polled: the streams of those sensors; empty if no sensor is left to be read.
     """
 
     def __init__(
         self,
         bus: Bus,
+        acyclic: Acyclic,
         sensors: Sequence[Sensor],
         streams: Sequence[SensorStream],
         announce: Callable[[JsonObject], None],
         others: OtherSlaves,
     ) -> None:
-        self.bus, self.announce = bus, announce
-        self._all, self._others = sensors, others
+        self.bus, self.acyclic, self.announce = bus, acyclic, announce
+        self._all, self._streams, self._others = sensors, streams, others
         self.causes = Causes(bus)
         self.sensors = [
             SensorRecovery(self, sensor, stream) for sensor, stream in zip(sensors, streams, strict=True)
         ]
-        # One after the other, so that no exchange has to wait for two.
-        self._looks = cycle(
-            [look for each in self.sensors for look in (each.look_at_mailbox, lambda e=each: self._watch(e))]
-        )
-        self._short = 0
-        self._watch_ns = 0
+        self.short = 0
+        self._looking: list[Task] = []
+        self._checked_ns = 0
         self.count_alive()
         bus.emergencies.tell = self._tell
+        acyclic.start(self._watch())
 
     def check(self) -> None:
         """To be called once a second: name another master, and try refused event times again."""
         self.causes.check()
         for each in self.sensors:
-            each.check_events()
+            self.acyclic.start(each.check_events())
 
-    def attend(self, complete: bool, now_ns: int) -> None:
+    def attend(self, *, complete: bool) -> None:
         """To be called after an exchange that is back.
 
         `complete`: all sensors took part that are not lost.
         """
-        self._short = max(0, self._short - 1) if complete else self._short + 2
-        if self._short >= 2 * _SHORT_EXCHANGES:
-            self._short = 0
-            for each in self.sensors:
-                each.look(counted=False)
-        for each in self.sensors:
-            if each.steps is not None:
-                each.step()
-        if now_ns >= self._watch_ns:
-            self._watch_ns = now_ns + _WATCH_EVERY_NS // (2 * len(self.sensors))
-            next(self._looks)()
-        self.attend_at_ns = 0 if self._is_at_work or self._short else self._watch_ns
+        self.short = max(0, self.short - 1) if complete else self.short + 2
+        if self.short >= 2 * _SHORT_EXCHANGES and all(task.finished for task in self._looking):
+            self.short = 0
+            self._looking = [self.acyclic.start(each.look(counted=False)) for each in self.sensors]
 
     def miss(self, silent_ns: int, now_ns: int) -> None:
         """To be called while exchanges are not answered, and have not been for `silent_ns`.
@@ -400,27 +407,30 @@ class Recovery:
         Without frames coming back there is nothing that could be done. InterfaceError if the network
         interface is gone for good.
         """
-        if not self.all_lost:
+        if self.polled:
             if silent_ns > _SILENCE_NS:
                 why = self._silence()
                 for each in self.sensors:
                     each.lose(why)
-        elif now_ns >= self._watch_ns:
-            self._watch_ns = now_ns + _WATCH_EVERY_NS
+        elif now_ns - self._checked_ns >= _WATCH_EVERY_NS:
+            self._checked_ns = now_ns
             self.bus.backend.check_present()
             if silent_ns > _SILENT_CHANGE_NS:
                 for each in self.sensors:
                     if each.is_changing:
-                        each.lose_in_change(self._silence())
+                        each.give_up(self._silence())
 
-    @property
-    def _is_at_work(self) -> bool:
-        return any(each.steps is not None for each in self.sensors)
-
-    def _watch(self, each: SensorRecovery) -> None:
-        # The working counter does not tell sensors apart: one that is out may be counted for another.
-        each.look(counted=not self._is_at_work)
-        self._others.look_at_next()
+    def _watch(self) -> Steps[None]:
+        """Look at one sensor after the other, without end."""
+        pause_s = _WATCH_EVERY_NS * 1e-9 / (2 * len(self.sensors))
+        for each in cycle(self.sensors):
+            yield from each.look_at_mailbox()
+            yield pause_s
+            # The working counter does not tell sensors apart: one that is out may be counted for another.
+            yield from each.look(counted=not any(one.task for one in self.sensors))
+            each.check_change()
+            yield from self._others.look_at_next()
+            yield pause_s
 
     def _silence(self) -> str:
         why, lost = self.bus.backend.why_silent(), "no frame comes back"
@@ -433,10 +443,9 @@ class Recovery:
     def count_alive(self) -> None:
         """A sensor has begun or ceased to stream."""
         process_data = self.bus.process_data
-        alive = [process_data.counters[sensor.number] for sensor in self._all if sensor.streams]
+        self.polled = [stream for stream in self._streams if self._all[stream.number].streams]
+        alive = [process_data.counters[stream.number] for stream in self.polled]
         self.alive_wkc = [sum(counts[which] for counts in alive) for which in range(len(process_data.inputs))]
-        self.all_lost = not alive
-        self.attend_at_ns = 0
 
     def _tell(self, number: int, emergency: Emergency, count: int) -> None:
         message = f"sensor {number} reports {emergency}"

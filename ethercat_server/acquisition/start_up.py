@@ -16,7 +16,8 @@ from ethercat_server.acquisition.terminals import Terminal, find_terminals, name
 from ethercat_server.errors import BusError, SdoAbortError, SetUpError, UsageError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
+from ethercat_server.ethercat.datagrams import Steps
+from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.scan import Slave, look_safely
@@ -96,7 +97,7 @@ def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Start
     found = _find_sensors(bus, wanted, check_interrupt)
     for sensor in found.sensors:
         sdo = GuardedSdo(bus.slaves[sensor.number].sdo)
-        finish(_prepare(sdo, sensor, wanted), clock=bus.clock, check_interrupt=check_interrupt)
+        bus.finish(_prepare(sdo, sensor, wanted), check_interrupt)
 
     def enter_op(again: bool) -> None:
         if again:
@@ -236,8 +237,7 @@ def _check_mailboxes(ifname: str, number: int, slave: Slave) -> None:
 
 
 def _find(bus: Bus, number: int, slave: Slave, wanted: Wanted, check_interrupt: CheckInterrupt) -> Sensor:
-    steps = identify(bus.slaves[number].sdo, slave.name)
-    identity = finish(steps, clock=bus.clock, check_interrupt=check_interrupt)
+    identity = bus.finish(identify(bus.slaves[number].sdo, slave.name), check_interrupt)
     if not is_known_model(identity.name):
         raise BusError(
             f"sensor {number} on {bus.ifname} is a {identity.name!r}, a model this server does not know: "

@@ -242,6 +242,8 @@ def make_streams(bus: Bus, sensors: Sequence[Sensor], round_trip: RoundTrip) -> 
     offset = RealtimeOffset(bus.clock)
     offsets_ns = {at.number: at.start * BYTE_NS for inputs in bus.process_data.inputs for at in inputs}
     return [
-        SensorStream(each, round_trip, bus.clock, bus.read_clock(number), offset, offsets_ns[number])
+        SensorStream(
+            each, round_trip, bus.clock, bus.finish(bus.read_clock(number)), offset, offsets_ns[number]
+        )
         for number, each in enumerate(sensors)
     ]

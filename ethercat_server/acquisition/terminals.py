@@ -14,14 +14,14 @@ from typing import Any, Final
 
 from bota_ethercat.framing import MessageType, encode_data
 from ethercat_server.acquisition.cycle import Cycle
-from ethercat_server.acquisition.recovery import pause, restore_station
+from ethercat_server.acquisition.recovery import restore_station
 from ethercat_server.acquisition.stream import INVALID, REPEATED, OutgoingFrame
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.datagrams import Steps, repeat
 from ethercat_server.ethercat.exchange import Exchange
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.slave.coe import Steps
 from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.sensor.scan import Kind, Slave
 
@@ -46,7 +46,7 @@ class Terminal:
         slave: as it was found.
         size: bytes of its process data.
         row: its part of the `describe` reply; kept up to date.
-        steps: keep it in OP, without end: a datagram or two a step.
+        steps: keep it in OP, without end.
     """
 
     def __init__(self, number: int, slave: Slave) -> None:
@@ -113,8 +113,8 @@ class Terminal:
                 yield from self._enter_op()
                 log.info("%s is in OP", self)
                 self._streams, self.row["state"], said = True, "OP", ""
-                while (status := controller.status() or controller.status()) and status.is_op:
-                    yield from pause(self._bus.clock, _LOOK_EVERY_S)
+                while (status := (yield from repeat(2, controller.status))) and status.is_op:
+                    yield _LOOK_EVERY_S
                 raise BusError(
                     f"{self} is lost: " + (f"it is in {status}" if status else "it does not answer")
                 )
@@ -122,14 +122,14 @@ class Terminal:
                 if str(error) != said:
                     log.warning("%s", error)
                 self._streams, self.row["state"], said = False, "LOST", str(error)
-            yield from pause(self._bus.clock, _LOOK_EVERY_S)
+            yield _LOOK_EVERY_S
 
     def _enter_op(self) -> Steps[None]:
         controller, kind = self._controller, (self.row["vendor"], self.row["product"])
         where = self._bus, controller.number, self.slave.position
-        status = controller.status()
+        status = yield from controller.status()
         if status is None and (yield from restore_station(*where, lambda *found: found == kind)):
-            status = controller.status()
+            status = yield from controller.status()
         if status is None:
             raise BusError(f"{self} does not answer: check cable and power")
         if not status.is_above_preop:
@@ -137,7 +137,7 @@ class Terminal:
             for manager, _, size, _ in self._inputs if self.slave.has_coe else ():
                 if (yield from controller.mapped_size(_ASSIGNMENTS + manager, size)) != size:
                     raise BusError(f"{self} maps other PDOs than its SII says: power it off and on")
-            controller.map_inputs(self._bus.terminal_areas[self._number].start, self._inputs)
+            yield from controller.map_inputs(self._bus.terminal_areas[self._number].start, self._inputs)
             yield from controller.go(AlState.SAFEOP)
         yield from controller.go(AlState.OP)
 
@@ -197,9 +197,3 @@ class CycleWithTerminals(Cycle):
                 made.append((frame[0], len(self._streams) + number, frame[1]))
         if made:
             self._hub.publish(made, exchange.back_ns)
-
-    def _do_chores(self, now: int) -> None:
-        super()._do_chores(now)
-        if self._unanswered <= 1:  # without frames coming back there is nothing that could be done
-            for terminal in self.terminals:
-                next(terminal.steps)

@@ -12,24 +12,21 @@ import contextlib
 import itertools
 import struct
 from collections.abc import Sequence
-from typing import Final, TypeVar
+from typing import Final
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import Backend, CheckInterrupt, Master
-from ethercat_server.ethercat.datagrams import Datagrams, repeat
+from ethercat_server.ethercat.datagrams import Answer, Datagrams, RegisterAccess, Steps, repeat
 from ethercat_server.ethercat.exchange import Area, ProcessData, fit_a_frame, read_clock
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.ethercat.slave.coe import Emergencies, Steps, finish
+from ethercat_server.ethercat.slave.coe import Emergencies
 from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.ethercat.slave.sii import Sii
 from ethercat_server.sampling.observation import DistributedClock
 
-T = TypeVar("T")
 _MOST_EMERGENCIES: Final = 16
-_PAUSE_S: Final = 0.001
 _INIT_ATTEMPTS: Final = 5
-_DONE: Final = object()  # steps themselves yield None
 _FIRST_STATION: Final = 0x1001
 _LOGICAL_BYTES: Final = 0x10000  # of the logical address space for the sensors' process data
 # Kind of the sync manager, the object with its PDOs, kind of the FMMU.
@@ -62,12 +59,9 @@ class Bus(Datagrams):
         self._sii: Sequence[Sii | None] = ()  # of all slaves on the wire
         self._soem: Master | None = None
 
-    def next_on_wire(self, until_ns: int) -> bytes | None:
-        """The next frame that arrives before `until_ns` and carries no process data; None if none does."""
-        while (frame := super().next_on_wire(until_ns)) is not None:
-            if self.process_data.take(frame, 0) is None:
-                return frame
-        return None
+    def take(self, frame: bytes) -> Answer | None:
+        """See `Datagrams`; it may answer an exchange."""
+        return super().take(frame) if self.process_data.take(frame, 0) is None else None
 
     def scan(
         self,
@@ -100,7 +94,7 @@ class Bus(Datagrams):
             self.slaves.append(slave)
             # SOEM has cleared it, and set its mailboxes up.
             steps = slave.enter_preop() if self._soem is None else slave.go(AlState.PREOP)
-            self._run(steps, check_interrupt)
+            self.finish(steps, check_interrupt)
 
     def scan_again(self, check_interrupt: CheckInterrupt) -> None:
         """See `scan`."""
@@ -109,7 +103,7 @@ class Bus(Datagrams):
     def map_process_data(self, check_interrupt: CheckInterrupt) -> list[int]:
         """Map the process data of all sensors, which are in PREOP; returns the bytes of each one's inputs."""
         for slave in self.slaves:  # pysoem takes an emergency that it meets in the mapping for a failure
-            self._run(slave.sdo.drain(_MOST_EMERGENCIES), check_interrupt)
+            self.finish(slave.sdo.drain(_MOST_EMERGENCIES), check_interrupt)
         if self._soem is not None:
             self._soem.map_process_data(check_interrupt)
         else:
@@ -118,7 +112,7 @@ class Bus(Datagrams):
                 logical = self.map(slave, content, logical, check_interrupt)
             ends = [*itertools.accumulate(self.input_sizes.values(), initial=logical)]
             self.terminal_areas = [Area(*span, reg.FMMU_READ) for span in itertools.pairwise(ends)]
-        return [slave.read_mapping() for slave in self.slaves]
+        return [self.finish(slave.read_mapping()) for slave in self.slaves]
 
     def enter_op(self, check_interrupt: CheckInterrupt) -> None:
         """Take all sensors to OP, exchanging process data, without which they do not go there."""
@@ -126,33 +120,41 @@ class Bus(Datagrams):
         for slave in self.slaves:
             if not fit_a_frame(slave.areas, lrw=lrw):
                 raise slave.unmapped()
-        stations = [self.stations[slave.number] if slave.latch_events() else None for slave in self.slaves]
+        stations = [
+            self.stations[slave.number] if self.finish(slave.latch_events()) else None
+            for slave in self.slaves
+        ]
         areas = [slave.areas for slave in self.slaves]
         self.process_data = ProcessData(
             areas, self.backend, lrw=lrw, stations=stations, terminals=self.terminal_areas
         )
-        waiting = [slave.enter_op() for slave in self.slaves]
-        while waiting:
-            check_interrupt()
-            self.process_data.send()
-            waiting = [steps for steps in waiting if next(steps, _DONE) is not _DONE]
-            self.clock.sleep(_PAUSE_S)
+        self.finish(self._enter_op(), check_interrupt)
         for slave in self.slaves:
             slave.attempts = 1
 
-    def read_clock(self, number: int) -> DistributedClock | None:
+    def _enter_op(self) -> Steps[None]:
+        waiting = [slave.enter_op() for slave in self.slaves]
+        while waiting:
+            self.process_data.send()
+            for steps in tuple(waiting):
+                if (yield from _take_turn(steps)):
+                    waiting.remove(steps)
+            yield None
+
+    def read_clock(self, number: int) -> Steps[DistributedClock | None]:
         """The clock of a sensor's controller, from now on read with its process data; None if it has none."""
         if (at := self.process_data.read_latched(number, reads=True)) is None:
             return None
-        return read_clock(self, number, at)
+        return (yield from read_clock(self, number, at))
 
     def close(self) -> None:
         """Take the sensors to INIT if they were scanned, and close the wire."""
         for number in range(len(self.stations)):
-            repeat(_INIT_ATTEMPTS, self.write_register, number, reg.AL_CONTROL, AlState.INIT.request())
+            init = AlState.INIT.request()
+            self.finish(repeat(_INIT_ATTEMPTS, self.write_register, number, reg.AL_CONTROL, init))
         for slave, state in self.terminals:
             with contextlib.suppress(BusError):  # it has gone
-                finish(slave.leave(state), _PAUSE_S, self.clock)
+                self.finish(slave.leave(state))
         self.stations, self.terminals = [], []
         self.backend.close()
 
@@ -172,14 +174,14 @@ class Bus(Datagrams):
         managers = units = b""
         for kind, assignment, direction in _ASSIGNMENTS:
             row = next((row for row in content["sync_managers"] if row["kind"] == kind), None)
-            size = row and self._run(slave.mapped_size(assignment, row["size"]), check_interrupt)
+            size = row and self.finish(slave.mapped_size(assignment, row["size"]), check_interrupt)
             if not row or not size:
                 managers += bytes(reg.SYNC_MANAGER_SIZE)
                 continue
             managers += reg.pack_sync_manager(row["start"], size, row["control"])
             units += reg.FMMU_LAYOUT.pack(logical, size, 0, 7, row["start"], 0, direction, 1)
             logical += size
-        slave.map(managers, units.ljust(len(_ASSIGNMENTS) * reg.FMMU_SIZE, b"\0"))
+        self.finish(slave.map(managers, units.ljust(len(_ASSIGNMENTS) * reg.FMMU_SIZE, b"\0")))
         return logical
 
     def _free_logical(self) -> int:
@@ -203,5 +205,13 @@ class Bus(Datagrams):
     def _sensors_sii(self) -> list[Sii]:
         return [content for at, content in enumerate(self._sii) if at in self.positions and content]
 
-    def _run(self, steps: Steps[T], check_interrupt: CheckInterrupt) -> T:
-        return finish(steps, _PAUSE_S, self.clock, check_interrupt)
+
+def _take_turn(steps: Steps[None]) -> Steps[bool]:
+    """Let `steps` go on until they wait; whether they are at their end."""
+    answer = None
+    try:
+        while isinstance(wanted := steps.send(answer), RegisterAccess):
+            answer = yield wanted
+    except StopIteration:
+        return True
+    return False

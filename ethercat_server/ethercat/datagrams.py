@@ -1,18 +1,19 @@
 """Single datagrams on the bus: registers of the slaves, by station address or position, and broadcast reads.
 
 Each is a frame, matched with its answer by index, command and address: a late answer is not mistaken for that
-to another datagram.
+to another datagram. What takes several is a generator, `Steps`: between two exchanges the acquisition loop
+sends what it asks for (`acquisition.acyclic`); where nothing streams `finish` waits for the answers.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from typing import Final, ParamSpec, Protocol, TypeVar
+from collections.abc import Callable, Generator
+from typing import Any, Final, NamedTuple, ParamSpec, TypeVar
 
 from ethercat_server.errors import BusError
-from ethercat_server.ethercat.backend import Backend
-from ethercat_server.ethercat.clock import Clock
+from ethercat_server.ethercat.backend import Backend, CheckInterrupt
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock
 from ethercat_server.ethercat.wire import (
     DATAGRAM_INDEX,
     FIRST_DATA,
@@ -26,6 +27,7 @@ from ethercat_server.ethercat.wire import (
 FIRST_INDEX: Final = 0x80
 _INDICES: Final = 0x10
 _TIMEOUT_S: Final = 0.02
+_PAUSE_S: Final = 0.001
 _REGISTER_ATTEMPTS: Final = 20
 _U16: Final = struct.Struct("<H")
 _LONGEST_TIMEOUT_S: Final = 0.25
@@ -39,23 +41,66 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def repeat(attempts: int, do: Callable[P, T | None], *args: P.args, **kwargs: P.kwargs) -> T | None:
-    """What `do` returns, called again while its datagram is lost: while it returns nothing, or False."""
-    return next(filter(None, (do(*args, **kwargs) for _ in range(attempts))), None)
+class RegisterAccess(NamedTuple):
+    """One datagram: registers or a mailbox of a slave, read or written."""
+
+    command: Command
+    adp: int
+    ado: int
+    data: bytes
+    timeout_s: float = _TIMEOUT_S
 
 
-class Registers(Protocol):
-    """Access to registers and mailboxes of slaves: by sensor number, as on a `Bus`, or `ByPosition`."""
+class Answer(NamedTuple):
+    """What came back."""
 
-    @property
-    def clock(self) -> Clock:
-        """The clock of the bus."""
+    wkc: int  # working counter
+    data: bytes
 
-    def read_register(self, number: int, address: int, size: int, /) -> bytes | None:
-        """None if the slave did not execute it."""
 
-    def write_register(self, number: int, address: int, data: bytes, /) -> bool:
-        """False if the slave did not execute it."""
+# An operation in steps, which never waits itself: it yields a datagram and is resumed with the answer, None
+# if it is lost; or it yields how long to wait, in s (None: a moment). It returns the result.
+Steps = Generator[RegisterAccess | float | None, Answer | None, T]
+
+
+def repeat(
+    attempts: int, do: Callable[P, Steps[T | None]], *args: P.args, **kwargs: P.kwargs
+) -> Steps[T | None]:
+    """What `do` returns, done again while its datagram is lost: while it returns nothing, or False."""
+    for _ in range(attempts):
+        if found := (yield from do(*args, **kwargs)):
+            return found
+    return None
+
+
+def finish(
+    steps: Steps[T],
+    clock: Clock = SYSTEM_CLOCK,
+    check_interrupt: CheckInterrupt = lambda: None,
+    ask: Callable[[RegisterAccess], Answer | None] | None = None,
+) -> T:
+    """Run `steps` to their end where nothing else is to be done meanwhile; returns their result.
+
+    What interrupts them is raised in them: they clean up on the bus.
+    """
+    resume: Callable[[Any], RegisterAccess | float | None] = steps.send
+    value: Any = None
+    while True:
+        try:
+            wanted = resume(value)
+        except StopIteration as stop:
+            result: T = stop.value
+            return result
+        resume, value = steps.send, None
+        try:
+            check_interrupt()
+            if isinstance(wanted, RegisterAccess):
+                assert ask is not None, "on a bus only"
+                value = ask(wanted)
+            else:
+                clock.sleep(_PAUSE_S if wanted is None else wanted)
+        except BaseException as error:  # noqa: BLE001 - the steps raise it again
+            resume, value, check_interrupt = steps.throw, error, lambda: None
 
 
 class LateAnswers:
@@ -98,9 +143,7 @@ class Datagrams:
         self._index = 0
         self._late = LateAnswers(backend.clock)
         self._pending_ns = self._late.pending_ns
-        # Returns the next frame before an instant in ns, None if there is none. The acquisition loop replaces
-        # it by one that continues to exchange process data.
-        self.next_frame = self.next_on_wire
+        self._awaited: tuple[bytearray, int] | None = None  # the frame sent last, bytes of data in it
         self.stations: list[int] = []  # configured station addresses of the sensors, by number
 
     @property
@@ -108,34 +151,58 @@ class Datagrams:
         """Name of the interface, for people."""
         return self.backend.ifname
 
-    def next_on_wire(self, until_ns: int) -> bytes | None:
-        """The next frame that arrives before `until_ns`; None if none does."""
-        left_ns = until_ns - self._monotonic_ns()
-        return self._receive(left_ns * 1e-9) if left_ns > 0 else None
+    def send(self, access: RegisterAccess) -> int:
+        """Send a datagram; returns until when, in ns, its answer is to be awaited."""
+        command, adp, ado, data, timeout_s = access
+        self._index = (self._index + 1) % len(self._pending_ns)
+        frame = build((command, adp, ado, data), first_index=self._index + FIRST_INDEX)
+        self._awaited = frame, len(data)
+        self._pending_ns[self._index] = now_ns = self._monotonic_ns()
+        self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
+        return now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
 
-    def read_register(self, number: int, address: int, size: int) -> bytes | None:
-        """Read ESC registers or a mailbox of a sensor with one datagram; None if it did not do it."""
-        return self._read(Command.FPRD, self.stations[number], address, size)
+    def take(self, frame: bytes) -> Answer | None:
+        """The answer to the datagram that was sent last, if this frame is that."""
+        if self._awaited is None or not is_answer(frame, *self._awaited):
+            self._late.note(frame)
+            return None
+        if self._late.timeout_s:
+            self._late.in_time(self._index)
+        end = FIRST_DATA + self._awaited[1]
+        self._pending_ns[self._index], self._awaited = 0, None
+        return Answer(_U16.unpack_from(frame, end)[0], frame[FIRST_DATA:end])
 
-    def write_register(self, number: int, address: int, data: bytes) -> bool:
-        """Write ESC registers or a mailbox of a sensor with one datagram; False if it did not."""
-        return self._write(Command.FPWR, self.stations[number], address, data)
+    def give_up(self) -> None:
+        """The answer that was awaited is lost, or late."""
+        self._awaited = None
 
-    def read_at(self, position: int, address: int, size: int) -> bytes | None:
-        """Read ESC registers of the slave at a position, scanned or not; None if it did not do it."""
-        return self._read(Command.APRD, -position, address, size)
+    def finish(self, steps: Steps[T], check_interrupt: CheckInterrupt = lambda: None) -> T:
+        """Run `steps` to their end, while nothing streams; see `finish`."""
+        return finish(steps, self.clock, check_interrupt, self._ask)
 
-    def write_at(self, position: int, address: int, data: bytes) -> bool:
-        """Write ESC registers of the slave at a position, scanned or not; False if it did not do it."""
-        return self._write(Command.APWR, -position, address, data)
+    def read_register(self, number: int, address: int, size: int) -> Steps[bytes | None]:
+        """Read ESC registers or a mailbox of a sensor; empty if it did not execute it, None if it is lost."""
+        return _read(Command.FPRD, self.stations[number], address, size)
+
+    def write_register(self, number: int, address: int, data: bytes) -> Steps[bool]:
+        """Write ESC registers or a mailbox of a sensor; False if it did not execute it, or that is lost."""
+        return _write(Command.FPWR, self.stations[number], address, data)
+
+    def read_at(self, position: int, address: int, size: int) -> Steps[bytes | None]:
+        """Read ESC registers of the slave at a position, scanned or not."""
+        return _read(Command.APRD, -position, address, size)
+
+    def write_at(self, position: int, address: int, data: bytes) -> Steps[bool]:
+        """Write ESC registers of the slave at a position, scanned or not."""
+        return _write(Command.APWR, -position, address, data)
 
     def count_slaves(self, size: int, timeout_s: float) -> int:
         """How many slaves answer a broadcast read of `size` bytes from register 0 on; -1 if it is lost.
 
         Needs no scan and changes nothing, so it also serves to measure the round trip of such a frame.
         """
-        answer = self._datagram(Command.BRD, 0, 0, bytes(size), timeout_s)
-        return -1 if answer is None else answer[0]
+        answer = self._ask(RegisterAccess(Command.BRD, 0, 0, bytes(size), timeout_s))
+        return -1 if answer is None else answer.wkc
 
     def listen(self, seconds: float) -> int:
         """The number of frames that arrive from others in this time; nothing is sent."""
@@ -146,44 +213,38 @@ class Datagrams:
 
     def read_surely_at(self, position: int, address: int, size: int) -> bytes:
         """Read ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
-        if data := repeat(_REGISTER_ATTEMPTS, self.read_at, position, address, size):
+        if data := self.finish(repeat(_REGISTER_ATTEMPTS, self.read_at, position, address, size)):
             return data
         raise self._unanswered(position)
 
     def write_surely_at(self, position: int, address: int, data: bytes) -> None:
         """Write ESC registers of the slave at a position, scanned or not; BusError if it does not answer."""
-        if not repeat(_REGISTER_ATTEMPTS, self.write_at, position, address, data):
+        if not self.finish(repeat(_REGISTER_ATTEMPTS, self.write_at, position, address, data)):
             raise self._unanswered(position)
 
     def _unanswered(self, position: int) -> BusError:
         return BusError(f"slave {position} on {self.ifname} does not answer: check cable and power")
 
-    def _read(self, command: Command, adp: int, address: int, size: int) -> bytes | None:
-        answer = self._datagram(command, adp, address, bytes(size), _TIMEOUT_S)
-        return answer[1] if answer is not None and answer[0] == 1 else None
-
-    def _write(self, command: Command, adp: int, address: int, data: bytes) -> bool:
-        answer = self._datagram(command, adp, address, data, _TIMEOUT_S)
-        return answer is not None and answer[0] == 1
-
-    def _datagram(
-        self, command: Command, adp: int, ado: int, data: bytes, timeout_s: float
-    ) -> tuple[int, bytes] | None:
-        """Send one datagram and wait for it: its working counter and data; None if it does not come back."""
-        self._index = (self._index + 1) % len(self._pending_ns)
-        frame = build((command, adp, ado, data), first_index=self._index + FIRST_INDEX)
-        self._pending_ns[self._index] = now_ns = self._monotonic_ns()
-        until_ns = now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
-        self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
-        end = FIRST_DATA + len(data)
-        while (answer := self.next_frame(until_ns)) is not None:
-            if is_answer(answer, frame, len(data)):
-                if self._late.timeout_s:
-                    self._late.in_time(self._index)
-                self._pending_ns[self._index] = 0
-                return _U16.unpack_from(answer, end)[0], answer[FIRST_DATA:end]
-            self._late.note(answer)
+    def _ask(self, access: RegisterAccess) -> Answer | None:
+        """Send a datagram and wait for its answer."""
+        until_ns = self.send(access)
+        while (left_ns := until_ns - self._monotonic_ns()) > 0:
+            if (frame := self._receive(left_ns * 1e-9)) is None:
+                break
+            if (answer := self.take(frame)) is not None:
+                return answer
+        self.give_up()
         return None
+
+
+def _read(command: Command, adp: int, address: int, size: int) -> Steps[bytes | None]:
+    answer = yield RegisterAccess(command, adp, address, bytes(size))
+    return answer and (answer.data if answer.wkc == 1 else b"")
+
+
+def _write(command: Command, adp: int, address: int, data: bytes) -> Steps[bool]:
+    answer = yield RegisterAccess(command, adp, address, data)
+    return answer is not None and answer.wkc == 1
 
 
 class ByPosition:
@@ -192,3 +253,6 @@ class ByPosition:
     def __init__(self, bus: Datagrams) -> None:
         self.clock = bus.clock
         self.read_register, self.write_register = bus.read_at, bus.write_at
+
+
+Registers = Datagrams | ByPosition

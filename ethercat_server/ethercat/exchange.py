@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from ethercat_server.errors import BusError, SetUpError
 from ethercat_server.ethercat.backend import Backend
-from ethercat_server.ethercat.datagrams import Datagrams, repeat
+from ethercat_server.ethercat.datagrams import Datagrams, Steps, repeat
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import (
     BYTE_NS,
@@ -61,24 +61,25 @@ def switch_latched(frame: bytearray, at: int, *, reads: bool) -> None:
         frame[data - DATAGRAM_HEADER] = Command.FPRD if reads else Command.NOP
 
 
-def read_clock(bus: Datagrams, number: int, at: int) -> DistributedClock | None:
+def read_clock(bus: Datagrams, number: int, at: int) -> Steps[DistributedClock | None]:
     """The clock of a sensor's controller as another master has set it; None if it does not answer.
 
     `at` is where frames read what is latched.
     """
-    if not (data := repeat(_ATTEMPTS, bus.read_register, number, reg.DC_OFFSET, _U64_U32.size)):
+    if not (data := (yield from repeat(_ATTEMPTS, bus.read_register, number, reg.DC_OFFSET, _U64_U32.size))):
         return None
     offset, delay = _U64_U32.unpack(data)
-    return DistributedClock((offset - delay) % _WRAP, _loop_delay_ns(bus, number), at * BYTE_NS + _SLACK_NS)
+    loop_ns = yield from _loop_delay_ns(bus, number)
+    return DistributedClock((offset - delay) % _WRAP, loop_ns, at * BYTE_NS + _SLACK_NS)
 
 
-def _loop_delay_ns(bus: Datagrams, number: int) -> int:
+def _loop_delay_ns(bus: Datagrams, number: int) -> Steps[int]:
     """A write to the receive times has the controller note when a frame arrives at each of its ports."""
-    if not bus.write_register(number, reg.DC_RECEIVE_TIMES, bytes(4)):
+    if not (yield from bus.write_register(number, reg.DC_RECEIVE_TIMES, bytes(4))):
         return 0
-    data = bus.read_register(number, reg.DC_RECEIVE_TIMES, _PORTS.size)
-    links = bus.read_register(number, reg.DL_STATUS, 2)
-    if data is None or links is None:
+    data = yield from bus.read_register(number, reg.DC_RECEIVE_TIMES, _PORTS.size)
+    links = yield from bus.read_register(number, reg.DL_STATUS, 2)
+    if not data or not links:
         return 0
     status = int.from_bytes(links, "little")
     out, *back = _PORTS.unpack(data)

@@ -50,7 +50,7 @@ class SoemBackend:
     def __init__(self, ifname: str) -> None:
         self._ifname = ifname  # any of its names, and then the last that it had
         self.clock = SYSTEM_CLOCK
-        self.master: Master = self
+        self.master: Master | None = self
         self._ifindex = 0
         self._master: Any = pysoem.Master()
         self._opened = False

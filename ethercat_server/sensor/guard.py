@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ethercat_server.errors import ForbiddenWriteError
-from ethercat_server.ethercat.slave.coe import Sdo, Steps
+from ethercat_server.ethercat.datagrams import Steps
+from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
 
 

@@ -16,12 +16,11 @@ from ethercat_server.errors import BusError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.datagrams import ByPosition
+from ethercat_server.ethercat.datagrams import ByPosition, Steps
 from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave import sii
 from ethercat_server.ethercat.slave.al import STATE_S, AlState, AlStatus
-from ethercat_server.ethercat.slave.coe import finish
 from ethercat_server.ethercat.slave.sii import read_sii
 from ethercat_server.sensor.objects.dictionary import is_sensor
 
@@ -31,7 +30,6 @@ _MASTER_FRAMES: Final = 3
 _TIMEOUT_S: Final = 0.02
 _ATTEMPTS: Final = 5
 _PROBE_BYTES: Final = 1
-_SII_PAUSE_S: Final = 0.0002  # between two questions whether an EEPROM has read a word: 1 to 3 ms
 _PAUSE_S: Final = 0.002
 # Start and length of a Bota sensor's sync managers 0 to 2, and start of the last one.
 _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
@@ -156,8 +154,7 @@ def read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambda
     registers = ByPosition(bus)
 
     def read(word: int, words: int) -> bytes:
-        steps = read_sii(registers, position, word, words, owner)
-        return finish(steps, pause_s=_SII_PAUSE_S, clock=bus.clock, check_interrupt=check_interrupt)
+        return bus.finish(read_sii(registers, position, word, words, owner), check_interrupt)
 
     return sii.read_image(read)
 
@@ -173,14 +170,14 @@ class OtherSlaves:
         self._unanswered = [0] * len(self.rows)
         self._turn = -1
 
-    def look_at_next(self) -> None:
+    def look_at_next(self) -> Steps[None]:
         """Read the AL state of the next one, with one datagram."""
         if not self.rows:
             return
         self._turn = turn = (self._turn + 1) % len(self.rows)
         row, slave = self.rows[turn], self._slaves[turn]
-        data = self._bus.read_at(slave.position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
-        if data is not None:
+        data = yield from self._bus.read_at(slave.position, reg.AL_STATUS, reg.AL_STATUS_SIZE)
+        if data:
             if row["state"] == _ABSENT:
                 log.info("%s is back", slave)
             row["state"], self._unanswered[turn] = AlStatus.parse(data).state.name, 0

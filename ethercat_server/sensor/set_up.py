@@ -1,8 +1,8 @@
 """The steps that identify a sensor, set it up, and change its settings while it streams, in OP or by way of
 PREOP; if that fails, the former settings are in force again afterwards.
 
-They are generators over an `Sdo` (see `ethercat.slave.coe`): the same code runs at start-up and, between two
-exchanges, when a sensor comes back.
+They are `Steps` over an `Sdo`: the same code runs at start-up and, between two exchanges, when a sensor comes
+back.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from bota_ethercat.settings import (
 from bota_ethercat.text.untrusted import visible
 from ethercat_server.errors import OBJECT_MISSING, BusError, CutOffError, SdoAbortError, extended
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.slave.coe import Sdo, Steps
+from ethercat_server.ethercat.datagrams import Steps
+from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import SETTLING_S, Identity, Sensor
 
@@ -183,7 +184,7 @@ def save(sdo: Sdo, sensor: Sensor) -> Steps[None]:
                 return
             if deadline.passed:
                 break
-            yield
+            yield None
     except SdoAbortError as error:
         raise extended(error, "; its settings are in force until its power goes, but not saved") from None
     except BusError as error:  # lost, or without an answer
@@ -254,7 +255,7 @@ def _check_rate(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     deadline = Deadline(sdo.clock, SETTLING_S)
     # A divided rate may be one from before: it counts once it has had the time to change.
     while (divisor := (yield from _divisor(sdo, sensor))) != 1 and not deadline.passed:
-        yield
+        yield None
     length = sensor.wanted[_LAST]
     nominal = BASE_SAMPLING_RATE_HZ / length
     if divisor is None:

@@ -25,7 +25,8 @@ from bota_ethercat.errors import RequestError
 from bota_ethercat.pdo import layout_for
 from ethercat_server.errors import BusError, CutOffError, extended
 from ethercat_server.ethercat.clock import Clock, Deadline
-from ethercat_server.ethercat.slave.coe import Sdo, Steps
+from ethercat_server.ethercat.datagrams import Steps
+from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor.sensor import SETTLING_SAMPLES, Sensor
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
 
@@ -86,7 +87,7 @@ def tare(
     _check_fits(target, "the key 'target'")
     samples = max(samples, LEAST_SAMPLES)
     while sensor.settling:
-        yield
+        yield None
     before = yield from _average(sdo.clock, sensor, stream, samples)
     if why := why_moving(before):
         raise RequestError(
@@ -197,7 +198,7 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
     parts = [Part() for _ in range(PARTS)]
     first: list[float] = []
     while taken < samples:
-        yield
+        yield None
         if deadline.passed:
             raise RequestError(
                 ErrorCode.NOT_READY, f"sensor {sensor.number} gives too few samples to tare it"
@@ -223,7 +224,7 @@ def _wait(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[
     target = stream.fresh + samples
     deadline = _patience(clock, sensor, samples)
     while stream.fresh < target and not deadline.passed:
-        yield
+        yield None
 
 
 def _patience(clock: Clock, sensor: Sensor, samples: int) -> Deadline:

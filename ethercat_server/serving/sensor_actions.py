@@ -12,7 +12,7 @@ from ethercat_server.acquisition.recovery import Recovery
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.slave.coe import Steps
+from ethercat_server.ethercat.datagrams import Steps
 from ethercat_server.ethercat.slave.sii import read_sii
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.access import bytes_to_write, entry_named, read, read_named, write

@@ -11,7 +11,8 @@ from bota_ethercat.pdo import INPUT_OBJECT
 from bota_ethercat.sensor.meaning import value_meaning
 from ethercat_server.access.sensors import note
 from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError, UsageError
-from ethercat_server.ethercat.slave.coe import Sdo, Steps, finish
+from ethercat_server.ethercat.datagrams import Steps, finish
+from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.objects.dictionary import (
     FACTORY_CALIBRATION,

@@ -25,7 +25,8 @@ from bota_ethercat.text.json_text import finite
 from ethercat_server.access.sensors import Sensors, note
 from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignments, read_config
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
-from ethercat_server.ethercat.slave.coe import Sdo, finish
+from ethercat_server.ethercat.datagrams import finish
+from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.process.signals import signals_held_back
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, KNOWN_OBJECTS, OBJECTS, Access, ObjectEntry

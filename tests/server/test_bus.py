@@ -73,14 +73,14 @@ def done(frame: bytearray, data: bytes = b"", wkc: int = 1) -> bytes:
 
 def test_a_datagram_brings_back_its_data() -> None:
     bus, _ = scripted(lambda frame: [done(frame, b"\x08\x00")])
-    assert bus.read_register(0, 0x0130, 2) == b"\x08\x00"
-    assert bus.read_at(0, 0x0130, 2) == b"\x08\x00"
+    assert bus.finish(bus.read_register(0, 0x0130, 2)) == b"\x08\x00"
+    assert bus.finish(bus.read_at(0, 0x0130, 2)) == b"\x08\x00"
     assert bus.count_slaves(2, 0.01) == 1
 
 
 def test_what_is_on_the_wire_is_a_datagram_of_the_standard() -> None:
     bus, wire = scripted()
-    assert not bus.write_register(0, 0x0120, b"\x02\x00")
+    assert not bus.finish(bus.write_register(0, 0x0120, b"\x02\x00"))
     (frame,) = wire.sent
     assert frame[12:14] == b"\x88\xa4"
     assert len(frame) == 60
@@ -88,15 +88,15 @@ def test_what_is_on_the_wire_is_a_datagram_of_the_standard() -> None:
     assert frame[16] == Command.FPWR
     assert frame[18:24] == STATION.to_bytes(2, "little") + b"\x20\x01" + b"\x02\x00"
     assert frame[26:30] == b"\x02\x00\x00\x00", "data, then the working counter"
-    bus.read_at(3, 0x0130, 2)
+    bus.finish(bus.read_at(3, 0x0130, 2))
     assert wire.sent[1][16:20] == bytes((Command.APRD, wire.sent[1][17], 0xFD, 0xFF)), "minus the position"
 
 
 def test_a_slave_that_did_not_do_it_and_a_lost_frame_are_no_answer() -> None:
-    for answer in (lambda frame: [done(frame, wkc=0)], lambda _: []):
+    for answer, nothing in ((lambda frame: [done(frame, wkc=0)], b""), (lambda _: [], None)):
         bus, _ = scripted(answer)
-        assert not bus.write_register(0, 0x1000, b"\1")
-        assert bus.read_register(0, 0x0130, 2) is None
+        assert not bus.finish(bus.write_register(0, 0x1000, b"\1"))
+        assert bus.finish(bus.read_register(0, 0x0130, 2)) == nothing
     assert bus.count_slaves(2, 0.01) == -1
 
 
@@ -116,7 +116,7 @@ def test_neither_late_nor_foreign_frames_are_taken_for_the_answer() -> None:
         return answers
 
     bus, _ = scripted(answer)
-    assert [bus.read_register(0, 0x0130, 2) for _ in range(5)] == [b"\x02\x00"] * 5
+    assert [bus.finish(bus.read_register(0, 0x0130, 2)) for _ in range(5)] == [b"\x02\x00"] * 5
 
 
 def test_duplicates_of_answers_are_not_taken_for_those_of_other_registers() -> None:
@@ -131,7 +131,7 @@ def test_duplicates_of_answers_are_not_taken_for_those_of_other_registers() -> N
     bus.stations += [STATION + 1]
     for ado in range(0x0100, 0x0180, 2):
         for number in (0, 1):
-            found = bus.read_register(number, ado, 4)
+            found = bus.finish(bus.read_register(number, ado, 4))
             assert found == (STATION + number).to_bytes(2, "little") + ado.to_bytes(2, "little")
     assert len(wire.sent) == 128
 
@@ -139,7 +139,7 @@ def test_duplicates_of_answers_are_not_taken_for_those_of_other_registers() -> N
 def test_indices_are_none_of_soems() -> None:
     bus, wire = scripted()
     for _ in range(300):
-        bus.read_register(0, 0x0130, 2)
+        bus.finish(bus.read_register(0, 0x0130, 2))
     assert {frame[17] for frame in wire.sent} == set(range(0x80, 0x90))
 
 
@@ -221,7 +221,7 @@ def test_late_answers_make_datagrams_wait_longer_until_they_are_in_time_again(
 
     def waited_s() -> float:
         began_ns, wire.answer = wire.clock.now_ns, lambda _: []
-        assert bus.read_register(0, 0x0130, 2) is None
+        assert bus.finish(bus.read_register(0, 0x0130, 2)) is None
         return (wire.clock.now_ns - began_ns) / 1e9
 
     def answered_after(seconds: float) -> bool:
@@ -230,12 +230,12 @@ def test_late_answers_make_datagrams_wait_longer_until_they_are_in_time_again(
             return [done(frame)]
 
         wire.answer = answer
-        return bus.read_register(0, 0x0130, 2) is not None
+        return bus.finish(bus.read_register(0, 0x0130, 2)) is not None
 
     usual_s = waited_s()
     wire.clock.sleep(late_s)
     wire.answer = lambda _: [done(bytearray(wire.sent[-2]))]
-    assert bus.read_register(0, 0x0130, 2) is None
+    assert bus.finish(bus.read_register(0, 0x0130, 2)) is None
     assert waited_s() == pytest.approx(wait_s, rel=0.01)
     assert answered_after(0.15)
     assert waited_s() == pytest.approx(0.25, rel=0.01)

@@ -189,6 +189,20 @@ def test_sensors_among_other_devices(text: str) -> None:
         assert {row["al_state"] for row in before} <= {"INIT", "PREOP"}
 
 
+def test_without_soems_master_the_sensors_come_to_op_as_well() -> None:
+    with (
+        virtual_sensor("--serial", "1,2", "--signal", "clock") as (veth, sensor),
+        claimed(veth.near),
+        contextlib.closing(Bus(backend := SoemBackend(veth.near))) as bus,
+    ):
+        backend.open()
+        backend.master = None
+        sizes = [found.pdo_size for found in bring_up(bus, Asked(), lambda: None).sensors]
+        assert sizes == [61, 61]
+        assert [sensor.stats(number)["al_state"] for number in range(2)] == ["OP", "OP"]
+        assert bus.process_data.most_wkc == [6]
+
+
 # -- a service on a chain of two sensors, with a configuration file; the last of these ends it
 
 CONFIG = "[sensor]\nfir = true\nsinc_length = 512\n[sensor.1]\nsinc_length = 1024\n"

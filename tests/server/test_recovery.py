@@ -12,6 +12,7 @@ import pytest
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.settings import SettingValue, sampling_rate_hz
+from ethercat_server.ethercat.datagrams import Steps
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import PROCESSED_BIT, SHORTEST_FRAME, SOURCE_ADDRESS, Command, build
 from ethercat_server.simulation.machine import Machine
@@ -229,9 +230,9 @@ def test_a_lost_datagram_is_no_lost_sensor(monkeypatch: pytest.MonkeyPatch, anot
         client.wait_event("sensor_lost", 1)
     read, count = simulation.bus.read_register, itertools.count()
 
-    def lose_every_other(number: int, address: int, size: int) -> bytes | None:
+    def lose_every_other(number: int, address: int, size: int) -> Steps[bytes | None]:
         lose = (number, address) == (0, reg.AL_STATUS) and next(count) % 2 == 0
-        return None if lose else read(number, address, size)
+        return None if lose else (yield from read(number, address, size))
 
     monkeypatch.setattr(simulation.bus, "read_register", lose_every_other)
     simulation.run(1.2)

@@ -251,7 +251,7 @@ def test_an_fmmu_that_was_not_written(monkeypatch: pytest.MonkeyPatch, unit: int
         end = map_process_data(bus, slave, *arguments)
         left[0] -= 1
         if left[0] >= 0:
-            slave.write(FMMU + unit * FMMU_SIZE, bytes(FMMU_SIZE))
+            bus.finish(slave.write(FMMU + unit * FMMU_SIZE, bytes(FMMU_SIZE)))
         return end
 
     monkeypatch.setattr(Bus, "map", odd)
@@ -279,7 +279,7 @@ class Misled:
         if self.step != "mailboxes":
             for position in positions:
                 managers = pack_sync_manager(0x1000, 128, 0x26) + pack_sync_manager(0x1080, 128, 0x22)
-                assert self.bus.write_at(position, SYNC_MANAGER, managers)
+                assert self.bus.finish(self.bus.write_at(position, SYNC_MANAGER, managers))
 
     def map_process_data(self, _: CheckInterrupt) -> None:
         self._do("map_process_data")

@@ -252,7 +252,7 @@ def test_more_inputs_than_fmmus_are_refused() -> None:
     wait_for(simulation, "OP")
     (controller, _), inputs = simulation.bus.terminals[0], [(3, 0x1180, 1, 0)] * 17
     with pytest.raises(SetUpError, match="FMMUs for 17 inputs: do not name it"):
-        controller.map_inputs(0, inputs)
+        simulation.bus.finish(controller.map_inputs(0, inputs))
 
 
 def test_padding_optional_pdos_types_and_equal_names_in_the_sii() -> None:

@@ -16,7 +16,7 @@ from ethercat_server.access import adapters as holder
 from ethercat_server.access.adapters import find_holder
 from ethercat_server.errors import ForbiddenWriteError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
-from ethercat_server.ethercat.slave.coe import Steps, finish
+from ethercat_server.ethercat.datagrams import Steps, finish
 from ethercat_server.ethercat.slave.sii import decode, raw_lines, read_image
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects.dictionary import BY_SETTING, FACTORY_CALIBRATION

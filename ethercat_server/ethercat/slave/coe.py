@@ -1,33 +1,25 @@
 """CoE, CAN objects over EtherCAT: SDO transfers by single datagrams, abort codes, emergency messages.
 
-Transfers are generators that yield after each datagram and end with the result, so that the acquisition loop
-continues in between; at start-up `finish` runs the same steps to their end. Emergencies are counted, the last
-one is kept, and they are logged and reported, at one bounded rate.
+Transfers are `Steps`. Emergencies are counted, the last one is kept, and they are logged and reported, at one
+bounded rate.
 
 Sources: ETG.1000.6 (abort codes: table "SDO Abort Codes"), CiA 301.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
-from typing import Any, Final, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, Final, NamedTuple, Protocol, Self
 
 from ethercat_server.errors import BusError, SdoAbortError, SetUpError
-from ethercat_server.ethercat.backend import CheckInterrupt
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
-from ethercat_server.ethercat.datagrams import Registers
-from ethercat_server.ethercat.slave.registers import MAILBOX_FULL, MAILBOX_IN_STATUS
+from ethercat_server.ethercat.clock import Clock, Deadline
+from ethercat_server.ethercat.datagrams import Registers, Steps, T
 
 log = logging.getLogger(__name__)
-
-T = TypeVar("T")
-# An operation in steps: yields after each datagram, returns the result.
-Steps = Generator[None, None, T]
 
 _SHORTEST: Final = 16
 _LONGEST: Final = 1486
@@ -62,26 +54,6 @@ class Sdo(Protocol):
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
         """Download an object; raises as `read`."""
-
-
-def finish(
-    steps: Steps[T],
-    pause_s: float = 0.001,
-    clock: Clock = SYSTEM_CLOCK,
-    check_interrupt: CheckInterrupt = lambda: None,
-) -> T:
-    """Run `steps` to their end, `pause_s` apart; returns their result."""
-    try:
-        while True:
-            check_interrupt()
-            try:
-                next(steps)
-            except StopIteration as stop:
-                result: T = stop.value
-                return result
-            clock.sleep(pause_s)
-    finally:
-        steps.close()  # if aborted, it cleans up while the bus is open
 
 
 class AbortCode(IntEnum):
@@ -249,10 +221,6 @@ class Emergencies:
         return {"emergencies": sensor.count, "emergency": last}
 
 
-class MessageLostError(Exception):
-    """A message was read from the mailbox, and the frame with it was lost."""
-
-
 class MailboxSdo:
     """The mailboxes of slave `number`.
 
@@ -280,6 +248,7 @@ class MailboxSdo:
             )
         self._counter = 0
         self._in_use = False
+        self._stale = True  # whether an answer may come that was not asked for last
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         """See `Sdo`."""
@@ -307,43 +276,46 @@ class MailboxSdo:
             command, data = _DOWNLOAD | _SIZE_GIVEN, struct.pack("<I", len(data)) + data
         yield from self._transfer(index, subindex, command, data)
 
-    def look(self) -> None:
+    def look(self) -> Steps[None]:
         """Read a message if one is there, unless a transfer is under way, which reads them itself."""
         if not self._in_use:
-            with contextlib.suppress(MessageLostError):
-                self._take()
+            yield from self._alone(self._take())
 
     def drain(self, most: int = _MOST_DRAINED) -> Steps[None]:
         """Discard the messages that are there, at most `most`."""
         for _ in range(most):
-            with contextlib.suppress(MessageLostError):
-                if self._take() is None:
-                    return
-            yield
+            if (yield from self._take()) == b"":
+                return
 
     def _transfer(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
+        while self._in_use:
+            yield None
+        return (yield from self._alone(self._ask(index, subindex, command, data)))
+
+    def _alone(self, steps: Steps[T]) -> Steps[T]:
         self._in_use = True
         try:
-            return (yield from self._ask(index, subindex, command, data))
+            return (yield from steps)
         finally:
             self._in_use = False
 
     def _ask(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
         doing, expected = ("reading", _UPLOAD) if command == _UPLOAD else ("writing", _DOWNLOADED)
-        give_up = Deadline(self.clock, _TRANSFER_S)
+        give_up, again = Deadline(self.clock, _TRANSFER_S), False
         body = _SDO_HEADER.pack(_COE_SDO_REQUEST << 12, command, index, subindex) + data.ljust(4, b"\0")
         while not give_up.passed:
-            yield from self.drain()
-            if self._put(body):
+            if self._stale:
+                yield from self.drain()
+            self._stale = True
+            if (yield from self._put(body)):
                 deadline = Deadline(self.clock, _ANSWER_S)
                 while not deadline.passed:
-                    yield
-                    try:
-                        answer = self._answer(index, subindex, expected)
-                    except MessageLostError:
+                    yield None
+                    if (message := (yield from self._take())) is None:
                         break  # ask again: reading and writing twice does no harm
-                    if answer is None:
+                    if (answer := _answer(message, index, subindex, expected)) is None:
                         continue
+                    self._stale = again
                     if answer[0] == _ABORT:
                         code = int.from_bytes(answer[1][:4], "little")
                         raise SdoAbortError(
@@ -352,45 +324,29 @@ class MailboxSdo:
                             code,
                         )
                     return answer
-            yield
+            again = True
+            yield None
         raise SetUpError(self._unanswered(doing, index, subindex, "no answer"))
 
-    def _answer(self, index: int, subindex: int, expected: int) -> tuple[int, bytes] | None:
-        """Command and data of the answer if it is there.
-
-        Others are dropped, such as the late answer to another command about the same object.
-        """
-        body = self._take()
-        if body is None or len(body) < _SDO_HEADER.size + 4:
-            return None
-        coe, command, its_index, its_subindex = _SDO_HEADER.unpack_from(body)
-        is_sdo = coe >> 12 == _COE_SDO_RESPONSE or (coe >> 12 == _COE_SDO_REQUEST and command == _ABORT)
-        if not is_sdo or (its_index, its_subindex) != (index, subindex):
-            return None
-        if command != _ABORT and command & _COMMAND_MASK != expected:
-            return None
-        return command, body[_SDO_HEADER.size :]
-
-    def _put(self, body: bytes) -> bool:
+    def _put(self, body: bytes) -> Steps[bool]:
         """Send a CoE message; False if that failed. It has another counter than the one before."""
         self._counter = max(2, self._counter + 1 & 7)  # SOEM's mapping begins with 1
         header = _HEADER.pack(len(body), 0, 0, _TYPE_COE | self._counter << 4)
-        return self._bus.write_register(self._number, self._out, (header + body).ljust(self._out_size, b"\0"))
+        message = (header + body).ljust(self._out_size, b"\0")
+        return (yield from self._bus.write_register(self._number, self._out, message))
 
-    def _take(self) -> bytes | None:
-        """The CoE message that is there; None if none is, empty if it is of another protocol.
+    def _take(self) -> Steps[bytes | None]:
+        """The CoE message that is there, or the header of one of another protocol; empty if none is.
 
-        MessageLostError if the datagram that took it did not come back in time.
+        None if the datagram that may have taken it is lost. The controller does not execute the reading of an
+        empty mailbox, so that its status need not be read first.
         """
-        status = self._bus.read_register(self._number, MAILBOX_IN_STATUS, 1)
-        if status is None or not status[0] & MAILBOX_FULL:
-            return None
-        message = self._bus.read_register(self._number, self._in, self._in_size)
-        if message is None:
-            raise MessageLostError
+        message = yield from self._bus.read_register(self._number, self._in, self._in_size)
+        if not message:
+            return message
         length, _, _, kind = _HEADER.unpack_from(message)
-        if kind & 0x0F != _TYPE_COE:
-            return b""
+        if kind & 0x0F != _TYPE_COE or not length:
+            return message[: _HEADER.size]
         body = message[_HEADER.size : _HEADER.size + length]
         if self._emergencies is not None and (emergency := Emergency.parse(body)) is not None:
             self._emergencies.note(self._number, emergency)
@@ -398,3 +354,19 @@ class MailboxSdo:
 
     def _unanswered(self, doing: str, index: int, subindex: int, what: str) -> str:
         return f"{self._name} did not answer {doing} object 0x{index:04X}:{subindex}: {what}"
+
+
+def _answer(body: bytes, index: int, subindex: int, expected: int) -> tuple[int, bytes] | None:
+    """Command and data of the answer if that is it.
+
+    Others are dropped, such as the late answer to another command about the same object.
+    """
+    if len(body) < _SDO_HEADER.size + 4:
+        return None
+    coe, command, its_index, its_subindex = _SDO_HEADER.unpack_from(body)
+    is_sdo = coe >> 12 == _COE_SDO_RESPONSE or (coe >> 12 == _COE_SDO_REQUEST and command == _ABORT)
+    if not is_sdo or (its_index, its_subindex) != (index, subindex):
+        return None
+    if command != _ABORT and command & _COMMAND_MASK != expected:
+        return None
+    return command, body[_SDO_HEADER.size :]

@@ -1,6 +1,6 @@
 """The slave controller of a sensor, or a terminal: AL states, mailbox, and the registers that it needs in OP.
 
-At the start and when a sensor comes back the same steps take it to OP, one or two datagrams each.
+At the start and when a sensor comes back the same steps take it to OP.
 Source: ETG.1000.4 and ETG.1000.6.
 """
 
@@ -12,11 +12,11 @@ from typing import Final
 
 from ethercat_server.errors import BusError, SdoAbortError, SetUpError
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.datagrams import Datagrams, repeat
+from ethercat_server.ethercat.datagrams import Datagrams, Steps, repeat
 from ethercat_server.ethercat.exchange import Area
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import ACKNOWLEDGE_S, STATE_S, AlState, AlStatus
-from ethercat_server.ethercat.slave.coe import Emergencies, MailboxSdo, Steps
+from ethercat_server.ethercat.slave.coe import Emergencies, MailboxSdo
 from ethercat_server.ethercat.slave.sii import OF_FIRMWARE
 
 _START_ATTEMPTS: Final = 20
@@ -58,27 +58,28 @@ class SlaveController:
         self._managers = self._fmmus = b""
         self._latch: tuple[int, bytes] | None = None
 
-    def status(self) -> AlStatus | None:
+    def status(self) -> Steps[AlStatus | None]:
         """Its AL status; None if it does not answer."""
-        data = repeat(self.attempts, self._bus.read_register, self.number, reg.AL_STATUS, reg.AL_STATUS_SIZE)
+        read = self._bus.read_register
+        data = yield from repeat(self.attempts, read, self.number, reg.AL_STATUS, reg.AL_STATUS_SIZE)
         return AlStatus.parse(data) if data else None
 
-    def _read(self, address: int, size: int) -> bytes:
-        if data := repeat(self.attempts, self._bus.read_register, self.number, address, size):
+    def _read(self, address: int, size: int) -> Steps[bytes]:
+        if data := (yield from repeat(self.attempts, self._bus.read_register, self.number, address, size)):
             return data
         raise self._gone()
 
-    def write(self, address: int, data: bytes) -> None:
+    def write(self, address: int, data: bytes) -> Steps[None]:
         """Write registers; GoneError if it does not answer."""
-        if not repeat(self.attempts, self._bus.write_register, self.number, address, data):
+        if not (yield from repeat(self.attempts, self._bus.write_register, self.number, address, data)):
             raise self._gone()
 
     def go(self, state: AlState) -> Steps[None]:
         """Request an AL state and wait for it; an error is acknowledged first. SetUpError if it fails."""
-        status = self.status()
+        status = yield from self.status()
         if status is not None and status.error:
             yield from self._acknowledge(status)
-        self.write(reg.AL_CONTROL, state.request())
+        yield from self.write(reg.AL_CONTROL, state.request())
         deadline = Deadline(self._bus.clock, STATE_S[state])
         while True:
             status = yield from self._next_status()
@@ -92,13 +93,15 @@ class SlaveController:
     def enter_preop(self) -> Steps[None]:
         """Through INIT, clearing what another master has set up (FMMUs, sync managers, SYNC0)."""
         yield from self._enter_init()
-        self._bus.write_register(self.number, reg.DC_ACTIVATION, b"\0\0")  # a controller without DC refuses
-        yield
-        self.write(reg.SYNC_MANAGER, self._mailboxes.ljust(self._count * reg.SYNC_MANAGER_SIZE, b"\0"))
-        self.write(reg.SII_OWNER, OF_FIRMWARE)  # a slave reads its SII on the way to PREOP
+        # A controller without DC refuses.
+        yield from self._bus.write_register(self.number, reg.DC_ACTIVATION, b"\0\0")
+        yield from self.write(
+            reg.SYNC_MANAGER, self._mailboxes.ljust(self._count * reg.SYNC_MANAGER_SIZE, b"\0")
+        )
+        yield from self.write(reg.SII_OWNER, OF_FIRMWARE)  # a slave reads its SII on the way to PREOP
         yield from self.go(AlState.PREOP)
 
-    def map_inputs(self, logical: int, inputs: Sequence[tuple[int, int, int, int]]) -> None:
+    def map_inputs(self, logical: int, inputs: Sequence[tuple[int, int, int, int]]) -> Steps[None]:
         """Map inputs from a logical address on, and nothing else: sync manager, its start, bytes, control.
 
         SetUpError if there are more of them than FMMUs.
@@ -108,10 +111,10 @@ class SlaveController:
         units = b""
         for manager, start, size, control in inputs:
             at = reg.SYNC_MANAGER + manager * reg.SYNC_MANAGER_SIZE
-            self.write(at, reg.pack_sync_manager(start, size, control))
+            yield from self.write(at, reg.pack_sync_manager(start, size, control))
             units += reg.FMMU_LAYOUT.pack(logical, size, 0, 7, start, 0, reg.FMMU_READ, 1)
             logical += size
-        self.write(reg.FMMU, units)
+        yield from self.write(reg.FMMU, units)
 
     def leave(self, state: AlState) -> Steps[None]:
         """Go to INIT, or PREOP if it was found there, with nothing mapped and without a station address."""
@@ -120,14 +123,14 @@ class SlaveController:
             yield from self.enter_preop()
         else:
             yield from self._enter_init()
-            self.write(reg.SYNC_MANAGER, bytes(self._count * reg.SYNC_MANAGER_SIZE))
-        self.write(reg.STATION_ADDRESS, bytes(2))
+            yield from self.write(reg.SYNC_MANAGER, bytes(self._count * reg.SYNC_MANAGER_SIZE))
+        yield from self.write(reg.STATION_ADDRESS, bytes(2))
 
     def _enter_init(self) -> Steps[None]:
         """Without FMMUs."""
         yield from self.go(AlState.INIT)
-        self._read_hardware()
-        self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
+        yield from self._read_hardware()
+        yield from self.write(reg.FMMU, bytes(self._units * reg.FMMU_SIZE))
 
     def mapped_size(self, assignment: int, in_sii: int) -> Steps[int]:
         """Bytes of process data by the PDOs that the object `assignment` lists; `in_sii` if there is none.
@@ -157,21 +160,21 @@ class SlaveController:
             )
         return value
 
-    def map(self, managers: bytes = b"", fmmus: bytes = b"") -> None:
+    def map(self, managers: bytes = b"", fmmus: bytes = b"") -> Steps[None]:
         """Write sync managers from the third on, and FMMUs: by default those that `read_mapping` has read."""
-        self.write(reg.SYNC_MANAGER + _MAILBOXES_END, managers or self._managers)
-        self.write(reg.FMMU, fmmus or self._fmmus)
+        yield from self.write(reg.SYNC_MANAGER + _MAILBOXES_END, managers or self._managers)
+        yield from self.write(reg.FMMU, fmmus or self._fmmus)
 
-    def read_mapping(self) -> int:
+    def read_mapping(self) -> Steps[int]:
         """Read back how a master has mapped the process data; returns the bytes of the inputs.
 
         SetUpError if something was not written: SOEM writes it once and does not verify it.
         """
-        self._read_hardware()
-        self._fmmus = self._read(reg.FMMU, self._units * reg.FMMU_SIZE)
+        yield from self._read_hardware()
+        self._fmmus = yield from self._read(reg.FMMU, self._units * reg.FMMU_SIZE)
         rows = reg.FMMU_LAYOUT.iter_unpack(self._fmmus)
         self.areas = [Area(row[0], row[0] + row[1], row[6]) for row in rows if row[7] & 1]
-        data = self._read(reg.SYNC_MANAGER, self._count * reg.SYNC_MANAGER_SIZE)
+        data = yield from self._read(reg.SYNC_MANAGER, self._count * reg.SYNC_MANAGER_SIZE)
         used = {
             reg.FMMU_WRITE if control & reg.SM_WRITE else reg.FMMU_READ: at * reg.SYNC_MANAGER_SIZE
             for at, (_, length, control, _, active, _) in enumerate(reg.SYNC_MANAGER_LAYOUT.iter_unpack(data))
@@ -186,14 +189,14 @@ class SlaveController:
         self._managers = data[_MAILBOXES_END:]
         return sum(area.end - area.start for area in self.areas if area.kind == reg.FMMU_READ)
 
-    def latch_events(self) -> bool:
+    def latch_events(self) -> Steps[bool]:
         """Have the controller latch the times of new samples; False if it has no distributed clock.
 
         Another master may switch that off at any time.
         """
         if self._latch is None:
             return False
-        self.write(*self._latch)
+        yield from self.write(*self._latch)
         return True
 
     def enter_op(self) -> Steps[None]:
@@ -207,15 +210,15 @@ class SlaveController:
 
     def _acknowledge(self, status: AlStatus) -> Steps[None]:
         # The next request must wait for the error to clear: the slave sees only the last write to AL control.
-        self.write(reg.AL_CONTROL, status.acknowledge())
+        yield from self.write(reg.AL_CONTROL, status.acknowledge())
         deadline = Deadline(self._bus.clock, ACKNOWLEDGE_S)
         while (now := (yield from self._next_status())).error:
             if deadline.passed:
                 raise BusError(f"{self._name} keeps its error although it was acknowledged: it is in {now}")
 
     def _next_status(self) -> Steps[AlStatus]:
-        yield
-        status = self.status()
+        yield None
+        status = yield from self.status()
         if status is None:
             raise self._gone()
         return status
@@ -223,8 +226,8 @@ class SlaveController:
     def _gone(self) -> GoneError:
         return GoneError(f"{self._name} does not answer: check cable and power")
 
-    def _read_hardware(self) -> None:
+    def _read_hardware(self) -> Steps[None]:
         if not self._count:
-            data = self._read(reg.FMMU_AND_SM_COUNT, _HARDWARE.size)
+            data = yield from self._read(reg.FMMU_AND_SM_COUNT, _HARDWARE.size)
             units, count, self.features = _HARDWARE.unpack(data)
             self._units, self._count = min(units, reg.MOST_FMMUS), min(count, reg.MOST_SYNC_MANAGERS)

@@ -13,8 +13,7 @@ from typing import Any, Final
 
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.clock import Deadline
-from ethercat_server.ethercat.datagrams import Registers, repeat
-from ethercat_server.ethercat.slave.coe import Steps
+from ethercat_server.ethercat.datagrams import Registers, Steps, repeat
 from ethercat_server.ethercat.slave.registers import SII_CONTROL, SII_OWNER
 
 Sii = dict[str, Any]  # what `decode` returns
@@ -208,6 +207,7 @@ _BUSY: Final = 0x8000
 _ERRORS: Final = 0x7800
 _EIGHT_BYTES: Final = 0x0040
 _ATTEMPTS_TO_GIVE_BACK: Final = 3
+_PAUSE_S: Final = 0.0002  # between two questions whether it has read a word: 1 to 3 ms
 _WORD_S: Final = 1.5  # an EEPROM behind a busy bus is slow
 
 
@@ -216,16 +216,24 @@ def read_sii(bus: Registers, slave: int, word: int, count: int, owner: bytes = O
 
     `owner` is who has the right to use it afterwards, as in register 0x0500.
     """
-    data = bytearray()
     try:
-        yield from _wait_for_firmware(bus, slave)
-        yield from _write(bus, slave, SII_OWNER, _TAKE, word)
-        yield from _write(bus, slave, SII_OWNER, OF_MASTER, word)
-        while len(data) < 2 * count:
-            data += yield from _read_word(bus, slave, word + len(data) // 2)
-    finally:
-        # Without waiting: the caller may have aborted.
-        repeat(_ATTEMPTS_TO_GIVE_BACK, bus.write_register, slave, SII_OWNER, owner)
+        data = yield from _read_words(bus, slave, word, count)
+    except GeneratorExit:
+        raise
+    except BaseException:  # whatever it is, also that the caller has aborted
+        yield from repeat(_ATTEMPTS_TO_GIVE_BACK, bus.write_register, slave, SII_OWNER, owner)
+        raise
+    yield from repeat(_ATTEMPTS_TO_GIVE_BACK, bus.write_register, slave, SII_OWNER, owner)
+    return data
+
+
+def _read_words(bus: Registers, slave: int, word: int, count: int) -> Steps[bytes]:
+    data = bytearray()
+    yield from _wait_for_firmware(bus, slave)
+    yield from _write(bus, slave, SII_OWNER, _TAKE, word)
+    yield from _write(bus, slave, SII_OWNER, OF_MASTER, word)
+    while len(data) < 2 * count:
+        data += yield from _read_word(bus, slave, word + len(data) // 2)
     return bytes(data[: 2 * count])
 
 
@@ -233,10 +241,10 @@ def _wait_for_firmware(bus: Registers, slave: int) -> Steps[None]:
     """Wait until the slave's own firmware has finished an access, for a limited time."""
     deadline = Deadline(bus.clock, _WORD_S)
     while not deadline.passed:
-        found = bus.read_register(slave, SII_OWNER, 2)
-        if found is not None and not (found[0] & 1 and found[1] & _IN_USE):
+        found = yield from bus.read_register(slave, SII_OWNER, 2)
+        if found and not (found[0] & 1 and found[1] & _IN_USE):
             return
-        yield
+        yield _PAUSE_S
 
 
 def _read_word(bus: Registers, slave: int, word: int) -> Steps[bytes]:
@@ -245,30 +253,27 @@ def _read_word(bus: Registers, slave: int, word: int) -> Steps[bytes]:
     answer, asked = "no answer", False
     while not deadline.passed:
         if not asked:
-            asked = bus.write_register(slave, SII_CONTROL, _COMMAND.pack(_READ, word))
-            yield
-            continue
-        found = bus.read_register(slave, SII_CONTROL, _REGISTERS.size)
-        if found is not None:
+            asked = yield from bus.write_register(slave, SII_CONTROL, _COMMAND.pack(_READ, word))
+        elif found := (yield from bus.read_register(slave, SII_CONTROL, _REGISTERS.size)):
             status, address, data = _REGISTERS.unpack(found)
             if status & _BUSY:
                 answer = f"it stays busy (status 0x{status:04X})"
             elif status & _ERRORS or address != word:
                 answer = f"it refuses (status 0x{status:04X})"
-                bus.write_register(slave, SII_CONTROL, _COMMAND.pack(_NONE, word))
+                yield from bus.write_register(slave, SII_CONTROL, _COMMAND.pack(_NONE, word))
                 asked = False
             else:
                 return bytes(data if status & _EIGHT_BYTES else data[:4])
-        yield
+        yield _PAUSE_S
     raise _unreadable(slave, word, answer)
 
 
 def _write(bus: Registers, slave: int, address: int, data: bytes, word: int) -> Steps[None]:
     deadline = Deadline(bus.clock, _WORD_S)
-    while not bus.write_register(slave, address, data):
+    while not (yield from bus.write_register(slave, address, data)):
         if deadline.passed:
             raise _unreadable(slave, word, "no answer")
-        yield
+        yield _PAUSE_S
 
 
 def _unreadable(slave: int, word: int, why: str) -> BusError:

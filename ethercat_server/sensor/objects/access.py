@@ -9,7 +9,8 @@ from bota_ethercat.control import MAX_SDO_BYTES, ErrorCode
 from bota_ethercat.errors import RequestError
 from bota_ethercat.sensor.sdo_types import SDO_TYPES, SdoType
 from ethercat_server.errors import CutOffError, extended
-from ethercat_server.ethercat.slave.coe import Sdo, Steps
+from ethercat_server.ethercat.datagrams import Steps
+from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.dictionary import ObjectEntry, find_objects, full_name
 from ethercat_server.sensor.sensor import Sensor
