@@ -15,9 +15,9 @@ from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
 from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.program.arguments import seconds
+from bota_ethercat.replies import SensorInfo, position_of
 from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import number, whole
 from ethercat_server.access.sensors import Sensors, note
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.clock import Deadline
@@ -42,9 +42,9 @@ _COUNTS: Final = ("lost", "repeated", "invalid")
 class _Watched:
     """One sensor: what came in this interval, and how many samples were used in all."""
 
-    def __init__(self, found: Found, rate_hz: object, now_ns: int) -> None:
-        self.found, self.rate_hz, self.samples = found, rate_hz, 0
-        self.observer = StreamObserver(number(rate_hz) or 0.0, now_ns)
+    def __init__(self, found: Found, info: SensorInfo, now_ns: int) -> None:
+        self.found, self.info, self.samples = found, info, 0
+        self.observer = StreamObserver(info.rate_hz, now_ns)
         self._sums, self._summed = [0.0] * 6, 0
 
     def take(self, frames: list[DataMessage], now_ns: int, most: int) -> None:
@@ -65,20 +65,20 @@ class _Watched:
             {"severity": row.severity.value, "meaning": row.meaning, "remedy": row.remedy}
             for row in explain(seen.warnings)
         ]
-        self.observer.begin(number(self.rate_hz) or 0.0, now_ns)
+        self.observer.begin(self.info.rate_hz, now_ns)
         self._sums, self._summed = [0.0] * 6, 0
         return found
 
 
 def _tell(opened: Sensors, event: JsonObject, watched: Mapping[int, _Watched]) -> bool:
     """Say what happened to a watched sensor; whether its data has to settle."""
-    kind, of = event["event"], whole(event.get("sensor"))
+    kind, of = event["event"], position_of(event)
     if kind == Event.SHUTTING_DOWN:
         raise ServerError(f"{opened.used} is shutting down")
     if of is None or of not in watched:
         return False
     note(event_sentence(event))
-    watched[of].rate_hz = event.get("rate_hz", watched[of].rate_hz)
+    watched[of].info = watched[of].info.changed_by(event)
     return kind in (Event.SENSOR_BACK, Event.RECONFIGURED)
 
 
@@ -131,9 +131,10 @@ def _watch(args: argparse.Namespace) -> int:
         try:
             with contextlib.suppress(KeyboardInterrupt):  # the normal end
                 opened.wait_settled([found.number for found in sensors])
-                rows, began_ns = opened.ask("describe")["sensors"], opened.clock.monotonic_ns()
+                known, began_ns = opened.describe(), opened.clock.monotonic_ns()
                 for found in sensors:
-                    watched[found.number] = _Watched(found, rows[found.number]["rate_hz"], began_ns)
+                    info = known.find(found.number) or SensorInfo(found.number)
+                    watched[found.number] = _Watched(found, info, began_ns)
                 _follow(opened, args, watched)
         finally:
             _show(opened, args, watched)

@@ -18,6 +18,7 @@ from bota_ethercat.health import history as words
 from bota_ethercat.health.judge import Observation, judge
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.pdo import PDO_FIELDS
+from bota_ethercat.replies import SensorStatus, decode
 from ethercat_server.acquisition.drift import Drift
 from ethercat_server.daemon.histories import kept
 from ethercat_server.sensor.sensor import Identity, Sensor
@@ -58,6 +59,11 @@ class Arm:
             self.drift.second()
 
     @property
+    def row(self) -> SensorStatus:
+        """As a client reads it in `status`."""
+        return decode(SensorStatus, self.drift.as_json())
+
+    @property
     def moved(self) -> float | None:
         """N of Fz; None before there is anything to compare."""
         found = self.drift.as_json()["drift"]
@@ -72,13 +78,12 @@ class Arm:
 def test_drift_since_the_tare_is_told_with_the_axis_the_time_and_the_temperature() -> None:
     arm = Arm()
     arm.warm_up(0.12)
-    row = arm.drift.as_json()
-    told = words.drift(row, LIMITS)
+    told = words.drift(arm.row, LIMITS)
     assert told == "Fz has drifted 1.2 N since the tare 10 min ago, 10 K warmer"
     assert str(judge(Observation(drift=told))) == f"Worth a look: {told}: re-tare advised"
     arm.drift.begin("tare")
     arm.rest(80)
-    assert words.drift(arm.drift.as_json(), LIMITS) == ""
+    assert words.drift(arm.row, LIMITS) == ""
     assert arm.moved == pytest.approx(0, abs=0.05)
 
 
@@ -135,7 +140,7 @@ def test_the_line_by_temperature_takes_three_runs_and_its_interval_is_how_they_d
     line: Any = arm.drift.as_json()["temperature_line"]
     assert (line["runs"], line["slope"][2]) == (3, pytest.approx(0.12, abs=0.003))
     assert line["interval"][2] == pytest.approx(4.30 * 0.02 / math.sqrt(3), rel=0.1)
-    assert words.temperature_line({"temperature_line": line}).startswith("by temperature, of 3 runs: Fz +0.1")
+    assert words.temperature_line(arm.row).startswith("by temperature, of 3 runs: Fz +0.1")
 
 
 def test_overload_is_counted_and_the_line_of_a_restored_history_goes_on(
@@ -153,7 +158,7 @@ def test_overload_is_counted_and_the_line_of_a_restored_history_goes_on(
             simulation.run(2.5)
         drift.history.add_run([0.1] * 6)
     row = simulation.status()["sensors"][0]
-    text, overloaded = words.overload(row)
+    text, overloaded = words.overload(decode(SensorStatus, row))
     assert overloaded
     assert "(2 times in all); largest wrench since " in text
     assert "Fz 9.75 N" in text
@@ -225,4 +230,5 @@ def test_sensors_with_the_same_serial_number_have_no_history(
     ],
 )
 def test_what_a_server_does_not_know_or_makes_up_is_not_said(row: dict[str, Any]) -> None:
-    assert (words.drift(row), words.temperature_line(row), words.overload(row)) == ("", "", ("", False))
+    known = decode(SensorStatus, row)
+    assert (words.drift(known), words.temperature_line(known), words.overload(known)) == ("", "", ("", False))

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping
 from typing import Any, Final
 
 from rclpy.node import Node
 
 from bota_ethercat.health.history import line_slope
+from bota_ethercat.replies import SensorStatus
 from bridge.compensating.sources import IMU_IS_OFF, SourceChoice
 from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import LiveParameters
@@ -103,7 +103,7 @@ class CompensationControl:
         self._log = node.get_logger()
         self.choice = SourceChoice(node, self.link)
         # Of the sensor that the bias in force is for, for any thread; None until there was one.
-        self._serial: str | None = None
+        self._serial: int | str | None = ""  # of the sensor that was there last; "": none was
         self.own_offset = OwnOffset(self.link)
         # Origin of the bias that is being put in force, and what it was taken with if by a tare.
         self._next: tuple[str, Taken | None] = (_FROM_PARAMETER, None)
@@ -336,7 +336,7 @@ class CompensationControl:
         with self._setting:
             while not self._is_same_sensor():
                 serial = self.link.info.serial
-                if self._serial is not None:
+                if self._serial != "":
                     bias = self.bias
                     if self.origin != _FROM_PARAMETER:
                         self._log.warning(
@@ -370,7 +370,7 @@ class CompensationControl:
             )
             self._guard.trigger()
 
-    def follow_temperature(self, row: Mapping[str, Any], celsius: float) -> None:
+    def follow_temperature(self, row: SensorStatus, celsius: float) -> None:
         """Shift a bias along the line in this row of `status`, if that is wanted; any thread."""
         slope = line_slope(row) if self.parameters.temperature_line and self.own_offset.has_bias else None
         if slope is None or self._celsius is None:
