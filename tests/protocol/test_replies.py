@@ -1,4 +1,4 @@
-"""What replies say, decoded once for all programs: rows have the types they promise, whatever a server sends."""
+"""What replies say, decoded once for all programs: rows have the types that they promise."""
 
 from __future__ import annotations
 
