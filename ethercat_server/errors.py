@@ -13,6 +13,11 @@ ServerError
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
+from bota_ethercat.errors import RequestError
+
 
 class ServerError(Exception):
     """Base of all errors here."""
@@ -50,10 +55,16 @@ class CutOffError(BusError):
     """The sensor went away in the middle of work on it."""
 
 
-def extended(error: BusError, addition: str) -> BusError:
+Refusal = TypeVar("Refusal", bound=BusError | RequestError)
+
+
+def extended(error: Refusal, addition: str) -> Refusal:
     """The same error, its sentence going on with `addition`."""
     text = f"{error}{addition}"
-    return SdoAbortError(text, error.abort_code) if isinstance(error, SdoAbortError) else type(error)(text)
+    kind: Callable[..., Refusal] = type(error)
+    if isinstance(error, RequestError):
+        return kind(error.code, text, **error.extra)
+    return kind(text, error.abort_code) if isinstance(error, SdoAbortError) else kind(text)
 
 
 # Abort codes of an object or sub-index that this firmware does not have.
