@@ -19,6 +19,7 @@ from bota_ethercat.errors import (
 )
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.server_choice import default_server, is_address
+from bota_ethercat.replies import Description, Status
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
@@ -61,8 +62,8 @@ class Sensors:
         self.client, self.used, self.private = client, used, private
         self._name = name
         self.sensors = [
-            Found(row["sensor"], Identity(row["name"], row["serial"], row["hardware"], row["firmware"]))
-            for row in client.description["sensors"]
+            Found(info.sensor, Identity(info.name, info.serial or 0, info.hardware, info.firmware))
+            for info in Description.parse(client.description).sensors
         ]
 
     @classmethod
@@ -114,6 +115,14 @@ class Sensors:
         except ConnectionFailedError as error:
             raise self._closed(error) from None
 
+    def describe(self) -> Description:
+        """The reply to `describe`."""
+        return Description.parse(self.ask("describe"))
+
+    def status(self) -> Status:
+        """The reply to `status`."""
+        return Status.parse(self.ask("status"))
+
     def _closed(self, error: ConnectionFailedError) -> Exception:
         if self.private is not None and self.private.error is not None:
             return self.private.error
@@ -161,9 +170,9 @@ class Sensors:
     def _wait_back(self, number: int) -> str:
         """Give a sensor that was lost in a tare the time to come back; what became of its offset."""
         deadline = Deadline(self.clock, _BACK_S)
-        while (row := self.ask("describe")["sensors"][number])["state"] != "OP":
+        while (info := self.describe().find(number)) is None or info.state != "OP":
             if deadline.passed:
-                old = " ".join(f"{value:g}" for value in row["offset"] or ())
+                old = " ".join(f"{value:g}" for value in (info and info.offset) or ())
                 return f"; its offset may be half written (it was {old}): tare it again"
             self.clock.sleep(_IDLE_S)
         return "; it is back with its old offset"
@@ -184,8 +193,7 @@ class Sensors:
         """Wait until the data of these sensors has settled."""
         deadline = Deadline(self.clock, _SETTLED_WITHIN_S)
         while numbers and not deadline.passed:
-            rows = self.ask("describe")["sensors"]
-            if not any(row.get("settling") is True for row in rows if row["sensor"] in numbers):
+            if not any(info.settling for info in self.describe().sensors if info.sensor in numbers):
                 return
             self.clock.sleep(_IDLE_S)
 

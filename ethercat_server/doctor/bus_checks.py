@@ -13,13 +13,12 @@ from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import Address
-from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import history
-from bota_ethercat.health.judge import Observation, emergency, judge
+from bota_ethercat.health.judge import judge
 from bota_ethercat.health.observer import StreamObserver, by_sensor
 from bota_ethercat.health.verdict import LIMITS, Level
-from bota_ethercat.text.untrusted import mapping, number
+from bota_ethercat.replies import DistributionStatus, Status, position_of
 from ethercat_server.access.adapters import Holder, find_holder, links
 from ethercat_server.access.private_server import open_interface
 from ethercat_server.access.sensors import Sensors
@@ -227,10 +226,12 @@ _EXCHANGE_NOTE_US: Final = 250
 _STEADIER: Final = "see docs/tuning.md"
 
 
-def points(summary: Mapping[str, Any]) -> str:
-    """Quantiles as text."""
-    names = {"p50": "p50", "p99": "p99", "p999": "p99.9", "max": "max"}
-    return ", ".join(f"{text} {float(summary[name]):.0f}" for name, text in names.items()) + " µs"
+def points(summary: DistributionStatus) -> str:
+    """Quantiles as text; CannotLookError if one is not known."""
+    names = zip(("p50", "p99", "p99.9", "max"), summary, strict=True)
+    if None in summary:
+        raise CannotLookError("the server does not report it: install the same version of both")
+    return ", ".join(f"{name} {value:.0f}" for name, value in names) + " µs"
 
 
 def scheduling(priority: int, *, real_time: bool) -> Finding:
@@ -244,7 +245,7 @@ def scheduling(priority: int, *, real_time: bool) -> Finding:
     )  # fmt: skip
 
 
-def wake_finding(summary: Mapping[str, Any], late: int, count: int) -> Finding:
+def wake_finding(summary: DistributionStatus, late: int, count: int) -> Finding:
     """The finding for a summary: `late` of `count` wake-ups were late by more than a sample period.
 
     It may be the cause of the verdict on the stream, and is not trouble itself.
@@ -253,43 +254,48 @@ def wake_finding(summary: Mapping[str, Any], late: int, count: int) -> Finding:
     return graded(
         f"{text}; {late} of {count} by more than a sample period" if late else text,
         (late, warning, f"each loses samples; other work, or a hypervisor, used the CPU: {_STEADIER}"),
-        (summary["p99"] > _WAKE_WARNING_US, warning, f"increases the age of samples: {_STEADIER}"),
-        (summary["p99"] > _WAKE_NOTE_US, note,
+        ((summary.p99 or 0) > _WAKE_WARNING_US, warning, f"increases the age of samples: {_STEADIER}"),
+        ((summary.p99 or 0) > _WAKE_NOTE_US, note,
          f"usual without a real-time kernel; occasionally increases the age of samples: {_STEADIER}"),
-        **{**summary, "wake_ups": count, "later_than_a_period": late},
+        **{**summary._asdict(), "wake_ups": count, "later_than_a_period": late},
     )  # fmt: skip
 
 
-def exchange_finding(when: str, summary: Mapping[str, Any], lost: int, count: int) -> Finding:
+def exchange_finding(when: str, summary: DistributionStatus, lost: int, count: int) -> Finding:
     """The finding for a summary: `lost` of `count` exchanges did not come back. A cause, too."""
     text = f"{points(summary)}{when}"
     return graded(
         f"{text}; {lost} frames lost of {count}" if lost else text,
         (lost, warning, "each may cost a sample: check the cable; a busy virtual machine loses frames, too"),
-        (summary["p50"] > SLOW_US, warning,
-         f"slow network card or driver: {cost(summary['p50'])}; see coalescing"),
-        (summary["p99"] > _EXCHANGE_NOTE_US, note,
+        ((summary.p50 or 0) > SLOW_US, warning,
+         f"slow network card or driver: {cost(summary.p50 or 0)}; see coalescing"),
+        ((summary.p99 or 0) > _EXCHANGE_NOTE_US, note,
          "network card, driver or load: see coalescing"),
-        **{**summary, "exchanges": count, "lost": lost},
+        **{**summary._asdict(), "exchanges": count, "lost": lost},
     )  # fmt: skip
 
 
-def age_finding(what: str, summary: Mapping[str, Any]) -> Finding:
+def age_finding(what: str, summary: DistributionStatus) -> Finding:
     """The finding for a summary of ages, by the limits of streams."""
-    how, p99_s = "the server's estimate; a message to a client takes about 50 µs more", summary["p99"] * 1e-6
+    how = "the server's estimate; a message to a client takes about 50 µs more"
+    p99_s = (summary.p99 or 0) * 1e-6
     old = f"occasionally more than a sample period ({how})"
     return graded(
         f"{what}: {points(summary)}",
         (p99_s >= LIMITS.age_error, bad, old),
         (p99_s >= LIMITS.age_warn, warning, old),
         (p99_s * 1e6 > _PERIOD_US, note, old),
-        why=how, **summary,
+        why=how, **summary._asdict(),
     )  # fmt: skip
 
 
-_FATES: Final = frozenset({Event.SENSOR_LOST, Event.SENSOR_BACK})
 _LOG: Final = "see the server's log (journalctl -u 'ethercat-server@*')"
 _COUNTS: Final = ("fresh", "repeated", "invalid", "lost_samples", "recoveries")
+
+
+def increase(before: int | None, after: int | None) -> int:
+    """That of a counter; 0 if it is not known, or the server was started anew."""
+    return 0 if before is None or after is None else max(0, after - before)
 
 
 class ServerView:
@@ -298,113 +304,106 @@ class ServerView:
     def __init__(self, sensors: Sensors, seconds: float) -> None:
         """Watch for `seconds`, then close `sensors`. A private server's figures are those since its start."""
         self._own, clock, private = sensors.private is not None, sensors.clock, sensors.private
-        self._events: list[dict[str, Any]] = []
-        self._unread = 0.0, False
         with contextlib.closing(sensors):
-            rows: list[dict[str, Any]] = sensors.ask("describe")["sensors"]
-            self.before: dict[str, Any] = sensors.ask("status")
-            start_ns, end = clock.monotonic_ns(), Deadline(clock, seconds)
-            self._observers = [StreamObserver(number(row["rate_hz"]) or 0.0, start_ns) for row in rows]
+            self._observers = {
+                info.sensor: StreamObserver(info.rate_hz, clock.monotonic_ns())
+                for info in sensors.describe().sensors
+            }
+            self.before = self._take_status(sensors)
+            end = Deadline(clock, seconds)
             for frames, events in sensors.stream(fresh_only=False) if seconds else ():
                 self._take(frames, clock.monotonic_ns(), same_machine=sensors.client.session.same_machine)
-                self._events += events
-                self._unread = max(self._unread, sensors.client.take_unread())
+                for event in events:
+                    if (position := position_of(event)) in self._observers:
+                        self._observers[position].said.take_event(event)
+                unread = sensors.client.take_unread()
+                for each in self._observers.values():
+                    each.said.note_unread(unread, clock.monotonic_ns())
                 if end.passed:
                     sensors.ask("unsubscribe")
                     break
             self.real_time = private is not None and private.real_time
             self._end_ns = clock.monotonic_ns()
-            self.after: dict[str, Any] = sensors.ask("status")
-            self.described: list[dict[str, Any]] = sensors.ask("describe")["sensors"]
-        rows = [*self.described, *self.before["sensors"], *self.after["sensors"]]
-        if not all(isinstance(row, dict) for row in rows):
-            raise ServerError("the server's reply is not understood: install the same version of both")
+            self.after = self._take_status(sensors)
+            self.described = sensors.describe().sensors
+        for info in self.described:
+            if info.sensor in self._observers:
+                self._observers[info.sensor].said.info = info
         self._when = "" if self._own else " in the last 10 s"
-        self._summaries: dict[str, Any] = self.after if self._own else self.after["last_10s"]
+        self._summaries = self.after if self._own else self.after.last_10s
+
+    def _take_status(self, sensors: Sensors) -> Status:
+        status = sensors.status()
+        for position, observer in self._observers.items():
+            observer.said.take_status(status, position, sensors.clock.monotonic_ns())
+        return status
 
     def _take(self, frames: Sequence[DataMessage], now_ns: int, *, same_machine: bool) -> None:
         for position, batch in by_sensor(frames).items():
-            if position < len(self._observers):
+            if position in self._observers:
                 self._observers[position].take(batch, now_ns)
                 if same_machine:
                     self._observers[position].note_age(batch[-1], now_ns)
 
-    def observation(self, position: int) -> Observation:
-        """What was seen of a sensor's stream."""
-        described, after = self.described[position], self.after["sensors"][position]
-        fates = [event["event"] for event in self._events if event.get("sensor") == position]
-        recoveries = int(after["recoveries"]) - int(self.before["sensors"][position]["recoveries"])
-        seen = self._observers[position].observation(self._end_ns)
-        return seen._replace(
-            unread_s=self._unread[0],
-            busy=self._unread[1],
-            locked=after["clock"]["mode"] == "locked",
-            recoveries=max(0, recoveries),
-            missed_deadlines=self._grown("missed_deadlines"),
-            is_lost=[fate for fate in fates if fate in _FATES][-1:] == [Event.SENSOR_LOST],
-            state=str(described["state"]),
-            emergency=emergency(after.get("emergency")),
-            drift=history.drift(after, LIMITS),
-            settings=mapping(described.get("settings")),
-        )
-
     def _grown(self, name: str) -> int:
         """Increase of a counter."""
-        return int(self.after[name]) - int(self.before[name])
+        return increase(getattr(self.before, name), getattr(self.after, name))
 
     def sensors(self) -> Iterator[Finding]:
         """Each sensor: the verdict on its stream."""
-        for position, described in enumerate(self.described):
-            before, after = self.before["sensors"][position], self.after["sensors"][position]
-            verdict, clock = judge(self.observation(position)), after["clock"]["mode"]
-            values: dict[str, Any] = {name: after[name] for name in _COUNTS}
-            values |= {f"new_{name}": int(after[name]) - int(before[name]) for name in _COUNTS}
-            values |= {key: described[key] for key in ("serial", "state")}
-            values |= {"sensor": position, "clock": clock, "verdict": verdict.level.key}
-            who = "{name}, serial {serial}, {state} at {rate_hz} Hz".format_map(described)
-            text = f"{who}, clock {clock}"
+        for info in self.described:
+            if (observer := self._observers.get(info.sensor)) is None:
+                continue  # it was not there before
+            before, after = self.before.find(info.sensor), self.after.find(info.sensor)
+            verdict = judge(observer.observation(self._end_ns))
+            clock = after.clock.mode or "unknown"
+            values: dict[str, Any] = {name: getattr(after, name) for name in _COUNTS}
+            values |= {f"new_{name}": increase(getattr(before, name), values[name]) for name in _COUNTS}
+            values |= {"serial": info.serial, "state": info.state, "sensor": info.sensor}
+            values |= {"clock": clock, "verdict": verdict.level.key}
+            text = f"{info.name}, serial {info.serial}, {info.state} at {info.rate_hz:g} Hz, clock {clock}"
             if verdict.findings:
                 found = "; ".join(each.found for each in verdict.findings)
                 why = "; ".join(dict.fromkeys(each.remedy for each in verdict.findings))
                 yield finding(max(verdict.level, Level.LOOK), f"{text}: {found}", why, **values)
-            elif after["lost_samples"] or after["recoveries"]:
-                lost = f"{after['lost_samples']} samples lost and {after['recoveries']} recoveries"
+            elif after.lost_samples or after.recoveries:
+                lost = f"{after.lost_samples} samples lost and {after.recoveries} recoveries"
                 yield note(f"{text}, {lost} since its start", f"none meanwhile; {_LOG}", **values)
             else:
                 yield ok(f"{text}: {verdict.sentence[0].lower()}{verdict.sentence[1:]}", **values)
             past, overloaded = history.overload(after)
             if overloaded:
-                yield note(f"sensor {position} {past}", "have it checked")
+                yield note(f"sensor {info.sensor} {past}", "have it checked")
 
     def wake_ups(self) -> Finding:
         """Its lateness."""
         late, count = self._grown("missed_deadlines"), max(1, self._grown("cycles"))
-        return wake_finding(self._summaries["wake_us"], late, count)
+        return wake_finding(self._summaries.wake_us, late, count)
 
     def exchanges(self) -> Finding:
         """How long its exchanges take, and how many are lost."""
         lost, count = self._grown("lost_frames"), max(1, self._grown("cycles"))
-        return exchange_finding(self._when, self._summaries["exchange_us"], lost, count)
+        return exchange_finding(self._when, self._summaries.exchange_us, lost, count)
 
     def ages(self) -> Iterator[Finding]:
         """The age of samples when the server sends them."""
-        recent = [row["age_us"] for row in self.after["sensors"]] if self._own else self._summaries["age_us"]
-        for position, summary in enumerate(recent):
-            if not summary or not summary.get("max"):
+        for row in self.after.sensors:
+            summary = row.age_us if self._own else self.after.recent_age_us(row.sensor)
+            if not summary.max:
                 raise CannotLookError("the server reports it once it follows the sensor's clock")
-            yield age_finding(f"sensor {position}, when sent{self._when}", summary)
+            yield age_finding(f"sensor {row.sensor}, when sent{self._when}", summary)
 
     def clients(self) -> Finding:
         """The clients, and those that are too slow."""
-        rows = self.after["clients"]
-        before = {row["peer"]: row["withheld"] for row in self.before["clients"]}
-        slow = [str(row["peer"]) for row in rows if row["withheld"] > before.get(row["peer"], 0)]
+        rows = self.after.clients
+        before = {row.peer: row.withheld for row in self.before.clients}
+        slow = [row.peer for row in rows if increase(before.get(row.peer, 0), row.withheld)]
         # The doctor itself is one of them.
         return graded(
             f"{len(rows) - 1} beside the doctor; too slow: {', '.join(slow) or 'none'}",
             (slow, note,
              "it reads more slowly than the sensor samples, so the server withholds frames from it"),
-            clients=rows,
+            clients=[row._asdict() for row in rows],
         )  # fmt: skip
 
     def examine(self, subject: str) -> Iterator[Finding]:
@@ -470,7 +469,7 @@ def _through_server(holder: Holder, address: Address, seconds: float) -> Iterato
 
     def describe(view: ServerView) -> Finding:
         why = "the bus is not accessed while it streams; these are the server's figures"
-        hours = float(view.after["uptime_s"]) / 3600
+        hours = (view.after.uptime_s or 0.0) / 3600
         return ok(f"{holder} serves it at {address}, up {hours:.1f} h", why, **address._asdict())
 
     yield from _watched("server", "server", lambda: Sensors.through(address), seconds, describe)

@@ -21,12 +21,13 @@ from bota_ethercat.settings import (
     sinc_length_of,
 )
 from bota_ethercat.text.untrusted import visible
-from ethercat_server.errors import OBJECT_MISSING, BusError, CutOffError, SdoAbortError, extended
+from ethercat_server.errors import OBJECT_MISSING, BusError, SdoAbortError, extended
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.datagrams import Steps
 from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.sensor import SETTLING_S, Identity, Sensor
+from ethercat_server.sensor.undo import Former, or_undone
 
 _LAST: Final = dictionary.SETTING_WRITE_ORDER[-1]  # sinc_length
 _OFFSETS: Final = tuple((dictionary.FORCE_TORQUE_OFFSET, sub) for sub in range(1, 7))
@@ -36,7 +37,7 @@ _SAVE_TIMEOUT_S: Final = 5.0
 # How the sentence of a change that failed goes on.
 IN_FORCE: Final = "; the former settings are in force"
 LATER: Final = "; it gets its former settings when it is back"
-_AGAIN: Final = "configure it again"
+FORMER: Final = Former("the former settings", IN_FORCE, LATER, "configure it again")
 
 NO_SETTINGS: Final[Mapping[str, SettingValue]] = {}
 
@@ -150,26 +151,27 @@ class Change:
 
 def apply_in_op(sdo: Sdo, sensor: Sensor, change: Change) -> Steps[None]:
     """Write what has changed and verify it; BusError if it fails, which says that the former is in force."""
-    before, asked = sensor.wanted, sensor.asked
-    sensor.wanted, sensor.asked = change.wanted, asked | set(change.names)
+    wanted, asked, before = sensor.wanted, sensor.asked, sensor.settings
     written = []
-    try:
+
+    def write() -> Steps[None]:
         for name in change.names:
             written.append(name)
             yield from write_setting(sdo, sensor, name)
         yield from read_settings(sdo, sensor)
-    except BusError as error:
-        sensor.wanted, sensor.asked, sensor.change_interrupted = before, asked, True
-        if isinstance(error, CutOffError):
-            raise extended(error, LATER) from None
-        try:
-            for name in written:
-                if name in sensor.settings:
-                    yield from write_setting(sdo, sensor, name, sensor.settings[name])
-        except BusError as worse:
-            raise extended(error, f"; restoring the former settings failed too: {worse}; {_AGAIN}") from None
-        sensor.change_interrupted = False
-        raise extended(error, IN_FORCE) from None
+
+    def undo() -> Steps[None]:
+        sensor.wanted, sensor.asked = wanted, asked
+        for name in written:
+            if name in before:
+                yield from write_setting(sdo, sensor, name, before[name])
+
+    sensor.wanted, sensor.asked = change.wanted, asked | set(change.names)
+    try:
+        yield from or_undone(write(), undo, FORMER, sensor)
+    except BusError:
+        sensor.wanted, sensor.asked = wanted, asked
+        raise
 
 
 def save(sdo: Sdo, sensor: Sensor) -> Steps[None]:

@@ -23,14 +23,16 @@ from typing import Any, Final, NamedTuple, Protocol
 from bota_ethercat.control import ErrorCode
 from bota_ethercat.errors import RequestError
 from bota_ethercat.pdo import layout_for
-from ethercat_server.errors import BusError, CutOffError, extended
+from ethercat_server.errors import BusError
 from ethercat_server.ethercat.clock import Clock, Deadline
 from ethercat_server.ethercat.datagrams import Steps
 from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor.sensor import SETTLING_SAMPLES, Sensor
 from ethercat_server.sensor.set_up import pack_offset, read_offset, write_offset
+from ethercat_server.sensor.undo import Former, or_undone
 
 LATER: Final = "; it gets its old offset when it is back"
+OLD: Final = Former("the former offset", "; the old offset is in force", LATER, "tare it again")
 # Fields of the process data with force and torque, and with the angular rate.
 LOAD: Final = slice(2, 8)
 RATE: Final = slice(13, 16)
@@ -97,15 +99,21 @@ def tare(
     old = yield from read_offset(sdo)
     new = tuple(t - found.mean + o for t, found, o in zip(target, before[:6], old, strict=True))
     _check_fits(new, "the offset that the key 'target' asks for")
-    try:
-        new = sensor.offset = yield from write_offset(sdo, new)
+
+    def write() -> Steps[tuple[tuple[float, ...], list[Found]]]:
+        written = sensor.offset = yield from write_offset(sdo, new)
         on_offset(sensor)
         yield from _wait(sdo.clock, sensor, stream, SETTLING_SAMPLES)
         after = yield from _average(sdo.clock, sensor, stream, samples)
         _check_better(sensor, before, after, samples, target)
-    except (BusError, RequestError) as error:
-        # In a variable of this frame, what is raised here would keep itself alive.
-        raise (yield from _take_back(sdo, sensor, old, error, on_offset)) from None
+        return written, after
+
+    try:
+        new, after = yield from or_undone(write(), lambda: write_offset(sdo, old), OLD, sensor)
+    except (BusError, RequestError):
+        sensor.offset = old
+        on_offset(sensor)
+        raise
     return {
         "old_offset": list(old),
         "new_offset": list(new),
@@ -119,30 +127,6 @@ def _check_fits(offset: Sequence[float], what: str) -> None:
         pack_offset(offset)
     except ValueError as error:
         raise RequestError(ErrorCode.BAD_REQUEST, f"{what} cannot be: {error}") from None
-
-
-def _take_back(
-    sdo: Sdo,
-    sensor: Sensor,
-    old: tuple[float, ...],
-    error: BusError | RequestError,
-    on_offset: Callable[[Sensor], object],
-) -> Steps[BusError | RequestError]:
-    """Write the old offset again; returns `error` with what came of that."""
-    addition = "; the old offset is in force"
-    if isinstance(error, CutOffError):
-        sensor.offset, sensor.change_interrupted = old, True
-        addition = LATER
-    else:
-        try:
-            sensor.offset = yield from write_offset(sdo, old)
-        except BusError as worse:
-            sensor.offset, sensor.change_interrupted = old, True
-            addition = f"; restoring the former offset failed too: {worse}; tare it again"
-    on_offset(sensor)
-    if isinstance(error, RequestError):
-        return RequestError(error.code, f"{error}{addition}", **error.extra)
-    return extended(error, addition)
 
 
 class Found(NamedTuple):

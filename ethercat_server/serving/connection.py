@@ -30,7 +30,7 @@ _LAST_REPLY_NS: Final = 1_000_000_000  # timeout for a connection that is being 
 
 
 class State(Enum):
-    """What a connection does now. It goes to a later one, or READY to READING and ANSWERING to READY."""
+    """What a connection does now."""
 
     READING = "waits for the client's next request, if the client has not closed its side"
     READY = "has received bytes that may contain whole requests; reads no more until they are taken"
@@ -43,6 +43,18 @@ class State(Enum):
         # Read for every connection in each turn: an attribute costs less than looking a member up in a set.
         # Whether no more requests are taken.
         self.ending = self.name in {"CLOSING", "LINGERING", "CLOSED"}
+
+
+_S = State
+# Any other is a defect of this program.
+TRANSITIONS: Final = {
+    _S.READING: {_S.READY, _S.CLOSING, _S.CLOSED},
+    _S.READY: {_S.READING, _S.ANSWERING, _S.CLOSING, _S.CLOSED},
+    _S.ANSWERING: {_S.READY, _S.CLOSING, _S.CLOSED},
+    _S.CLOSING: {_S.LINGERING, _S.CLOSED},
+    _S.LINGERING: {_S.CLOSED},
+    _S.CLOSED: set[State](),
+}
 
 
 class Limits(NamedTuple):
@@ -243,7 +255,7 @@ class Connection:
         return f"client {self.peer} (uid {'unknown' if self.uid is None else self.uid})"
 
     def _become(self, state: State) -> None:
-        assert self.state is not State.CLOSED, f"{self}: closed -> {state.name}"
+        assert state in TRANSITIONS[self.state], f"{self}: {self.state.name} -> {state.name}"
         self.state = state
         if self._client_ended or state in (State.READY, State.ANSWERING, State.CLOSED):
             self._watched.readers.discard(self.fd)
@@ -283,12 +295,11 @@ class Connection:
             self._become(State.READY)
         else:
             self._client_ended = True
+            self._watched.readers.discard(self.fd)
             if self.state is State.LINGERING:
                 self._become(State.CLOSED)
-            elif self.state is State.CLOSING or self.subscription is not None:
-                self._become(self.state)
-            else:
-                self._end()
+            elif self.subscription is None:
+                self.finish()
 
     def _feed(self, data: bytes) -> None:
         decoder = self.framed or self.bare
@@ -326,8 +337,9 @@ class Connection:
         return None
 
     def answer_later(self) -> None:
-        """The request that was taken is answered later: `answered` then."""
-        self._become(State.ANSWERING)
+        """The request that was taken is answered later: `answered` then. It may have ended the connection."""
+        if not self.state.ending:
+            self._become(State.ANSWERING)
 
     def answered(self) -> None:
         """Go on with what the client sent after the request; it is idle from now on."""

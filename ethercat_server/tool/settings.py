@@ -25,13 +25,15 @@ from bota_ethercat.text.json_text import finite
 from ethercat_server.access.sensors import Sensors, note
 from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignments, read_config
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
-from ethercat_server.ethercat.datagrams import finish
+from ethercat_server.ethercat.datagrams import Steps, finish
 from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.process.signals import signals_held_back
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, KNOWN_OBJECTS, OBJECTS, Access, ObjectEntry
 from ethercat_server.sensor.sensor import Found, Identity, Sensor
-from ethercat_server.sensor.set_up import Change, pack_offset, read_offset, save, write_offset
+from ethercat_server.sensor.set_up import FORMER, Change, pack_offset, read_offset, save, write_offset
+from ethercat_server.sensor.tare import OLD
+from ethercat_server.sensor.undo import or_undone
 from ethercat_server.tool.command import (
     CHANGES,
     DONE,
@@ -217,11 +219,8 @@ def _taken_back(opened: Sensors, found: Found, *, undo: bool) -> dict[str, Seque
         except ValueError as error:
             raise BusError(str(error)) from None
     with signals_held_back():
-        try:
-            finish(write_offset(sdo, after), clock=opened.clock)
-        except BusError as error:
-            finish(write_offset(sdo, before), clock=opened.clock)
-            raise BusError(f"{error}; the old offset is in force") from None
+        steps = or_undone(write_offset(sdo, after), lambda: write_offset(sdo, before), OLD)
+        finish(steps, clock=opened.clock)
     return {"old_offset": list(before), "new_offset": list(after)}
 
 
@@ -362,25 +361,23 @@ def _put_back(
     if any(before.get(name) != value for name, value in settings.items()):
         opened.configure(found.number, settings, save=False)
     written = []
-    try:
+
+    def write() -> Steps[None]:
         for address, (_, wanted) in objects.items():
             written.append(address)
-            _write(sdo, address, wanted)
-    except BusError as error:
-        try:
-            for address in written:
-                _write(sdo, address, objects[address][0])
-            opened.configure(found.number, before, save=False)
-        except BusError as again:
-            raise BusError(
-                f"{error}; the former values could not be restored ({again}): power the sensor off and on"
-            ) from None
-        raise BusError(f"{error}; the former settings are in force") from None
+            yield from _write(sdo, address, wanted)
+
+    def undo() -> Steps[None]:
+        for address in written:
+            yield from _write(sdo, address, objects[address][0])
+        opened.configure(found.number, before, save=False)
+
+    finish(or_undone(write(), undo, FORMER), clock=opened.clock)
 
 
-def _write(sdo: Sdo, address: Address, data: bytes) -> None:
-    finish(sdo.write(*address, data))
-    if (held := finish(sdo.read(*address))) != data:
+def _write(sdo: Sdo, address: Address, data: bytes) -> Steps[None]:
+    yield from sdo.write(*address, data)
+    if (held := (yield from sdo.read(*address))) != data:
         raise BusError(
             f"object 0x{address[0]:04X}:{address[1]} reads back {held.hex()} after writing {data.hex()}"
         )

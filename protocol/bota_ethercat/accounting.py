@@ -12,11 +12,9 @@ from enum import Enum, auto
 from typing import Final
 
 from bota_ethercat.framing import DataFlag
-from bota_ethercat.text.untrusted import number
 
 # Either of these flags says that a frame brings no new sample.
 NOT_NEW: Final = int(DataFlag.REPEATED | DataFlag.INVALID)
-_MOST_HZ: Final = 1e6  # a higher rate is no sensor's
 _INVALID: Final = int(DataFlag.INVALID)
 _GAP: Final = int(DataFlag.GAP)
 
@@ -73,11 +71,6 @@ class StreamAccounting:
         self._every = every
         self._fresh_only = fresh_only
         self.begin()
-
-    def take_rate(self, rate_hz: object) -> None:
-        """The sampling rate that a message gives, Hz; one that is no sensor's changes nothing."""
-        if (rate := number(rate_hz)) is not None and 0 < rate <= _MOST_HZ:
-            self.rate_hz = rate
 
     def begin(self) -> None:
         """A new subscription begins: nothing before its first frame counts as missing, unless it has GAP."""

@@ -13,18 +13,18 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from bota_ethercat.errors import ConnectionFailedError
-from bota_ethercat.health.history import drift
-from bota_ethercat.health.judge import SATURATIONS, Observation, emergency, judge
-from bota_ethercat.health.observer import p99
+from bota_ethercat.health.judge import SATURATIONS, Observation, judge
+from bota_ethercat.health.observer import SensorObserver, p99
 from bota_ethercat.health.verdict import About, Level, Limits
+from bota_ethercat.replies import Status
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import mapping, number, printable, whole
+from bota_ethercat.text.untrusted import printable
 from bridge.process import Worker
 from bridge.publishing.messages import Stamps, create_publisher
 from bridge.stream.reader import Flags, Outputs, Reader
@@ -33,7 +33,6 @@ TICK_S: Final = 0.1
 _REPORT_S: Final = 1.0
 _SHORTEST_RATE_S: Final = 0.8  # a rate measured over less time than this says little
 _SLOW_ANSWER_S: Final = 2.0  # a server that owes an answer for this time is stopped or overloaded
-_OF_SERVER: Final = ("lost_samples", "not_finite", "recoveries", "missed_deadlines")
 _LEVELS: Final = {
     Level.GOOD: DiagnosticStatus.OK,
     Level.LOOK: DiagnosticStatus.WARN,
@@ -78,8 +77,7 @@ class Monitor:
         self._published_s = now_s = self._clock.monotonic()
         self._levels: list[Level] = []
         # The server's newest `status` reply of this connection, when it was asked, and what it owes.
-        self._server: Mapping[str, Any] = {}
-        self._row: Mapping[str, Any] = {}  # our sensor's in it
+        self._server, self._said = Status(), SensorObserver()  # and of our sensor
         self._connects, self._asked_s, self._waiting = 0, 0.0, dict[str, Future[JsonObject]]()
         # Since the node and, of the server's ("server_..."), the server started.
         self._counts = self._then = self._count(0)  # now, and as of the last regular report
@@ -146,25 +144,27 @@ class Monitor:
         """Take what the server has answered, without waiting; the link gets the description."""
         link = self._link
         if not link.is_connected or link.connects != self._connects:
-            self._connects, self._server, self._waiting = link.connects, {}, {}
+            self._server, self._waiting = Status(), {}
+            self._said.disconnected()
+        if link.connects != self._connects:
+            self._connects = link.connects
+            self._said.connected(self._clock.monotonic_ns())
         for action in [action for action, reply in self._waiting.items() if reply.done()]:
             reply = self._waiting.pop(action)
             if reply.exception() is None and (content := reply.result()).get("ok") is True:
                 if action == "status":
-                    self._server = content
+                    self._server = Status.parse(content)
+                    self._said.take_status(self._server, link.sensor, self._clock.monotonic_ns())
                 else:
                     link.described(content)
-        self._row = row_of(self._server.get("sensors"), link.sensor)
 
     def _count(self, withheld: int) -> Counter[str]:
-        """All counts: of the node, and those that the server has reported."""
-        seen, row = self._reader.counts, {**self._server, **self._row}
-        reported = {f"server_{name}": row.get(name) for name in _OF_SERVER} if row else {}
+        """All counts of the node."""
+        seen = self._reader.counts
         return Counter(
             connects=self._link.connects, samples=seen.new, lost=seen.missing, stale=seen.stale,
             limited=seen.limited, repeated=seen.repeated, invalid=seen.invalid,
             not_finite=self._reader.not_finite, saturated=self._reader.watch.saturated, withheld=withheld,
-            **{name: count if type(count) is int else 0 for name, count in reported.items()},
         )  # fmt: skip
 
     def _look(self, now_s: float, withheld: int) -> None:
@@ -185,8 +185,8 @@ class Monitor:
         """A regular report was made: what is new counts from there on. Asks the server again."""
         self._flags, link = Flags(), self._link
         self._unread = self._unread if self._is_silent else (0.0, False)
-        # What a server has counted is compared with what the same one had counted before.
-        self._then = Counter({**(self._then if link.is_connected else {}), **self._counts})
+        self._then = self._counts
+        self._said.begin()
         if link.is_connected and not self._waiting:  # unless an answer is still owed
             self._asked_s = now_s
             try:
@@ -203,37 +203,28 @@ class Monitor:
         silent_s = max(now_s - max(self._fresh_s, link.since_s), 0.0)
         # How long the server has owed an answer that this node would have seen.
         answer_s = max(now_s - self._asked_s - self._unread[0], 0.0) if self._waiting else 0.0
-        mode = mapping(self._row.get("clock")).get("mode")
         sample = self._reader.watch.sample
         temperature = None if sample is None else sample.temperature
         seen = Observation(
             seconds=1.0,
             samples=new["samples"],
-            lost=max(new["lost"], new["server_lost_samples"]),
+            lost=max(new["lost"], self._said.grown("lost_samples")),
             skipped=new["stale"],
             repeated=new["repeated"],
             invalid=new["invalid"],
             silent_s=silent_s,
-            unread_s=self._unread[0],
-            busy=self._unread[1],
             rate_hz=self._rate_hz,
             nominal_hz=link.info.rate_hz,
             age_p99_us=None if self._age_us is None else self._age_us[1],
-            # The node checks those that it publishes, the server all.
-            not_finite=max(new["not_finite"], new["server_not_finite"]),
+            not_finite=new["not_finite"],  # of those that it publishes; the server checks all
             **{name: bits for name, bits in self._flags._asdict().items() if name != "status"},
             temperature=temperature,
-            locked=None if mode is None else mode == "locked",
-            recoveries=new["server_recoveries"],
-            missed_deadlines=new["server_missed_deadlines"],
-            reconnects=new["connects"] if self._counts["connects"] > 1 else 0,
-            is_lost=link.lost is not None,
-            state=link.info.state,
             server_silent=answer_s > _SLOW_ANSWER_S / 2,
-            emergency=emergency(self._row.get("emergency")),
-            drift=drift(self._row, self.limits),
-            settings=link.info.settings,
         )
+        said = self._said
+        said.info, said.lost = link.info, link.lost
+        said.note_unread(self._unread, self._clock.monotonic_ns())
+        seen = said.complete(seen, self._clock.monotonic_ns(), limits=self.limits)
         findings = judge(seen, self.limits).findings
 
         def about(subject: About) -> Problems:
@@ -260,7 +251,7 @@ class Monitor:
             name=self._prefix + name,
             level=_LEVELS[problems[0][0] if problems else Level.GOOD],
             message="; ".join(sentence for _, sentence in problems) or good,
-            hardware_id=f"{info.name} {info.serial}".strip(),
+            hardware_id=f"{info.name} {text_of(info.serial)}".strip(),
             values=[KeyValue(key=key, value=text_of(value)) for key, value in values.items()],
         )
 
@@ -276,7 +267,7 @@ class Monitor:
             "connected": link.is_connected,
             "connected_s" if link.is_connected else "disconnected_s": round(now_s - link.since_s, 1),
             "reconnects": max(self._counts["connects"] - 1, 0),
-            "server_uptime_s": self._server.get("uptime_s", ""),
+            "server_uptime_s": self._server.uptime_s,
             "last_problem": link.problem,
         }
         return self._status("link", problems, f"connected to {link.address}", values)
@@ -285,11 +276,10 @@ class Monitor:
         link, counts = self._link, self._counts
         if not link.is_connected:
             problems = [(Level.NOT_POSSIBLE, "no samples: there is no connection to the server, see link")]
-        recent = mapping(self._server.get("last_10s"))
-        age = row_of(recent.get("age_us"), link.sensor)
-        wake, exchange = mapping(recent.get("wake_us")), mapping(recent.get("exchange_us"))
+        recent, row = self._server.last_10s, self._said.status
+        age, wake = self._server.recent_age_us(link.sensor), recent.wake_us
         values = {
-            "rate_hz": "" if self._rate_hz is None else round(self._rate_hz, 1),
+            "rate_hz": None if self._rate_hz is None else round(self._rate_hz, 1),
             "expected_hz": link.info.rate_hz or "",
             "age_p50_us": "" if self._age_us is None else round(self._age_us[0]),
             "age_p99_us": "" if self._age_us is None else round(self._age_us[1]),
@@ -297,16 +287,15 @@ class Monitor:
             "lost": counts["lost"],
             "skipped": counts["stale"],
             **{name: counts[name] for name in ("limited", "repeated", "invalid", "not_finite")},
-            "server_not_finite": self._row.get("not_finite", ""),
-            "server_lost": self._row.get("lost_samples", ""),
-            "server_recoveries": self._row.get("recoveries", ""),
-            "server_missed_deadlines": self._server.get("missed_deadlines", ""),
-            "server_lost_frames": self._server.get("lost_frames", ""),
-            "server_late_p50_us": wake.get("p50", ""),
-            "server_late_p99_us": wake.get("p99", ""),
-            "server_exchange_p99_us": exchange.get("p99", ""),
-            "server_age_p50_us": age.get("p50", ""),
-            "server_age_p99_us": age.get("p99", ""),
+            **{f"server_{key}": getattr(row, key) for key in ("not_finite", "recoveries")},
+            "server_lost": row.lost_samples,
+            "server_missed_deadlines": self._server.missed_deadlines,
+            "server_lost_frames": self._server.lost_frames,
+            "server_late_p50_us": wake.p50,
+            "server_late_p99_us": wake.p99,
+            "server_exchange_p99_us": recent.exchange_us.p99,
+            "server_age_p50_us": age.p50,
+            "server_age_p99_us": age.p99,
         }
         good = "samples arrive" if self._rate_hz is None else f"{self._rate_hz:.0f} samples a second"
         return self._status("stream", problems, good, values)
@@ -320,9 +309,8 @@ class Monitor:
             problems = [(Level.TROUBLE, lost)]
         elif self._is_silent:
             problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
-        last = mapping(self._row.get("emergency"))
-        code, ago_s = whole(last.get("code")), number(last.get("ago_s"))
-        text = "" if code is None else f"emergency 0x{code:04X} ({printable(last.get('text'), 80)})"
+        last = self._said.status.emergency
+        text = "" if last.code is None else f"emergency 0x{last.code:04X} ({last.text})"
         values = {
             **{name: getattr(info, name) for name in ("name", "serial", "hardware", "firmware")},
             "al_state": info.state if link.is_connected else "",
@@ -331,22 +319,21 @@ class Monitor:
             "warnings_register": f"{flags.warnings:#010x}",
             **{row.field: f"{getattr(flags, row.field):#x}" for row in SATURATIONS},
             "saturated_samples": self._counts["saturated"],
-            "emergencies": self._row.get("emergencies", ""),
+            "emergencies": self._said.status.emergencies,
             "last_emergency": text,
-            "last_emergency_ago_s": "" if ago_s is None else ago_s,
+            "last_emergency_ago_s": last.ago_s,
         }
         return self._status("sensor", problems, "as it should be", values)
 
     def _judge_clock(self, problems: Problems, *, has_samples: bool) -> DiagnosticStatus:
-        clock, delays = mapping(self._row.get("clock")), self._link.info.delay_ns
+        clock, delays = self._said.status.clock, self._link.info.delay_ns
         if not has_samples:
             problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
-        elif clock.get("mode") is None:
+        elif not clock.mode:
             problems = [(Level.NOT_POSSIBLE, "the server has not said yet")]
         elif self._stamps.problem:
             problems = [*problems, (Level.LOOK, self._stamps.problem)]
-        names = "mode", "stamps", "period_us", "offset_ppm", "uncertainty_us"
-        values = {name: clock.get(name, "") for name in names} | {
+        values = clock._asdict() | {
             "stamp": self._stamps.kind,
             "delay_force_torque_ms": "" if delays.force_torque is None else delays.force_torque / 1e6,
             "delay_acceleration_ms": "" if delays.acceleration is None else delays.acceleration / 1e6,
@@ -371,10 +358,7 @@ class Monitor:
 
 
 def text_of(value: object) -> str:
-    """A value as a KeyValue carries it."""
+    """A value as a KeyValue carries it; empty if it is not known."""
+    if value is None:
+        return ""
     return str(value).lower() if isinstance(value, bool) else printable(value)
-
-
-def row_of(rows: object, position: int) -> Mapping[str, Any]:
-    """The object at `position` of a JSON list; empty if there is none."""
-    return mapping(rows[position] if isinstance(rows, list) and position < len(rows) else None)

@@ -236,7 +236,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
     def _on_supervisor(self, message: KeyValue) -> None:
         link = self.reader.link
         # All nodes are meant, or the one of this sensor or server: robots may share a domain.
-        names = [name for name in (link.info.serial, link.address) if name]
+        names = [name for name in (link.info.serial, link.address) if name is not None]
         keys = SUPERVISOR_KEY, *(f"{SUPERVISOR_KEY}/{name}" for name in names)
         if message.key not in keys or message.value != SUPERVISOR_STOP or self.exit_code is not None:
             return

@@ -286,7 +286,7 @@ class IdentifyServices:
             raise CompensationError("no identification was started: call identify/start first")
         return self._poses
 
-    def _sensor_now(self) -> tuple[str, object]:
+    def _sensor_now(self) -> tuple[object, object]:
         """What all poses must share: the sensor and its own offset."""
         info = self._control.link.info
         return info.serial, info.offset
@@ -306,7 +306,7 @@ class IdentifyServices:
         path = self._control.parameters.identify_file
         if path == AUTO:
             serial = self._control.link.info.serial
-            name = f"sensor-{serial if serial.isalnum() else 'unknown'}-payload.yaml"
+            name = f"sensor-{'unknown' if serial is None else serial}-payload.yaml"
             path = f"{state.folder()}/{name}"
         try:
             return Path(path).expanduser()

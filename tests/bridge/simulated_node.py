@@ -65,7 +65,9 @@ def status(lost_samples: int = 0, mode: str = "locked") -> JsonObject:
         "ok": True, "cycles": 1, "missed_deadlines": 2, "lost_frames": 3, "wake_us": spread,
         "exchange_us": spread, "uptime_s": 4.0, "clients": [],
         "last_10s": {"wake_us": spread, "exchange_us": spread, "age_us": [spread]},
-        "sensors": [{"sensor": 0, "lost_samples": lost_samples, "recoveries": 1, "clock": clock}],
+        "sensors": [
+            {"sensor": 0, "lost_samples": lost_samples, "not_finite": 0, "recoveries": 1, "clock": clock}
+        ],
     }  # fmt: skip
 
 

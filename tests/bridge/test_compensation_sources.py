@@ -15,12 +15,12 @@ from geometry_msgs.msg import PoseStamped, QuaternionStamped
 from sensor_msgs.msg import Imu
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
 from bridge.compensating.sources import ImuSource, Oriented, RobotSource
 from bridge.node import StartError
 from bridge.parameters.table import PARAMETERS, gather
-from bridge.stream.link import SensorInfo
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import (
     DEFAULTS,

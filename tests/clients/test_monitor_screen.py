@@ -69,14 +69,16 @@ def test_before_the_first_connection() -> None:
 
 def test_of_an_imu_that_is_off_no_delay_is_shown_and_an_unknown_one_is_not_known() -> None:
     state = made.healthy()
-    settings = {**state.sensors[0].settings, "imu_active": 0, "chop": True}
-    text = plain(replace(state, sensors=(replace(state.sensors[0], settings=settings),)))
+    info = state.sensors[0].info
+    info = info._replace(settings={**info.settings, "imu_active": 0, "chop": True})
+    text = plain(replace(state, sensors=(replace(state.sensors[0], info=info),)))
     assert "Delay    force, torque not known\n" in text
 
 
 def test_a_lost_sensor_is_told_in_80_columns() -> None:
     state = made.troubled()
-    sensor = replace(state.sensors[0], al_state="LOST", old_s=1800.0, firmware="1.3.8-dirty-R")
+    info = state.sensors[0].info._replace(firmware="1.3.8-dirty-R")
+    sensor = replace(state.sensors[0], al_state="LOST", old_s=1800.0, info=info)
     text = plain(replace(state, sensors=(sensor, *state.sensors[1:])))
     assert "values 30m00s old  Sensor 0  LOST  BFT-SENS-ECAT-M8  serial 1234" in text
 

@@ -251,7 +251,7 @@ def test_what_needs_a_sensor_is_refused_in_a_sentence(
 def test_the_node_takes_it_for_a_server_and_shutdown_ends_it(path: Path) -> None:
     with Replay("--loop", path) as served, connect(served.port, sensors=[1]) as client:
         info = find_sensor(client.description, 1)
-        assert (info.sensor, info.serial, info.rate_hz, info.settings) == (1, "101", 800, {"sinc_length": 64})
+        assert (info.sensor, info.serial, info.rate_hz, info.settings) == (1, 101, 800, {"sinc_length": 64})
         assert client.receive(PATIENCE_S)
         client.ask("shutdown")
         assert served.wait() == 0

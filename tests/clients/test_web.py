@@ -390,7 +390,8 @@ def test_a_page_says_what_the_monitor_says() -> None:
     assert dict(sensor["stream"])["Temperature"] == "34.6 °C"
     assert found["message"] == {"text": "12:00:00 Sensor 0 is not tared: it is not at rest", "bad": True}
     assert (sensor["units"], sensor["imu_off"]) == (["N", "Nm"], False)
-    raw = replace(state, settings={"calibration_matrix": False, "imu_active": 0})
+    info = state.info._replace(settings={"calibration_matrix": False, "imu_active": 0})
+    raw = replace(state, info=info)
     counts = json.loads(state_text(replace(made.troubled(), sensors=(raw,)), 0, 8))["sensor"]
     assert (counts["units"], counts["imu_off"]) == (["counts", "counts"], True)
     gone = json.loads(state_text(made.gone(), 0, 8))

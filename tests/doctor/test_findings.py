@@ -8,6 +8,7 @@ from typing import Any, cast
 import pytest
 
 from bota_ethercat.health.verdict import Level
+from bota_ethercat.replies import DistributionStatus
 from ethercat_server.doctor import bus_checks
 from ethercat_server.doctor.bus_checks import ErrorCounters, Slave
 from ethercat_server.doctor.report import Finding
@@ -123,8 +124,8 @@ def test_only_what_is_new_counts_while_measuring() -> None:
 # -- latencies that a server has measured
 
 
-def summary(p99_us: float, p50_us: float = 20.0, max_us: float | None = None) -> dict[str, float]:
-    return {"p50": p50_us, "p99": p99_us, "p999": p99_us, "max": max_us or p99_us}
+def summary(p99_us: float, p50_us: float = 20.0, max_us: float | None = None) -> DistributionStatus:
+    return DistributionStatus(p50_us, p99_us, p99_us, max_us or p99_us)
 
 
 @pytest.mark.parametrize(

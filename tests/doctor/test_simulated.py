@@ -12,6 +12,7 @@ import pytest
 
 from bota_ethercat.address import Address
 from bota_ethercat.health.verdict import Level
+from bota_ethercat.replies import Description, Status
 from ethercat_server.access.adapters import Holder
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor import bus_checks
@@ -274,7 +275,8 @@ def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable() -> None:
     sensor = {"sensor": 0, "name": "", "serial": 1, "rate_hz": 800.0, "state": "OP"}
     link = SimpleNamespace(
         clock=SimpleNamespace(monotonic_ns=lambda: 0), private=None, close=lambda: None,
-        ask=lambda action: {"sensors": [sensor]} if action == "describe" else next(statuses),
+        describe=lambda: Description.parse({"sensors": [sensor]}),
+        status=lambda: Status.parse(next(statuses)),
     )  # fmt: skip
     view = ServerView(cast("Sensors", link), 0.0)
     [finding] = examine("server", "sensors", view.sensors)

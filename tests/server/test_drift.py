@@ -18,6 +18,7 @@ from bota_ethercat.health import history as words
 from bota_ethercat.health.judge import Observation, judge
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.pdo import PDO_FIELDS
+from bota_ethercat.replies import SensorStatus, decode
 from ethercat_server.acquisition.drift import Drift
 from ethercat_server.daemon.histories import kept
 from ethercat_server.sensor.sensor import Identity, Sensor
@@ -58,6 +59,11 @@ class Arm:
             self.drift.second()
 
     @property
+    def row(self) -> SensorStatus:
+        """As a client reads it in `status`."""
+        return decode(SensorStatus, self.drift.as_json())
+
+    @property
     def moved(self) -> float | None:
         """N of Fz; None before there is anything to compare."""
         found = self.drift.as_json()["drift"]
@@ -72,13 +78,12 @@ class Arm:
 def test_drift_since_the_tare_is_told_with_the_axis_the_time_and_the_temperature() -> None:
     arm = Arm()
     arm.warm_up(0.12)
-    row = arm.drift.as_json()
-    told = words.drift(row, LIMITS)
+    told = words.drift(arm.row, LIMITS)
     assert told == "Fz has drifted 1.2 N since the tare 10 min ago, 10 K warmer"
     assert str(judge(Observation(drift=told))) == f"Worth a look: {told}: re-tare advised"
     arm.drift.begin("tare")
     arm.rest(80)
-    assert words.drift(arm.drift.as_json(), LIMITS) == ""
+    assert words.drift(arm.row, LIMITS) == ""
     assert arm.moved == pytest.approx(0, abs=0.05)
 
 
@@ -131,7 +136,7 @@ def test_overload_is_counted_and_kept(tmp_path: Path, monkeypatch: pytest.Monkey
             simulation.command("limit force.z off")
             simulation.run(2.5)
     row = simulation.status()["sensors"][0]
-    text, overloaded = words.overload(row)
+    text, overloaded = words.overload(decode(SensorStatus, row))
     assert overloaded
     assert "(2 times in all); largest wrench since " in text
     assert "Fz 9.75 N" in text
@@ -198,4 +203,5 @@ def test_sensors_with_the_same_serial_number_have_no_history(
     ],
 )
 def test_what_a_server_does_not_know_or_makes_up_is_not_said(row: dict[str, Any]) -> None:
-    assert (words.drift(row), words.overload(row)) == ("", ("", False))
+    known = decode(SensorStatus, row)
+    assert (words.drift(known), words.overload(known)) == ("", ("", False))

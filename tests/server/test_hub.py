@@ -666,3 +666,27 @@ def test_shutdown_ends_the_loop_and_takes_the_sensor_to_init() -> None:
     watcher.receive()
     assert watcher.at_end
     assert len(Simulation(backend=simulation.backend).subscribe().fresh(50)) == 50
+
+
+def test_a_connection_that_ends_while_its_request_is_handled_is_not_revived(served: Served) -> None:
+    def end(connection: Connection, _: JsonObject) -> None:
+        connection.finish()  # or an event found its queue full, say; the answer comes later
+
+    served.hub.start(end)
+    client = served.connect(sent=DESCRIBE)
+    served.serve()
+    assert served.is_closed(client)
+    client.end_sending()
+    served.serve(0.1)
+    assert not served.connections
+
+
+def test_a_transition_that_is_not_in_the_table_is_an_error(served: Served) -> None:
+    served.connect()
+    connection = served.only
+    with pytest.raises(AssertionError, match="READING -> ANSWERING"):
+        connection.answer_later()
+    connection.finish()
+    with pytest.raises(AssertionError, match="CLOSING -> READY"):
+        connection.answered()
+    assert connection.state is State.CLOSING

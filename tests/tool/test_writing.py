@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from ethercat_server.errors import BusError
+from ethercat_server.ethercat.datagrams import Steps
 from tests.simulation import SimulatedBus, more_if_long, simulated_bus
 from tests.tool.odd_firmware import fewer_objects, other_sinc_length, refusing
 from tests.tool.running import offset, one_sentence, refused, told, tool_here
@@ -249,6 +253,22 @@ def test_a_clearing_that_does_not_take_leaves_the_old_offset(bench: SimulatedBus
     bench.command("on-write 0x8000 2 abort 0x8000 3 0x08000022")
     assert "the old offset is in force" in refused("tare", bench.near, "--clear")
     assert offset(bench.near) == before
+
+
+def test_a_clearing_that_cannot_be_undone_says_both(
+    bench: SimulatedBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempts = count(1)
+
+    def write(*_: object) -> Steps[Any]:
+        yield from ()
+        raise BusError(f"write {next(attempts)} failed")
+
+    monkeypatch.setattr("ethercat_server.tool.settings.write_offset", write)
+    said = refused("tare", bench.near, "--clear")
+    assert said.endswith(
+        "write 1 failed; restoring the former offset failed too: write 2 failed; tare it again"
+    )
 
 
 UNMATCHED = ": by the sampling rate, which this length does not match"

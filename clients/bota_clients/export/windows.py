@@ -24,9 +24,9 @@ from bota_clients.errors import RecordingError
 from bota_clients.recording.columns import Columns, Ints, columns
 from bota_clients.recording.own_offset import DOUBT_AFTER, doubt_ns
 from bota_ethercat.accounting import NOT_NEW
-from bota_ethercat.client.reading import Delays
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, Vector3
+from bota_ethercat.replies import Delays
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import known_settings

@@ -10,28 +10,34 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import history
-from bota_ethercat.health.judge import Observation, emergency, judge, saturated_axes
+from bota_ethercat.health.judge import judge, saturated_axes
 from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
 from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.health.verdict import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
+from bota_ethercat.replies import (
+    Description,
+    DistributionStatus,
+    SensorInfo,
+    SensorStatus,
+    Status,
+    position_of,
+)
 from bota_ethercat.sensor.response import delays_ms
-from bota_ethercat.settings import SETTINGS, SettingValue
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import mapping, number, rows, text, whole
+from bota_ethercat.text.untrusted import mapping, text
 
 SILENT_S: Final = LIMITS.stale_after  # a server normally sends a frame per sample period
 _WRENCH: Final = tuple(COMMON.index(f.name) for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
 _WINDOW_NS: Final = 5 * 10**9  # of rate, jitter and age
 _JUDGED_NS: Final = 10**9  # of a verdict
-_JUDGED_S: Final = _JUDGED_NS * 1e-9
 _MESSAGE_S: Final = 30.0
 
 
@@ -48,14 +54,6 @@ class Spread(NamedTuple):
     p50: float
     high: float
     which: str = "p99"
-
-
-class Clock(NamedTuple):
-    """How the server follows a sensor's sampling clock: `locked` or `oversampling`."""
-
-    mode: str
-    offset_ppm: float | None
-    uncertainty_us: float | None
 
 
 class Alert(NamedTuple):
@@ -89,12 +87,9 @@ class SensorState:
     """One sensor. Counts are since connecting, rate, jitter and age are those of the last five seconds."""
 
     position: int
-    name: str = ""
-    serial: int | None = None
-    firmware: str = ""
+    info: SensorInfo
+    status: SensorStatus
     al_state: str = ""
-    nominal_hz: float | None = None
-    settings: Mapping[str, SettingValue] = field(default_factory=dict)
     sample: Sample | None = None
     old_s: float | None = None  # age of its values if they are stale
     peaks: tuple[Range, ...] | None = None  # of the six axes since the reset; every sample counts
@@ -111,26 +106,23 @@ class SensorState:
     repeated: int = 0
     invalid: int = 0
     silent_s: float | None = None  # since the last new sample
-    clock: Clock | None = None
-    lost_on_bus: int | None = None
-    recoveries: int | None = None
     hand_out_us: Spread | None = None  # age when the server hands them out
     zero: str = ""  # its drift, in words
 
     @property
     def units(self) -> tuple[str, str]:
         """Of force and of torque: counts if the calibration matrix is off."""
-        return ("counts", "counts") if self.settings.get("calibration_matrix") is False else ("N", "Nm")
+        return ("counts", "counts") if self.info.settings.get("calibration_matrix") is False else ("N", "Nm")
 
     @property
     def imu_off(self) -> bool:
         """Whether the IMU is off."""
-        return self.settings.get("imu_active") == 0
+        return self.info.settings.get("imu_active") == 0
 
     @property
     def delay_ms(self) -> dict[str, float | None]:
         """Of the filters in effect, by channel; as `describe` has it, also where a recording has not."""
-        return delays_ms(self.settings, self.nominal_hz)
+        return delays_ms(self.info.settings, self.info.rate_hz or None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,9 +138,7 @@ class ServerState:
     version: str = ""
     replay: str = ""  # what it replays; empty if it has sensors
     uptime_s: float | None = None
-    cycles: int | None = None
-    missed_deadlines: int | None = None
-    lost_frames: int | None = None
+    status: Status = field(default_factory=Status)
     wake_us: Spread | None = None
     exchange_us: Spread | None = None
 
@@ -174,54 +164,41 @@ class _Sensor:
 
     def __init__(self, position: int, imu_units: ImuUnits) -> None:
         self.position = position
-        self.lost: str | None = None  # why the server has lost it, if it has
         self.peaks: tuple[Range, ...] | None = None
         self._imu_units = imu_units
         self.observer = StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
-        self._row: JsonObject = {}
-        self._status: JsonObject = {}
-        self._hand_out: Any = None
+        self._hand_out = DistributionStatus()
         self._newest: bytes | None = None
         self._verdict = NOTHING_WRONG
         self._saturated: frozenset[str] = frozenset()
         self._now: list[Finding] = []
         self._seen: dict[str, tuple[Finding, float]] = {}  # since the reset, each at its worst, and when last
-        self.unread = 0.0, False, -math.inf  # the latest that matters of `Client.take_unread`, and when
-        self._grown: dict[str, tuple[int, float]] = {}  # by how much counts of `status` last grew, and when
-        self._emergency = "", 0.0
-        self._emergencies: int | None = 0  # how many there were when `_emergency` was the last
 
     def reset(self) -> None:
         """Reset peaks and past warnings."""
-        self.peaks = None
-        self._seen, self._grown, self._emergency = {}, {}, ("", 0.0)
+        self.peaks, self._seen = None, {}
         self.observer.forget()
+        self.observer.said.forget()
 
-    def describe(self, row: JsonObject, now_s: float, *, anew: bool) -> None:
+    def describe(self, info: SensorInfo, now_s: float, *, anew: bool) -> None:
         """Take its row of `describe`; `anew`: after connecting; nothing before counts as lost."""
-        before, self._row = self._row, row
+        said, now_ns = self.observer.said, _ns(now_s)
+        before = said.info
         if anew:
-            self.lost, self._status, self.observer = None, {}, StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
-            if before:
-                self._grown["reconnects"] = 1, now_s
-        if before and row.get("serial") != before.get("serial"):
+            self.observer = StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
+            self.observer.said = said
+            said.connected(now_ns)
+        said.info = info
+        if info.serial != before.serial and before != SensorInfo():
             self.reset()
             self._newest = None
-        if anew or not before or any(row.get(name) != before.get(name) for name in ("rate_hz", "serial")):
-            self.observer.begin(number(row.get("rate_hz")) or 0.0, _ns(now_s))
+        if anew or (info.rate_hz, info.serial) != (before.rate_hz, before.serial):
+            self.observer.begin(info.rate_hz, now_ns)
 
-    def take_status(self, row: JsonObject, hand_out: Any, missed_deadlines: Any, now_s: float) -> None:
-        """Take its row of `status`, the distribution of ages at hand-out, and what its server missed."""
-        row = {**row, "missed_deadlines": missed_deadlines}
-        for name in ("not_finite", "recoveries", "missed_deadlines"):
-            before, after = whole(self._status.get(name)), whole(row.get(name))
-            if before is not None and after is not None and after > before:
-                self._grown[name] = after - before, now_s
-        count, last = whole(row.get("emergencies")), row.get("emergency")
-        if count != self._emergencies and isinstance(last, dict):
-            self._emergencies = count
-            self._emergency = emergency(last), now_s - (number(last.get("ago_s")) or 0.0)
-        self._status, self._hand_out = row, hand_out
+    def take_status(self, status: Status, now_s: float) -> None:
+        """Take a reply to `status`."""
+        self.observer.said.take_status(status, self.position, _ns(now_s))
+        self._hand_out = status.recent_age_us(self.position)
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
         """Frames of this sensor as they came, oldest first."""
@@ -235,40 +212,19 @@ class _Sensor:
         self.peaks = tuple(_range([*was, *columns[i]]) for was, i in zip(before, _WRENCH, strict=True))
 
     def _judge(self, now_s: float) -> None:
-        seen = self._observation(now_s)
+        seen, lost = self.observer.observation(_ns(now_s), _JUDGED_NS), self.observer.said.lost
         self._verdict = judge(seen)
         self._saturated = frozenset(axis for axes in saturated_axes(seen).values() for axis in axes)
         self._now = []
         for finding in self._verdict.findings:
-            if self.lost is not None and finding.key == "silence":
+            if lost is not None and finding.key == "silence":
                 # The server's words of why it has lost the sensor may say what to do.
-                why = self.lost if "check " in self.lost else f"{finding.remedy} ({self.lost})"
+                why = lost if "check " in lost else f"{finding.remedy} ({lost})"
                 finding = finding._replace(remedy=why)  # noqa: PLW2901
             self._now.append(finding)
             known, _ = self._seen.get(finding.key, (finding, 0.0))
             worst = max(finding, known, key=lambda one: (one.level, one.size))
             self._seen[finding.key] = worst, now_s
-
-    def _observation(self, now_s: float) -> Observation:
-        mode = mapping(self._status.get("clock")).get("mode")
-        said, at_s = self._emergency
-        grown = {name: by for name, (by, then_s) in self._grown.items() if now_s - then_s < _JUDGED_S}
-        seen = self.observer.observation(_ns(now_s), _JUDGED_NS)
-        unread_s, busy, unread_at_s = self.unread
-        return seen._replace(
-            unread_s=unread_s if now_s - unread_at_s < _JUDGED_S else 0.0,
-            busy=busy,
-            not_finite=seen.not_finite + ("not_finite" in grown),
-            recoveries=int("recoveries" in grown),
-            missed_deadlines=grown.get("missed_deadlines", 0),
-            reconnects=int("reconnects" in grown),
-            locked=None if mode is None else mode == "locked",
-            is_lost=self.lost is not None,
-            state=text(self._row.get("state")),
-            emergency=said if now_s - at_s < LIMITS.emergency_s else "",
-            drift=history.drift(self._status, LIMITS),
-            settings=mapping(self._row.get("settings")),
-        )
 
     def state(self, now_s: float, *, server_speaks: bool) -> SensorState:
         """The current state. Silence is the sensor's fault only if the server is not silent."""
@@ -283,27 +239,19 @@ class _Sensor:
             for key, (finding, at_s) in latest
             if key not in keys
         ]
-        row, status, clock = self._row, self._status, self._status.get("clock")
-        settings = mapping(row.get("settings"))
+        said = self.observer.said
+        info, status = said.info, said.status
         sample = self._newest and SampleDecoder(len(self._newest), self._imu_units).decode(self._newest)
         return SensorState(
             position=self.position,
-            name=text(row.get("name")),
-            serial=whole(row.get("serial")),
-            firmware=text(row.get("firmware")),
-            al_state="LOST" if self.lost is not None else text(row.get("state")),
-            nominal_hz=number(row.get("rate_hz")),
-            settings={name: settings[name] for name in SETTINGS if isinstance(settings.get(name), int)},
+            info=info,
+            status=status,
+            al_state="LOST" if said.lost is not None else info.state,
             sample=sample or None,
             peaks=self.peaks,
             saturated=self._saturated,
             verdict=self._verdict,
             alerts=tuple(alerts),
-            clock=Clock(text(clock.get("mode")), *(number(clock.get(name)) for name in Clock._fields[1:]))
-            if isinstance(clock, dict)
-            else None,
-            lost_on_bus=whole(status.get("lost_samples")),
-            recoveries=whole(status.get("recoveries")),
             hand_out_us=_spread(self._hand_out),
             zero=history.drift(status),
             **self._stream(_ns(now_s)),
@@ -341,7 +289,7 @@ class Model:
         self._own_peer = ""
         self._heard_s = 0.0
         self._read_s = math.inf  # when somebody looked last whether anything had come
-        self._status: JsonObject = {}
+        self._status = Status()
         self._status_s = 0.0
         self._clients: tuple[Client, ...] = ()
         self._message: Message | None = None
@@ -353,7 +301,7 @@ class Model:
         with self._lock:
             self._server = replace(self._server, connected=True, reason="", since_clock=clock_text())
             self._since_s = self._heard_s = now_s
-            self._own_peer, self._status, self._clients = own_peer, {}, ()
+            self._own_peer, self._status, self._clients = own_peer, Status(), ()
             self._describe(description, now_s, anew=True)
 
     def described(self, description: JsonObject, now_s: float) -> None:
@@ -384,7 +332,7 @@ class Model:
             self._read_s = now_s
             if seconds >= SILENT_S:
                 for sensor in self._sensors.values():
-                    sensor.unread = seconds, busy, now_s
+                    sensor.observer.said.note_unread((seconds, busy), _ns(now_s))
 
     def note_age(self, frame: DataMessage, now_ns: int) -> None:
         """This frame arrived exactly at this CLOCK_MONOTONIC."""
@@ -392,22 +340,19 @@ class Model:
             if frame.sensor in self._sensors:
                 self._sensors[frame.sensor].observer.note_age(frame, now_ns)
 
-    def take_status(self, status: JsonObject, now_s: float) -> None:
+    def take_status(self, reply: JsonObject, now_s: float) -> None:
         """A reply to `status`."""
+        status = Status.parse(reply)
         with self._lock:
             self._heard_s = now_s
-            ages: Any = mapping(status.get("last_10s")).get("age_us")
-            for place, row in enumerate(rows(status.get("sensors"))):
-                if (sensor := self._sensor(row)) is not None:
-                    hand_out = ages[place] if isinstance(ages, list) and place < len(ages) else None
-                    sensor.take_status(row, hand_out, status.get("missed_deadlines"), now_s)
+            for sensor in self._sensors.values():
+                sensor.take_status(status, now_s)
             seconds, before = now_s - self._status_s, {client.peer: client.sent for client in self._clients}
             clients = []
-            for row in rows(status.get("clients")):
-                peer, sent = text(row.get("peer")), whole(row.get("sent")) or 0
+            for row in status.clients:
+                peer, sent = row.peer, row.sent or 0
                 rate = (sent - before[peer]) / seconds if peer in before and seconds > 0 else None
-                withheld = whole(row.get("withheld")) or 0
-                clients.append(Client(peer, peer == self._own_peer, rate, sent, withheld))
+                clients.append(Client(peer, peer == self._own_peer, rate, sent, row.withheld or 0))
             self._clients = tuple(sorted(clients, key=lambda c: (not c.this, -c.withheld, -c.sent)))
             self._status, self._status_s = status, now_s
 
@@ -415,15 +360,12 @@ class Model:
         """An event of the server."""
         with self._lock:
             self._heard_s = now_s
-            name, said = text(event.get("event")), event_sentence(event)
-            if (sensor := self._sensor(event)) is not None:
-                if name == Event.SENSOR_LOST:
-                    sensor.lost = said
-                elif name == Event.SENSOR_BACK:
-                    sensor.lost = None
-                elif name == Event.OFFSET_CHANGED:  # the zero has moved
+            position = position_of(event)
+            if position is not None and (sensor := self._sensors.get(position)) is not None:
+                sensor.observer.said.take_event(event)
+                if event.get("event") == Event.OFFSET_CHANGED:  # the zero has moved
                     sensor.peaks = None
-            self._events.append(f"{clock_text()} {said}")
+            self._events.append(f"{clock_text()} {event_sentence(event)}")
 
     def reset(self) -> None:
         """Reset peaks and past warnings."""
@@ -443,18 +385,15 @@ class Model:
             if now_s > self._message_ends_s:
                 self._message = None
             status, connected = self._status, self._server.connected
-            timing = mapping(status.get("last_10s")) or status
-            up_s = number(status.get("uptime_s"))
+            recent, up_s = status.last_10s, status.uptime_s
             server = replace(
                 self._server,
                 since_s=None if self._since_s is None else now_s - self._since_s,
                 heard_s=max(min(now_s, self._read_s) - self._heard_s, 0.0) if connected else None,
                 uptime_s=up_s + now_s - self._status_s if up_s is not None and connected else up_s,
-                cycles=whole(status.get("cycles")),
-                missed_deadlines=whole(status.get("missed_deadlines")),
-                lost_frames=whole(status.get("lost_frames")),
-                wake_us=_spread(timing.get("wake_us")),
-                exchange_us=_spread(timing.get("exchange_us")),
+                status=status,
+                wake_us=_spread(recent.wake_us) or _spread(status.wake_us),
+                exchange_us=_spread(recent.exchange_us) or _spread(status.exchange_us),
             )
             speaks = server.connected and not server.silent
             sensors = [self._sensors[position] for position in sorted(self._sensors)]
@@ -471,16 +410,13 @@ class Model:
         files = mapping(replay).get("files")
         name = text(files[0]) if isinstance(files, list) and files else "a recording"
         replayed = name if isinstance(replay, dict) else ""
-        self._server = replace(self._server, version=text(description.get("version")), replay=replayed)
+        known = Description.parse(description)
+        self._server = replace(self._server, version=known.version, replay=replayed)
         before, self._sensors = self._sensors, {}
-        for row in rows(description.get("sensors")):
-            if (position := whole(row.get("sensor"))) is not None:
-                self._sensors[position] = before.get(position) or _Sensor(position, self._imu_units)
-                self._sensors[position].describe(row, now_s, anew=anew)
-
-    def _sensor(self, row: JsonObject) -> _Sensor | None:
-        position = whole(row.get("sensor"))
-        return None if position is None else self._sensors.get(position)
+        for info in known.sensors:
+            sensor = before.get(info.sensor) or _Sensor(info.sensor, self._imu_units)
+            self._sensors[info.sensor] = sensor
+            sensor.describe(info, now_s, anew=anew)
 
 
 def clock_text() -> str:
@@ -494,10 +430,9 @@ def _range(column: Sequence[float]) -> Range:
     return Range(min(column), max(column))
 
 
-def _spread(values: Any) -> Spread | None:
-    """The distribution in a reply to `status`; None if there is none."""
-    middle, end = number(mapping(values).get("p50")), number(mapping(values).get("p99"))
-    return None if middle is None or end is None else Spread(middle, end)
+def _spread(known: DistributionStatus) -> Spread | None:
+    """A distribution in a reply to `status`; None if it is not known."""
+    return None if known.p50 is None or known.p99 is None else Spread(known.p50, known.p99)
 
 
 def _ns(seconds: float) -> int:

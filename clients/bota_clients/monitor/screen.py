@@ -191,7 +191,7 @@ def _panel(sensor: SensorState, width: int, *, bars: bool = True) -> list[Text]:
     lost = _field("Lost", "")
     for number, (text, bad) in enumerate(words.losses(sensor)):
         lost.append("   " if number else "").append(text, PEAK if bad else "")
-    unlocked = sensor.clock is not None and sensor.clock.mode != "locked"
+    unlocked = sensor.status.clock.mode not in {"locked", ""}
     clock = _field("Clock", words.clock(sensor), NOTICE if unlocked else "")
     if sensor.hand_out_us is not None:
         clock.append(f"   age at hand-out {words.times(sensor.hand_out_us)}")

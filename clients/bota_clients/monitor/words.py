@@ -60,20 +60,21 @@ def server_facts(server: ServerState) -> list[tuple[str, str]]:
         return []
     return [
         ("Up", duration(server.uptime_s)),
-        ("Missed deadlines", count(server.missed_deadlines)),
-        ("Lost frames", count(server.lost_frames)),
+        ("Missed deadlines", count(server.status.missed_deadlines)),
+        ("Lost frames", count(server.status.lost_frames)),
         ("Exchange", times(server.exchange_us)),
         ("Woke late by", times(server.wake_us)),
-        ("Cycles", count(server.cycles)),
+        ("Cycles", count(server.status.cycles)),
         ("Version", server.version or "?"),
     ]
 
 
 def identity(sensor: SensorState) -> str:
     """Position, AL state, name, serial number and firmware."""
-    serial = "" if sensor.serial is None else f"serial {sensor.serial}"
-    firmware = f"firmware {sensor.firmware}" if sensor.firmware else ""
-    parts = (f"Sensor {sensor.position}", sensor.al_state, sensor.name, serial, firmware)
+    info = sensor.info
+    serial = "" if info.serial is None else f"serial {info.serial}"
+    firmware = f"firmware {info.firmware}" if info.firmware else ""
+    parts = (f"Sensor {sensor.position}", sensor.al_state, info.name, serial, firmware)
     return "  ".join(part for part in parts if part)
 
 
@@ -87,7 +88,7 @@ def delays(sensor: SensorState) -> str:
 def rate(sensor: SensorState) -> str:
     """Measured and nominal rate."""
     found = "no samples" if sensor.rate_hz is None else f"{sensor.rate_hz:.1f}"
-    return f"{found} of {sensor.nominal_hz:g} Hz" if sensor.nominal_hz else f"{found} Hz"
+    return f"{found} of {sensor.info.rate_hz:g} Hz" if sensor.info.rate_hz else f"{found} Hz"
 
 
 def jitter(sensor: SensorState) -> str:
@@ -99,8 +100,9 @@ def jitter(sensor: SensorState) -> str:
 
 def losses(sensor: SensorState) -> list[tuple[str, bool]]:
     """Each kind of loss in words, and whether there was any."""
+    lost = sensor.status.lost_samples
     return [
-        (f"{count(sensor.lost_on_bus)} on the bus", bool(sensor.lost_on_bus)),
+        (f"{count(lost)} on the bus", bool(lost)),
         (f"{sensor.missed} on the way here", bool(sensor.missed)),
         (f"repeated {sensor.repeated}", bool(sensor.repeated)),
         (f"invalid {sensor.invalid}", bool(sensor.invalid)),
@@ -109,13 +111,12 @@ def losses(sensor: SensorState) -> list[tuple[str, bool]]:
 
 def clock(sensor: SensorState) -> str:
     """How the server follows the sensor's clock."""
-    if sensor.clock is None:
-        return "not known"
-    text, offset_ppm, uncertainty_us = sensor.clock
+    known = sensor.status.clock
+    text = known.mode
     if text == "locked":
-        text += "" if offset_ppm is None else f", {offset_ppm:+.1f} ppm"
-        text += "" if uncertainty_us is None else f", ±{uncertainty_us:.0f} µs"
-    return text
+        text += "" if known.offset_ppm is None else f", {known.offset_ppm:+.1f} ppm"
+        text += "" if known.uncertainty_us is None else f", ±{known.uncertainty_us:.0f} µs"
+    return text or "not known"
 
 
 def client(one: Client) -> str:
@@ -157,7 +158,8 @@ def json_line(state: State, unix_s: float) -> str:
         "reason": server.reason or None,
         "replay": server.replay or None,
         "server": {
-            **_plain(server, "version uptime_s cycles missed_deadlines lost_frames"),
+            **_plain(server, "version uptime_s"),
+            **_plain(server.status, "cycles missed_deadlines lost_frames"),
             "wake_us": _spread(server.wake_us),
             "exchange_us": _spread(server.exchange_us),
         }
@@ -170,12 +172,14 @@ def json_line(state: State, unix_s: float) -> str:
 
 
 def _sensor(sensor: SensorState) -> dict[str, Any]:
-    sample, peaks = sensor.sample, sensor.peaks
+    sample, peaks, info, status = sensor.sample, sensor.peaks, sensor.info, sensor.status
     imu = None if sensor.imu_off else sample
     return {
         "sensor": sensor.position,
         "state": sensor.al_state,
-        **_plain(sensor, "name serial firmware nominal_hz delay_ms units"),
+        **_plain(info, "name serial firmware"),
+        "nominal_hz": info.rate_hz or None,
+        **_plain(sensor, "delay_ms units"),
         "force": sample and sample.force,
         "torque": sample and sample.torque,
         "force_min_max": peaks and peaks[:3],
@@ -188,9 +192,10 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         "verdict": sensor.verdict.level.key,
         "alerts": [alert(one) for one in sensor.alerts],
         **_plain(sensor, "samples rate_hz jitter_us jitter_worst_us missed gaps repeated invalid silent_s"),
-        **_plain(sensor, "lost_on_bus recoveries"),
+        "lost_on_bus": status.lost_samples,
+        "recoveries": status.recoveries,
         "age_us": _spread(sensor.age_us),
-        "clock": sensor.clock and sensor.clock._asdict(),
+        "clock": _plain(status.clock, "mode offset_ppm uncertainty_us") if status.clock.mode else None,
         "hand_out_us": _spread(sensor.hand_out_us),
     }
 

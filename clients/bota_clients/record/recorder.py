@@ -34,7 +34,7 @@ from bota_ethercat.control import Event as ServerEvent
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.version import VERSION
-from bota_ethercat.sensor_choice import MOST_PLACES
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
@@ -270,8 +270,9 @@ class Recorder:
     def _take_rates(self, told: Sequence[JsonObject]) -> None:
         """By them the samples that are missing are counted."""
         for row in told:
-            if type(position := row.get("sensor")) is int and 0 <= position < MOST_PLACES:
-                self._stream(position).take_rate(row.get("rate_hz"))
+            if (info := SensorInfo.parse(row)) is not None:
+                stream = self._stream(info.sensor)
+                stream.rate_hz = info.rate_hz or stream.rate_hz
 
     def _stream(self, position: int) -> StreamAccounting:
         if position not in self._streams:

@@ -32,8 +32,9 @@ from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import history
 from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.replies import Status
 from bota_ethercat.sensor_choice import SensorChoice
-from bota_ethercat.text.untrusted import printable, rows
+from bota_ethercat.text.untrusted import printable
 
 _MOST_EVENTS_NAMED: Final = 10
 _MOST_SENSORS_NAMED: Final = 4
@@ -197,7 +198,7 @@ def of_server(
 
 def past(status: Mapping[str, Any], position: int) -> list[str]:
     """What the server knows of a sensor's past, from its reply to `status`: sentences."""
-    row = next((row for row in rows(status.get("sensors")) if row.get("sensor") == position), {})
+    row = Status.parse(status).find(position)
     overload, overloaded = history.overload(row)
     texts = [history.drift(row), overload]
     texts += ["have it checked for damage by overload"] if overloaded else []

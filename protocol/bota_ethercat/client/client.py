@@ -275,7 +275,7 @@ class Client:
 
     def measured_ns(self, frame: DataMessage, channel: str = "force_torque") -> int | None:
         """As `Reading.measured_ns`, with the filters as of now."""
-        delay_ns = getattr(self.session.state(frame.sensor).delay_ns, channel)
+        delay_ns = getattr(self.session.state(frame.sensor).info.delay_ns, channel)
         return None if delay_ns is None else frame.stamp_ns - delay_ns
 
     # -- requests

@@ -7,19 +7,17 @@ Conditions, their numbers and the rules are those of the C++ header (`reading.hp
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from enum import IntEnum
 from typing import Final, NamedTuple
 
 from bota_ethercat.accounting import FrameKind, StreamAccounting
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
+from bota_ethercat.replies import Delays, SensorInfo
 from bota_ethercat.sensor.warnings_register import WarningFlag
-from bota_ethercat.text.untrusted import mapping, number
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
-LONGEST_MS: Final = 1000  # a longer delay is no filter's
 _LEAST_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
 _WARNINGS_AT: Final = LAYOUTS[min(LAYOUTS)].offsets["warnings"]
@@ -53,20 +51,6 @@ class Condition(IntEnum):
 
     def __str__(self) -> str:
         return self.meaning
-
-
-class Delays(NamedTuple):
-    """Group delay of each channel's filters, ns; None: unknown."""
-
-    force_torque: int | None = None
-    acceleration: int | None = None
-    angular_rate: int | None = None
-
-    @classmethod
-    def parse(cls, delay_ms: object) -> Delays:
-        """From `delay_ms` in a message."""
-        values = (number(mapping(delay_ms).get(channel)) for channel in cls._fields)
-        return cls(*(round(ms * 1e6) if ms is not None and 0 <= ms <= LONGEST_MS else None for ms in values))
 
 
 class Reading(NamedTuple):
@@ -114,13 +98,13 @@ class SensorState:
         self._same_clock = self._reconnected = self._gap = False
         self._carried = 0
         self._warnings = 0
-        self.delay_ns = self._sampled_delay_ns = Delays()
+        self.info = SensorInfo(sensor)
+        self._sampled_delay_ns = Delays()
 
-    def take_in_force(self, message: Mapping[str, object]) -> None:
-        """The rate and the delays that a description or an event gives; others stay as they were."""
-        self.accounting.take_rate(message.get("rate_hz"))
-        if isinstance(delay_ms := message.get("delay_ms"), dict):
-            self.delay_ns = Delays.parse(delay_ms)
+    def take_info(self, info: SensorInfo) -> None:
+        """What the server says of it now."""
+        self.info = info
+        self.accounting.rate_hz = info.rate_hz or self.accounting.rate_hz
 
     def begin(self) -> None:
         """A new connection."""
@@ -153,7 +137,7 @@ class SensorState:
             self.lost = False
         self._flags, self._same_clock = flags, same_clock
         self._sampled, self._received_ns, self._sampled_received_ns = frame, received_ns, received_ns
-        self._sampled_delay_ns = self.delay_ns
+        self._sampled_delay_ns = self.info.delay_ns
         self.unread += 1
         if (warnings := process_data[_WARNINGS]) != _NO_WARNINGS:
             self._warnings |= int.from_bytes(warnings, "little")

@@ -21,7 +21,7 @@ from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import boot_id
-from bota_ethercat.client.reading import Delays, SensorState
+from bota_ethercat.client.reading import SensorState
 from bota_ethercat.control import Event, check_version, request
 from bota_ethercat.errors import (
     BadMessageError,
@@ -32,7 +32,7 @@ from bota_ethercat.errors import (
 )
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, TerminalMessage, encode_json
 from bota_ethercat.pdo import ImuUnits
-from bota_ethercat.sensor_choice import MOST_PLACES
+from bota_ethercat.replies import Description, position_of
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
@@ -44,6 +44,8 @@ _MOST_ITEMS: Final = 65536  # kept until they are taken; a tare of 20,000 sample
 _HANDSHAKE_NS: Final = 5_000_000_000
 _LEAST_TIMEOUT_S: Final = 0.02
 _TIMEOUT_PERIODS: Final = 5
+# Events that say what is in force from then on.
+_IN_FORCE: Final = frozenset({Event.SENSOR_BACK, Event.RECONFIGURED, Event.OFFSET_CHANGED})
 
 
 class Connected(NamedTuple):
@@ -250,7 +252,7 @@ class Session:
         if not self._stream:
             return self._granted(reply)
         self.describe(reply)
-        there = [position for row in rows(reply.get("sensors")) if (position := _position(row)) is not None]
+        there = [info.sensor for info in Description.parse(reply).sensors]
         values: dict[str, Any] = {"every": self._every, "fresh_only": self._fresh_only}
         if self.wanted is not None:
             found = [position for position in self.wanted if position in there]
@@ -279,18 +281,17 @@ class Session:
     def describe(self, description: JsonObject) -> None:
         """Take a description of the server, which may be newer than that of the connection."""
         self.description = description
-        for row in rows(description.get("sensors")):
-            if (position := _position(row)) is not None:
-                self.state(position).delay_ns = Delays()
-                self.state(position).take_in_force(row)
+        for info in Description.parse(description).sensors:
+            self.state(info.sensor).take_info(info)
 
     def _take_event(self, message: JsonObject) -> None:
-        state = self.sensors.get(position) if (position := _position(message)) is not None else None
-        if state is not None and message["event"] == Event.SENSOR_LOST:
+        kind, position = message["event"], position_of(message)
+        state = None if position is None else self.sensors.get(position)
+        if state is not None and kind in _IN_FORCE:
+            state.lost = state.lost and kind == Event.OFFSET_CHANGED
+            state.take_info(state.info.changed_by(message))
+        elif state is not None and kind == Event.SENSOR_LOST:
             state.lost = True
-        elif state is not None and message["event"] in (Event.SENSOR_BACK, Event.RECONFIGURED):
-            state.lost = False
-            state.take_in_force(message)
         self.items.append(message)
 
     # -- what is known
@@ -333,8 +334,3 @@ def check_granted(reply: JsonObject) -> None:
     """RefusedError unless the server granted it."""
     if reply.get("ok") is not True:
         raise RefusedError.of(reply)
-
-
-def _position(row: JsonObject) -> int | None:
-    position = row.get("sensor")
-    return position if type(position) is int and 0 <= position < MOST_PLACES else None

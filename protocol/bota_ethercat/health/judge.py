@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 from bota_ethercat.health.sentences import IT_TELLS, STOOD_STILL, did_not_read
 from bota_ethercat.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
 from bota_ethercat.pdo import AXES
+from bota_ethercat.replies import Emergency
 from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain
-from bota_ethercat.text.untrusted import mapping, number, printable, whole
 
 
 class Observation(NamedTuple):
@@ -271,10 +271,8 @@ def _circumstances(seen: Observation) -> Iterator[Finding]:
         yield _look("reconnects", found, "If it happens again, see the server's log", About.LINK)
 
 
-def emergency(row: object, limits: Limits = LIMITS) -> str:
-    """In words, the `emergency` in a reply to `status`; empty if there is none, or none that matters now."""
-    last = mapping(row)
-    code, ago_s = whole(last.get("code")), number(last.get("ago_s"))
-    if code is None or not code & _ERROR_CLASS or ago_s is None or not 0 <= ago_s < limits.emergency_s:
+def emergency(last: Emergency) -> str:
+    """An emergency of a sensor in words; empty if there is none, or one that says that an error is over."""
+    if last.code is None or not last.code & _ERROR_CLASS:
         return ""
-    return f"Emergency 0x{code:04X} ({printable(last.get('text'), 80)})"
+    return f"Emergency 0x{last.code:04X} ({last.text})"

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observes the frames of one sensor over a time that ends now. Every frame is used."""
+"""Observes one sensor over a time that ends now: its frames, of which every one is used, and what the server
+says of it in `describe`, `status` and events.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +9,18 @@ import functools
 import math
 import operator
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.accounting import NOT_NEW, FrameKind, StreamAccounting, StreamCounts
+from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health.judge import Observation
+from bota_ethercat.health.history import drift
+from bota_ethercat.health.judge import Observation, emergency
+from bota_ethercat.health.sentences import event_sentence
+from bota_ethercat.health.verdict import LIMITS, Limits
 from bota_ethercat.pdo import LAYOUTS, PdoLayout, is_finite
+from bota_ethercat.replies import SensorInfo, SensorStatus, Status
 
 COMMON: Final[PdoLayout] = LAYOUTS[min(LAYOUTS)]  # the fields of every size of process data
 _FLAGS: Final = tuple(
@@ -22,6 +29,7 @@ _FLAGS: Final = tuple(
 )
 _TEMPERATURE: Final = COMMON.index("temperature")
 _MOST_KEPT: Final = 1 << 16
+_COUNTED: Final = ("lost_samples", "not_finite", "recoveries")  # what has grown matters
 _HIGHEST_HZ: Final = 1e6  # a rate beyond it is no sensor's, and not known
 
 
@@ -56,16 +64,111 @@ class _Batch(NamedTuple):
         )
 
 
+class SensorObserver:
+    """What the server says of one sensor, and what came of it in some time.
+
+    Attributes:
+        info: its row of the newest description.
+        status: its row of the newest `status`; nothing is known before the first of a connection.
+        lost: why the server has lost it, if it has.
+    """
+
+    def __init__(self) -> None:
+        self.info, self.status = SensorInfo(), SensorStatus()
+        self.lost: str | None = None
+        self._missed_deadlines: int | None = None
+        self._grown: deque[tuple[int, str, int]] = deque()  # when, what, and by how much
+        self._unread: deque[tuple[int, tuple[float, bool]]] = deque()  # when, and of `Client.take_unread`
+        self.dated = self._grown, self._unread
+        self._emergency = "", 0  # and when it came
+        self._emergencies: int | None = 0  # how many there were when `_emergency` was the last
+
+    def connected(self, now_ns: int) -> None:
+        """A connection was made."""
+        if self.info != SensorInfo():
+            self._grown.append((now_ns, "reconnects", 1))
+        self.disconnected()
+
+    def disconnected(self) -> None:
+        """Counts are not compared with those of another connection."""
+        self.lost, self.status, self._missed_deadlines = None, SensorStatus(), None
+
+    def take_event(self, event: Mapping[str, Any]) -> None:
+        """An event of this sensor."""
+        kind = event.get("event")
+        if kind == Event.SENSOR_LOST:
+            self.lost = event_sentence(event)
+        elif kind in (Event.SENSOR_BACK, Event.RECONFIGURED):
+            self.lost = None
+
+    def take_status(self, status: Status, position: int, now_ns: int) -> None:
+        """A reply to `status`, in which it is the sensor at `position`."""
+        before, row = self.status, status.find(position)
+        counts = [(name, getattr(before, name), getattr(row, name)) for name in _COUNTED]
+        for name, was, count in [
+            *counts, ("missed_deadlines", self._missed_deadlines, status.missed_deadlines)
+        ]:  # fmt: skip
+            if was is not None and count is not None and count > was:
+                self._grown.append((now_ns, name, count - was))
+        if row.emergencies != self._emergencies and row.emergency.ago_s is not None:
+            self._emergencies = row.emergencies
+            self._emergency = emergency(row.emergency), now_ns - round(row.emergency.ago_s * 1e9)
+        self.status, self._missed_deadlines = row, status.missed_deadlines
+
+    def note_unread(self, unread: tuple[float, bool], now_ns: int) -> None:
+        """What `Client.take_unread` has returned just now."""
+        self._unread.append((now_ns, unread))
+
+    def begin(self) -> None:
+        """What comes from here on counts."""
+        for dated in self.dated:
+            dated.clear()
+
+    def forget(self) -> None:
+        """Forget all that has been."""
+        self.begin()
+        self._emergency = "", 0
+
+    def grown(self, name: str, since_ns: int = 0) -> int:
+        """By how much a count of `status` has grown, as known since then."""
+        return sum(by for at_ns, what, by in self._grown if what == name and at_ns >= since_ns)
+
+    def complete(
+        self, seen: Observation, now_ns: int, window_ns: int | None = None, limits: Limits = LIMITS
+    ) -> Observation:
+        """`seen` of its frames, with what the server said, at most in the last `window_ns`."""
+        since_ns = now_ns - window_ns if window_ns else 0
+        said, at_ns = self._emergency
+        mode = self.status.clock.mode
+        unread_s, busy = max((each for at, each in self._unread if at >= since_ns), default=(0.0, None))
+        return seen._replace(
+            unread_s=unread_s,
+            busy=busy,
+            not_finite=max(seen.not_finite, self.grown("not_finite", since_ns)),
+            recoveries=self.grown("recoveries", since_ns),
+            missed_deadlines=self.grown("missed_deadlines", since_ns),
+            reconnects=self.grown("reconnects", since_ns),
+            locked=mode == "locked" if mode else None,
+            is_lost=self.lost is not None,
+            state=self.info.state,
+            emergency=said if 0 <= now_ns - at_ns < limits.emergency_s * 1e9 else "",
+            drift=drift(self.status, limits),
+            settings=self.info.settings,
+        )
+
+
 class StreamObserver:
     """One sensor's frames from `start_ns` (CLOCK_MONOTONIC) on, subscribed to with `fresh_only` false.
 
     Attributes:
         newest: process data of the newest sample.
+        said: what the server says of the sensor.
     """
 
     def __init__(self, nominal_hz: float, start_ns: int, *, window_ns: int | None = None) -> None:
         """`window_ns`: look back no further than this."""
         self.newest: bytes | None = None
+        self.said = SensorObserver()
         self._accounting = StreamAccounting(fresh_only=False)
         self._window_ns = window_ns
         self._previous_ns: int | None = None  # the newest sample's stamp, unless other frames have come since
@@ -152,7 +255,7 @@ class StreamObserver:
         warnings, force_torque, acceleration, angular_rate = seen.flags
         span_ns = seen.last_ns - seen.first_ns
         since_ns = now_ns - self._fresh_at_ns
-        return Observation(
+        found = Observation(
             seconds=seconds if window_ns is None else min(seconds, window_ns * 1e-9),
             samples=samples,
             lost=lost,
@@ -170,6 +273,7 @@ class StreamObserver:
             acceleration_saturated=acceleration,
             angular_rate_saturated=angular_rate,
         )
+        return self.said.complete(found, now_ns, window_ns)
 
     def ages_us(self, now_ns: int, window_ns: int | None = None) -> list[float]:
         """The ages noted, at most those of the last `window_ns`."""
@@ -195,7 +299,7 @@ class StreamObserver:
         if self._window_ns is None:
             return
         oldest_ns = now_ns - self._window_ns
-        for kept in (self._batches, self._ages, self._intervals):
+        for kept in (self._batches, self._ages, self._intervals, *self.said.dated):
             while kept and kept[0][0] < oldest_ns:
                 kept.popleft()
 

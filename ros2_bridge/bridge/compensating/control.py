@@ -49,7 +49,7 @@ class CompensationControl:
         self._log = node.get_logger()
         self.choice = SourceChoice(node, self.link)
         # Of the sensor that the bias in force is for, for any thread; None until there was one.
-        self._serial: str | None = None
+        self._serial: int | str | None = ""  # of the sensor that was there last; "": none was
         self.own_offset = OwnOffset()
         # Origin of the bias that is being put in force, and what it was taken with if by a tare.
         self._next: tuple[str, Taken | None] = (_FROM_PARAMETER, None)
@@ -262,7 +262,7 @@ class CompensationControl:
         with self._setting:
             while not self._is_same_sensor():
                 serial, given = self.link.info.serial, None
-                if self._serial is not None:
+                if self._serial != "":
                     bias = self.bias
                     if self.origin != _FROM_PARAMETER:
                         self._log.warning(

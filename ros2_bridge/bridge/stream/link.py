@@ -11,23 +11,22 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from bota_ethercat.client.client import Client
-from bota_ethercat.client.reading import Delays
 from bota_ethercat.client.session import Disconnected
 from bota_ethercat.control import Event, known_six
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError
 from bota_ethercat.health.sentences import event_sentence, no_server
+from bota_ethercat.replies import Description, SensorInfo
 from bota_ethercat.settings import SettingValue, known_settings
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import printable, rows
+from bota_ethercat.text.untrusted import printable
 from ft_compensation.quantities import Wrench, wrench_text
 
 CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0
 SHUTDOWN_TIMEOUT_S: Final = 3.0
-_MOST_HZ: Final = 1e6
 _NEWER_IN_DESCRIPTIONS: Final = ("name", "serial", "state", "hardware", "firmware", "rate_hz", "settling")
 
 
@@ -49,28 +48,6 @@ class RequestFailedError(Exception):
 
 class RequestRefusedError(RequestFailedError):
     """The server refused; the text is its own sentence."""
-
-
-class SensorInfo(NamedTuple):
-    """What the server says about the sensor, made safe to print; so far nothing."""
-
-    sensor: int = 0
-    name: str = ""
-    serial: str = ""
-    state: str = "?"
-    hardware: str = ""
-    firmware: str = ""
-    rate_hz: float = 0.0  # samples a second that are to be expected; 0 if the server does not say
-    settings: Mapping[str, SettingValue] = {}  # empty without a connection
-    delay_ns: Delays = Delays()  # of the filters
-    settling: bool = False  # whether its data has not settled
-    # The sensor's own force/torque offset, part of every sample, N and Nm; None if it is not known.
-    offset: tuple[float, ...] | None = None
-
-    def __str__(self) -> str:
-        """One phrase for the log."""
-        rate_hz = f"{self.rate_hz:g}" if self.rate_hz else "?"
-        return f"sensor {self.sensor} ({self.name}, serial {self.serial}, {rate_hz} Hz, {self.state})"
 
 
 class Link:
@@ -133,18 +110,12 @@ class Link:
         elif event in (Event.SENSOR_BACK, Event.RECONFIGURED):
             self.lost = None
             self.epoch += 1
-            self._take_settings(message)
         elif event != Event.OFFSET_CHANGED:
             return True
-        if "offset" in message:
-            self._change(offset=known_six(message["offset"]))
+        with self._changing:
+            self.info = self.info.changed_by(message)
         self.on_change()
         return True
-
-    def _take_settings(self, message: JsonObject) -> None:
-        if found := known_settings(message.get("settings")):
-            rate_hz = known_rate(message.get("rate_hz")) or self.info.rate_hz
-            self._change(settings=found, rate_hz=rate_hz, delay_ns=Delays.parse(message.get("delay_ms")))
 
     def _change(self, **values: Any) -> None:
         with self._changing:
@@ -208,11 +179,6 @@ class Link:
         return f"the server at {address} is shutting down"
 
 
-def known_rate(rate_hz: object) -> float:
-    """The sampling rate that a message gives, Hz; 0 if it is none."""
-    return float(rate_hz) if isinstance(rate_hz, int | float) and 0 < rate_hz <= _MOST_HZ else 0.0
-
-
 def offset_text(offset: object) -> str:
     """An offset from a message for people."""
     known = known_six(offset)
@@ -221,20 +187,10 @@ def offset_text(offset: object) -> str:
 
 def find_sensor(description: Mapping[str, Any], sensor: int) -> SensorInfo:
     """The row of `sensor` in a `describe` reply; RequestFailedError if there is none."""
-    found = rows(description.get("sensors"))
-    for row in found:
-        if row.get("sensor") == sensor and not isinstance(row.get("sensor"), bool):
-            keys = "name", "serial", "state", "hardware", "firmware"
-            return SensorInfo(
-                sensor=sensor,
-                **{key: printable(row.get(key, "?"), 40) for key in keys},
-                rate_hz=known_rate(row.get("rate_hz")),
-                settings=known_settings(row.get("settings")),
-                delay_ns=Delays.parse(row.get("delay_ms")),
-                settling=row.get("settling") is True,
-                offset=known_six(row.get("offset")),
-            )
-    there = ", ".join(printable(row.get("sensor"), 10) for row in found[:16]) or "none"
+    known = Description.parse(description)
+    if (info := known.find(sensor)) is not None:
+        return info
+    there = ", ".join(str(each.sensor) for each in known.sensors[:16]) or "none"
     raise RequestFailedError(
         f"the server has no sensor {sensor} (it has: {there}): set the parameter 'sensor' to one it has"
     )

@@ -16,13 +16,13 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.client.channel import Channel
 from bota_ethercat.client.client import Client
-from bota_ethercat.client.reading import LONGEST_MS
 from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
 from bota_ethercat.control import Event
 from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import no_server
 from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
+from bota_ethercat.replies import LONGEST_MS
 from bota_ethercat.text.untrusted import rows
 from bridge.parameters.table import Parameters
 from bridge.process import Worker

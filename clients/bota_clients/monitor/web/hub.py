@@ -298,7 +298,7 @@ def state_text(state: State, position: int, number: int) -> str:
         "sensors": [
             {
                 "position": s.position,
-                "name": s.name,
+                "name": s.info.name,
                 "ok": None if trouble else s.verdict.level < Level.TROUBLE,
             }
             for s in state.sensors
@@ -313,7 +313,7 @@ def _json(message: object) -> str:
 
 
 def _sensor(sensor: SensorState) -> dict[str, Any]:
-    sample, rate_hz = sensor.sample, sensor.nominal_hz
+    sample, rate_hz = sensor.sample, sensor.info.rate_hz or None
     stream = {
         "Rate": words.rate(sensor),
         "Filter delay": words.delays(sensor),
@@ -346,8 +346,10 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
             (
                 name,
                 str(value).lower(),
-                value_meaning(name, value, round(rate_hz) if rate_hz else None, sensor.settings.get("chop")),
+                value_meaning(
+                    name, value, round(rate_hz) if rate_hz else None, sensor.info.settings.get("chop")
+                ),
             )
-            for name, value in sensor.settings.items()
+            for name, value in sensor.info.settings.items()
         ],
     }
