@@ -213,7 +213,9 @@ class SensorRecovery:
         sensor, change = self._sensor, self._change
         assert change is not None
         log.warning("sensor %d keeps its former settings: %s", self._number, error)
-        self._change = change._replace(failed=error, until=Deadline(self._bus.clock, _REVERT_S))
+        self._change = change._replace(
+            failed=error.with_traceback(None), until=Deadline(self._bus.clock, _REVERT_S)
+        )
         sensor.enter(SensorState.REVERTING)
         sensor.wanted, sensor.asked = change.wanted, change.asked
 

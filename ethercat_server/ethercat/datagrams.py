@@ -83,24 +83,25 @@ def finish(
 
     What interrupts them is raised in them: they clean up on the bus.
     """
-    resume: Callable[[Any], RegisterAccess | float | None] = steps.send
-    value: Any = None
-    while True:
-        try:
-            wanted = resume(value)
-        except StopIteration as stop:
-            result: T = stop.value
-            return result
-        resume, value = steps.send, None
-        try:
-            check_interrupt()
-            if isinstance(wanted, RegisterAccess):
-                assert ask is not None, "on a bus only"
-                value = ask(wanted)
+    try:
+        wanted = next(steps)
+        while True:
+            try:
+                check_interrupt()
+                value: Any = None
+                if isinstance(wanted, RegisterAccess):
+                    assert ask is not None, "on a bus only"
+                    value = ask(wanted)
+                else:
+                    clock.sleep(_PAUSE_S if wanted is None else wanted)
+            except BaseException as error:  # noqa: BLE001 - the steps raise it again
+                check_interrupt = lambda: None  # noqa: E731
+                wanted = steps.throw(error)
             else:
-                clock.sleep(_PAUSE_S if wanted is None else wanted)
-        except BaseException as error:  # noqa: BLE001 - the steps raise it again
-            resume, value, check_interrupt = steps.throw, error, lambda: None
+                wanted = steps.send(value)
+    except StopIteration as stop:
+        result: T = stop.value
+        return result
 
 
 class LateAnswers:

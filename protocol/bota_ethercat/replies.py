@@ -197,8 +197,9 @@ class Status(NamedTuple):
     def parse(cls, reply: object) -> Status:
         """From the reply; a row that does not say which sensor it is of is by its place."""
         found = decode(cls, reply)
+        said = {row.sensor for row in found.sensors}
         places = (
-            row if row.sensor is not None else row._replace(sensor=place)
+            row if row.sensor is not None or place in said else row._replace(sensor=place)
             for place, row in enumerate(found.sensors)
         )  # fmt: skip
         return found._replace(sensors=tuple(places))

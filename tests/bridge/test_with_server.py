@@ -22,7 +22,9 @@ from tests.server.running import server as server_process
 @pytest.mark.bus
 def test_both_as_processes(listener: Listener, start_process: StartProcess) -> None:
     """As in use, with pysoem, TCP, DDS and signals: from the first sample to the end of both."""
-    with server_process("virtual", "--virtual=--signal rest", "--set", "sinc_length=512") as running:
+    with server_process(
+        "virtual", "--virtual=--signal rest --noise none", "--set", "sinc_length=512"
+    ) as running:
         node = start_process(running.port)
         arrays = listener.subscribe(DiagnosticArray, "diagnostics")
         wrenches = listener.subscribe(WrenchStamped, "wrench", depth=20)

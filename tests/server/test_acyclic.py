@@ -128,7 +128,7 @@ def test_a_frame_is_sent_only_with_time_left_before_the_next_exchange(sensors: i
     sends = Sends(simulation)
     asks_without_pause(simulation)
     others = [at for at, (_, is_exchange) in enumerate(sends[:-1]) if not is_exchange]
-    assert len(others) >= 40
+    assert len(others) >= 2 * 20 - 2, "two for each object"
     for at in others:
         following = next((ns for ns, is_exchange in sends[at:] if is_exchange), None)
         assert following is None or following - sends[at][0] >= LEAST_NS

@@ -240,7 +240,7 @@ def test_an_address_for_some_time_is_refused_by_server_tool_and_doctor_and_marke
     with address(veth, "valid_lft", "600", "preferred_lft", "600"):
         assert refusal(veth.near).startswith(why)
         assert f"'sudo ip address flush dev {veth.near}'" in refusal(veth.near)
-        assert why in tool_here("watch", veth.near, code=1).err
+        assert why in tool_here("eeprom", veth.near, code=1).err
         with pytest.raises(InterfaceError, match="has the IP address"):
             serve([veth.near, "14999", "--user", "root"], Signals())
         found = doctor_here(veth.near, "--seconds", 0, "--json")

@@ -77,7 +77,9 @@ def test_requests_refusals_losses_and_recoveries_leave_nothing_to_collect(seed: 
         for client in clients:
             for _ in range(chance.randrange(3)):
                 # The others are more likely to be under way when something happens.
-                action = chance.choice([*ACTIONS, "configure", "configure", "sdo_read", "tare", "no_such"])
+                action = chance.choice(
+                    [*ACTIONS, "configure", "configure", "configure", "sdo_read", "tare", "no_such"]
+                )
                 if action != "shutdown":
                     keys = any_request(chance, action) if action in ACTIONS else {}
                     client.send(action, **keys)

@@ -289,7 +289,8 @@ class Session:
         state = None if position is None else self.sensors.get(position)
         if state is not None and kind in _IN_FORCE:
             state.lost = state.lost and kind == Event.OFFSET_CHANGED
-            state.take_info(state.info.changed_by(message))
+            said = message if kind != Event.OFFSET_CHANGED else {"offset": message.get("offset")}
+            state.take_info(state.info.changed_by(said))
         elif state is not None and kind == Event.SENSOR_LOST:
             state.lost = True
         self.items.append(message)
