@@ -2,7 +2,7 @@
 # rclpy (ros-rclpy 7.1.6, Jazzy): a whole number in a float64 field is sent as 5e-324.
 #
 # One would guess: `message.wrench.force.x = 5` either raises or sends 5.0, for Python converts everywhere else.
-# What happens: the attribute keeps the int and prints as 5, and the C extension writes the bits of the integer: a
+# What happens: the attribute keeps the int and prints as 5, and the C extension reads the object as if it were a float: a
 # subscriber, a bag and every tool get 5e-324, which plots as 0. A list of ints in Float64MultiArray does arrive right,
 # so half of a program may look correct. With ROS_PYTHON_CHECK_FIELDS=1 the assignment raises; it is off by default.
 # Where it is met: a wrench that is set by hand in a test or a controller, and numpy.float32 values from a policy.

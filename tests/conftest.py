@@ -8,6 +8,7 @@ import os
 import random
 import re
 import shutil
+import signal
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
@@ -32,6 +33,8 @@ def _choose_domain() -> None:
 
 
 _choose_domain()
+# Programs started here have the signals of a shell's, also where nohup ignores this one.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # The servers started here stay the user that the tests are, whose files they read.
 os.environ.pop("SUDO_UID", None)
 # And what they keep of virtual sensors is nobody's.

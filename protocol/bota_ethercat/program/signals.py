@@ -26,6 +26,7 @@ class Signals:
             number = getattr(signal, name, None)  # Windows lacks the last one
             if number and not (name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN):
                 signal.signal(number, self._on_signal)
+        _unblock()
 
     def call(self, stop: Callable[[], object]) -> None:
         """From now on a signal calls `stop`, also one that has arrived already."""
@@ -42,3 +43,10 @@ def interrupt_on_signals() -> None:
     """SIGINT and SIGTERM raise KeyboardInterrupt: for when everything is imported."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
+    _unblock()
+
+
+def _unblock() -> None:
+    """The program that started this one may have had them blocked, which is inherited."""
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
