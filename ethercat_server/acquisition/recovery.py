@@ -382,7 +382,7 @@ class Recovery:
         ]
         self.short = 0
         self._looking: list[Task] = []
-        self._checked_ns = 0
+        self._checked_ns = self._look_ns = 0
         self.count_alive()
         bus.emergencies.tell = self._tell
         acyclic.start(self._watch())
@@ -424,15 +424,20 @@ class Recovery:
 
     def _watch(self) -> Steps[None]:
         """Look at one sensor after the other, without end."""
-        pause_s = _WATCH_EVERY_NS * 1e-9 / (2 * len(self.sensors))
         for each in cycle(self.sensors):
             yield from each.look_at_mailbox()
-            yield pause_s
+            yield self._until_next_look_s()
             # The working counter does not tell sensors apart: one that is out may be counted for another.
             yield from each.look(counted=not any(one.task for one in self.sensors))
             each.check_change()
             yield from self._others.look_at_next()
-            yield pause_s
+            yield self._until_next_look_s()
+
+    def _until_next_look_s(self) -> float:
+        """The looks are evenly spaced, however long each of them takes."""
+        now_ns = self.bus.clock.monotonic_ns()
+        self._look_ns = max(self._look_ns + _WATCH_EVERY_NS // (2 * len(self.sensors)), now_ns)
+        return (self._look_ns - now_ns) * 1e-9
 
     def _silence(self) -> str:
         why, lost = self.bus.backend.why_silent(), "no frame comes back"
