@@ -38,7 +38,7 @@ from tests.server.running import Program, free_port, full_listener
 def test_a_missing_module_is_named(
     missing: str, remedy: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(process, "StopSignals", lambda: None)
+    monkeypatch.setattr(client, "StopSignals", lambda: None)  # which blocks them in this process
     for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bridge"}]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)

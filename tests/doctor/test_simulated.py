@@ -22,9 +22,11 @@ from ethercat_server.doctor.report import examine
 from ethercat_server.errors import InterfaceError
 from tests.doctor.running import examined
 from tests.simulation import (
+    RATE_HZ,
     SINC_LENGTH,
     SimulatedBus,
     SimulatedServer,
+    life_of,
     registers,
     simulated_bus,
     simulated_server,
@@ -239,10 +241,14 @@ def test_losses_show(served: Served, tmp_path: Path) -> None:
 
 def test_losses_while_it_looks_are_told(served: Served, tmp_path: Path) -> None:
     bus, _ = served
-    bus.at(0.5, "deaf 0.04")
+    sampling, period_s = life_of(bus.backend, 1).sampler.clock, 1 / RATE_HZ
+    # From between two samples to between two others: the poll after it still brings the last of four.
+    begin_ns = sampling.instant(sampling.number_at(bus.clock.now_ns) + RATE_HZ // 2)
+    bus.at((begin_ns - bus.clock.now_ns) * 1e-9 + period_s / 3, f"deaf {4 * period_s}")
     sensor = examined(bus, tmp_path, 1.0).of("server")["sensors"]
-    assert sensor.level is Level.LOOK, "four samples of a hundred, in one place"
-    assert re.search(r"samples \([345] %\) were lost", sensor.found), sensor.found
+    assert sensor.level is Level.LOOK, "three samples of a hundred, in one place"
+    assert re.search(r": 3 of \d+ samples \(3(\.1)? %\) were lost", sensor.found), sensor.found
+    assert sensor.values["new_lost_samples"] == 3
     assert sensor.values["new_invalid"] > 0
 
 
