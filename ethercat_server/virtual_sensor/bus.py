@@ -23,14 +23,12 @@ from typing import Any, Final
 from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.application import Application
+from ethercat_server.virtual_sensor.application import Application, Slave
 from ethercat_server.virtual_sensor.device import size_of
 from ethercat_server.virtual_sensor.esc import Esc, pass_through
 from ethercat_server.virtual_sensor.foreign import ForeignSlave, leave_in
 from ethercat_server.virtual_sensor.options import SensorOptions, SlaveOptions, UsageError
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
-
-Slave = VirtualSensor | ForeignSlave
 
 _LONGEST_PERIOD_NS = 50_000_000
 _FIRST_STATION: Final = 0x1001  # where another master begins

@@ -1,4 +1,4 @@
-"""CANopen over EtherCAT (CoE): the objects of a slave, the SDO server, and the SDO Information service.
+"""CANopen over EtherCAT (CoE): the objects of a slave, its SDO server, the list and descriptions of objects.
 
 Source: ETG.1000.6. Bytes in, bytes out: what follows the mailbox header.
 """
@@ -12,7 +12,6 @@ from typing import Final
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import AbortCode, abort_meaning
 from ethercat_server.sensor.objects.dictionary import TITLES, Access, ObjectEntry
-from ethercat_server.virtual_sensor.device import Device
 from ethercat_server.virtual_sensor.mailbox import INVALID_HEADER, TOO_SHORT, MailboxError
 
 Address = tuple[int, int]  # index and sub-index of an object entry
@@ -80,30 +79,30 @@ _REQUEST, _RESPONSE, _INFORMATION = 2, 3, 8  # services in the CoE header
 # Command specifiers, in the top three bits of the command.
 _DOWNLOAD, _UPLOAD, _DOWNLOADED, _ABORT = 1, 2, 3, 4
 _SIZE_INDICATED, _EXPEDITED, _COMPLETE = 0x01, 0x02, 0x10
+_INFO_HEADER: Final = struct.Struct("<BBH")
+# Requests of the SDO Information service, with the shortest body of each; a response is one more.
+_LIST, _OBJECT, _ENTRY, _INFO_ERROR = 1, 3, 5, 7
+_SHORTEST: Final = {_LIST: 2, _OBJECT: 2, _ENTRY: 4}
+_INCOMPLETE: Final = 0x80
+_ALL: Final = 1  # the list of all objects
+_VARIABLE, _ARRAY, _RECORD = 7, 8, 9
+_READ_ALWAYS = 0x07
+_WRITE: Final = {Access.RO: 0, Access.RW: 0x38, Access.RW_PREOP: 0x08}
 
 
 class CoeServer:
-    """Answers CoE requests one at a time: SDO upload and download, expedited and normal.
+    """Answers CoE requests one at a time: SDO upload and download, expedited and normal, SDO Information.
 
-    No object is too long for the mailbox, so there are no segments. `state` gives the AL state; `information`
-    answers requests to the SDO Information service.
+    No object is too long for the mailbox, so there are no segments; a list that is goes out in fragments.
+    `state` gives the AL state.
     """
 
-    def __init__(
-        self,
-        objects: ObjectTable,
-        state: Callable[[], AlState],
-        information: Callable[[bytes, int], list[bytes]],
-    ) -> None:
+    def __init__(self, objects: ObjectTable, state: Callable[[], AlState]) -> None:
         self._objects = objects
         self._state = state
-        self._information = information
 
     def answer(self, message: bytes, room: int) -> list[bytes]:
-        """The replies to `message`, each at most `room` bytes.
-
-        MailboxError if it is no CoE request.
-        """
+        """The replies to `message`, each at most `room` bytes; MailboxError if it is no CoE request."""
         if len(message) < _COE_HEADER.size:
             raise MailboxError(TOO_SHORT)
         service, request, room = message[1] >> 4, message[_COE_HEADER.size :], room - _COE_HEADER.size
@@ -129,11 +128,8 @@ class CoeServer:
             raise SdoAbortError(AbortCode.UNKNOWN_COMMAND)
         if command & _COMPLETE:
             raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS)
-        if specifier == _UPLOAD:
-            return self._upload(index, subindex)
-        return self._download(request, index, subindex)
-
-    def _upload(self, index: int, subindex: int) -> bytes:
+        if specifier == _DOWNLOAD:
+            return self._download(request, index, subindex)
         data = self._objects.read(index, subindex)
         if 0 < len(data) <= 4:
             command = _UPLOAD << 5 | (4 - len(data)) << 2 | _EXPEDITED | _SIZE_INDICATED
@@ -142,121 +138,59 @@ class CoeServer:
 
     def _download(self, request: bytes, index: int, subindex: int) -> bytes:
         command = request[0]
-        if command & _EXPEDITED:
-            if command & _SIZE_INDICATED:
-                size = 4 - (command >> 2 & 3)
-            else:  # the client leaves it to the server
-                size = min(self._objects.size(self._objects.entry(index, subindex)), 4)
-            data = request[4 : 4 + size]
-        else:
+        if not command & _EXPEDITED:
             (size,) = struct.unpack_from("<I", request, 4)
             data = request[_SDO_HEADER_SIZE : _SDO_HEADER_SIZE + size]
             self._objects.check_download(index, subindex, size, self._state())
+        else:
+            size = 4 - (command >> 2 & 3)
+            if not command & _SIZE_INDICATED:  # the client leaves it to the server
+                size = min(self._objects.size(self._objects.entry(index, subindex)), 4)
+            data = request[4 : 4 + size]
         self._objects.write(index, subindex, data, self._state())
         return struct.pack("<BHBI", _DOWNLOADED << 5, index, subindex, 0)
 
-
-_INFO_HEADER: Final = struct.Struct("<BBH")
-_LIST, _OBJECT, _ENTRY, _INFO_ERROR = 1, 3, 5, 7  # requests; a response is one more
-_INCOMPLETE: Final = 0x80
-_LIST_LENGTHS, _LIST_ALL, _LIST_RXPDO, _LIST_TXPDO, _LIST_BACKUP, _LIST_SETTINGS = range(6)
-_VARIABLE, _ARRAY, _RECORD = 7, 8, 9
-# Data types of the objects whose structure the standard names.
-_TYPE_RECORD_OF: Final = {0x1018: 0x0023, 0x1600: 0x0021, 0x1A00: 0x0021, 0x1A01: 0x0021}
-_READ_ALWAYS = 0x07
-_WRITE: Final = {Access.RO: 0, Access.RW: 0x38, Access.RW_PREOP: 0x08}
-_RXPDO_MAPPABLE, _TXPDO_MAPPABLE = 0x40, 0x80
-
-
-_NAMES: Final = {
-    **TITLES,
-    0x1600: "Outputs mapping",
-    0x1A00: "Inputs mapping",
-    0x1A01: "Inputs mapping",
-    0x1C00: "Sync manager communication type",
-    0x1C12: "Outputs assignment",
-    0x1C13: "Inputs assignment",
-}
-
-
-class SdoInformation:
-    """Tells a master which objects there are: lists of objects, descriptions of objects and entries.
-
-    A list too long for the mailbox goes out in fragments.
-    """
-
-    def __init__(self, objects: ObjectTable, device: Device) -> None:
-        self._objects = objects
-        self._outputs, self._inputs = device.output_entries, device.input_entries
-
-    def answer(self, request: bytes, room: int) -> list[bytes]:
-        """The replies to one request, `room` bytes at most each; MailboxError if it is too short."""
+    def _information(self, request: bytes, room: int) -> list[bytes]:
         if len(request) < _INFO_HEADER.size:
             raise MailboxError(TOO_SHORT)
-        operation, body, room = (
-            request[0] & ~_INCOMPLETE,
-            request[_INFO_HEADER.size :],
-            room - _INFO_HEADER.size,
-        )
+        operation, body = request[0] & ~_INCOMPLETE, request[_INFO_HEADER.size :]
+        room -= _INFO_HEADER.size
         try:
-            if operation not in (_LIST, _OBJECT, _ENTRY):
+            if operation not in _SHORTEST:
                 raise SdoAbortError(AbortCode.UNKNOWN_COMMAND)
-            if len(body) < (4 if operation == _ENTRY else 2):
+            if len(body) < _SHORTEST[operation]:
                 raise MailboxError(TOO_SHORT)
             (index,) = struct.unpack_from("<H", body)
             if operation == _LIST:
-                return self._fragments(self._list(index), room & ~1)
-            described = self._object(index) if operation == _OBJECT else self._entry(index, body[2])
-            return [_INFO_HEADER.pack(operation + 1, 0, 0) + described[:room]]
+                found, room = self._list(index), room & ~1
+            else:
+                found = (self._object(index) if operation == _OBJECT else self._entry(index, body[2]))[:room]
         except SdoAbortError as abort:
             return [_INFO_HEADER.pack(_INFO_ERROR, 0, 0) + struct.pack("<I", abort.code)]
-
-    @staticmethod
-    def _fragments(data: bytes, room: int) -> list[bytes]:
-        parts = [data[at : at + room] for at in range(0, len(data), room)]
-        last = len(parts) - 1
+        parts = [found[at : at + room] for at in range(0, len(found), room)]
         return [
-            _INFO_HEADER.pack(_LIST + 1 | (_INCOMPLETE if number < last else 0), 0, last - number) + part
-            for number, part in enumerate(parts)
+            _INFO_HEADER.pack(operation + 1 | (_INCOMPLETE if left else 0), 0, left) + part
+            for left, part in zip(reversed(range(len(parts))), parts, strict=True)
         ]
 
     def _list(self, kind: int) -> bytes:
-        rows = self._objects.entries.values()
-        stored = [row for row in rows if row.access is not Access.RO and row.index >= 0x8000]
-        listed = {
-            _LIST_ALL: rows,
-            _LIST_RXPDO: self._outputs,
-            _LIST_TXPDO: self._inputs,
-            _LIST_BACKUP: stored,
-            _LIST_SETTINGS: [row for row in stored if row.access is Access.RW_PREOP],
-        }
-        lists = {kind: sorted({row.index for row in rows}) for kind, rows in listed.items()}
-        if kind == _LIST_LENGTHS:
-            return struct.pack("<H5H", kind, *(len(found) for found in lists.values()))
-        if kind not in lists:
+        if kind != _ALL:
             raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS)
-        return struct.pack(f"<H{len(lists[kind])}H", kind, *lists[kind])
+        indices = sorted({index for index, _ in self._objects.entries})
+        return struct.pack(f"<H{len(indices)}H", kind, *indices)
 
     def _object(self, index: int) -> bytes:
         rows = [row for (known, _), row in self._objects.entries.items() if known == index]
         if not rows:
             raise SdoAbortError(AbortCode.NO_OBJECT)
-        parts = [row for row in rows if row.subindex]
-        if not parts:
-            kind, code, name = rows[0].type.coe_code, _VARIABLE, rows[0].name
-        else:
-            types = {row.type for row in parts}
-            code = _ARRAY if len(types) == 1 and index not in _TYPE_RECORD_OF else _RECORD
-            kind = _TYPE_RECORD_OF.get(index, parts[0].type.coe_code if code == _ARRAY else 0)
-            name = _NAMES.get(index, parts[0].name)
-        highest = max(row.subindex for row in rows)
-        return struct.pack("<HHBB", index, kind, highest, code) + name.encode("ascii")
+        types = {row.type for row in rows if row.subindex}
+        code = _VARIABLE if not types else _ARRAY if len(types) == 1 else _RECORD
+        kind = 0 if code == _RECORD else rows[-1].type.coe_code
+        head = struct.pack("<HHBB", index, kind, max(row.subindex for row in rows), code)
+        return head + TITLES.get(index, rows[-1].name).encode("ascii")
 
     def _entry(self, index: int, subindex: int) -> bytes:
         row = self._objects.entry(index, subindex)
-        access = _READ_ALWAYS | _WRITE[row.access]
-        access |= _RXPDO_MAPPABLE if row in self._outputs else 0
-        access |= _TXPDO_MAPPABLE if row in self._inputs else 0
-        bits = self._objects.size(row) * 8
+        access, bits = _READ_ALWAYS | _WRITE[row.access], self._objects.size(row) * 8
         head = struct.pack("<HBBHHH", index, subindex, 0, row.type.coe_code, bits, access)
         return head + row.name.encode("ascii")

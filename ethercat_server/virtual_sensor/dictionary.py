@@ -28,6 +28,7 @@ _UNKNOWN_COMMAND: Final = 1
 _SINC_UNIT: Final = 307_200
 # Objects stored by the save command; the factory calibration is stored at once.
 _SAVED: Final = range(0x8000, 0x8011)
+_REPETITION_NS: Final = 300_000_000
 
 
 class Flash:
@@ -103,10 +104,15 @@ def _initial(row: table.ObjectEntry) -> bytes:
     return data.ljust(_STRING_SIZES.get(row.index, len(data)), b"\0")
 
 
+OnWrite = Callable[[int, int, bytes, AlState, int], None]
+
+
 class Dictionary(ObjectTable):
     """Values of all entries of one sensor.
 
-    `process_data` returns the newest process data (for 0x6000), `now` the time in ns.
+    `process_data` returns the newest process data (for 0x6000), `now` the time in ns. `on_write` is called
+    for every SDO write: index, sub-index, data, AL state, abort code or 0. The next transfer of an entry in
+    `aborts` is aborted with the code there.
     """
 
     def __init__(
@@ -115,14 +121,16 @@ class Dictionary(ObjectTable):
         flash: Flash,
         process_data: Callable[[], bytes],
         now: Callable[[], int],
+        on_write: OnWrite = lambda *_: None,
     ) -> None:
         entries = sensor_entries(options.pdo_size)
         super().__init__(entries, {address: _initial(row) for address, row in entries.items()})
-        self._flash = flash
-        self._layout = LAYOUTS[options.pdo_size]
-        self._process_data = process_data
         self.changed: Callable[[], None] = lambda: None  # called after a write
-        self._now = now
+        self.aborts: dict[Address, int] = {}
+        # Code and until when, by write.
+        self._aborted: dict[tuple[Address, bytes | None], tuple[int | None, int]] = {}
+        self._flash, self._process_data, self._now, self._on_write = flash, process_data, now, on_write
+        self._layout = LAYOUTS[options.pdo_size]
         self._saved = False  # the last command was a save: the flash has its status
         self.values[table.DEVICE_NAME] = options.model.encode("ascii").ljust(
             _STRING_SIZES[table.DEVICE_NAME[0]], b"\0"
@@ -131,8 +139,17 @@ class Dictionary(ObjectTable):
         self.values.update(flash.entries)
         self.let_chop_divide(options.chop_divides)
 
+    def _check_abort(self, address: Address, data: bytes | None = None) -> None:
+        code, until = self._aborted.get((address, data), (None, 0))
+        if self._now() >= until:
+            code = self.aborts.pop(address, None)
+            if code is not None and data is not None:  # if it is repeated soon after, its answer was lost
+                self._aborted = {(address, data): (code, self._now() + _REPETITION_NS)}
+        if code is not None:
+            raise SdoAbortError(code)
+
     def read(self, index: int, subindex: int) -> bytes:
-        """See `ObjectTable`."""
+        self._check_abort((index, subindex))
         row = self.entry(index, subindex)
         if index == INPUT_OBJECT and subindex:
             field = next(f for f in self._layout.fields if f.subindex == subindex)
@@ -144,14 +161,32 @@ class Dictionary(ObjectTable):
             return bytes([self._flash.status(self._now())])
         return self.values[row.address]
 
+    def check_download(self, index: int, subindex: int, length: int, state: AlState) -> None:
+        try:
+            super().check_download(index, subindex, length, state)
+        except SdoAbortError as error:
+            self._on_write(index, subindex, b"", state, error.code)
+            raise
+
     def write(self, index: int, subindex: int, data: bytes, state: AlState) -> None:
-        """See `ObjectTable`."""
-        row = self.entry(index, subindex)
-        self.check_write(row, len(data), state)
-        if row.setting is not None:
-            _check_range(row, data)
+        abort = 0
+        try:
+            self._check_abort((index, subindex), data)
+            row = self.entry(index, subindex)
+            self.check_write(row, len(data), state)
+            if row.setting is not None:
+                _check_range(row, data)
+        except SdoAbortError as error:
+            abort = error.code
+            raise
+        else:
+            self._store(row, data)
+        finally:
+            self._on_write(index, subindex, data, state, abort)
+
+    def _store(self, row: table.ObjectEntry, data: bytes) -> None:
         self.values[row.address] = data
-        if index == table.FACTORY_CALIBRATION:
+        if row.index == table.FACTORY_CALIBRATION:
             self._flash.entries[row.address] = data
         if row.address == table.CONTROL_COMMAND:
             self._command(data[0])

@@ -18,7 +18,7 @@ from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, Distributed
 _U16, _AL_STATUS = struct.Struct("<H"), struct.Struct("<HHH")
 _REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
 _DC_SYSTEM_TIME, _DC_RECEIVE_TIME = reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME
-_DC_ECAT_EVENT, _DC_CHANGE_EVENT = reg.DC_ECAT_EVENT, reg.DC_PDI_CHANGE_EVENT
+_DC_CHANGE_EVENT = reg.DC_PDI_CHANGE_EVENT
 _LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613  # DL status: ports 0 and 1 have a link, or only port 0
 
 
@@ -80,8 +80,7 @@ class SyncManager:
         self.watched = bool(self.control & 0x40)  # writes to it trigger the process data watchdog
         activate = self._memory[self._activate]
         self.enabled = bool(activate & 1)
-        self.latches_ecat = bool(activate & reg.SM_LATCH_ECAT)
-        self.latches_pdi = bool(activate & reg.SM_LATCH_PDI)
+        self.latches = bool(activate & reg.SM_LATCH_PDI)
         self._refresh(self.enabled)
 
     def allow(self, allowed: bool) -> None:
@@ -318,8 +317,6 @@ class Esc:
 
     def _exchanged(self, manager: SyncManager) -> None:
         """The master has read or written the last byte of a buffer."""
-        if manager.latches_ecat and self.clock.present:
-            self.clock.events.taken(self.clock.frame_start + self.clock.way_ns, reg.DC_ECAT_EVENT)
         if manager.mailbox:
             manager.full = manager.master_writes
             self._pdi.mailbox_exchanged()
@@ -332,8 +329,8 @@ class Esc:
         if end > _DC_SYSTEM_TIME and start < _DC_END and clock.present:
             if start < _DC_RECEIVE_TIME:
                 clock.show_system_time()
-            if end > _DC_ECAT_EVENT:
-                clock.events.update(self._pdi.clock() + clock.way_ns, starts=start < _DC_CHANGE_EVENT)
+            if end > _DC_CHANGE_EVENT:
+                clock.events.update(self._pdi.clock() + clock.way_ns)
         if start > _DC_RECEIVE_TIMES:
             return self.memory[start:end]
         if start < reg.SII_DATA and end > reg.SII_CONTROL:
@@ -376,13 +373,8 @@ class Esc:
             self._pdi.sync_managers_changed()
             if self.sync_managers[1].repeat_asked():
                 self._pdi.repeat_requested()
-        if self.clock.present and end > reg.DC_RECEIVE_TIMES and start < reg.DC_END:
-            if touched(reg.DC_RECEIVE_TIMES, 4):
-                self.clock.latch()
-            if touched(reg.DC_SPEED_START, 2):
-                self.clock.reset()
-            if touched(reg.DC_SYSTEM_TIME, 1):
-                self.clock.compare()
+        if self.clock.present and touched(reg.DC_RECEIVE_TIMES, 4):
+            self.clock.latch()
         if touched(reg.AL_CONTROL, 2):
             self._pdi.al_control(_U16.unpack_from(self.memory, reg.AL_CONTROL)[0])
 

@@ -16,8 +16,8 @@ from typing import Final
 
 from bota_ethercat.program.arguments import number
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.virtual_sensor.application import Application
-from ethercat_server.virtual_sensor.bus import Bus, Damage, Slave
+from ethercat_server.virtual_sensor.application import Application, Slave
+from ethercat_server.virtual_sensor.bus import Bus, Damage
 from ethercat_server.virtual_sensor.distributed_clock import parse_word
 from ethercat_server.virtual_sensor.esc import SiiInterface
 from ethercat_server.virtual_sensor.options import Command, UsageError, model_name, whole

@@ -17,7 +17,7 @@ from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry, ObjectType
 from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.application import Application, al_statistics
+from ethercat_server.virtual_sensor.application import Application, Slave
 from ethercat_server.virtual_sensor.coe import ObjectTable
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
 from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions, SlaveOptions, UsageError
@@ -122,27 +122,25 @@ _WRITES_REMEMBERED: Final = 1000
 _VELOCITY_AT_WORK: Final = 1000
 
 
-class ForeignSlave:
-    """A foreign slave, powered or not. `clock` gives the time in ns."""
+class ForeignSlave(Slave):
+    """A foreign slave."""
+
+    options: ForeignOptions
 
     def __init__(self, options: ForeignOptions, clock: Callable[[], int]) -> None:
+        super().__init__(clock)
         self.options = options
-        self._clock = clock
         # Address and data of the latest register and memory writes that reached it; the number of all.
         self.writes: deque[tuple[int, bytes]] = deque(maxlen=_WRITES_REMEMBERED)
         self.write_count = 0
-        self.life: Application | None = None  # from power-on to power-off
         self.power(True)
 
-    def power(self, on: bool) -> None:
-        """Switch it off or on; no effect if it already is."""
-        if not on:
-            self.life = None
-        elif self.life is None:
-            device = KINDS[self.options.kind]
-            kind = Drive if device is _DRIVE else InputTerminal if device.inputs else Application
-            self.life = kind(device, self._clock, _objects_of(device))
-            self.life.esc.record = self._remember
+    def _switched_on(self) -> Application:
+        device = KINDS[self.options.kind]
+        kind = Drive if device is _DRIVE else InputTerminal if device.inputs else Application
+        life = kind(device, self._clock, _objects_of(device))
+        life.esc.record = self._remember
+        return life
 
     def _remember(self, address: int, data: bytes) -> None:
         self.writes.append((address, bytes(data)))
@@ -164,13 +162,8 @@ class ForeignSlave:
         )
 
     def statistics(self) -> dict[str, Any]:
-        """Its part of what the command `stats` reports."""
-        return {
-            "kind": self.options.kind,
-            **al_statistics(self.life),
-            "turning": self.turning,
-            "write_count": self.write_count,
-        }
+        own = {"turning": self.turning, "write_count": self.write_count}
+        return {"kind": self.options.kind, **super().statistics(), **own}
 
 
 def leave_in(life: Application, state: AlState, station: int, outputs_at: int, inputs_at: int) -> None:

@@ -1,8 +1,7 @@
 """Registers of the virtual sensor's slave controller: what a master may write, power-on values.
 
 The addresses are those of `ethercat_server.ethercat.slave.registers`. The controller has two ports, 3 FMMUs,
-4 sync managers, 4 KB of process data memory, and a distributed clock of 64 bits, whose SYNC unit can be set
-up but gives no signals.
+4 sync managers, 4 KB of process data memory, and a distributed clock of 64 bits.
 """
 # ruff: noqa: F403, F405
 
@@ -19,8 +18,6 @@ MEMORY_KB: Final = 4
 MEMORY_END: Final = REGISTERS_END + MEMORY_KB * 1024
 # Repeat request in a sync manager's activate register, repeat acknowledge in its PDI control register.
 REPEAT: Final = 0x02
-DC_SYNC_START: Final = 0x0990
-DC_SYNC_CYCLES: Final = 0x09A0  # of SYNC0, then SYNC1, four bytes each
 PDI_TYPE: Final = 0x05  # SPI slave, as word 0 of the SII says too
 
 # Counters: a write of any value to one of a group sets the whole group to zero.
@@ -36,13 +33,12 @@ _SYNC_MANAGERS = range(SYNC_MANAGER, SYNC_MANAGER + SYNC_MANAGER_COUNT * SYNC_MA
 _WRITABLE: Final = (
     (STATION_ADDRESS, 2, 0xFF), (DL_CONTROL, 4, 0xFF), (AL_CONTROL, 2, 0xFF),
     *((counters.start, len(counters), 0xFF) for counters in CLEARED_BY_WRITE),
-    (WATCHDOG_DIVIDER, 2, 0xFF), (WATCHDOG_TIME_PDI, 2, 0xFF), (WATCHDOG_TIME, 2, 0xFF),
+    (WATCHDOG_DIVIDER, 2, 0xFF), (WATCHDOG_TIME, 2, 0xFF),
     (SII_OWNER, 1, 0x03), (SII_CONTROL, 1, 0x01), (SII_CONTROL + 1, 1, 0x07), (SII_ADDRESS, 8, 0xFF),
     *((FMMU + number * FMMU_SIZE, 13, 0xFF) for number in range(FMMU_COUNT)),
     *((manager, 5, 0xFF) for manager in _SYNC_MANAGERS),
     *((manager + SM_ACTIVATE, 1, 0xC3) for manager in _SYNC_MANAGERS),
-    (DC_RECEIVE_TIMES, 4, 0xFF), (DC_SYSTEM_TIME, 8, 0xFF), (DC_OFFSET, 12, 0xFF), (DC_SPEED_START, 2, 0xFF),
-    (DC_FILTERS, 2, 0xFF), (DC_ACTIVATION, 2, 0xFF), (DC_SYNC_START, 8, 0xFF), (DC_SYNC_CYCLES, 8, 0xFF),
+    (DC_RECEIVE_TIMES, 4, 0xFF), (DC_SYSTEM_TIME, 8, 0xFF), (DC_OFFSET, 12, 0xFF), (DC_ACTIVATION, 2, 0xFF),
     (USER_RAM, REGISTERS_END - USER_RAM, 0xFF),
 )  # fmt: skip
 
@@ -67,6 +63,5 @@ def power_on_values() -> bytearray:
     memory[DL_CONTROL] = memory[AL_CONTROL] = memory[AL_STATUS] = memory[WATCHDOG_STATUS] = 1
     memory[PDI_CONTROL] = PDI_TYPE
     struct.pack_into("<H", memory, WATCHDOG_DIVIDER, 2498)  # (2498 + 2) * 40 ns = 100 µs a tick
-    struct.pack_into("<H", memory, WATCHDOG_TIME_PDI, 1000)
     struct.pack_into("<H", memory, WATCHDOG_TIME, 1000)
     return memory

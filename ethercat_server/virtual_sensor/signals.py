@@ -61,7 +61,6 @@ def _clock(number: int, instant: int) -> Iterable[float]:
 
 FORMULAS: Final = {
     "clock": Formula(_clock, is_exact=True),
-    "ramp": Formula(lambda k, _: (((k + 100 * i) % 1024) / 64 - 8 for i in range(6)), is_exact=True),
     "constant": Formula(lambda *_: CONSTANT),
     # The sample number in the temperature: steps of 2**-18 °C, from 32 to 48 °C, are exact in REAL32.
     "rest": Formula(lambda *_: CONSTANT, lambda k: 32 + k % 2**22 / 2**18),

@@ -135,13 +135,6 @@ def test_object_lists() -> None:
     found = b"".join(f[4:] for f in fragments)
     assert found[:2] == b"\1\0"
     assert list(struct.unpack(f"<{len(found) // 2}H", found)[1:]) == expected
-    settings = [*range(0x8004, 0x8009)]
-    listed = ([0x7000], [0x6000], [*range(0x8000, 0x8003), *settings, 0x8010, 0x8030], settings)
-    for kind, indices in enumerate(listed, 2):
-        [one] = master.information(1, struct.pack("<H", kind))
-        assert one[4:] == struct.pack(f"<{1 + len(indices)}H", kind, *indices)
-    [lengths] = master.information(1, struct.pack("<H", 0))
-    assert struct.unpack("<6H", lengths[4:]) == (0, len(expected), *map(len, listed))
     [error] = master.information(1, struct.pack("<H", 9))
     assert error[0] == 7
 
@@ -160,9 +153,6 @@ def test_descriptions() -> None:
     for index, subindex in [(0x8004, 0), (0x8005, 0), (0x8007, 0), (0x8008, 0), (0x8010, 1), (0x8010, 6)]:
         [reply] = master.information(5, struct.pack("<HBB", index, subindex, 0))
         assert struct.unpack_from("<HH", reply, 8) == (0x0037, 8), "one-byte settings are BIT8"
-    for index, subindex, access in ((0x6000, 4, 0x87), (0x7000, 0, 0x47)):
-        [reply] = master.information(5, struct.pack("<HBB", index, subindex, 0))
-        assert struct.unpack_from("<H", reply, 12)[0] == access, "read always, mapped to TxPDO or RxPDO"
     for request in ((3, struct.pack("<H", 0x5555)), (5, struct.pack("<HBB", 0x1018, 9, 0)), (9, b"")):
         [reply] = master.information(*request)
         assert reply[0] == 7
