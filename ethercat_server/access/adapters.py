@@ -46,7 +46,6 @@ class Holder(NamedTuple):
     address: Address | None  # the TCP address it listens on; None if it does not, or if that is not visible
 
     def __str__(self) -> str:
-        """Its description in messages."""
         if self.pid is not None:
             return f"process {self.pid} ({self.name})"
         return "another EtherCAT master" if self.address is None else self.name
@@ -71,7 +70,6 @@ class Adapter(NamedTuple):
 
     @property
     def state(self) -> str:
-        """Of the link, as text."""
         return "down" if not self.up else "up" if self.carrier else "up, no carrier"
 
     @property

@@ -218,12 +218,10 @@ class ServerOptions:
 
     @property
     def terminals(self) -> Sequence[str]:
-        """The slaves beside the sensors that are read, too."""
         return tuple(self.server["terminals"])
 
     @property
     def keep_unset(self) -> bool:
-        """Whether the sensors keep the settings that nobody set."""
         return bool(self.server["unset_settings"] == KEEP)
 
     def asked_settings(self, number: int, name: str, serial: int) -> dict[str, SettingValue]:
@@ -247,7 +245,6 @@ class ServerOptions:
         return wanted
 
     def _unset(self) -> dict[str, SettingValue]:
-        """What settings that nobody set become."""
         return {} if self.keep_unset else start_up_defaults()
 
     def _sources(self, number: int, name: str, serial: int) -> list[tuple[str, Mapping[str, SettingValue]]]:

@@ -31,7 +31,6 @@ class Notifier:
                 self._socket.connect("\0" + name[1:] if name.startswith("@") else name)
 
     def feed(self) -> None:
-        """The acquisition loop is running."""
         self.send("WATCHDOG=1")
 
     def update(self, server: Server) -> None:
@@ -47,7 +46,6 @@ class Notifier:
             self.send(f"STATUS={text}")
 
     def send(self, text: str) -> None:
-        """A state such as READY=1."""
         if self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.send(text.encode())

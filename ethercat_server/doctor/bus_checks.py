@@ -67,7 +67,6 @@ class ErrorCounters(NamedTuple):
 
     @classmethod
     def parse(cls, data: bytes) -> ErrorCounters:
-        """From the registers 0x0300 to 0x0313."""
         by_port = tuple(data[0:8:2]), tuple(data[1:8:2]), tuple(data[8:12])
         return cls(*by_port, data[12], data[13], tuple(data[16:20]))
 
@@ -346,11 +345,9 @@ class ServerView:
                     self._observers[position].note_age(batch[-1], now_ns)
 
     def _grown(self, name: str) -> int:
-        """Increase of a counter."""
         return increase(getattr(self.before, name), getattr(self.after, name))
 
     def sensors(self) -> Iterator[Finding]:
-        """Each sensor: the verdict on its stream."""
         for info in self.described:
             if (observer := self._observers.get(info.sensor)) is None:
                 continue  # it was not there before
@@ -376,17 +373,14 @@ class ServerView:
                 yield note(f"sensor {info.sensor} {past}", "have it checked")
 
     def wake_ups(self) -> Finding:
-        """Its lateness."""
         late, count = self._grown("missed_deadlines"), max(1, self._grown("cycles"))
         return wake_finding(self._summaries.wake_us, late, count)
 
     def exchanges(self) -> Finding:
-        """How long its exchanges take, and how many are lost."""
         lost, count = self._grown("lost_frames"), max(1, self._grown("cycles"))
         return exchange_finding(self._when, self._summaries.exchange_us, lost, count)
 
     def ages(self) -> Iterator[Finding]:
-        """The age of samples when the server sends them."""
         for row in self.after.sensors:
             summary = row.age_us if self._own else self.after.recent_age_us(row.sensor)
             if not summary.max:
@@ -394,7 +388,6 @@ class ServerView:
             yield age_finding(f"sensor {row.sensor}, when sent{self._when}", summary)
 
     def clients(self) -> Finding:
-        """The clients, and those that are too slow."""
         rows = self.after.clients
         before = {row.peer: row.withheld for row in self.before.clients}
         slow = [row.peer for row in rows if increase(before.get(row.peer, 0), row.withheld)]
@@ -407,7 +400,6 @@ class ServerView:
         )  # fmt: skip
 
     def examine(self, subject: str) -> Iterator[Finding]:
-        """All checks."""
         yield from examine(subject, "sensors", self.sensors)
         yield from examine(subject, "wake-ups", self.wake_ups)
         yield from examine(subject, "exchanges", self.exchanges)

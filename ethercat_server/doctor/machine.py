@@ -112,7 +112,6 @@ class Machine:
 
     @property
     def link(self) -> Adapter:
-        """The interface itself."""
         found: Adapter | None = self.fact("link")
         if found is None:
             raise CannotLookError("there is no such interface")
@@ -140,7 +139,6 @@ class Machine:
         return found
 
     def number(self, name: str) -> int:
-        """The whole number in a file."""
         text = self.text(name)
         try:
             return int(text)
@@ -156,11 +154,9 @@ class Machine:
 
     @cached_property
     def processors(self) -> list[int]:
-        """The online processors."""
         return processor_list(self.text("/sys/devices/system/cpu/online"))
 
     def commands_running(self) -> dict[int, str]:
-        """The visible processes by PID, with their short names."""
         pids = [int(name) for name in self.names("/proc") if name.isdecimal()]
         return {pid: name for pid in pids if (name := self.text(f"/proc/{pid}/comm", ""))}
 

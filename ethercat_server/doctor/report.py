@@ -41,7 +41,6 @@ class Finding:
     check: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """Its JSON form."""
         names = ("subject", "check", "level", "found", "why", "commands", "values")
         return {name: getattr(self, name) for name in names} | {"level": NAMES[self.level]}
 
@@ -162,7 +161,6 @@ class Report:
             self._waiting = True
 
     def write(self, finding: Finding) -> None:
-        """One finding, under its subject."""
         if finding.subject != self._subject:
             self.say(("\n" if self._subject else "") + self._painted(finding.subject, "\x1b[1m"))
             self._subject = finding.subject

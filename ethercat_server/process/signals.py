@@ -14,7 +14,6 @@ class Signals(signals.Signals):
     """Checked between the steps of start-up; passed on to the loop once it runs."""
 
     def check(self) -> None:
-        """StopRequestedError if a signal has arrived."""
         if self.asked:
             raise StopRequestedError("stopped during start-up")
 

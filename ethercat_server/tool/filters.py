@@ -41,7 +41,6 @@ class Choice(NamedTuple):
         return [self.response.phase_deg(hz) or 0.0 for hz in FREQUENCIES_HZ]
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
         return {
             **{name: getattr(self, name) for name in Choice._fields if name != "response"},
             "delay_ms": self.response.delay_ms,
@@ -50,7 +49,6 @@ class Choice(NamedTuple):
         }
 
     def cells(self) -> tuple[str, ...]:
-        """A row of the table."""
         limit = "" if self.noise_limit_n is None else f"{self.noise_limit_n:.2f}"
         return (
             str(self.sinc_length), "on" if self.fir else "off", str(self.rate_hz), f"{self.cutoff_hz:g}",

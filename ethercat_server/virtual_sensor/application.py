@@ -73,7 +73,6 @@ class Application:
         self._show_state()
 
     def inputs(self) -> bytes:
-        """The newest process data."""
         return b"".join(self.objects.read(*entry.address) for entry in self.device.input_entries)
 
     def outputs(self, data: bytes) -> None:
@@ -84,7 +83,6 @@ class Application:
             self.take_outputs(data)
 
     def take_outputs(self, data: bytes) -> None:
-        """The master wrote the outputs, in OP."""
         at = 0
         for address, size in self._outputs:
             self.objects.values[address] = data[at : at + size]
@@ -93,11 +91,9 @@ class Application:
     def prepare(self, expected: int) -> None:
         """Compute what a frame at the time `expected` will read, while there is time."""
 
-    def state_changed(self) -> None:
-        """The AL state has changed."""
+    def state_changed(self) -> None: ...
 
     def al_control(self, control: int) -> None:
-        """The master asks for a state."""
         before, wanted = self.state, control & 0x0F
         if self.error and (control & _ERROR or wanted < before or wanted == AlState.INIT):
             self.error, self.code = False, 0
@@ -177,11 +173,9 @@ class Application:
             self.fail(AlState.SAFEOP, AlCode.SYNC_MANAGER_WATCHDOG)
 
     def mailbox_exchanged(self) -> None:
-        """A request has arrived, or the last reply has been taken."""
         self.mailbox.work()
 
     def repeat_requested(self) -> None:
-        """The last reply was lost on the way."""
         self.mailbox.repeat()
 
 
@@ -209,7 +203,6 @@ class Slave:
         raise NotImplementedError
 
     def statistics(self) -> dict[str, Any]:
-        """Its part of what the command `stats` reports."""
         life = self.life
         return {
             "powered": life is not None,

@@ -69,7 +69,6 @@ class Bus:
         self._leave_behind()
 
     def repair(self) -> None:
-        """End what loses or damages frames."""
         self.lost: tuple[float, float] = (0, 0)  # the numbers of the frames that are: from this, before that
         self.deaf_until: float = 0  # no frame comes back before this time
         self.damage: Damage | None = None  # of the next frames on the cable
@@ -101,7 +100,6 @@ class Bus:
             life.esc.set_line(position, len(self._alive) - 1 - position)
 
     def lose(self, frames: float, after: int = 0) -> None:
-        """Lose so many frames, after so many that come back."""
         self.lost = self.frames + after, self.frames + after + frames
 
     def set_time(self, now: int) -> None:
@@ -114,7 +112,6 @@ class Bus:
         self.now = now
 
     def power(self, slave: Slave, on: bool, seconds: float | None = None) -> None:
-        """Switch a slave on or off; on again after `seconds` unless None."""
         self._power_events = [event for event in self._power_events if event[1] is not slave]
         slave.power(on)
         if seconds is not None:
@@ -219,7 +216,6 @@ class Bus:
                 slave.life.check_watchdog(now)
 
     def statistics(self) -> dict[str, Any]:
-        """What the command `stats` reports."""
         return {
             "frames": self.frames,
             "frames_lost": self.frames_lost,

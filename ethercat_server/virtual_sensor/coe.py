@@ -33,7 +33,6 @@ class ObjectTable:
         self.values = values
 
     def entry(self, index: int, subindex: int) -> ObjectEntry:
-        """The entry at an address; SdoAbortError if there is none."""
         row = self.entries.get((index, subindex))
         if row is None:
             exists = any(known == index for known, _ in self.entries)
@@ -41,21 +40,17 @@ class ObjectTable:
         return row
 
     def size(self, row: ObjectEntry) -> int:
-        """Bytes of the entry `row`."""
         return row.type.size or len(self.values[row.address])
 
     def number(self, address: Address) -> float:
-        """The number that an entry holds."""
         value = self.entries[address].type.unpack(self.values[address])
         assert not isinstance(value, str)
         return value
 
     def read(self, index: int, subindex: int) -> bytes:
-        """The bytes of an entry; SdoAbortError if it cannot be read."""
         return self.values[self.entry(index, subindex).address]
 
     def write(self, index: int, subindex: int, data: bytes, state: AlState) -> None:
-        """Write an entry as a master does in the AL state `state`; SdoAbortError if it cannot be."""
         self.check_write(self.entry(index, subindex), len(data), state)
         self.values[index, subindex] = data
 

@@ -76,12 +76,10 @@ class Device:
 
     @property
     def output_entries(self) -> list[ObjectEntry]:
-        """What the outputs carry, in their order."""
         return [entry for pdo in self.outputs for entry in pdo.entries]
 
     @property
     def input_entries(self) -> list[ObjectEntry]:
-        """What the inputs carry, in their order."""
         return [entry for pdo in self.inputs for entry in pdo.entries]
 
 

@@ -47,7 +47,6 @@ class Flash:
         self._ends = 0.0
 
     def save(self, values: Mapping[Address, bytes], now: int) -> None:
-        """Start to write `values`."""
         if self.cut is not None:
             (count, cut_power), self.cut = self.cut, None
             self.entries.update(sorted(values.items())[:count])
@@ -194,15 +193,12 @@ class Dictionary(ObjectTable):
         self.changed()
 
     def settings(self) -> dict[str, SettingValue]:
-        """Every setting in force."""
         return {name: row.decode_setting(self.values[row.address]) for name, row in table.BY_SETTING.items()}
 
     def offsets(self, index: int) -> tuple[float, ...]:
-        """The six offsets of an offset object."""
         return tuple(self.number((index, sub)) for sub in range(1, 7))
 
     def let_chop_divide(self, by: int) -> None:
-        """Have CHOP divide the sampling rate."""
         self._chop_divides = by
         self._follow_sinc()
 

@@ -41,7 +41,6 @@ class LocalClock:
         return self._local + (instant - self._anchor) * (RATE_SCALE + self._rate)
 
     def set_ppm(self, now: int, ppm: float) -> None:
-        """Set the error of its crystal, positive for a fast one."""
         self._local, self._anchor, self._rate = self._scaled(now), now, round(ppm * 1e6)
 
     def set(self, now: int, ns: int) -> None:
@@ -78,13 +77,11 @@ class EventTimes:
         self._newest_at, self._end_of = newest_at, end_of
 
     def latch(self, wanted: bool, now: int) -> None:
-        """Latch the writes from now on, or no longer."""
         if wanted != (self._since is not None):
             self.update(now)
             self._since = now if wanted else None
 
     def update(self, now: int) -> None:
-        """Latch the writes up to now."""
         if self._since is None or self._newest_at is None or self.none or (self.stuck and self._shown >= 0):
             return
         number = self._newest_at(now)
@@ -115,7 +112,6 @@ class DistributedClock:
         self._miss(reg.DC_AVAILABLE | reg.DC_64_BIT, range(reg.DC_RECEIVE_TIMES, reg.DC_END))
 
     def narrow(self) -> None:
-        """Be a distributed clock of 32 bits."""
         self.time_mask = _MASK
         for time in (reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME, reg.DC_OFFSET):
             self._miss(reg.DC_64_BIT, range(time + 4, time + 8))

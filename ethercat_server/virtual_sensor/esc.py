@@ -34,7 +34,6 @@ class Fmmu:
 
     @classmethod
     def decode(cls, memory: bytearray, number: int) -> Fmmu | None:
-        """FMMU `number` from the registers; None if it is not active, or maps nothing, or single bits."""
         logical, length, first, last, physical, bit, kind, active = reg.FMMU_LAYOUT.unpack_from(
             memory, reg.FMMU + number * reg.FMMU_SIZE
         )
@@ -72,7 +71,6 @@ class SyncManager:
         self.reload()
 
     def reload(self) -> None:
-        """Take over what the registers say."""
         self.start, self.length, self.control = struct.unpack_from("<HHB", self._memory, self.registers)
         self.end = self.start + self.length
         self.mailbox = self.control & 0x03 == reg.SM_MAILBOX
@@ -126,13 +124,11 @@ class SyncManager:
         return may
 
     def load(self, message: bytes) -> None:
-        """The firmware fills the read mailbox."""
         self._memory[self.start : self.end] = message.ljust(self.length, b"\0")[: self.length]
         self.open = False
         self.full = True
 
     def content(self) -> bytes:
-        """The whole buffer, as the firmware sees it."""
         return bytes(self._memory[self.start : self.end])
 
 
@@ -180,7 +176,6 @@ class SiiInterface:
             self._end(0)
 
     def command(self) -> None:
-        """Execute the command in the control register at the word in the address register."""
         control, word = struct.unpack_from("<HI", self._memory, reg.SII_CONTROL)
         self.advance()
         operation = control >> 8 & 0x07
@@ -218,7 +213,6 @@ class Esc:
     """Registers and memory of one controller."""
 
     def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
-        """`sii_read_ns` is how long reading from the EEPROM takes."""
         self._pdi = pdi
         self.memory = reg.power_on_values()
         self.memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = sii_image[8:10]
@@ -249,7 +243,6 @@ class Esc:
             _U16.pack_into(self.memory, reg.DL_STATUS, status)
 
     def set_al_status(self, status: int, code: int) -> bool:
-        """Show AL status (state and error bit) and AL status code; False if they are as before."""
         was, _, code_was = _AL_STATUS.unpack_from(self.memory, reg.AL_STATUS)
         if (was, code_was) == (status, code):
             return False
@@ -293,7 +286,6 @@ class Esc:
         return address < reg.MEMORY_END and bool(data)
 
     def _owner(self, start: int, end: int) -> SyncManager | None:
-        """The first active sync manager that guards any of this memory."""
         return next((m for m in self.sync_managers if m.active and m.start < end and start < m.end), None)
 
     def _read_manager(self, manager: SyncManager, offset: int, length: int) -> bytes | None:
@@ -324,7 +316,6 @@ class Esc:
             self._pdi.outputs(manager.content())
 
     def read_registers(self, start: int, end: int) -> bytes | bytearray:
-        """Registers `start` to `end`, as a master reads them."""
         clock = self.clock
         if end > _DC_SYSTEM_TIME and start < _DC_END and clock.present:
             if start < _DC_RECEIVE_TIME:

@@ -38,21 +38,18 @@ class Call:
 
     @property
     def sensor(self) -> VirtualSensor:
-        """The sensor it is for; UsageError if it is for a foreign slave."""
         if not isinstance(self.slave, VirtualSensor):
             raise UsageError("that slave is no sensor: choose one with `@N`")
         return self.slave
 
     @property
     def application(self) -> Application:
-        """What runs in the slave; UsageError if it has no power."""
         if self.slave.life is None:
             raise UsageError("it has no power: use `power on` first")
         return self.slave.life
 
     @property
     def firmware(self) -> Firmware:
-        """The sensor's firmware; UsageError if it has no power, or is for a foreign slave."""
         if self.sensor.life is None:
             raise UsageError("the sensor has no power: use `power on` first")
         return self.sensor.life

@@ -58,7 +58,6 @@ class LoadFilter:
         return tuple(map(operator.add, weighted(_SINC, values), self._noise()))
 
     def _look(self, number: int) -> list[Sequence[float]]:
-        """In the period before a sample, the newest first."""
         end_s, step_s = self._begin_s + number * self._period_s, self._period_s / _STEPS
         return [self._signal(end_s - (n + 0.5) * step_s) for n in range(_STEPS)]
 

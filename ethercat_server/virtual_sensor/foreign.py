@@ -100,7 +100,6 @@ class Drive(Application):
     """A servo drive, which the controlword enables in one step, and the end of process data disables."""
 
     def state_changed(self) -> None:
-        """See `Application`."""
         if self.state is not AlState.OP:
             self.objects.values[_CONTROLWORD.address] = bytes(2)
 
@@ -110,7 +109,6 @@ class InputTerminal(Application):
     count tenths of a second."""
 
     def inputs(self) -> bytes:
-        """See `Application`."""
         ms = self.clock() // 1_000_000
         if self.device.name == "EL1008":
             return bytes([ms // 100 & 0xFF])
@@ -155,7 +153,6 @@ class ForeignSlave(Slave):
 
     @property
     def turning(self) -> bool:
-        """Whether it is a drive whose motor moves."""
         objects = self.life.objects if self.life else None
         return (
             isinstance(objects, _DriveObjects) and objects.enabled and objects.number(_VELOCITY.address) != 0

@@ -57,7 +57,6 @@ class Mailbox:
         self.mute = 0  # number of the next requests to drop: a fault
 
     def reset(self) -> None:
-        """The mailbox was switched off or on."""
         self._replies.clear()
         self._last_reply = b""
         self._last_counter = self._counter = 0
@@ -91,7 +90,6 @@ class Mailbox:
         self.work()
 
     def repeat(self) -> None:
-        """The master lost the last reply: repeat it."""
         if not self._read.full and self._last_reply:
             self._read.load(self._last_reply)
 

@@ -84,11 +84,9 @@ class Command:
 
     @property
     def name(self) -> str:
-        """Its first word."""
         return self.usage.split()[0]
 
     def parse(self, words: Sequence[str]) -> list[Any]:
-        """The arguments; UsageError if they are wrong."""
         least = len(self.arguments) - self.usage.replace("[@N]", "").count("[")
         most = math.inf if "..." in self.usage else len(self.arguments)
         if not least <= len(words) <= most:

@@ -39,14 +39,12 @@ class SampleClock:
         self._denominator = BASE_SAMPLING_RATE_HZ * (_PPM_SCALE + round(ppm * 1e6))
 
     def number_at(self, now: int) -> int:
-        """Number of the newest sample at the time `now`, ns."""
         elapsed = now - self._anchor
         if elapsed < 0:
             return self._anchor_number
         return self._anchor_number + ((elapsed + 1) * self._denominator - 1) // self._numerator
 
     def instant(self, number: int) -> int:
-        """Instant of sample `number`, ns."""
         return self._anchor + (number - self._anchor_number) * self._numerator // self._denominator
 
     def change(self, now: int, *, sinc_length: int | None = None, ppm: float | None = None) -> None:
@@ -148,7 +146,6 @@ class Sampler:
         return number
 
     def newest(self, later: int = 0) -> bytes:
-        """The newest process data, `later` ns from now."""
         if self.stuck:
             return self.stuck
         now = self._now() + later
@@ -241,7 +238,6 @@ class Sampler:
         self._prepared_number = -1
 
     def settings_changed(self) -> None:
-        """Settings or offsets in the dictionary have changed."""
         sinc_length = self._dictionary.sinc_in_effect
         if sinc_length != self.clock.sinc_length:
             self.clock.change(self._now(), sinc_length=sinc_length)
@@ -259,12 +255,10 @@ class Sampler:
         self.changed()
 
     def set_ppm(self, ppm: float) -> None:
-        """Set the error of the clock from the newest sample on."""
         self.clock.change(self._now(), ppm=ppm)
         self.changed()
 
     def set_warnings(self, bits: int, samples: int | None) -> None:
-        """OR `bits` into the warnings of the next `samples` samples, or of all."""
         self._warnings = bits
         self._warnings_until = 2**63 if samples is None else self.clock.number_at(self._now()) + 1 + samples
         self.changed()

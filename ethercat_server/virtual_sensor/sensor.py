@@ -43,7 +43,6 @@ class Firmware(Application):
         return self.sampler.newest(self.esc.clock.way_ns + self.esc.into_ns)
 
     def prepare(self, expected: int) -> None:
-        """Compute the sample that a frame at the time `expected` will read."""
         self.sampler.prepare(expected)
 
 
@@ -99,14 +98,12 @@ class VirtualSensor(Slave):
         self._begin()
 
     def set_ppm(self, ppm: float) -> None:
-        """Set the error of its clock, now and after a power cycle."""
         self.options = replace(self.options, ppm=ppm)
         if self.life is not None:
             self.life.esc.clock.settle()
             self.life.sampler.set_ppm(ppm)
 
     def set_signal(self, signal: str) -> None:
-        """Measure another signal, now and after a power cycle."""
         self.options = replace(self.options, signal=signal, world=None)
         if self.life is not None:
             self.life.sampler.measure(self.options)

@@ -43,7 +43,6 @@ class Formula:
     is_exact: bool = False  # noise would make its numbers unreadable
 
     def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
-        """The reading of sample `number`, taken at `instant` ns, `seconds` after power-on."""
         load, temperature = tuple(self.load(number, instant)), self.temperature(number)
         return Reading(load, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), temperature, (0.0, 0.0, 0.0, 1.0))
 

@@ -56,7 +56,6 @@ class VirtualBus:
 
     @property
     def pid(self) -> int:
-        """Process id of the sensor; 0 while the bus is down."""
         return self._process.pid if self._process else 0
 
     def __enter__(self) -> VirtualBus:
@@ -94,7 +93,6 @@ class VirtualBus:
                 raise ServerError(f"cannot enter the namespaces of the virtual sensor ({why}): use root")
 
     def __exit__(self, *_: object) -> None:
-        """End the sensor's process, and with it the bus."""
         process, self._process = self._process, None
         if process is None:
             return

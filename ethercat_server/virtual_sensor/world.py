@@ -51,7 +51,6 @@ class ExternalWorld:
         return self._lost == FAULT and LOST_AFTER_S < now_s - self._moments[-1][0] < math.inf
 
     def __call__(self, seconds: float) -> Felt:
-        """What the sensor feels."""
         at = bisect.bisect_right(self._moments, seconds, key=operator.itemgetter(0))
         begin_s, felt = self._moments[max(0, at - 1)]
         return REST if self._lost == ZERO and seconds - begin_s > LOST_AFTER_S else felt
@@ -66,7 +65,6 @@ class Measured:
         self._settings: tuple[SettingValue, ...] = ()  # of the filters
 
     def set_filters(self, sinc_length: int, settings: Mapping[str, SettingValue]) -> None:
-        """Measure through these filters; `sinc_length` is that in effect."""
         wanted = sinc_length, *(settings[name] for name in _FILTERS)
         if wanted == self._settings:
             return
@@ -86,7 +84,6 @@ class Measured:
         return [self._gauss(0.0, deviation) if self._noise else 0.0 for deviation in self.deviations]
 
     def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
-        """See `Formula`."""
         world = self._world
         felt = world(seconds)
         load = self._load_filter.at(number, seconds)
