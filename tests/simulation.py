@@ -16,7 +16,7 @@ within `simulated_server` whatever connects to a server gets one that streams th
 
     with simulated_bus("--serial", "10,20") as bus:
         bus.command("power cycle 0.5")
-        result = run_here(main, "plan", bus.near, "--set", "fir=on")
+        result = run_here(main, "apply", "--dry-run", bus.near, "--set", "fir=on")
         assert bus.written(1) == []
 """
 

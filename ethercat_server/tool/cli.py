@@ -16,9 +16,7 @@ from ethercat_server.tool import bus, filters, objects, settings
 from ethercat_server.tool.command import Command, say_json
 
 _PROGRAM: Final = "ethercat-sensor"
-_EXIT_CODES: Final = (
-    "exit codes: 0 done (plan: nothing to change), 1 failed, 2 wrong arguments, 3 plan: there are changes"
-)
+_EXIT_CODES: Final = "exit codes: 0 done, 1 failed, 2 wrong arguments, 3 apply --dry-run: there are changes"
 
 COMMANDS: Final[Mapping[str, Command]] = {
     command.name: command for module in (bus, objects, settings, filters) for command in module.COMMANDS
