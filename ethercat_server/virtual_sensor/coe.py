@@ -138,10 +138,7 @@ class CoeServer:
             data = request[_SDO_HEADER_SIZE : _SDO_HEADER_SIZE + size]
             self._objects.check_download(index, subindex, size, self._state())
         else:
-            size = 4 - (command >> 2 & 3)
-            if not command & _SIZE_INDICATED:  # the client leaves it to the server
-                size = min(self._objects.size(self._objects.entry(index, subindex)), 4)
-            data = request[4 : 4 + size]
+            data = request[4 : 8 - (command >> 2 & 3)]
         self._objects.write(index, subindex, data, self._state())
         return struct.pack("<BHBI", _DOWNLOADED << 5, index, subindex, 0)
 

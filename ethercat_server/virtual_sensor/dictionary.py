@@ -7,7 +7,6 @@ That is of the dump of a real Rokubi (see `bota_ethercat.pdo`).
 from __future__ import annotations
 
 import struct
-from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final
 
@@ -23,7 +22,6 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 
 _STRING_SIZES: Final = {0x1008: 20, 0x1009: 12, 0x100A: 13}  # declared; padded with NUL
 _BUSY: Final = 0xFF  # status while a save is under way
-_UNKNOWN_COMMAND: Final = 1
 # What the SINC length reads back, times the sampling rate: 768 at 400 Hz, 2048 at 150 Hz (real sensors).
 _SINC_UNIT: Final = 307_200
 # Objects stored by the save command; the factory calibration is stored at once.
@@ -32,18 +30,15 @@ _REPETITION_NS: Final = 300_000_000
 
 
 class Flash:
-    """The sensor's flash, entries by address, and the process of saving to it. Times are in ns.
-
-    Entries are written one by one in order of address; a power loss in between leaves the rest unchanged.
-    """
+    """The sensor's flash, entries by address, and the process of saving to it. Times are in ns."""
 
     def __init__(self) -> None:
         self.entries: dict[Address, bytes] = {}
         self.seconds = 0.0  # duration of a save
         self.result = 0  # status at the end of a save; 0 is success, with any other nothing is stored
-        # Number of entries after which the next save loses power, and the action for it.
+        # Number of entries, in order of address, after which the next save loses power; the action for it.
         self.cut: tuple[int, Callable[[], None]] | None = None
-        self._waiting: deque[tuple[float, Address, bytes]] = deque()
+        self._saving: Mapping[Address, bytes] = {}
         self._ends = 0.0
 
     def save(self, values: Mapping[Address, bytes], now: int) -> None:
@@ -52,28 +47,22 @@ class Flash:
             self.entries.update(sorted(values.items())[:count])
             cut_power()
             return
-        length = self.seconds * 1e9
-        self._ends = now + length
-        step = length / max(len(values), 1)
-        rows = sorted(values.items()) if not self.result else []
-        self._waiting = deque((now + (n + 1) * step, *row) for n, row in enumerate(rows))
-        self._advance(now)
-
-    def _advance(self, now: int) -> None:
-        while self._waiting and self._waiting[0][0] <= now:
-            _, address, data = self._waiting.popleft()
-            self.entries[address] = data
+        self.status(now)
+        self._saving, self._ends = values, now + self.seconds * 1e9
 
     def status(self, now: int) -> int:
         """Value of object 0x8030:2 for the last save."""
-        self._advance(now)
-        return _BUSY if now < self._ends else self.result
+        if now < self._ends:
+            return _BUSY
+        if not self.result:
+            self.entries.update(self._saving)
+        self._saving = {}
+        return self.result
 
     def power_cut(self, now: int) -> None:
-        """Drop what is not written yet."""
-        self._advance(now)
-        self._waiting.clear()
-        self._ends = 0.0
+        """Drop what is not saved yet."""
+        self.status(now)
+        self._saving, self._ends = {}, 0.0
 
 
 def sensor_device(model: str, serial: int, pdo_size: int) -> Device:
@@ -215,8 +204,7 @@ class Dictionary(ObjectTable):
         self._saved = command == table.SAVE_PARAMETERS
         if self._saved:
             self._flash.save({a: v for a, v in self.values.items() if a[0] in _SAVED}, self._now())
-        status = 0 if command in (0, table.SAVE_PARAMETERS) else _UNKNOWN_COMMAND
-        self.values[table.CONTROL_STATUS] = bytes([status])
+        self.values[table.CONTROL_STATUS] = b"\0"
         self.values[table.CONTROL_COMMAND] = b"\0"
 
 

@@ -15,9 +15,8 @@ from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.virtual_sensor.esc import SyncManager
 
 HEADER: Final = struct.Struct("<HHBB")
-_ERROR, _COE, _FOE = 0, 3, 4  # protocols, as numbered in the header
+_ERROR, _COE = 0, 3  # protocols, as numbered in the header
 _COE_EMERGENCY: Final = 1  # service in the CoE header
-_ACCESS_DENIED: Final = struct.pack("<BBI", 5, 0, 0x8002) + b"Access denied"  # FoE is for firmware updates
 
 
 # Details of a mailbox error reply.
@@ -107,14 +106,10 @@ class Mailbox:
         try:
             if length > len(message) - HEADER.size:
                 raise MailboxError(INVALID_SIZE)
-            kind, replies = self._answer(kind & 0x0F, message[HEADER.size : HEADER.size + length])
+            kind &= 0x0F
+            if kind != _COE or MailboxProtocol.CoE not in self._protocols:
+                raise MailboxError(UNSUPPORTED_PROTOCOL)
+            replies = self._coe(message[HEADER.size : HEADER.size + length], self._read.length - HEADER.size)
         except MailboxError as fault:
             kind, replies = _ERROR, [struct.pack("<HH", 1, fault.detail)]
         self._replies += [(kind, address, reply) for reply in replies]
-
-    def _answer(self, kind: int, body: bytes) -> tuple[int, list[bytes]]:
-        if kind == _COE and MailboxProtocol.CoE in self._protocols:
-            return kind, self._coe(body, self._read.length - HEADER.size)
-        if kind == _FOE and MailboxProtocol.FoE in self._protocols:
-            return kind, [_ACCESS_DENIED]
-        raise MailboxError(UNSUPPORTED_PROTOCOL)

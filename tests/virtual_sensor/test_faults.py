@@ -217,60 +217,6 @@ def test_a_command_waits_for_a_write() -> None:
         assert obey(master.bus, line).startswith("error: ")
 
 
-SAVE, STATUS = (0x8030, 1), (0x8030, 2)
-
-
-def test_saving_takes_its_time_and_a_power_cut_leaves_the_rest() -> None:
-    master = RawMaster().go(PREOP)
-    do(master, "saving 0.37")  # ten milliseconds each
-    for subindex, data in ((1, b"\x80\0"), (2, b"\0"), (4, b"\1")):
-        master.download(0x8006, subindex, data)
-    master.download(*SAVE, b"\1")
-    assert master.upload(*STATUS) == b"\xff"
-    master.wait(265_000_000)
-    do(master, "power off", "power on")
-    master.go(PREOP)
-    assert [master.upload(0x8006, n) for n in (1, 2, 3, 4)] == [b"\0\3", b"\0", b"\0", b"\0"], "768"
-    assert master.upload(*STATUS) == b"\0"
-    master.download(*SAVE, b"\1")
-    master.wait(371_000_000)
-    assert master.upload(*STATUS) == b"\0"
-
-
-def test_a_save_may_end_with_a_status_or_with_the_power() -> None:
-    master = RawMaster().go(PREOP)
-    do(master, "saving 0 7")
-    master.download(0x8006, 4, b"\1")
-    master.download(*SAVE, b"\1")
-    assert master.upload(*STATUS) == b"\x07"
-    do(master, "power cycle 0")
-    master.go(PREOP)
-    assert master.upload(0x8006, 4) == b"\0"
-    do(master, "saving 0")
-    master.download(0x8006, 2, b"\0")
-    master.download(0x8006, 4, b"\1")
-    do(master, "cut-save 27")
-    with pytest.raises(AssertionError):
-        master.download(*SAVE, b"\1")
-    assert answering(master) == 0
-    do(master, "power on")
-    master.go(PREOP)
-    assert [master.upload(0x8006, n) for n in (2, 4)] == [b"\0", b"\0"]
-
-
-def test_an_eeprom_that_cannot_be_read() -> None:
-    master = RawMaster(SensorOptions(eeprom_ms=0))
-
-    def status() -> int:
-        master.write(0x0502, struct.pack("<HI", 0x0100, 8))
-        return master.read16(0x0502) & 0xE000
-
-    for result, bits in (("ok", 0), ("error", 0x2000), ("busy", 0x8000), ("ok", 0)):
-        do(master, f"sii {result}")
-        assert status() == bits
-    assert obey(master.bus, "sii sometimes").startswith("error: ")
-
-
 def test_another_signal_begins_with_the_next_sample_and_outlasts_a_power_cycle() -> None:
     master = RawMaster(SensorOptions(signal="clock")).go(OP)
     master.wait(7 * PERIOD + PERIOD // 2)
@@ -286,20 +232,6 @@ def test_another_signal_begins_with_the_next_sample_and_outlasts_a_power_cycle()
         do(master, "power cycle 0")
         master.wait(10**6)
         master.go(OP)
-
-
-def test_stats_tell_what_was_written() -> None:
-    master = RawMaster().go(OP)
-    master.download(0x2000, 1, bytes(4))
-    with pytest.raises(Abort):
-        master.download(0x8006, 1, b"\x40\0")
-    [sensor] = stats(master)["sensors"]
-    assert sensor["al_state"] == "OP"
-    assert sensor["calibration_writes"] == 1
-    assert sensor["sdo_writes"] == [
-        {"index": "0x2000", "subindex": 1, "hex": "00000000", "state": "OP", "abort": None},
-        {"index": "0x8006", "subindex": 1, "hex": "4000", "state": "OP", "abort": "0x08000022"},
-    ]
 
 
 @pytest.mark.parametrize(

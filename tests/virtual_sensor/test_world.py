@@ -140,16 +140,6 @@ def test_where_nothing_moves_and_nobody_wants_a_last_bit_no_sample_is_new() -> N
     assert {frame.flags for frame in simulation.frames[100:]} == {DataFlag.REPEATED}
 
 
-def test_the_last_bit_is_the_same_in_every_run() -> None:
-    def run(seed: int) -> list[bytes]:
-        options = SensorOptions(noise=False, seed=seed)
-        simulation = Simulation(options, world=lambda _: push(-7.0))
-        simulation.run(0.5)
-        return [frame.process_data for frame in simulation.frames]
-
-    assert run(1) == run(1) != run(2)
-
-
 def rising(t: float) -> Felt:
     """10 N a second, from 0."""
     return push(10.0 * t)
