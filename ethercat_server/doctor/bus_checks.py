@@ -8,6 +8,7 @@ found.
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
@@ -514,7 +515,7 @@ def _on_bus(machine: Machine, seconds: float, announce: Callable[[str], None]) -
 
 def _card_counters(ifname: str) -> Mapping[str, int]:
     """The present counters of the interface; empty if they cannot be read."""
-    with contextlib.suppress(Exception):  # pyroute2's errors share no base
+    with contextlib.suppress(OSError, struct.error):
         return next((row.counters for row in links() if row.name == ifname), {})
     return {}
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from ethercat_server.access.adapters import Adapter
+from ethercat_server.access.adapters import Adapter, is_wireless
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE
 from ethercat_server.doctor.machine import Machine
 from ethercat_server.doctor.report import (
@@ -219,9 +219,8 @@ def _speed(machine: Machine) -> Finding:
 
 
 def _driver(machine: Machine) -> Finding:
-    kind, folder = machine.link.kind, f"/sys/class/net/{machine.ifname}"
-    found, bus = machine.fact("driver")
-    wireless = any(machine.path(f"{folder}/{mark}").exists() for mark in ("wireless", "phy80211"))
+    kind, (found, bus) = machine.link.kind, machine.fact("driver")
+    wireless = is_wireless(machine.path(f"/sys/class/net/{machine.ifname}"))
     text = f"{found} on {bus}" if bus and bus != "N/A" else found
     return graded(
         text + (f", {kind}" if kind and kind != found else ""),
