@@ -19,7 +19,6 @@ from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor import bus_checks
 from ethercat_server.doctor.bus_checks import ServerView
 from ethercat_server.doctor.report import examine
-from ethercat_server.errors import InterfaceError
 from tests.doctor.running import examined
 from tests.simulation import (
     RATE_HZ,
@@ -128,13 +127,6 @@ def test_frames_damaged_while_it_measures_are_bad(bench: SimulatedBus, tmp_path:
     assert "5 corrupted between slave 0 and slave 1" in found.found
 
 
-def test_devices_that_the_server_would_refuse(single: SimulatedBus, tmp_path: Path) -> None:
-    single.command("swap EK1100 5")
-    found = examined(single, tmp_path, LOOK).of("bus")["slave 0"]
-    assert found.level is Level.TROUBLE
-    assert "EK1100, serial 5" in found.found
-
-
 def test_nothing_answers(single: SimulatedBus, tmp_path: Path) -> None:
     single.command("deaf")
     found = examined(single, tmp_path)
@@ -147,19 +139,6 @@ def test_a_sensor_that_goes_away_while_it_measures(single: SimulatedBus, tmp_pat
     single.at(0.7, "deaf")
     found = examined(single, tmp_path, 1.0).levels("measurement")
     assert (found["sensors"], found["bus meanwhile"]) == ("bad", "bad")
-
-
-def test_an_interface_that_may_not_be_used_is_left_alone(
-    single: SimulatedBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise InterfaceError("ens5 has the machine's default route")
-
-    monkeypatch.setattr(bus_checks, "open_interface", refuse)
-    found = examined(single, tmp_path, 0.02)
-    assert found.of("bus")["slaves"].level is Level.NOT_POSSIBLE
-    assert found.of("bus")["slaves"].found == "not checked: ens5 has the machine's default route"
-    assert found.levels("measurement") == {"all": "skipped"}
 
 
 def test_another_master_is_not_disturbed(

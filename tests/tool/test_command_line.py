@@ -229,19 +229,13 @@ def test_an_image_is_read_to_the_end_of_its_categories_and_no_further() -> None:
     assert not decode(image[:2] + bytes([image[2] ^ 1]) + image[3:])["check_byte_right"]
 
 
-def test_an_erased_eeprom_has_nothing() -> None:
-    read = reader(b"")
-    found = decode(read)
-    assert (found["name"], found["sync_managers"], found["categories"]) == ("", [], {})
-    assert raw_lines(read)[0] == "0000: ff|ff|ff|ff"
-
-
 @pytest.mark.parametrize("blank", [b"\0", b"\xff"])
 def test_blank_memory_ends_an_image_as_the_end_mark_does(blank: bytes) -> None:
     whole = reader(build_image(sensor_device("BFT-ROKS-ECAT-M8", 7, 61)))
     for kept in (0, 0x80, len(whole) - 4):
         read = reader(whole[:kept].ljust(0x8000, blank))
         assert len(read) == max(0x100, kept + 4)
+    assert raw_lines(reader(b""))[0] == "0000: ff|ff|ff|ff"
         assert decode(read)["categories"] == (decode(whole)["categories"] if kept > 0x80 else {})
 
 
