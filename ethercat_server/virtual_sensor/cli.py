@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 import threading
@@ -13,6 +12,7 @@ from typing import Any, Final
 from bota_ethercat.pdo import LAYOUTS
 from bota_ethercat.program.arguments import Parser, number
 from bota_ethercat.program.output import ends_with_its_reader
+from bota_ethercat.program.real_time import make_real_time
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import look_up
@@ -152,11 +152,8 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
 
 def _get_priority() -> None:
     """That of SCHED_FIFO above a master's: real sensors do not wait for a CPU."""
-    priority = DEFAULT_PRIORITY + 1
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except PermissionError:
-        _say(f"not granted: real-time priority {priority} (CAP_SYS_NICE); samples may come late")
+    if refused := make_real_time(DEFAULT_PRIORITY + 1).refused:
+        _say(f"not granted: {', '.join(refused)}; samples may come late")
 
 
 @ends_with_its_reader
