@@ -8,6 +8,7 @@ found.
 from __future__ import annotations
 
 import contextlib
+import functools
 import struct
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -303,7 +304,7 @@ class ServerView:
 
     def __init__(self, sensors: Sensors, seconds: float) -> None:
         """Watch for `seconds`, then close `sensors`. A private server's figures are those since its start."""
-        self._own, clock, private = sensors.private is not None, sensors.clock, sensors.private
+        self.own, clock, private = sensors.private is not None, sensors.clock, sensors.private
         with contextlib.closing(sensors):
             self._observers = {
                 info.sensor: StreamObserver(info.rate_hz, clock.monotonic_ns())
@@ -329,8 +330,8 @@ class ServerView:
         for info in self.described:
             if info.sensor in self._observers:
                 self._observers[info.sensor].said.info = info
-        self._when = "" if self._own else " in the last 10 s"
-        self._summaries = self.after if self._own else self.after.last_10s
+        self._when = "" if self.own else " in the last 10 s"
+        self._summaries = self.after if self.own else self.after.last_10s
 
     def _take_status(self, sensors: Sensors) -> Status:
         status = sensors.status()
@@ -383,7 +384,7 @@ class ServerView:
 
     def ages(self) -> Iterator[Finding]:
         for row in self.after.sensors:
-            summary = row.age_us if self._own else self.after.recent_age_us(row.sensor)
+            summary = row.age_us if self.own else self.after.recent_age_us(row.sensor)
             if not summary.max:
                 raise CannotLookError("the server reports it once it follows the sensor's clock")
             yield age_finding(f"sensor {row.sensor}, when sent{self._when}", summary)
@@ -400,13 +401,26 @@ class ServerView:
             clients=[row._asdict() for row in rows],
         )  # fmt: skip
 
-    def examine(self, subject: str) -> Iterator[Finding]:
-        yield from examine(subject, "sensors", self.sensors)
-        yield from examine(subject, "wake-ups", self.wake_ups)
-        yield from examine(subject, "exchanges", self.exchanges)
-        yield from examine(subject, "age of data", self.ages)
-        if not self._own:
-            yield from examine(subject, "clients", self.clients)
+
+def watched(
+    subject: str, check: str, open_sensors: Callable[[], Sensors], seconds: float,
+    describe: Callable[[ServerView], Finding],
+) -> Iterator[Finding]:  # fmt: skip
+    """The checks of a server's figures; `describe` is the first one."""
+    views: list[ServerView] = []
+
+    def watch() -> Finding:
+        views.append(ServerView(open_sensors(), seconds))
+        return describe(views[0])
+
+    yield from examine(subject, check, watch)
+    for view in views:
+        yield from examine(subject, "sensors", view.sensors)
+        yield from examine(subject, "wake-ups", view.wake_ups)
+        yield from examine(subject, "exchanges", view.exchanges)
+        yield from examine(subject, "age of data", view.ages)
+        if not view.own:
+            yield from examine(subject, "clients", view.clients)
 
 
 def examine_bus(
@@ -438,23 +452,7 @@ def _left_alone(found: Finding) -> Iterator[Finding]:
 
 
 def _not_measured(why: str) -> Finding:
-    return replace(skipped(why), subject="measurement", check="all")
-
-
-def _watched(
-    subject: str, check: str, open_sensors: Callable[[], Sensors], seconds: float,
-    describe: Callable[[ServerView], Finding],
-) -> Iterator[Finding]:  # fmt: skip
-    """The checks of a server's figures; `describe` is the first one."""
-    views: list[ServerView] = []
-
-    def watch() -> Finding:
-        views.append(ServerView(open_sensors(), seconds))
-        return describe(views[0])
-
-    yield from examine(subject, check, watch)
-    for view in views:
-        yield from view.examine(subject)
+    return skipped(why, subject="measurement", check="all")
 
 
 def _through_server(holder: Holder, address: Address, seconds: float) -> Iterator[Finding]:
@@ -465,21 +463,7 @@ def _through_server(holder: Holder, address: Address, seconds: float) -> Iterato
         hours = (view.after.uptime_s or 0.0) / 3600
         return ok(f"{holder} serves it at {address}, up {hours:.1f} h", why, **address._asdict())
 
-    yield from _watched("server", "server", lambda: Sensors.through(address), seconds, describe)
-
-
-def _measured(machine: Machine, seconds: float) -> Iterator[Finding]:
-    """What a server measures here, with the sensors set as they are."""
-
-    def open_sensors() -> Sensors:
-        return Sensors.on_interface(
-            machine.ifname, allow_ip=machine.allow_ip, rt_priority=machine.rt_priority, cpu=machine.cpu
-        )
-
-    def describe(view: ServerView) -> Finding:
-        return scheduling(machine.rt_priority, real_time=view.real_time)
-
-    yield from _watched("measurement", "scheduling", open_sensors, seconds, describe)
+    yield from watched("server", "server", lambda: Sensors.through(address), seconds, describe)
 
 
 def _on_bus(machine: Machine, seconds: float, announce: Callable[[str], None]) -> Iterator[Finding]:
@@ -501,7 +485,14 @@ def _on_bus(machine: Machine, seconds: float, announce: Callable[[str], None]) -
         yield _not_measured("there is no sensor to measure with, or another master has the bus")
         return
     announce(f"measuring for {seconds:g} s ...")
-    yield from _measured(machine, seconds)
+    open_sensors = functools.partial(
+        Sensors.on_interface, machine.ifname,
+        allow_ip=machine.allow_ip, rt_priority=machine.rt_priority, cpu=machine.cpu,
+    )  # fmt: skip
+    yield from watched(
+        "measurement", "scheduling", open_sensors, seconds,
+        lambda view: scheduling(machine.rt_priority, real_time=view.real_time),
+    )  # fmt: skip
 
     def meanwhile() -> Finding:
         before = {slave.looked.position: slave.errors for slave in found}

@@ -67,9 +67,9 @@ def graded(found: str, *limits: Limit, why: str = "", **values: Any) -> Finding:
     return ok(found, why, **values)
 
 
-def skipped(why: str) -> Finding:
+def skipped(why: str, *, subject: str = "", check: str = "") -> Finding:
     """Not checked."""
-    return finding(Level.NOT_POSSIBLE, f"not checked: {why}")
+    return Finding(Level.NOT_POSSIBLE, f"not checked: {why}", subject=subject, check=check)
 
 
 class CannotLookError(Exception):

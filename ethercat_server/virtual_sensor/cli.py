@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
-from bota_ethercat.program.arguments import Parser, number
+from bota_ethercat.program.arguments import Parser, number, whole
 from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.real_time import make_real_time
 from bota_ethercat.settings import SETTINGS
@@ -29,7 +29,6 @@ from ethercat_server.virtual_sensor.options import (
     SlaveOptions,
     UsageError,
     model_name,
-    whole,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
 from ethercat_server.virtual_sensor.world import FAULT, LOST, ExternalWorld

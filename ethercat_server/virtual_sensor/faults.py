@@ -14,13 +14,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from bota_ethercat.program.arguments import number
+from bota_ethercat.program.arguments import number, whole
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor.application import Application, Slave
 from ethercat_server.virtual_sensor.bus import Bus, Damage
 from ethercat_server.virtual_sensor.distributed_clock import parse_word
 from ethercat_server.virtual_sensor.esc import SiiInterface
-from ethercat_server.virtual_sensor.options import Command, UsageError, model_name, whole
+from ethercat_server.virtual_sensor.options import Command, UsageError, model_name
 from ethercat_server.virtual_sensor.sampler import CHANNELS, MOST_SKIPPED
 from ethercat_server.virtual_sensor.sensor import Firmware, VirtualSensor
 from ethercat_server.virtual_sensor.signals import SIGNALS

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from bota_ethercat.program.arguments import typed
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor.world import World
@@ -49,17 +48,6 @@ class ForeignOptions:
 
 
 SlaveOptions = SensorOptions | ForeignOptions
-
-
-def whole(lowest: int, highest: int) -> Callable[[str], int]:
-    """Parses a whole number, decimal or 0x...; UsageError if it is invalid or out of range."""
-
-    def within(text: str) -> int:
-        if lowest <= (value := int(text, 0)) <= highest:
-            return value
-        raise ValueError
-
-    return typed(within, f"a whole number from {lowest} to {highest}")
 
 
 def model_name(text: str) -> str:

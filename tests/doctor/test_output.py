@@ -31,7 +31,7 @@ from tests.ended import run_here
         (["ens5", "--seconds", "soon"], "must be from 0 to 3600"),
         (["ens5", "--seconds", "-1"], "from 0 to 3600"),
         (["ens5", "--cpu", "4000"], "--cpu 4000: this machine has the processors 0 to"),
-        (["ens5", "--rt-priority", "100"], "--rt-priority: must be a whole number from 0 to 99, not '100'"),
+        (["ens5", "--rt-priority", "100"], "--rt-priority: '100': it must be a whole number from 0 to 99"),
         (["a-name-that-is-too-long"], "is not an interface name"),
         (["../lo"], "is not an interface name"),
     ],
