@@ -12,10 +12,9 @@ from typing import Any, Final
 
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.coe import CoeServer, ObjectTable
 from ethercat_server.virtual_sensor.device import Device, build_image
 from ethercat_server.virtual_sensor.esc import Esc
-from ethercat_server.virtual_sensor.mailbox import Mailbox
+from ethercat_server.virtual_sensor.mailbox import CoeServer, Mailbox, ObjectTable
 from ethercat_server.virtual_sensor.options import EEPROM_MS, SlaveOptions
 
 _ERROR: Final = 0x10  # error bit of AL status, acknowledge bit of AL control

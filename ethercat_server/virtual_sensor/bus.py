@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import operator
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any, Final
 
 from ethercat_server.ethercat import wire
@@ -32,15 +31,6 @@ from ethercat_server.virtual_sensor.sensor import VirtualSensor
 
 _LONGEST_PERIOD_NS = 50_000_000
 _FIRST_STATION: Final = 0x1001  # where another master begins
-
-
-@dataclass(slots=True)
-class Damage:
-    """Frames that arrive corrupted at one port of one slave."""
-
-    slave: Slave
-    port: int  # 0: on the way out; 1: on the way back, from the slave behind
-    frames: int  # how many more
 
 
 class Bus:
@@ -71,7 +61,7 @@ class Bus:
     def repair(self) -> None:
         self.lost: tuple[float, float] = (0, 0)  # the numbers of the frames that are: from this, before that
         self.deaf_until: float = 0  # no frame comes back before this time
-        self.damage: Damage | None = None  # of the next frames on the cable
+        self.damage: tuple[Slave, int] | None = None  # which gets so many more frames corrupted
 
     def _leave_behind(self) -> None:
         """Take slaves to the state of their options as another master does: all outputs, then all inputs."""
@@ -166,35 +156,28 @@ class Bus:
     def _damaged_at(self) -> int | None:
         """Count a corrupted frame in the error counters; how many slaves received it intact, None for all.
 
-        The slave that detects the error marks the frame; those it passes afterwards, on the way out at
-        port 0 and on the way back at port 1, count it as forwarded.
+        The slave that detects the error marks the frame; those it passes afterwards count it as forwarded, on
+        the way out at port 0 and on the way back at port 1.
         """
-        damage = self.damage
-        if damage is None or damage.slave.life not in self._alive:
+        if self.damage is None or self.damage[0].life not in self._alive:
             return None
-        damage.frames -= 1
-        if damage.frames <= 0:
-            self.damage = None
-        position = self._alive.index(damage.slave.life)
+        slave, frames = self.damage
+        self.damage = (slave, frames - 1) if frames > 1 else None
+        position = [life is slave.life for life in self._alive].index(True)
         for counter in (0, 1):
-            self._alive[position].esc.count(reg.RX_ERRORS + 2 * damage.port + counter)
-        if damage.port == 1:
-            back = self._alive[:position]
-        else:
-            for life in self._alive[position + 1 :]:
-                life.esc.count(reg.FORWARDED_ERRORS)
-            back = self._alive[:-1]
-        for life in back:
-            life.esc.count(reg.FORWARDED_ERRORS + 1)
-        return len(self._alive) if damage.port == 1 else position
+            self._escs[position].count(reg.RX_ERRORS + counter)
+        for esc in self._escs[position + 1 :]:
+            esc.count(reg.FORWARDED_ERRORS)
+        for esc in self._escs[:-1]:
+            esc.count(reg.FORWARDED_ERRORS + 1)
+        return position
 
-    def flap(self, slave: Slave, port: int) -> None:
-        """A link is lost and returns: the controllers at both ends count it."""
+    def flap(self, slave: Slave) -> None:
+        """The link at port 0 is lost and returns: the controllers at both ends count it."""
         position = self.slaves.index(slave)
-        ends = ((position, 0), (position - 1, 1)) if port == 0 else ((position, 1), (position + 1, 0))
-        for end, its_port in ends:
+        for end, port in ((position, 0), (position - 1, 1)):
             if 0 <= end < len(self._alive):
-                self._alive[end].esc.count(reg.LOST_LINKS + its_port)
+                self._escs[end].count(reg.LOST_LINKS + port)
 
     def prepare(self) -> None:
         """All waiting frames are answered: check the watchdogs, and compute the next samples ahead.

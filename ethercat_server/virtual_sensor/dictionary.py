@@ -16,8 +16,8 @@ from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import AbortCode
 from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects import dictionary as table
-from ethercat_server.virtual_sensor.coe import Address, ObjectTable, SdoAbortError
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
+from ethercat_server.virtual_sensor.mailbox import Address, ObjectTable, SdoAbortError
 from ethercat_server.virtual_sensor.options import SensorOptions
 
 _STRING_SIZES: Final = {0x1008: 20, 0x1009: 12, 0x100A: 13}  # declared; padded with NUL

@@ -17,7 +17,7 @@ from typing import Final
 from bota_ethercat.program.arguments import number, whole
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor.application import Application, Slave
-from ethercat_server.virtual_sensor.bus import Bus, Damage
+from ethercat_server.virtual_sensor.bus import Bus
 from ethercat_server.virtual_sensor.distributed_clock import parse_word
 from ethercat_server.virtual_sensor.esc import SiiInterface
 from ethercat_server.virtual_sensor.options import Command, UsageError, model_name
@@ -53,14 +53,6 @@ class Call:
         if self.sensor.life is None:
             raise UsageError("the sensor has no power: use `power on` first")
         return self.sensor.life
-
-    def _port(self, port: int) -> int:
-        if port == 1 and self.slave is self.bus.slaves[-1]:
-            raise UsageError("port 1 of the last slave is not connected")
-        return port
-
-    def _damage(self, frames: int, port: int = 0) -> None:
-        self.bus.damage = Damage(self.slave, self._port(port), frames) if frames else None
 
     def _power(self, how: str, seconds: float | None = None) -> None:
         if how not in ("on", "off", "cycle") or (how == "cycle") == (seconds is None):
@@ -103,7 +95,7 @@ class Call:
         apply(self.application.esc.clock)
 
 
-_COUNT, _LONG, _WORD, _BYTE, _PORT = (whole(0, most) for most in (2**31, 2**32 - 1, 0xFFFF, 0xFF, 1))
+_COUNT, _LONG, _WORD, _BYTE = (whole(0, most) for most in (2**31, 2**32 - 1, 0xFFFF, 0xFF))
 _AMOUNT = number(0, 1e6)
 
 
@@ -133,10 +125,9 @@ COMMANDS: Final[tuple[Command, ...]] = (
     Command("deaf-after N", "lose every frame after the next N", lambda c, n: c.bus.lose(math.inf, n),
             (_COUNT,)),
     Command("hear", "end `deaf`, `deaf-after`, `lose` and `damage`", lambda c: c.bus.repair()),
-    Command("damage N [PORT] [@N]", "corrupt the next N frames on the cable at port 0 or 1 of this slave",
-            Call._damage, (_COUNT, _PORT)),
-    Command("flap [PORT] [@N]", "interrupt the link at port 0 or 1 for a moment",
-            lambda c, port=0: c.bus.flap(c.slave, c._port(port)), (_PORT,)),
+    Command("damage N [@N]", "corrupt the next N frames on the cable before this slave",
+            lambda c, n: setattr(c.bus, "damage", (c.slave, n) if n else None), (_COUNT,)),
+    Command("flap [@N]", "interrupt the link before this slave for a moment", lambda c: c.bus.flap(c.slave)),
     Command("power off|on|cycle [SECONDS] [@N]",
             "switch a slave off or on; those behind one without power are cut off",
             Call._power, (str, _AMOUNT)),

@@ -18,8 +18,8 @@ from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry, ObjectType
 from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.application import Application, Slave
-from ethercat_server.virtual_sensor.coe import ObjectTable
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
+from ethercat_server.virtual_sensor.mailbox import ObjectTable
 from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions, SlaveOptions, UsageError
 
 _RO, _RW = Access.RO, Access.RW

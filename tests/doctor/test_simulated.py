@@ -121,7 +121,7 @@ def test_damaged_frames_are_told_with_their_cable(bench: SimulatedBus, tmp_path:
 
 
 def test_frames_damaged_while_it_measures_are_bad(bench: SimulatedBus, tmp_path: Path) -> None:
-    bench.at(0.7, "damage 5 1")
+    bench.at(0.7, "damage 5 @1")
     found = examined(bench, tmp_path, 1.0).of("measurement")["bus meanwhile"]
     assert found.level is Level.TROUBLE
     assert "5 corrupted between slave 0 and slave 1" in found.found

@@ -10,8 +10,8 @@ import pytest
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import AbortCode
 from ethercat_server.virtual_sensor import application, device, dictionary
-from ethercat_server.virtual_sensor.coe import SdoAbortError
 from ethercat_server.virtual_sensor.device import Device
+from ethercat_server.virtual_sensor.mailbox import SdoAbortError
 from ethercat_server.virtual_sensor.sensor import Firmware
 
 REFUSED = {(0x8006, 1): b"\x80\0", (0x8000, 5): struct.pack("<f", 0.5)}
