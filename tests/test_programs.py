@@ -100,7 +100,7 @@ def test_nobody_reads_what_the_virtual_sensor_answers(tmp_path: Path) -> None:
         ("ethercat-report", "jinja2", "--seconds 1"),
         ("ethercat-monitor", "bota_clients.monitor.screen", "--once"),
         ("ethercat-monitor", "textual.app", ""),
-        ("ethercat-server", "ethercat_server.process.signals", "--help"),
+        ("ethercat-server", "ethercat_server.process.logs", "--help"),
     ],
 )
 def test_a_signal_while_it_is_imported_is_no_traceback(

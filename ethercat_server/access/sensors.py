@@ -19,6 +19,7 @@ from bota_ethercat.errors import (
 )
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.server_choice import default_server, is_address
+from bota_ethercat.program.signals import signals_call, signals_held_back
 from bota_ethercat.replies import Description, Status
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import SettingValue
@@ -28,7 +29,6 @@ from ethercat_server.access.private_server import PrivateServer
 from ethercat_server.errors import BusError, InterfaceError, SdoAbortError, ServerError, UsageError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
 from ethercat_server.ethercat.datagrams import Steps, finish
-from ethercat_server.process.signals import signals_call, signals_held_back
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.sensor import Found, Identity, Sensor
 from ethercat_server.sensor.set_up import NO_SETTINGS, read_in_force

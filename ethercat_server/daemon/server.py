@@ -12,12 +12,13 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
+from bota_ethercat.program.signals import Signals
 from ethercat_server.daemon.histories import kept
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
+from ethercat_server.errors import StopRequestedError
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.process.privileges import User, become, forbid_new_privileges, user_to_become
-from ethercat_server.process.signals import Signals
 from ethercat_server.server import Server
 from ethercat_server.serving.connection import Limits
 from ethercat_server.serving.hub import Hub
@@ -53,7 +54,12 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
         _give_up_root(user, options)
         hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
-        server = Server(bus, hub, options, signals.check, watchdog=notifier)
+
+        def check_interrupt() -> None:
+            if signals.asked:
+                raise StopRequestedError("stopped during start-up")
+
+        server = Server(bus, hub, options, check_interrupt, watchdog=notifier)
         server.cycle.every_second = partial(every_second, server, notifier)
         signals.call(server.stop)
         for sensor in server.sensors:

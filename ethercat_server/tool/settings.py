@@ -18,6 +18,7 @@ from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
 from bota_ethercat.errors import SettingError
 from bota_ethercat.pdo import AXES
 from bota_ethercat.program.new_file import NewFile
+from bota_ethercat.program.signals import signals_held_back
 from bota_ethercat.program.tare_memory import former, remember
 from bota_ethercat.sensor.meaning import meaning, value_meaning
 from bota_ethercat.settings import SETTINGS, SettingValue, check_settings
@@ -27,7 +28,6 @@ from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignmen
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
 from ethercat_server.ethercat.datagrams import Steps, finish
 from ethercat_server.ethercat.slave.coe import Sdo
-from ethercat_server.process.signals import signals_held_back
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, KNOWN_OBJECTS, OBJECTS, Access, ObjectEntry
 from ethercat_server.sensor.sensor import Found, Identity, Sensor

@@ -13,11 +13,11 @@ from bota_ethercat.pdo import LAYOUTS
 from bota_ethercat.program.arguments import Parser, number, whole
 from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.real_time import make_real_time
+from bota_ethercat.program.signals import signals_call
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import look_up
 from ethercat_server.process.realtime import DEFAULT_PRIORITY
-from ethercat_server.process.signals import signals_call
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_clock

@@ -20,12 +20,12 @@ from unittest.mock import MagicMock
 
 import pytest
 
+from bota_ethercat.program.signals import Signals
 from ethercat_server import server as assembly
 from ethercat_server.daemon import server as daemon
 from ethercat_server.errors import ServerError, StopRequestedError, UsageError
 from ethercat_server.process import privileges, realtime
 from ethercat_server.process.privileges import User, user_to_become
-from ethercat_server.process.signals import Signals
 from tests import rights
 from tests.rights import IPC_LOCK, NOBODY, SYS_NICE, needs_another_user, without
 from tests.server.running import (
