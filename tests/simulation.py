@@ -242,7 +242,7 @@ class Simulation(SimulatedBus):
     def _ask(self, world: World, external: ExternalWorld, step: int) -> None:
         """Tell the sensors what they feel in this millisecond, and in the following."""
         due_ns = self.started_ns + step * 1_000_000
-        external.take(due_ns * 1e-9, world(step * 1e-3), due_ns * 1e-9)
+        external.update(due_ns * 1e-9, world(step * 1e-3), due_ns * 1e-9)
         self.clock.at(due_ns + 1_000_000, functools.partial(self._ask, world, external, step + 1))
 
     def listen(self) -> Transport:

@@ -61,7 +61,7 @@ _MOST_PROCESSORS: Final = 8192
 
 
 @dataclass
-class Machine:
+class Host:
     """One machine, and the interface in question."""
 
     ifname: str

@@ -1,6 +1,6 @@
 """The backend in memory (see `ethercat.backend`): virtual sensors on a simulated wire.
 
-Frames are processed by `virtual_sensor.bus.Bus` as those of a network interface are.
+Frames are processed by `virtual_sensor.bus.SlaveChain` as those of a network interface are.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class MemoryBackend:
         self.ifname = "memory"
         self.clock = SimulatedClock(machine)
         self.wire = Wire(machine)
-        self.sensors = virtual.Bus(slaves or (SensorOptions(),), self.clock.now_ns)
+        self.sensors = virtual.SlaveChain(slaves or (SensorOptions(),), self.clock.now_ns)
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
         self._free_at_ns = 0

@@ -30,7 +30,7 @@ def argument(name: str, help_text: str, **options: Any) -> Argument:
     return lambda parser: parser.add_argument(name, help=help_text, **options)
 
 
-class Command(NamedTuple):
+class Subcommand(NamedTuple):
     """One subcommand."""
 
     name: str

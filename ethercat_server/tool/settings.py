@@ -37,7 +37,7 @@ from ethercat_server.sensor.undo import or_undone
 from ethercat_server.tool.command import (
     CHANGES,
     DONE,
-    Command,
+    Subcommand,
     argument,
     columns,
     report,
@@ -389,9 +389,9 @@ _TARGET: Final = "wrench the sensor is to read, in N and Nm (default: zeros)"
 
 
 COMMANDS: Final = (
-    Command("apply", "change settings, all or none, and verify them", _SETTINGS, _apply),
-    Command("save", "store the sensor's parameters in its flash", _SENSOR, _save),
-    Command(
+    Subcommand("apply", "change settings, all or none, and verify them", _SETTINGS, _apply),
+    Subcommand("save", "store the sensor's parameters in its flash", _SENSOR, _save),
+    Subcommand(
         "tare", "set the force/torque offset so that the mean reading becomes zero",
         (
             *_SENSOR,
@@ -402,11 +402,11 @@ COMMANDS: Final = (
         ),
         _tare,
     ),
-    Command(
+    Subcommand(
         "snapshot", "write all readable objects to a file",
         (*_FILE, argument("--force", "replace an existing file")), _snapshot,
     ),
-    Command(
+    Subcommand(
         "restore", "write back what differs from a snapshot",
         (*_FILE, _SAVE, argument("--force", "accept a file of another sensor")), _restore,
     ),

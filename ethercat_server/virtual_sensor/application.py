@@ -79,9 +79,9 @@ class Application:
         self._fed = self.clock()
         self.esc.memory[reg.WATCHDOG_STATUS] = 1
         if self.state is AlState.OP:
-            self.take_outputs(data)
+            self.store_outputs(data)
 
-    def take_outputs(self, data: bytes) -> None:
+    def store_outputs(self, data: bytes) -> None:
         at = 0
         for address, size in self._outputs:
             self.objects.values[address] = data[at : at + size]
@@ -178,7 +178,7 @@ class Application:
         self.mailbox.repeat()
 
 
-class Slave:
+class VirtualSlave:
     """A slave, powered or not. `clock` gives the time in ns.
 
     Attributes:

@@ -2,7 +2,7 @@
 
 Time is an argument, in ns of any clock that only goes forward; nothing in here asks for it elsewhere:
 
-    bus = Bus((SensorOptions(serial=1), SensorOptions(serial=2)), now=0)
+    bus = SlaveChain((SensorOptions(serial=1), SensorOptions(serial=2)), now=0)
     if bus.process(frame, len(frame), now)  # an Ethernet frame, in place; False if it is lost on the bus
     bus.idle(now)                           # no frame for a while: watchdogs expire, power returns
     faults.obey(bus, "power off @1")        # a fault, as one line of text; answers "ok" or "error: ..."
@@ -22,7 +22,7 @@ from typing import Any, Final
 from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.application import Application, Slave
+from ethercat_server.virtual_sensor.application import Application, VirtualSlave
 from ethercat_server.virtual_sensor.device import size_of
 from ethercat_server.virtual_sensor.esc import Esc, pass_through
 from ethercat_server.virtual_sensor.foreign import ForeignSlave, leave_in
@@ -33,25 +33,25 @@ _LONGEST_PERIOD_NS = 50_000_000
 _FIRST_STATION: Final = 0x1001  # where another master begins
 
 
-class Bus:
+class SlaveChain:
     """Slaves in the order in which frames reach them. All times are in ns, on the caller's clock."""
 
     def __init__(self, slaves: Iterable[SlaveOptions], now: int) -> None:
         """All slaves are switched on at `now`."""
         self.now = now  # time of the latest call, or at which the latest datagram passed
-        self.slaves: list[Slave] = [
+        self.slaves: list[VirtualSlave] = [
             VirtualSensor(options, lambda: self.now)
             if isinstance(options, SensorOptions)
             else ForeignSlave(options, lambda: self.now)
             for options in slaves
         ]
         self.sensors = [slave for slave in self.slaves if isinstance(slave, VirtualSensor)]
-        self.disconnected: set[Slave] = set()  # those whose cable at port 0 is unplugged
+        self.disconnected: set[VirtualSlave] = set()  # those whose cable at port 0 is unplugged
         self.due: list[Callable[[], object]] = []  # for the end of the frame that is being processed
         self.frames = self.frames_lost = 0
         self.quit = False  # the program is to end
         self.repair()
-        self._power_events: list[tuple[int, Slave]] = []
+        self._power_events: list[tuple[int, VirtualSlave]] = []
         self._alive: list[Application] = []
         self._escs: list[Esc] = []
         self._last_frame = 0
@@ -61,7 +61,7 @@ class Bus:
     def repair(self) -> None:
         self.lost: tuple[float, float] = (0, 0)  # the numbers of the frames that are: from this, before that
         self.deaf_until: float = 0  # no frame comes back before this time
-        self.damage: tuple[Slave, int] | None = None  # which gets so many more frames corrupted
+        self.damage: tuple[VirtualSlave, int] | None = None  # which gets so many more frames corrupted
 
     def _leave_behind(self) -> None:
         """Take slaves to the state of their options as another master does: all outputs, then all inputs."""
@@ -101,7 +101,7 @@ class Bus:
             self.rewire()
         self.now = now
 
-    def power(self, slave: Slave, on: bool, seconds: float | None = None) -> None:
+    def power(self, slave: VirtualSlave, on: bool, seconds: float | None = None) -> None:
         self._power_events = [event for event in self._power_events if event[1] is not slave]
         slave.power(on)
         if seconds is not None:
@@ -109,7 +109,7 @@ class Bus:
             self._power_events.sort(key=operator.itemgetter(0))
         self.rewire()
 
-    def connect(self, slave: Slave, connected: bool) -> None:
+    def connect(self, slave: VirtualSlave, connected: bool) -> None:
         """Plug or unplug the cable at port 0 of a slave, which keeps its power."""
         if connected:
             self.disconnected.discard(slave)
@@ -172,7 +172,7 @@ class Bus:
             esc.count(reg.FORWARDED_ERRORS + 1)
         return position
 
-    def flap(self, slave: Slave) -> None:
+    def flap(self, slave: VirtualSlave) -> None:
         """The link at port 0 is lost and returns: the controllers at both ends count it."""
         position = self.slaves.index(slave)
         for end, port in ((position, 0), (position - 1, 1)):

@@ -17,7 +17,7 @@ from ethercat_server.ethercat.slave.coe import AbortCode
 from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects import dictionary as table
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
-from ethercat_server.virtual_sensor.mailbox import Address, ObjectTable, SdoAbortError
+from ethercat_server.virtual_sensor.mailbox import Address, ObjectTable, TransferRefusedError
 from ethercat_server.virtual_sensor.options import SensorOptions
 
 _STRING_SIZES: Final = {0x1008: 20, 0x1009: 12, 0x100A: 13}  # declared; padded with NUL
@@ -134,7 +134,7 @@ class Dictionary(ObjectTable):
             if code is not None and data is not None:  # if it is repeated soon after, its answer was lost
                 self._aborted = {(address, data): (code, self._now() + _REPETITION_NS)}
         if code is not None:
-            raise SdoAbortError(code)
+            raise TransferRefusedError(code)
 
     def read(self, index: int, subindex: int) -> bytes:
         self._check_abort((index, subindex))
@@ -152,7 +152,7 @@ class Dictionary(ObjectTable):
     def check_download(self, index: int, subindex: int, length: int, state: AlState) -> None:
         try:
             super().check_download(index, subindex, length, state)
-        except SdoAbortError as error:
+        except TransferRefusedError as error:
             self._on_write(index, subindex, b"", state, error.code)
             raise
 
@@ -164,7 +164,7 @@ class Dictionary(ObjectTable):
             self.check_write(row, len(data), state)
             if row.setting is not None:
                 _check_range(row, data)
-        except SdoAbortError as error:
+        except TransferRefusedError as error:
             abort = error.code
             raise
         else:
@@ -211,8 +211,8 @@ class Dictionary(ObjectTable):
 def _check_range(row: table.ObjectEntry, data: bytes) -> None:
     value, allowed = int.from_bytes(data, "little"), row.allowed or ()
     if value > max(allowed):
-        raise SdoAbortError(AbortCode.TOO_HIGH)
+        raise TransferRefusedError(AbortCode.TOO_HIGH)
     if value < min(allowed):
-        raise SdoAbortError(AbortCode.TOO_LOW)
+        raise TransferRefusedError(AbortCode.TOO_LOW)
     if value not in allowed:
-        raise SdoAbortError(AbortCode.INVALID_VALUE)
+        raise TransferRefusedError(AbortCode.INVALID_VALUE)

@@ -12,7 +12,7 @@ from typing import Final
 
 from bota_ethercat.program.arguments import number
 from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.options import Command, UsageError
+from ethercat_server.virtual_sensor.options import Fault, UsageError
 
 RATE_SCALE: Final = 10**12  # rates are in parts of this
 HOP_NS: Final = 700  # from slave to slave, cable included
@@ -23,7 +23,7 @@ _offset_and_delay = struct.Struct("<QI").unpack_from
 _DC_OFFSET: Final = reg.DC_OFFSET
 
 
-class LocalClock:
+class CrystalClock:
     """The local clock: ns since power-on, by a crystal of its own, at any instant since its latest change.
 
     Whatever changes, the time goes on from what it is, but for `set`; rounding errors do not accumulate.
@@ -47,13 +47,13 @@ class LocalClock:
         self._anchor, self._local = now, ns * RATE_SCALE
 
 
-class EventTimes:
+class InputEvents:
     """When the firmware wrote the inputs, in local time.
 
     Computed from the instants of the samples when a master reads it, or something changes.
     """
 
-    def __init__(self, memory: bytearray, local: LocalClock) -> None:
+    def __init__(self, memory: bytearray, local: CrystalClock) -> None:
         self._memory = memory
         self._local = local
         self._newest_at: Callable[[int], int] | None = None
@@ -67,7 +67,7 @@ class EventTimes:
         self.stuck = False  # no further one is shown
         self.shift = 0  # added to them
 
-    def take_away(self) -> None:
+    def remove(self) -> None:
         """Be a controller without this register."""
         self.none = True
         _U32.pack_into(self._memory, reg.DC_PDI_CHANGE_EVENT, 0)
@@ -91,7 +91,7 @@ class EventTimes:
             _U32.pack_into(self._memory, reg.DC_PDI_CHANGE_EVENT, time)
 
 
-class DistributedClock:
+class DcUnit:
     """A view of the controller's clock registers. `clock` gives the time in ns."""
 
     def __init__(self, memory: bytearray, write_mask: bytearray, clock: Callable[[], int]) -> None:
@@ -102,21 +102,21 @@ class DistributedClock:
         self.behind_ns = 0  # a frame's way through the slaves behind it and back
         self.frame_start = clock()  # when the frame that is being processed reached the first slave
         self.time_mask = _U64  # the bits of the system time that it has
-        self.local = LocalClock(self.frame_start)
-        self.events = EventTimes(memory, self.local)
+        self.local = CrystalClock(self.frame_start)
+        self.events = InputEvents(memory, self.local)
 
-    def take_away(self) -> None:
+    def remove(self) -> None:
         """Be a controller without a distributed clock."""
         self.present = False
-        self.events.take_away()
-        self._miss(reg.DC_AVAILABLE | reg.DC_64_BIT, range(reg.DC_RECEIVE_TIMES, reg.DC_END))
+        self.events.remove()
+        self._remove(reg.DC_AVAILABLE | reg.DC_64_BIT, range(reg.DC_RECEIVE_TIMES, reg.DC_END))
 
     def narrow(self) -> None:
         self.time_mask = _MASK
         for time in (reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME, reg.DC_OFFSET):
-            self._miss(reg.DC_64_BIT, range(time + 4, time + 8))
+            self._remove(reg.DC_64_BIT, range(time + 4, time + 8))
 
-    def _miss(self, feature: int, registers: range) -> None:
+    def _remove(self, feature: int, registers: range) -> None:
         self._memory[reg.FEATURES] &= ~feature
         for memory in (self._memory, self._write_mask):
             memory[registers.start : registers.stop] = bytes(len(registers))
@@ -143,22 +143,22 @@ class DistributedClock:
 
 
 CLOCK_WORDS: Final = (
-    Command("ok", "nothing is wrong; rate and time stay", lambda c, _: c.events.repair()),
-    Command("none", "no DC: no feature bit, registers read zero", lambda c, _: c.take_away()),
-    Command("32-bit", "system and local time have 32 bits", lambda c, _: c.narrow()),
-    Command("no-events", "no 0x09FC: it reads zero", lambda c, _: c.events.take_away()),
-    Command("stuck", "0x09FC stands still", lambda c, _: setattr(c.events, "stuck", True)),
-    Command("late US", "0x09FC is too late by this, too early if negative",
+    Fault("ok", "nothing is wrong; rate and time stay", lambda c, _: c.events.repair()),
+    Fault("none", "no DC: no feature bit, registers read zero", lambda c, _: c.remove()),
+    Fault("32-bit", "system and local time have 32 bits", lambda c, _: c.narrow()),
+    Fault("no-events", "no 0x09FC: it reads zero", lambda c, _: c.events.remove()),
+    Fault("stuck", "0x09FC stands still", lambda c, _: setattr(c.events, "stuck", True)),
+    Fault("late US", "0x09FC is too late by this, too early if negative",
             lambda c, _, us: setattr(c.events, "shift", round(us * 1000)), (number(-1e6, 1e6),)),
-    Command("at NS", "the local clock jumps to this time",
+    Fault("at NS", "the local clock jumps to this time",
             lambda c, now, ns: c.local.set(now, round(ns)), (number(0, 2.0**62),)),
-    Command("ppm X", "rate of the local clock, without a jump of the time",
+    Fault("ppm X", "rate of the local clock, without a jump of the time",
             lambda c, now, ppm: c.local.set_ppm(now, ppm), (number(-100_000, 100_000),)),
 )  # fmt: skip
 _FROM_POWER_ON: Final = ("none", "32-bit")  # which cannot come about while the controller runs
 
 
-def parse_word(name: str, values: Sequence[str], *, running: bool) -> Callable[[DistributedClock], None]:
+def parse_word(name: str, values: Sequence[str], *, running: bool) -> Callable[[DcUnit], None]:
     """What one word does to a clock, one that is `running`; UsageError if it is wrong."""
     known = {word.name: word for word in CLOCK_WORDS if not (running and word.name in _FROM_POWER_ON)}
     word = known.get(name.lower())
@@ -168,7 +168,7 @@ def parse_word(name: str, values: Sequence[str], *, running: bool) -> Callable[[
     return lambda clock: word.run(clock, clock.settle(), *numbers)
 
 
-def parse_clock(text: str) -> list[Callable[[DistributedClock], None]]:
+def parse_clock(text: str) -> list[Callable[[DcUnit], None]]:
     """What an option such as `32-bit+late=50` does to a clock at power-on, in this order."""
     parsed = []
     for item in text.split("+") if text else ():

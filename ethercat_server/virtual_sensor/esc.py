@@ -13,7 +13,7 @@ from typing import Final, Protocol
 
 from ethercat_server.ethercat.wire import BYTE_NS, Command, Datagram
 from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, DistributedClock
+from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, DcUnit
 
 _U16, _AL_STATUS = struct.Struct("<H"), struct.Struct("<HHH")
 _REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
@@ -218,7 +218,7 @@ class Esc:
         self.memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = sii_image[8:10]
         self._write_mask = reg.write_mask()
         self.sii = SiiInterface(self.memory, sii_image, pdi.clock, sii_read_ns)
-        self.clock = DistributedClock(self.memory, self._write_mask, pdi.clock)
+        self.clock = DcUnit(self.memory, self._write_mask, pdi.clock)
         self.sync_managers = [SyncManager(self.memory, n) for n in range(reg.SYNC_MANAGER_COUNT)]
         self.fmmus: list[Fmmu] = []  # the active ones
         # What each logical command copies, by address and length; emptied when an FMMU changes.

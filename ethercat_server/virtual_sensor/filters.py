@@ -46,7 +46,7 @@ class LoadFilter:
         self._taps = fir_taps() if fir else (1.0,)
         self._begin_s = 0.0  # time of sample 0
         remember = functools.lru_cache(2 * FIR_TAPS)  # what following samples need too
-        self._values, self._sinc = remember(self._look), remember(self._add_up)
+        self._values, self._sinc = remember(self._before), remember(self._add_up)
 
     def at(self, number: int, seconds: float) -> tuple[float, ...]:
         """N, Nm: of sample `number`, at this time."""
@@ -57,7 +57,7 @@ class LoadFilter:
         values = [value for n in range(3) for value in self._values(number - n)]
         return tuple(map(operator.add, weighted(_SINC, values), self._noise()))
 
-    def _look(self, number: int) -> list[Sequence[float]]:
+    def _before(self, number: int) -> list[Sequence[float]]:
         end_s, step_s = self._begin_s + number * self._period_s, self._period_s / _STEPS
         return [self._signal(end_s - (n + 0.5) * step_s) for n in range(_STEPS)]
 

@@ -17,7 +17,7 @@ from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry, ObjectType
 from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.application import Application, Slave
+from ethercat_server.virtual_sensor.application import Application, VirtualSlave
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
 from ethercat_server.virtual_sensor.mailbox import ObjectTable
 from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions, SlaveOptions, UsageError
@@ -120,7 +120,7 @@ _WRITES_REMEMBERED: Final = 1000
 _VELOCITY_AT_WORK: Final = 1000
 
 
-class ForeignSlave(Slave):
+class ForeignSlave(VirtualSlave):
     """A foreign slave."""
 
     options: ForeignOptions
@@ -147,7 +147,7 @@ class ForeignSlave(Slave):
     def left_at_work(self) -> None:
         """Another master has left it in the AL state it is in: record from now on."""
         if isinstance(self.life, Drive) and self.life.state is AlState.OP:
-            self.life.take_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
+            self.life.store_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
         self.writes.clear()
         self.write_count = 0
 

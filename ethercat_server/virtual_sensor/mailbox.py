@@ -122,7 +122,7 @@ class Mailbox:
 Address = tuple[int, int]  # index and sub-index of an object entry
 
 
-class SdoAbortError(Exception):
+class TransferRefusedError(Exception):
     """The slave aborts the SDO transfer with `code`."""
 
     def __init__(self, code: int) -> None:
@@ -141,7 +141,7 @@ class ObjectTable:
         row = self.entries.get((index, subindex))
         if row is None:
             exists = any(known == index for known, _ in self.entries)
-            raise SdoAbortError(AbortCode.NO_SUBINDEX if exists else AbortCode.NO_OBJECT)
+            raise TransferRefusedError(AbortCode.NO_SUBINDEX if exists else AbortCode.NO_OBJECT)
         return row
 
     def size(self, row: ObjectEntry) -> int:
@@ -164,13 +164,13 @@ class ObjectTable:
         self.check_write(self.entry(index, subindex), length, state)
 
     def check_write(self, row: ObjectEntry, length: int, state: AlState) -> None:
-        """SdoAbortError if `length` bytes cannot be written to `row` in `state`, whatever they are."""
+        """TransferRefusedError if `length` bytes cannot be written to `row` in `state`, whatever they are."""
         if row.access is Access.RO:
-            raise SdoAbortError(AbortCode.READ_ONLY)
+            raise TransferRefusedError(AbortCode.READ_ONLY)
         if row.access is Access.RW_PREOP and state is not AlState.PREOP:
-            raise SdoAbortError(AbortCode.NOT_IN_THIS_STATE)
+            raise TransferRefusedError(AbortCode.NOT_IN_THIS_STATE)
         if length != self.size(row):
-            raise SdoAbortError(AbortCode.TOO_LONG if length > self.size(row) else AbortCode.TOO_SHORT)
+            raise TransferRefusedError(AbortCode.TOO_LONG if length > self.size(row) else AbortCode.TOO_SHORT)
 
 
 _COE_HEADER: Final = struct.Struct("<H")
@@ -215,7 +215,7 @@ class CoeServer:
         index, subindex = struct.unpack_from("<HB", request, 1)
         try:
             reply = self._sdo(request, index, subindex)
-        except SdoAbortError as abort:
+        except TransferRefusedError as abort:
             # An abort is coded as a request.
             return [struct.pack("<HBHBI", _REQUEST << 12, _ABORT << 5, index, subindex, abort.code)]
         return [_COE_HEADER.pack(_RESPONSE << 12) + reply] if reply else []
@@ -225,9 +225,9 @@ class CoeServer:
         if specifier == _ABORT:
             return b""
         if specifier not in (_UPLOAD, _DOWNLOAD):
-            raise SdoAbortError(AbortCode.UNKNOWN_COMMAND)
+            raise TransferRefusedError(AbortCode.UNKNOWN_COMMAND)
         if command & _COMPLETE:
-            raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS)
+            raise TransferRefusedError(AbortCode.UNSUPPORTED_ACCESS)
         if specifier == _DOWNLOAD:
             return self._download(request, index, subindex)
         data = self._objects.read(index, subindex)
@@ -254,7 +254,7 @@ class CoeServer:
         room -= _INFO_HEADER.size
         try:
             if operation not in _SHORTEST:
-                raise SdoAbortError(AbortCode.UNKNOWN_COMMAND)
+                raise TransferRefusedError(AbortCode.UNKNOWN_COMMAND)
             if len(body) < _SHORTEST[operation]:
                 raise MailboxError(TOO_SHORT)
             (index,) = struct.unpack_from("<H", body)
@@ -262,7 +262,7 @@ class CoeServer:
                 found, room = self._list(index), room & ~1
             else:
                 found = (self._object(index) if operation == _OBJECT else self._entry(index, body[2]))[:room]
-        except SdoAbortError as abort:
+        except TransferRefusedError as abort:
             return [_INFO_HEADER.pack(_INFO_ERROR, 0, 0) + struct.pack("<I", abort.code)]
         parts = [found[at : at + room] for at in range(0, len(found), room)]
         return [
@@ -272,14 +272,14 @@ class CoeServer:
 
     def _list(self, kind: int) -> bytes:
         if kind != _ALL:
-            raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS)
+            raise TransferRefusedError(AbortCode.UNSUPPORTED_ACCESS)
         indices = sorted({index for index, _ in self._objects.entries})
         return struct.pack(f"<H{len(indices)}H", kind, *indices)
 
     def _object(self, index: int) -> bytes:
         rows = [row for (known, _), row in self._objects.entries.items() if known == index]
         if not rows:
-            raise SdoAbortError(AbortCode.NO_OBJECT)
+            raise TransferRefusedError(AbortCode.NO_OBJECT)
         types = {row.type for row in rows if row.subindex}
         code = _VARIABLE if not types else _ARRAY if len(types) == 1 else _RECORD
         kind = 0 if code == _RECORD else rows[-1].type.coe_code

@@ -58,7 +58,7 @@ def model_name(text: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class Fault:
     """A fault command, or a word of a distributed clock: `run` takes what it is for, and the arguments.
 
     Each is parsed by one of `arguments`. Those in brackets in `usage` can be left out; the last one may be

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import BY_SETTING, FACTORY_CALIBRATION
-from ethercat_server.virtual_sensor.application import Application, Slave
+from ethercat_server.virtual_sensor.application import Application, VirtualSlave
 from ethercat_server.virtual_sensor.dictionary import Dictionary, Flash, OnWrite, sensor_device
 from ethercat_server.virtual_sensor.distributed_clock import parse_clock
 from ethercat_server.virtual_sensor.mailbox import Address
@@ -46,7 +46,7 @@ class Firmware(Application):
         self.sampler.prepare(expected)
 
 
-class VirtualSensor(Slave):
+class VirtualSensor(VirtualSlave):
     """A sensor."""
 
     options: SensorOptions  # its current ones

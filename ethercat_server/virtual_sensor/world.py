@@ -15,7 +15,7 @@ from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILT
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
 from bota_ethercat.world import REST, Felt
 from ethercat_server.virtual_sensor.filters import LoadFilter, filtered, imu_filter
-from ethercat_server.virtual_sensor.signals import Reading, quaternion, reading_of
+from ethercat_server.virtual_sensor.signals import Measurement, measurement_of, quaternion
 
 World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MONOTONIC if it is external
 
@@ -39,7 +39,7 @@ class ExternalWorld:
         self._moments = deque([(-math.inf, REST)], maxlen=_REMEMBERED)
         self.counts = {"taken": 0, "refused": 0}  # moments
 
-    def take(self, time_s: float, felt: Felt, now_s: float) -> None:
+    def update(self, time_s: float, felt: Felt, now_s: float) -> None:
         """A moment later than the one before; any other, or one far from now, is refused."""
         is_good = time_s > self._moments[-1][0] and abs(time_s - now_s) <= LOST_AFTER_S
         self.counts["taken" if is_good else "refused"] += 1
@@ -83,7 +83,7 @@ class Measured:
     def _load_noise(self) -> list[float]:
         return [self._gauss(0.0, deviation) if self._noise else 0.0 for deviation in self.deviations]
 
-    def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
+    def reading(self, number: int, instant: int, seconds: float) -> Measurement:  # noqa: ARG002
         world = self._world
         felt = world(seconds)
         load = self._load_filter.at(number, seconds)
@@ -95,4 +95,4 @@ class Measured:
                 values[axis] += self._gauss(0.0, _ACCELERATION_NOISE)
                 values[axis + 3] += self._gauss(0.0, _ANGULAR_RATE_NOISE)
         orientation = (0.0, 0.0, 0.0, 0.0) if felt.attitude is None else quaternion(felt.attitude)
-        return reading_of(values, felt.temperature, orientation)
+        return measurement_of(values, felt.temperature, orientation)

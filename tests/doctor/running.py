@@ -10,7 +10,7 @@ from typing import Any
 from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.bus_checks import examine_bus
 from ethercat_server.doctor.cli import main
-from ethercat_server.doctor.report import NAMES, Finding, worst
+from ethercat_server.doctor.report import NAMES, CheckResult, worst
 from tests import rights
 from tests.doctor.made_up import FACTS, Facts, Files, machine
 from tests.ended import Result, patiently, run, run_here
@@ -46,7 +46,7 @@ def _without_errors(ended: Result) -> Examined:
     return Examined(*ended)
 
 
-class BusFindings(list[Finding]):
+class BusFindings(list[CheckResult]):
     """What was found on a simulated bus."""
 
     @property
@@ -54,7 +54,7 @@ class BusFindings(list[Finding]):
         """Decides on the exit code."""
         return worst(self)
 
-    def of(self, subject: str) -> dict[str, Finding]:
+    def of(self, subject: str) -> dict[str, CheckResult]:
         """The findings of a subject by check; the last one where there are two."""
         return {finding.check: finding for finding in self if finding.subject == subject}
 

@@ -9,8 +9,8 @@ import pytest
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.replies import DistributionStatus
 from ethercat_server.doctor import bus_checks
-from ethercat_server.doctor.bus_checks import ErrorCounters, Slave
-from ethercat_server.doctor.report import Finding
+from ethercat_server.doctor.bus_checks import ErrorCounters, ExaminedSlave
+from ethercat_server.doctor.report import CheckResult
 from ethercat_server.ethercat.slave.al import AlStatus
 from ethercat_server.sensor import scan
 
@@ -22,12 +22,12 @@ PORTS = {
 }  # fmt: skip
 
 
-def slave(**changes: Any) -> Slave:
+def slave(**changes: Any) -> ExaminedSlave:
     who = {"vendor": 0xB07A, "product": 1, "serial": 1234, "name": "BFT-SENS-ECAT-M8"}
     who |= {key: changes.pop(key) for key in who if key in changes}
     position, al, problem = (changes.pop(key, usual) for key, usual in USUAL.items())
     sii = None if problem else cast("Any", who)
-    return Slave(scan.Slave(position, al, sii, problem), **changes)
+    return ExaminedSlave(scan.Slave(position, al, sii, problem), **changes)
 
 
 def counted(**by_name: tuple[int, ...]) -> bytes:
@@ -38,22 +38,22 @@ def counted(**by_name: tuple[int, ...]) -> bytes:
     return bytes(data)
 
 
-def who(**changes: Any) -> Finding:
+def who(**changes: Any) -> CheckResult:
     found = bus_checks.identity(slave(al=AlStatus.of(0x14, 0x1B), **changes))
     assert (found.values["al_state"], found.values["al_error"]) == ("SAFEOP", True)
     return found
 
 
-def state(status: int, code: int) -> Finding:
+def state(status: int, code: int) -> CheckResult:
     return bus_checks.al_state(slave(al=AlStatus.of(status, code)))
 
 
-def errors(position: int, **by_name: tuple[int, ...]) -> Finding:
+def errors(position: int, **by_name: tuple[int, ...]) -> CheckResult:
     """Of one of two slaves."""
     return bus_checks.error_counters(slave(position=position, errors=counted(**by_name)), 2)
 
 
-def grown(*after: bytes) -> Finding:
+def grown(*after: bytes) -> CheckResult:
     """What came up while measuring two slaves, the first of which had five errors before."""
     before = {0: counted(invalid=(5, 0, 0, 0)), 1: counted()}
     return bus_checks.new_errors(before, dict(enumerate(after)), 2)
@@ -63,13 +63,13 @@ def summary(p99_us: float, p50_us: float = 20.0) -> DistributionStatus:
     return DistributionStatus(p50_us, p99_us, p99_us, p99_us)
 
 
-def late(p99_us: float, count: int = 0) -> Finding:
+def late(p99_us: float, count: int = 0) -> CheckResult:
     found = bus_checks.wake_finding(summary(p99_us), count, 2001)
     assert found.values["later_than_a_period"] == count
     return found
 
 
-def exchanges(p50_us: float, p99_us: float, lost: int = 0) -> Finding:
+def exchanges(p50_us: float, p99_us: float, lost: int = 0) -> CheckResult:
     return bus_checks.exchange_finding("", summary(p99_us, p50_us), lost, 2000)
 
 
@@ -111,7 +111,7 @@ def exchanges(p50_us: float, p99_us: float, lost: int = 0) -> Finding:
         (bus_checks.scheduling(0, real_time=False), NOTE, "as requested"),
     ],
 )  # fmt: skip
-def test_what_is_said(found: Finding, level: Level, said: str) -> None:
+def test_what_is_said(found: CheckResult, level: Level, said: str) -> None:
     assert found.level is level
     assert said in f"{found.found} {found.why}"
 

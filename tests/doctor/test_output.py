@@ -11,7 +11,7 @@ import pytest
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.machine_checks import CHECKS
 from ethercat_server.doctor.report import (
-    Finding,
+    CheckResult,
     Report,
     bad,
     ok,
@@ -89,11 +89,11 @@ class Terminal(io.StringIO):
         return True
 
 
-def named(finding: Finding, subject: str = "kernel", check: str = "preemption") -> Finding:
+def named(finding: CheckResult, subject: str = "kernel", check: str = "preemption") -> CheckResult:
     return replace(finding, subject=subject, check=check)
 
 
-def written(*findings: Finding, stream: io.StringIO | None = None) -> str:
+def written(*findings: CheckResult, stream: io.StringIO | None = None) -> str:
     stream = stream or io.StringIO()
     report = Report(stream)
     for finding in findings:

@@ -16,7 +16,7 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 from bota_ethercat.world import Felt
 from ethercat_server.virtual_sensor import signals
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.sampler import SampleClock
+from ethercat_server.virtual_sensor.sampler import SamplingClock
 from ethercat_server.virtual_sensor.signals import (
     CONSTANT,
     carry,
@@ -40,7 +40,7 @@ def load(data: bytes) -> tuple[float, ...]:
 @pytest.mark.parametrize("ppm", [0.0, 150.0, -300.0, 1234.5678])
 @pytest.mark.parametrize("sinc", [32, 51, 64, 341])
 def test_numbers_and_instants_agree(ppm: float, sinc: int) -> None:
-    clock = SampleClock(1_000_000_007, sinc, ppm)
+    clock = SamplingClock(1_000_000_007, sinc, ppm)
     for number in (*range(0, 3000, 7), 10**9):
         instant = clock.instant(number)
         assert clock.number_at(instant) == number
@@ -50,7 +50,7 @@ def test_numbers_and_instants_agree(ppm: float, sinc: int) -> None:
 
 
 def test_a_change_of_rate_neither_skips_nor_repeats() -> None:
-    clock = SampleClock(0, 64)
+    clock = SamplingClock(0, 64)
     now = 3 * PERIOD + 400
     clock.change(now, ppm=100_000.0)
     assert clock.number_at(now) == 3
