@@ -10,8 +10,8 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, Final
 
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.device import Device, build_image
 from ethercat_server.virtual_sensor.esc import Esc
 from ethercat_server.virtual_sensor.mailbox import CoeServer, Mailbox, ObjectTable

@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 from ethercat_server.ethercat import wire
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.application import Application, VirtualSlave
 from ethercat_server.virtual_sensor.device import size_of
 from ethercat_server.virtual_sensor.esc import Esc, pass_through

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from bota_ethercat.program.arguments import number
-from ethercat_server.virtual_sensor import registers as reg
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.virtual_sensor.options import Fault, UsageError
 
 RATE_SCALE: Final = 10**12  # rates are in parts of this

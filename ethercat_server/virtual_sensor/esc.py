@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import BYTE_NS, Command, Datagram
-from ethercat_server.virtual_sensor import registers as reg
+from ethercat_server.virtual_sensor.device import PDI_TYPE
 from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, DcUnit
 
 _U16, _AL_STATUS = struct.Struct("<H"), struct.Struct("<HHH")
@@ -20,6 +21,65 @@ _REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_T
 _DC_SYSTEM_TIME, _DC_RECEIVE_TIME = reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME
 _DC_CHANGE_EVENT = reg.DC_PDI_CHANGE_EVENT
 _LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613  # DL status: ports 0 and 1 have a link, or only port 0
+
+
+# The controller has two ports, these, 4 KB of process data memory, and a distributed clock of 64 bits.
+FMMU_COUNT: Final = 3
+SYNC_MANAGER_COUNT: Final = 4
+MEMORY_KB: Final = 4
+MEMORY_END: Final = reg.REGISTERS_END + MEMORY_KB * 1024
+# Repeat request in a sync manager's activate register, repeat acknowledge in its PDI control register.
+REPEAT: Final = 0x02
+
+# Counters: a write of any value to one of a group sets the whole group to zero.
+CLEARED_BY_WRITE: Final = (
+    range(reg.RX_ERRORS, reg.FORWARDED_ERRORS + reg.PORT_COUNT),
+    range(reg.PROCESSING_UNIT_ERRORS, reg.PROCESSING_UNIT_ERRORS + 1),
+    range(reg.PDI_ERRORS, reg.PDI_ERRORS + 1),
+    range(reg.LOST_LINKS, reg.LOST_LINKS + reg.PORT_COUNT),
+    range(reg.WATCHDOG_COUNTER, reg.WATCHDOG_COUNTER + 2),
+)
+_SYNC_MANAGERS = range(
+    reg.SYNC_MANAGER, reg.SYNC_MANAGER + SYNC_MANAGER_COUNT * reg.SYNC_MANAGER_SIZE, reg.SYNC_MANAGER_SIZE
+)
+# Register, bytes, and which bits of each a master may write.
+_WRITABLE: Final = (
+    (reg.STATION_ADDRESS, 2, 0xFF), (reg.DL_CONTROL, 4, 0xFF), (reg.AL_CONTROL, 2, 0xFF),
+    *((counters.start, len(counters), 0xFF) for counters in CLEARED_BY_WRITE),
+    (reg.WATCHDOG_DIVIDER, 2, 0xFF), (reg.WATCHDOG_TIME, 2, 0xFF),
+    (reg.SII_OWNER, 1, 0x03), (reg.SII_CONTROL, 1, 0x01), (reg.SII_CONTROL + 1, 1, 0x07),
+    (reg.SII_ADDRESS, 8, 0xFF),
+    *((reg.FMMU + number * reg.FMMU_SIZE, 13, 0xFF) for number in range(FMMU_COUNT)),
+    *((manager, 5, 0xFF) for manager in _SYNC_MANAGERS),
+    *((manager + reg.SM_ACTIVATE, 1, 0xC3) for manager in _SYNC_MANAGERS),
+    (reg.DC_RECEIVE_TIMES, 4, 0xFF), (reg.DC_SYSTEM_TIME, 8, 0xFF), (reg.DC_OFFSET, 12, 0xFF),
+    (reg.DC_ACTIVATION, 2, 0xFF),
+    (reg.USER_RAM, reg.REGISTERS_END - reg.USER_RAM, 0xFF),
+)  # fmt: skip
+
+
+def _write_mask() -> bytearray:
+    """For every register byte, the bits that a master may write."""
+    mask = bytearray(reg.REGISTERS_END)
+    for start, length, bits in _WRITABLE:
+        mask[start : start + length] = bytes([bits]) * length
+    return mask
+
+
+def _power_on_values() -> bytearray:
+    """Registers and memory of a controller that has just been switched on."""
+    memory = bytearray(MEMORY_END)
+    # Type, revision, build, FMMUs, sync managers, RAM in KB, ports 0 and 1 MII, features: FMMUs of bytes,
+    # distributed clock, of 64 bits, separate counting of check sum errors.
+    struct.pack_into(
+        "<BBHBBBBH", memory, reg.DL_INFORMATION,
+        0xC0, 2, 0, FMMU_COUNT, SYNC_MANAGER_COUNT, MEMORY_KB, 0x0F, 0x008D,
+    )  # fmt: skip
+    memory[reg.DL_CONTROL] = memory[reg.AL_CONTROL] = memory[reg.AL_STATUS] = memory[reg.WATCHDOG_STATUS] = 1
+    memory[reg.PDI_CONTROL] = PDI_TYPE
+    struct.pack_into("<H", memory, reg.WATCHDOG_DIVIDER, 2498)  # (2498 + 2) * 40 ns = 100 µs a tick
+    struct.pack_into("<H", memory, reg.WATCHDOG_TIME, 1000)
+    return memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +149,7 @@ class SyncManager:
     def _refresh(self, on: bool) -> None:
         # Switched off by the firmware, a sync manager goes on guarding its memory: nobody gets in.
         self.locked = bool(self._memory[self._pdi_control] & 1)
-        inside = self.start >= reg.REGISTERS_END and self.end <= reg.MEMORY_END
+        inside = self.start >= reg.REGISTERS_END and self.end <= MEMORY_END
         self.active = self.enabled and self.length > 0 and inside
         if not on:
             self.full = self.open = False
@@ -99,10 +159,10 @@ class SyncManager:
 
     def repeat_asked(self) -> bool:
         """Whether the master has newly asked for the last mailbox again, by a toggle bit; acknowledges it."""
-        asked = self._memory[self._activate] & reg.REPEAT
-        if asked == self._memory[self._pdi_control] & reg.REPEAT:
+        asked = self._memory[self._activate] & REPEAT
+        if asked == self._memory[self._pdi_control] & REPEAT:
             return False
-        self._set(self._pdi_control, reg.REPEAT, bool(asked))
+        self._set(self._pdi_control, REPEAT, bool(asked))
         return True
 
     @property
@@ -214,12 +274,12 @@ class Esc:
 
     def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
         self._pdi = pdi
-        self.memory = reg.power_on_values()
+        self.memory = _power_on_values()
         self.memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = sii_image[8:10]
-        self._write_mask = reg.write_mask()
+        self._write_mask = _write_mask()
         self.sii = SiiInterface(self.memory, sii_image, pdi.clock, sii_read_ns)
         self.clock = DcUnit(self.memory, self._write_mask, pdi.clock)
-        self.sync_managers = [SyncManager(self.memory, n) for n in range(reg.SYNC_MANAGER_COUNT)]
+        self.sync_managers = [SyncManager(self.memory, n) for n in range(SYNC_MANAGER_COUNT)]
         self.fmmus: list[Fmmu] = []  # the active ones
         # What each logical command copies, by address and length; emptied when an FMMU changes.
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
@@ -282,8 +342,8 @@ class Esc:
         owner = self._owner(address, end)
         if owner is not None:
             return self._write_manager(owner, address - owner.start, data)
-        self.memory[address:end] = data[: reg.MEMORY_END - address]
-        return address < reg.MEMORY_END and bool(data)
+        self.memory[address:end] = data[: MEMORY_END - address]
+        return address < MEMORY_END and bool(data)
 
     def _owner(self, start: int, end: int) -> SyncManager | None:
         return next((m for m in self.sync_managers if m.active and m.start < end and start < m.end), None)
@@ -338,7 +398,7 @@ class Esc:
             if not mask or any(first <= at < first + reg.SM_STATUS for first in locked):
                 continue  # a sync manager's area can be changed only while it is disabled
             self.memory[at] = self.memory[at] & ~mask | value & mask
-        for counters in reg.CLEARED_BY_WRITE:
+        for counters in CLEARED_BY_WRITE:
             if address < counters.stop and end > counters.start:
                 self.memory[counters.start : counters.stop] = bytes(len(counters))
         self._after_write(address, end)
@@ -354,11 +414,11 @@ class Esc:
             (self.station,) = _U16.unpack_from(self.memory, reg.STATION_ADDRESS)
         if touched(reg.SII_CONTROL, 2):
             self.sii.command()
-        if touched(reg.FMMU, reg.FMMU_COUNT * reg.FMMU_SIZE):
+        if touched(reg.FMMU, FMMU_COUNT * reg.FMMU_SIZE):
             self.plans.clear()
-            every = (Fmmu.decode(self.memory, n) for n in range(reg.FMMU_COUNT))
+            every = (Fmmu.decode(self.memory, n) for n in range(FMMU_COUNT))
             self.fmmus = [fmmu for fmmu in every if fmmu is not None]
-        if touched(reg.SYNC_MANAGER, reg.SYNC_MANAGER_COUNT * reg.SYNC_MANAGER_SIZE):
+        if touched(reg.SYNC_MANAGER, SYNC_MANAGER_COUNT * reg.SYNC_MANAGER_SIZE):
             for manager in self.sync_managers:
                 manager.reload()
             self._pdi.sync_managers_changed()
