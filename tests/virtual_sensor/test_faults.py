@@ -217,6 +217,19 @@ def test_a_command_waits_for_a_write() -> None:
         assert obey(master.bus, line).startswith("error: ")
 
 
+def test_a_save_takes_its_time_and_is_lost_with_the_power() -> None:
+    master = RawMaster().go(PREOP)
+    for milliseconds, status, kept in ((200, b"\xff", b"\0"), (371, b"\0", b"\1")):
+        do(master, "saving 0.37")
+        master.download(0x8006, 4, b"\1")
+        master.download(0x8030, 1, b"\1")
+        master.wait(milliseconds * 1_000_000)
+        assert master.upload(0x8030, 2) == status
+        do(master, "power off", "power on")
+        master.go(PREOP)
+        assert master.upload(0x8006, 4) == kept
+
+
 def test_another_signal_begins_with_the_next_sample_and_outlasts_a_power_cycle() -> None:
     master = RawMaster(SensorOptions(signal="clock")).go(OP)
     master.wait(7 * PERIOD + PERIOD // 2)

@@ -82,6 +82,16 @@ def test_an_emergency_is_the_next_message_out() -> None:
     assert emergency_of(master.fetch_mailbox()) == (0x1000, 0, bytes(5))
 
 
+def test_an_emergency_comes_before_an_answer_that_is_not_read_yet() -> None:
+    master = RawMaster().go(PREOP)
+    master.send_mailbox(3, READ_TYPE)
+    do(master, "emergency 0x1000")
+    messages = [master.one(Command.APRD, 0, 0x1080, bytes(MAILBOX))[0] for _ in range(2)]
+    assert [message[5] >> 4 for message in messages] == [1, 2], "numbered as they go out"
+    assert [message[7] >> 4 for message in messages] == [1, 3], "emergency, SDO response"
+    assert master.fetch_mailbox() is None
+
+
 def test_emergencies_that_cannot_be_sent() -> None:
     master = RawMaster()
     assert obey(master.bus, "emergency 0x8130").startswith("error: its mailbox is off")
