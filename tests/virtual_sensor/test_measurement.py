@@ -72,10 +72,11 @@ def test_the_same_sample_is_the_same_bytes_also_if_computed_ahead() -> None:
             assert plain.inputs() == ahead.inputs()
             assert number < 2 or life.sampler.made == made, "nothing is left to compute for an answer"
             ahead.bus.prepare()
-    noisy = [RawMaster(SensorOptions(seed=seed)).go(OP) for seed in (4, 4, 5)]
-    one, again, other = (master.inputs() for master in noisy)
-    assert one == again != other, "a seed gives the same noise again"
-    assert noisy[0].inputs() == one
+    for noise in (True, False):  # of a healthy sensor, or of the last bit
+        noisy = [RawMaster(SensorOptions(seed=seed, noise=noise)).go(OP) for seed in (4, 4, 5)]
+        one, again, other = (master.inputs() for master in noisy)
+        assert one == again != other, "a seed gives the same noise again"
+        assert noisy[0].inputs() == one
 
 
 def test_formulas() -> None:

@@ -81,6 +81,12 @@ def test_a_buffer_is_read_and_written_from_its_first_byte_on() -> None:
     assert [drive.write(at + n, bytes(size)) for n, size in ((1, 5), (0, 1), (1, 5), (1, 5))] == [0, 1, 1, 0]
 
 
+def test_an_enabled_sync_manager_keeps_its_area() -> None:
+    master = RawMaster().go(PREOP)
+    master.write(0x0800, struct.pack("<HH", 0x1400, 64))
+    assert master.read(0x0800, 4) == struct.pack("<HH", 0x1000, 128)
+
+
 def test_memory_that_sync_managers_guard() -> None:
     master = RawMaster()
     master.write(0x0800, sync_manager(0x1000, 128, 0x26, 0))
