@@ -70,6 +70,15 @@ def _no_exception_cycles() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True)
+def _no_blocked_signals() -> Iterator[None]:
+    """What a test left blocked, all programs that later tests start would inherit."""
+    yield
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    assert not blocked, f"left blocked: {blocked}"
+
+
 def pytest_collection_finish() -> None:
     gc.freeze()
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tests.server.running import PATIENCE_S
+from tests.server.running import ATTEMPTS, PATIENCE_S, STARVED, starved
 
 
 class Result(NamedTuple):
@@ -57,3 +57,12 @@ def run(
     )
     assert "Traceback" not in ended.stderr, ended.stderr
     return Result(ended.returncode, ended.stdout, ended.stderr)
+
+
+def patiently(ends: Callable[[], Result], words: Sequence[str] = STARVED) -> Result:
+    """How it ended, at last where a busy machine had the virtual sensor's process wait for too long."""
+    for _ in range(ATTEMPTS):
+        ended = ends()
+        if not starved(ended.out + ended.err, words):
+            break
+    return ended

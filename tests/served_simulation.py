@@ -34,7 +34,7 @@ class _Backend(MemoryBackend):
     def __init__(self, *sensors: SensorOptions) -> None:
         super().__init__(*sensors)
         self.clock = SimulatedClock(Machine(), time.monotonic_ns())
-        self.sensors = virtual.Bus(sensors or (SensorOptions(),), self.clock.now_ns)
+        self.sensors = virtual.SlaveChain(sensors or (SensorOptions(),), self.clock.now_ns)
 
 
 class _Transport(SocketTransport):

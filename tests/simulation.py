@@ -16,7 +16,7 @@ within `simulated_server` whatever connects to a server gets one that streams th
 
     with simulated_bus("--serial", "10,20") as bus:
         bus.command("power cycle 0.5")
-        result = run_here(main, "plan", bus.near, "--set", "fir=on")
+        result = run_here(main, "apply", "--dry-run", bus.near, "--set", "fir=on")
         assert bus.written(1) == []
 """
 
@@ -242,7 +242,7 @@ class Simulation(SimulatedBus):
     def _ask(self, world: World, external: ExternalWorld, step: int) -> None:
         """Tell the sensors what they feel in this millisecond, and in the following."""
         due_ns = self.started_ns + step * 1_000_000
-        external.take(due_ns * 1e-9, world(step * 1e-3), due_ns * 1e-9)
+        external.update(due_ns * 1e-9, world(step * 1e-3), due_ns * 1e-9)
         self.clock.at(due_ns + 1_000_000, functools.partial(self._ask, world, external, step + 1))
 
     def listen(self) -> Transport:

@@ -46,14 +46,14 @@ def test_every_command_of_the_tool(size: int, tmp_path: Path) -> None:
     file = tmp_path / "a.json"
     asked = [
         ("eeprom",), ("objects",), ("read", "sinc_length", "0x1018:4"), ("snapshot", file), ("save",),
-        ("plan", "--set", "chop=on"), ("apply", "--set", "sinc_length=128"),
+        ("apply", "--dry-run", "--set", "chop=on"), ("apply", "--set", "sinc_length=128"),
         ("restore", file, "--save"), ("restore", file),
     ]  # fmt: skip
     with simulated_bus("--pdo", str(size), "--sinc", 512) as bus:
         for command, *arguments in asked:
             ended = tool_here(command, bus.near, *arguments, "--json", code=None)
             assert not problems("sensor", ended.json, str(command))
-        assert problems("sensor", tool_here("read", bus.near, "0x8000", "--json").json, "plan")
+        assert problems("sensor", tool_here("read", bus.near, "0x8000", "--json").json, "apply")
     with simulated_bus("--pdo", str(size), "--sinc", 512, "--signal", "rest") as bus:
         assert not problems("sensor", tool_here("tare", bus.near, "--json").json, "tare")
     assert not problems("sensor", tool_here("adapters", "--json").json, "adapters")

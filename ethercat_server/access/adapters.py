@@ -1,5 +1,5 @@
-"""The network interfaces of this machine, as the kernel describes them by pyroute2; and which process uses
-one as an EtherCAT master, with the TCP port it listens on.
+"""The network interfaces of this machine, as the kernel describes them; and which process uses one as an
+EtherCAT master, with the TCP port it listens on.
 
 See `packet_sockets`; listening TCP sockets are in /proc/net too. Of another user's process, and in another
 network namespace, neither is visible: then the server that programs use by default is asked for
@@ -11,9 +11,10 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import struct
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
@@ -23,19 +24,23 @@ from ethercat_server.errors import InterfaceError, ServerError
 from ethercat_server.ethercat.nic import (
     Routes,
     find_routes,
+    interfaces,
     look_up,
     master_sockets,
     own_name,
     table,
     users_of,
 )
-from ethercat_server.process.signals import signals_held_back
 
-_IFF_UP, _IFF_LOOPBACK = 0x1, 0x8
-_ETHERNET: Final = 1
 # Kinds that a sensor can be connected to: network cards, and what tests use for one.
 _CARDS: Final = frozenset({"", "veth"})
 _LISTEN: Final = 0x0A
+# The counters of an interface, in the kernel's order (linux/if_link.h).
+_COUNTERS: Final = (
+    "rx_packets", "tx_packets", "rx_bytes", "tx_bytes", "rx_errors", "tx_errors", "rx_dropped", "tx_dropped",
+    "multicast", "collisions", "rx_length_errors", "rx_over_errors", "rx_crc_errors", "rx_frame_errors",
+    "rx_fifo_errors", "rx_missed_errors", "tx_aborted_errors", "tx_carrier_errors", "tx_fifo_errors",
+)  # fmt: skip
 
 
 class Holder(NamedTuple):
@@ -46,7 +51,6 @@ class Holder(NamedTuple):
     address: Address | None  # the TCP address it listens on; None if it does not, or if that is not visible
 
     def __str__(self) -> str:
-        """Its description in messages."""
         if self.pid is not None:
             return f"process {self.pid} ({self.name})"
         return "another EtherCAT master" if self.address is None else self.name
@@ -71,7 +75,6 @@ class Adapter(NamedTuple):
 
     @property
     def state(self) -> str:
-        """Of the link, as text."""
         return "down" if not self.up else "up" if self.carrier else "up, no carrier"
 
     @property
@@ -99,47 +102,33 @@ def adapters() -> list[Adapter]:
 
 def links() -> list[Adapter]:
     """All interfaces of this machine, without their routes and users."""
-    # Signals wait meanwhile: pyroute2's import and its event loop do not bear an exception.
-    with signals_held_back():
-        from pyroute2 import IPRoute  # noqa: PLC0415 - takes a moment
-
-        with IPRoute() as route:
-            rows = list(route.get_links())
-    return [_link(row, rows) for row in rows]
-
-
-def _link(row: Any, rows: Sequence[Any]) -> Adapter:
-    name, up = row.get_attr("IFLA_IFNAME"), bool(row["flags"] & _IFF_UP)
-    stats = row.get_attr("IFLA_STATS64") or row.get_attr("IFLA_STATS") or {}
-    wireless = any(Path(f"/sys/class/net/{name}/{mark}").exists() for mark in ("wireless", "phy80211"))
-    return Adapter(
-        name,
-        ifindex=row["index"],
-        kind=_kind(row),
-        address=row.get_attr("IFLA_ADDRESS"),
-        up=up,
-        carrier=up and row.get_attr("IFLA_CARRIER") == 1,
-        loopback=bool(row["flags"] & _IFF_LOOPBACK),
-        ethernet=row["ifi_type"] == _ETHERNET and not wireless,
-        master=next((_name(each) for each in rows if each["index"] == row.get_attr("IFLA_MASTER")), ""),
-        upper=tuple(_name(each) for each in rows if _stands_on(each, row["index"])),
-        counters={key: int(stats[key]) for key in stats.keys() if isinstance(stats[key], int)},  # noqa: SIM118
-    )
+    rows = interfaces()
+    names = {row.ifindex: row.name for row in rows}
+    return [
+        Adapter(
+            row.name,
+            ifindex=row.ifindex,
+            kind=row.kind,
+            address=row.address.hex(":") or None,
+            up=row.is_up,
+            carrier=row.has_carrier,
+            loopback=row.is_loopback,
+            ethernet=row.is_ethernet and not is_wireless(Path("/sys/class/net") / row.name),
+            master=names.get(row.master, ""),
+            # A veth's other end, or an interface of another namespace, does not stand on it.
+            upper=tuple(
+                each.name for each in rows
+                if each.link == row.ifindex != each.ifindex and not each.namespace and each.kind != "veth"
+            ),
+            counters=dict(zip(_COUNTERS, array("Q", row.stats[: 8 * len(_COUNTERS)]), strict=False)),
+        )
+        for row in rows
+    ]  # fmt: skip
 
 
-def _name(row: Any) -> str:
-    return str(row.get_attr("IFLA_IFNAME"))
-
-
-def _kind(row: Any) -> str:
-    info = row.get_attr("IFLA_LINKINFO")
-    return (info.get_attr("IFLA_INFO_KIND") if info else None) or ""
-
-
-def _stands_on(row: Any, index: int) -> bool:
-    """A veth's other end, or an interface of another namespace, is not below it."""
-    of_here = row.get_attr("IFLA_LINK_NETNSID") is None and _kind(row) != "veth"
-    return of_here and row.get_attr("IFLA_LINK") == index != row["index"]
+def is_wireless(folder: Path) -> bool:
+    """By its folder in /sys/class/net."""
+    return any((folder / mark).exists() for mark in ("wireless", "phy80211"))
 
 
 def find_holder(ifname: str) -> Holder | None:

@@ -132,13 +132,11 @@ class _PairTransport(SocketTransport):
         self._listeners = {sock.fileno(): sock}
 
     def accept(self, fd: int) -> SocketStream | None:
-        """See `Transport`."""
         return _PairStream(self._listeners.pop(fd), None) if fd in self._listeners else None
 
 
 class _PairStream(SocketStream):
     def peer_uid(self) -> int | None:
-        """See `Stream`."""
         return os.geteuid()
 
 

@@ -19,6 +19,7 @@ from bota_ethercat.errors import (
 )
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.server_choice import default_server, is_address
+from bota_ethercat.program.signals import signals_call, signals_held_back
 from bota_ethercat.replies import Description, Status
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import SettingValue
@@ -28,7 +29,6 @@ from ethercat_server.access.private_server import PrivateServer
 from ethercat_server.errors import BusError, InterfaceError, SdoAbortError, ServerError, UsageError
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
 from ethercat_server.ethercat.datagrams import Steps, finish
-from ethercat_server.process.signals import signals_call, signals_held_back
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.sensor import Found, Identity, Sensor
 from ethercat_server.sensor.set_up import NO_SETTINGS, read_in_force
@@ -68,7 +68,6 @@ class Sensors:
 
     @classmethod
     def through(cls, address: Address, used: str | None = None) -> Sensors:
-        """Those of the server at `address`."""
         name = f"the server at {address}"
         client = Client(address.port, address.host, stream=False, raw=True, reconnect=False)
         try:
@@ -95,14 +94,12 @@ class Sensors:
             raise
 
     def close(self) -> None:
-        """End the connection."""
         self.client.close()
         if self.private is not None:
             with signals_call(lambda: None):  # what was asked for is done, and this takes a moment only
                 self.private.close()
 
     def ask(self, action: str, timeout_s: float = _ANSWER_TIMEOUT_S, **values: object) -> JsonObject:
-        """The reply to a request; SdoAbortError, UsageError or BusError if it is refused."""
         try:
             return self.client.ask(action, timeout_s, **values)
         except RefusedError as error:
@@ -116,11 +113,9 @@ class Sensors:
             raise self._closed(error) from None
 
     def describe(self) -> Description:
-        """The reply to `describe`."""
         return Description.parse(self.ask("describe"))
 
     def status(self) -> Status:
-        """The reply to `status`."""
         return Status.parse(self.ask("status"))
 
     def _closed(self, error: ConnectionFailedError) -> Exception:
@@ -135,7 +130,6 @@ class Sensors:
         return sensor
 
     def sdo(self, number: int) -> GuardedSdo:
-        """The object dictionary of a sensor."""
         return GuardedSdo(_ServerSdo(self, number))
 
     def configure(self, number: int, settings: Mapping[str, SettingValue], save: bool) -> None:
@@ -190,7 +184,6 @@ class Sensors:
             yield frames, events
 
     def wait_settled(self, numbers: Collection[int]) -> None:
-        """Wait until the data of these sensors has settled."""
         deadline = Deadline(self.clock, _SETTLED_WITHIN_S)
         while numbers and not deadline.passed:
             if not any(info.settling for info in self.describe().sensors if info.sensor in numbers):
@@ -206,7 +199,6 @@ class _ServerSdo:
         self.clock = sensors.clock
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
-        """See `Sdo`."""
         yield from ()
         for left in reversed(range(_READ_ATTEMPTS)):
             try:
@@ -219,7 +211,6 @@ class _ServerSdo:
         return bytes.fromhex(reply["hex"])
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:
-        """See `Sdo`."""
         yield from ()
         self._sensors.ask("sdo_write", sensor=self._number, index=index, subindex=subindex, hex=data.hex())
 

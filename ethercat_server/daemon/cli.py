@@ -8,9 +8,9 @@ import sys
 from collections.abc import Sequence
 
 from bota_ethercat.program.output import ends_with_its_reader
+from bota_ethercat.program.signals import Signals
 from ethercat_server.errors import ServerError, StopRequestedError
 from ethercat_server.process.logs import set_up_logging
-from ethercat_server.process.signals import Signals
 
 log = logging.getLogger(__name__)
 

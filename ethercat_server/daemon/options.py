@@ -4,7 +4,6 @@ for the sensors."""
 from __future__ import annotations
 
 import argparse
-import contextlib
 import functools
 import ipaddress
 import shlex
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.errors import SettingError
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.program.arguments import Parser, number, typed, whole
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import (
     SETTINGS,
@@ -58,34 +57,25 @@ class ServerSetting(NamedTuple):
         return checked if self.many else checked[0]
 
 
-def _checked(
-    convert: Callable[[str], Any], holds: Callable[[Any], object], what: str
-) -> Callable[[str], Any]:
-    """Parses what `convert` takes and `holds` is true of; ArgumentTypeError says `what` it must be."""
+def _text(holds: Callable[[str], object], what: str) -> Callable[[str], str]:
+    """The type of an argument that is a text of which something `holds`."""
 
-    def parse(text: str) -> Any:
-        with contextlib.suppress(ValueError):
-            if holds(value := convert(text)):
-                return value
-        raise argparse.ArgumentTypeError(f"must be {what}, not {text!r}")
+    def checked(text: str) -> str:
+        if not holds(text):
+            raise ValueError
+        return text
 
-    return parse
+    return typed(checked, what)
 
 
-def _whole(low: int, high: int) -> Callable[[str], Any]:
-    what = f"a whole number from {low} to {high}"
-    return _checked(
-        lambda text: int(text) if text.isdecimal() else -1, range(low, high + 1).__contains__, what
-    )
-
-
-_ADDRESS: Final = _checked(
-    lambda text: str(ipaddress.ip_address(text)), bool,
+_ADDRESS: Final = typed(
+    lambda text: str(ipaddress.ip_address(text)),
     "an IP address of this machine, such as 127.0.0.1 or 0.0.0.0",
-)  # fmt: skip
-_NAME: Final = _checked(str, lambda text: text and text.isprintable(), "a name")
-_SECONDS: Final = _checked(float, lambda s: 0.1 <= s <= 1e6, "seconds, from 0.1 to 1000000")
-_UNSET: Final = _checked(str, (DEFAULTS, KEEP).__contains__, f"'{DEFAULTS}' or '{KEEP}'")
+)
+_NAME: Final = _text(lambda text: text and text.isprintable(), "a name")
+_SECONDS: Final = number(0.1, 1e6, "seconds, from 0.1 to 1000000")
+_UNSET: Final = _text((DEFAULTS, KEEP).__contains__, f"'{DEFAULTS}' or '{KEEP}'")
+_TERMINAL: Final = _text(CHOICE.fullmatch, "0xVENDOR:0xPRODUCT, POSITION or 0xVENDOR:0xPRODUCT@POSITION")
 _ROWS: Final = (
     ServerSetting(
         "hosts", "ADDRESS", "address to listen on; remote clients are read-only "
@@ -112,15 +102,14 @@ _ROWS: Final = (
     ),
     ServerSetting(
         "rt_priority", "N", "SCHED_FIFO priority, if permitted; 0 for ordinary scheduling",
-        _whole(0, 99), realtime.DEFAULT_PRIORITY,
+        whole(0, 99), realtime.DEFAULT_PRIORITY,
     ),
     ServerSetting(
         "terminals", "WHICH", "slave beside the sensors whose inputs are read, too: VENDOR:PRODUCT (such as "
         "0x2:0x0C1E3052), its POSITION on the wire, or VENDOR:PRODUCT@POSITION",
-        _checked(str, CHOICE.fullmatch, "0xVENDOR:0xPRODUCT, POSITION or 0xVENDOR:0xPRODUCT@POSITION"), (),
-        many=True,
+        _TERMINAL, (), many=True,
     ),
-    ServerSetting("cpu", "N", "pin the server to this CPU, if permitted", _whole(0, 4095), None),
+    ServerSetting("cpu", "N", "pin the server to this CPU, if permitted", whole(0, 4095), None),
     ServerSetting(
         "stall_timeout_s", "S", "timeout in seconds for a client that does not read what is queued for it",
         _SECONDS, 10.0,
@@ -176,7 +165,7 @@ def _server(table: dict[str, Any]) -> dict[str, Any]:
         try:
             values[key] = setting.check(value)
         except argparse.ArgumentTypeError as error:
-            raise UsageError(f"[server] {key} = {value!r}: it {error}") from None
+            raise UsageError(f"[server] {key} = {error}") from None
     return values
 
 
@@ -218,12 +207,10 @@ class ServerOptions:
 
     @property
     def terminals(self) -> Sequence[str]:
-        """The slaves beside the sensors that are read, too."""
         return tuple(self.server["terminals"])
 
     @property
     def keep_unset(self) -> bool:
-        """Whether the sensors keep the settings that nobody set."""
         return bool(self.server["unset_settings"] == KEEP)
 
     def asked_settings(self, number: int, name: str, serial: int) -> dict[str, SettingValue]:
@@ -247,7 +234,6 @@ class ServerOptions:
         return wanted
 
     def _unset(self) -> dict[str, SettingValue]:
-        """What settings that nobody set become."""
         return {} if self.keep_unset else start_up_defaults()
 
     def _sources(self, number: int, name: str, serial: int) -> list[tuple[str, Mapping[str, SettingValue]]]:
@@ -293,7 +279,7 @@ def build_parser() -> argparse.ArgumentParser:
     interface = f"network interface ('{VIRTUAL_INTERFACE}' for a simulated sensor)"
     parser.add_argument("ifname", metavar="IFACE", help=interface)
     parser.add_argument("sensor_name", metavar="SENSOR_NAME", nargs="?", help="model of the first sensor")
-    parser.add_argument("port", metavar="PORT", type=_whole(1, 65535), help="TCP port")
+    parser.add_argument("port", metavar="PORT", type=whole(1, 65535), help="TCP port")
     parser.add_argument(
         "--force", action="store_true",
         help="take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop",

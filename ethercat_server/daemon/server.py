@@ -1,4 +1,4 @@
-"""One run of the server: start-up, acquisition loop, shutdown."""
+"""One run of the server: start-up, acquisition loop, shutdown; what the service manager is told of it."""
 
 from __future__ import annotations
 
@@ -7,22 +7,26 @@ import gc
 import ipaddress
 import logging
 import os
+import socket
 from collections.abc import Sequence
 from functools import partial
+from typing import Final
 
+from bota_ethercat.program.signals import Signals
 from ethercat_server.daemon.histories import kept
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
-from ethercat_server.daemon.service import Notifier
+from ethercat_server.errors import StopRequestedError
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.process.privileges import User, become, forbid_new_privileges, user_to_become
-from ethercat_server.process.signals import Signals
 from ethercat_server.server import Server
 from ethercat_server.serving.connection import Limits
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import SocketTransport
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
+
+_NEVER_NS: Final = 1 << 62
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +54,12 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
         _give_up_root(user, options)
         hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
-        server = Server(bus, hub, options, signals.check, watchdog=notifier)
+
+        def check_interrupt() -> None:
+            if signals.asked:
+                raise StopRequestedError("stopped during start-up")
+
+        server = Server(bus, hub, options, check_interrupt, watchdog=notifier)
         server.cycle.every_second = partial(every_second, server, notifier)
         signals.call(server.stop)
         for sensor in server.sensors:
@@ -91,3 +100,50 @@ def _give_up_root(user: User | None, options: ServerOptions) -> None:
         return
     become(user)
     log.info("running as user %s from here on, without privileges", user)
+
+
+class Notifier:
+    """The service manager's socket (sd_notify(3)); sending never blocks and never fails.
+
+    Without systemd it does nothing.
+    """
+
+    def __init__(self) -> None:
+        name = os.environ.pop("NOTIFY_SOCKET", "")
+        self._status = ""
+        self._socket: socket.socket | None = None
+        self.feed_every_ns = _watchdog_ns() // 3  # a third of the watchdog's timeout
+        if name:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            self._socket.setblocking(False)
+            with contextlib.suppress(OSError):
+                # A name that starts with @ is in the abstract namespace.
+                self._socket.connect("\0" + name[1:] if name.startswith("@") else name)
+
+    def feed(self) -> None:
+        self.send("WATCHDOG=1")
+
+    def update(self, server: Server) -> None:
+        """One line for `systemctl status`; sent only if it has changed."""
+        sensors = server.sensors
+        lost = [sensor.number for sensor in sensors if not sensor.streams]
+        text = f"streaming {len(sensors) - len(lost)} of {len(sensors)} sensors"
+        if lost:
+            text += f", lost: {', '.join(map(str, lost))}"
+        text += f"; {len(server.hub.connections)} clients"
+        if text != self._status:
+            self._status = text
+            self.send(f"STATUS={text}")
+
+    def send(self, text: str) -> None:
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.send(text.encode())
+
+
+def _watchdog_ns() -> int:
+    """Timeout of the watchdog."""
+    microseconds, process = os.environ.get("WATCHDOG_USEC", ""), os.environ.get("WATCHDOG_PID", "")
+    if not microseconds.isdecimal() or process not in {"", str(os.getpid())}:
+        return _NEVER_NS
+    return int(microseconds) * 1000

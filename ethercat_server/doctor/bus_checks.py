@@ -8,6 +8,8 @@ found.
 from __future__ import annotations
 
 import contextlib
+import functools
+import struct
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
@@ -23,11 +25,11 @@ from ethercat_server.access.adapters import Holder, find_holder, links
 from ethercat_server.access.private_server import open_interface
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.acquisition.health import SLOW_US, cost
-from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.machine_checks import rising
 from ethercat_server.doctor.report import (
     CannotLookError,
-    Finding,
+    CheckResult,
     bad,
     examine,
     finding,
@@ -67,12 +69,11 @@ class ErrorCounters(NamedTuple):
 
     @classmethod
     def parse(cls, data: bytes) -> ErrorCounters:
-        """From the registers 0x0300 to 0x0313."""
         by_port = tuple(data[0:8:2]), tuple(data[1:8:2]), tuple(data[8:12])
         return cls(*by_port, data[12], data[13], tuple(data[16:20]))
 
 
-class Slave(NamedTuple):
+class ExaminedSlave(NamedTuple):
     """One slave."""
 
     looked: scan.Slave  # without its SII if another master has the bus
@@ -81,7 +82,7 @@ class Slave(NamedTuple):
     left_alone: bool = False  # its SII was not read, for another master has the bus
 
     @classmethod
-    def look_at(cls, bus: Bus, position: int, *, in_use: bool) -> Slave:
+    def read(cls, bus: Bus, position: int, *, in_use: bool) -> ExaminedSlave:
         """The slave at `position`; BusError if it does not answer. `in_use`: another master has the bus."""
         looked = scan.look_at(bus, position)
         return cls(
@@ -96,7 +97,7 @@ def _read_errors(bus: Bus, position: int) -> bytes:
     return bus.read_surely_at(position, reg.RX_ERRORS, reg.ERROR_COUNTERS_SIZE)
 
 
-def answers(ifname: str, count: int, silent: str = CHECK_CABLE) -> Finding:
+def answers(ifname: str, count: int, silent: str = CHECK_CABLE) -> CheckResult:
     """Whether any slave answers; `silent` is the interface's part if none does, as of a `Backend`."""
     text = "no EtherCAT slave answers" if not count else f"{count} slave{'s' if count > 1 else ''} answer"
     why = silent
@@ -111,7 +112,7 @@ def answers(ifname: str, count: int, silent: str = CHECK_CABLE) -> Finding:
     )  # fmt: skip
 
 
-def identity(slave: Slave) -> Finding:
+def identity(slave: ExaminedSlave) -> CheckResult:
     """Identity, and whether the server supports it."""
     looked, al = slave.looked, slave.looked.status
     sii = looked.sii or {"name": "", "serial": 0, "vendor": 0, "product": 0}
@@ -138,14 +139,14 @@ def identity(slave: Slave) -> Finding:
     return ok(f"{text}, supported", **values)
 
 
-def any_sensor(slaves: Sequence[Slave]) -> Iterator[Finding]:
+def any_sensor(slaves: Sequence[ExaminedSlave]) -> Iterator[CheckResult]:
     """Whether there is a sensor among them."""
     may_be = (slave.looked.is_sensor or slave.left_alone or slave.looked.problem for slave in slaves)
     if slaves and not any(may_be):
         yield bad("no Bota Gen-0 sensor", "connect one, or name the interface that it is connected to")
 
 
-def al_state(slave: Slave) -> Finding:
+def al_state(slave: ExaminedSlave) -> CheckResult:
     """Its AL state, which the doctor does not change."""
     al = slave.looked.status
     return graded(
@@ -161,7 +162,7 @@ def al_state(slave: Slave) -> Finding:
 _UNUSABLE: Final = frozenset({AlState.NONE, AlState.BOOT})
 
 
-def error_counters(slave: Slave, count: int) -> Finding:
+def error_counters(slave: ExaminedSlave, count: int) -> CheckResult:
     """Error counters of its ESC since power-on or the last start of a master."""
     counters = ErrorCounters.parse(slave.errors)
     values, text = counters._asdict(), "; ".join(_port_errors(slave.looked.position, counters, count))
@@ -179,7 +180,7 @@ def error_counters(slave: Slave, count: int) -> Finding:
     return ok("none", **values)
 
 
-def new_errors(before: Mapping[int, bytes], after: Mapping[int, bytes], count: int) -> Finding:
+def new_errors(before: Mapping[int, bytes], after: Mapping[int, bytes], count: int) -> CheckResult:
     """Errors counted during the measurement: registers by position, at its begin and its end."""
     new: dict[int, ErrorCounters] = {}
     for position, now in after.items():
@@ -234,7 +235,7 @@ def points(summary: DistributionStatus) -> str:
     return ", ".join(f"{name} {value:.0f}" for name, value in names) + " µs"
 
 
-def scheduling(priority: int, *, real_time: bool) -> Finding:
+def scheduling(priority: int, *, real_time: bool) -> CheckResult:
     """Scheduling of the loop."""
     return graded(
         f"SCHED_FIFO {priority}" if real_time else "ordinary scheduling",
@@ -245,7 +246,7 @@ def scheduling(priority: int, *, real_time: bool) -> Finding:
     )  # fmt: skip
 
 
-def wake_finding(summary: DistributionStatus, late: int, count: int) -> Finding:
+def wake_finding(summary: DistributionStatus, late: int, count: int) -> CheckResult:
     """The finding for a summary: `late` of `count` wake-ups were late by more than a sample period.
 
     It may be the cause of the verdict on the stream, and is not trouble itself.
@@ -261,7 +262,7 @@ def wake_finding(summary: DistributionStatus, late: int, count: int) -> Finding:
     )  # fmt: skip
 
 
-def exchange_finding(when: str, summary: DistributionStatus, lost: int, count: int) -> Finding:
+def exchange_finding(when: str, summary: DistributionStatus, lost: int, count: int) -> CheckResult:
     """The finding for a summary: `lost` of `count` exchanges did not come back. A cause, too."""
     text = f"{points(summary)}{when}"
     return graded(
@@ -275,7 +276,7 @@ def exchange_finding(when: str, summary: DistributionStatus, lost: int, count: i
     )  # fmt: skip
 
 
-def age_finding(what: str, summary: DistributionStatus) -> Finding:
+def age_finding(what: str, summary: DistributionStatus) -> CheckResult:
     """The finding for a summary of ages, by the limits of streams."""
     how = "the server's estimate; a message to a client takes about 50 µs more"
     p99_s = (summary.p99 or 0) * 1e-6
@@ -303,16 +304,16 @@ class ServerView:
 
     def __init__(self, sensors: Sensors, seconds: float) -> None:
         """Watch for `seconds`, then close `sensors`. A private server's figures are those since its start."""
-        self._own, clock, private = sensors.private is not None, sensors.clock, sensors.private
+        self.own, clock, private = sensors.private is not None, sensors.clock, sensors.private
         with contextlib.closing(sensors):
             self._observers = {
                 info.sensor: StreamObserver(info.rate_hz, clock.monotonic_ns())
                 for info in sensors.describe().sensors
             }
-            self.before = self._take_status(sensors)
+            self.before = self._read_status(sensors)
             end = Deadline(clock, seconds)
             for frames, events in sensors.stream(fresh_only=False) if seconds else ():
-                self._take(frames, clock.monotonic_ns(), same_machine=sensors.client.session.same_machine)
+                self._observe(frames, clock.monotonic_ns(), same_machine=sensors.client.session.same_machine)
                 for event in events:
                     if (position := position_of(event)) in self._observers:
                         self._observers[position].said.take_event(event)
@@ -324,21 +325,21 @@ class ServerView:
                     break
             self.real_time = private is not None and private.real_time
             self._end_ns = clock.monotonic_ns()
-            self.after = self._take_status(sensors)
+            self.after = self._read_status(sensors)
             self.described = sensors.describe().sensors
         for info in self.described:
             if info.sensor in self._observers:
                 self._observers[info.sensor].said.info = info
-        self._when = "" if self._own else " in the last 10 s"
-        self._summaries = self.after if self._own else self.after.last_10s
+        self._when = "" if self.own else " in the last 10 s"
+        self._summaries = self.after if self.own else self.after.last_10s
 
-    def _take_status(self, sensors: Sensors) -> Status:
+    def _read_status(self, sensors: Sensors) -> Status:
         status = sensors.status()
         for position, observer in self._observers.items():
             observer.said.take_status(status, position, sensors.clock.monotonic_ns())
         return status
 
-    def _take(self, frames: Sequence[DataMessage], now_ns: int, *, same_machine: bool) -> None:
+    def _observe(self, frames: Sequence[DataMessage], now_ns: int, *, same_machine: bool) -> None:
         for position, batch in by_sensor(frames).items():
             if position in self._observers:
                 self._observers[position].take(batch, now_ns)
@@ -346,11 +347,9 @@ class ServerView:
                     self._observers[position].note_age(batch[-1], now_ns)
 
     def _grown(self, name: str) -> int:
-        """Increase of a counter."""
         return increase(getattr(self.before, name), getattr(self.after, name))
 
-    def sensors(self) -> Iterator[Finding]:
-        """Each sensor: the verdict on its stream."""
+    def sensors(self) -> Iterator[CheckResult]:
         for info in self.described:
             if (observer := self._observers.get(info.sensor)) is None:
                 continue  # it was not there before
@@ -375,26 +374,22 @@ class ServerView:
             if overloaded:
                 yield note(f"sensor {info.sensor} {past}", "have it checked")
 
-    def wake_ups(self) -> Finding:
-        """Its lateness."""
+    def wake_ups(self) -> CheckResult:
         late, count = self._grown("missed_deadlines"), max(1, self._grown("cycles"))
         return wake_finding(self._summaries.wake_us, late, count)
 
-    def exchanges(self) -> Finding:
-        """How long its exchanges take, and how many are lost."""
+    def exchanges(self) -> CheckResult:
         lost, count = self._grown("lost_frames"), max(1, self._grown("cycles"))
         return exchange_finding(self._when, self._summaries.exchange_us, lost, count)
 
-    def ages(self) -> Iterator[Finding]:
-        """The age of samples when the server sends them."""
+    def ages(self) -> Iterator[CheckResult]:
         for row in self.after.sensors:
-            summary = row.age_us if self._own else self.after.recent_age_us(row.sensor)
+            summary = row.age_us if self.own else self.after.recent_age_us(row.sensor)
             if not summary.max:
                 raise CannotLookError("the server reports it once it follows the sensor's clock")
             yield age_finding(f"sensor {row.sensor}, when sent{self._when}", summary)
 
-    def clients(self) -> Finding:
-        """The clients, and those that are too slow."""
+    def clients(self) -> CheckResult:
         rows = self.after.clients
         before = {row.peer: row.withheld for row in self.before.clients}
         slow = [row.peer for row in rows if increase(before.get(row.peer, 0), row.withheld)]
@@ -406,19 +401,31 @@ class ServerView:
             clients=[row._asdict() for row in rows],
         )  # fmt: skip
 
-    def examine(self, subject: str) -> Iterator[Finding]:
-        """All checks."""
-        yield from examine(subject, "sensors", self.sensors)
-        yield from examine(subject, "wake-ups", self.wake_ups)
-        yield from examine(subject, "exchanges", self.exchanges)
-        yield from examine(subject, "age of data", self.ages)
-        if not self._own:
-            yield from examine(subject, "clients", self.clients)
+
+def watched(
+    subject: str, check: str, open_sensors: Callable[[], Sensors], seconds: float,
+    describe: Callable[[ServerView], CheckResult],
+) -> Iterator[CheckResult]:  # fmt: skip
+    """The checks of a server's figures; `describe` is the first one."""
+    views: list[ServerView] = []
+
+    def watch() -> CheckResult:
+        views.append(ServerView(open_sensors(), seconds))
+        return describe(views[0])
+
+    yield from examine(subject, check, watch)
+    for view in views:
+        yield from examine(subject, "sensors", view.sensors)
+        yield from examine(subject, "wake-ups", view.wake_ups)
+        yield from examine(subject, "exchanges", view.exchanges)
+        yield from examine(subject, "age of data", view.ages)
+        if not view.own:
+            yield from examine(subject, "clients", view.clients)
 
 
 def examine_bus(
-    machine: Machine, seconds: float = 10.0, announce: Callable[[str], None] = lambda _: None
-) -> Iterator[Finding]:
+    machine: Host, seconds: float = 10.0, announce: Callable[[str], None] = lambda _: None
+) -> Iterator[CheckResult]:
     """The bus itself, or the figures of its server; and the measurement. `announce` is told the progress."""
     holder, found = find_holder(machine.ifname), None
     if holder is not None and holder.address is not None:
@@ -439,59 +446,29 @@ def examine_bus(
         yield from _left_alone(found)
 
 
-def _left_alone(found: Finding) -> Iterator[Finding]:
+def _left_alone(found: CheckResult) -> Iterator[CheckResult]:
     yield replace(found, subject="bus", check="slaves")
     yield _not_measured("the bus is not accessed")
 
 
-def _not_measured(why: str) -> Finding:
-    return replace(skipped(why), subject="measurement", check="all")
+def _not_measured(why: str) -> CheckResult:
+    return skipped(why, subject="measurement", check="all")
 
 
-def _watched(
-    subject: str, check: str, open_sensors: Callable[[], Sensors], seconds: float,
-    describe: Callable[[ServerView], Finding],
-) -> Iterator[Finding]:  # fmt: skip
-    """The checks of a server's figures; `describe` is the first one."""
-    views: list[ServerView] = []
-
-    def watch() -> Finding:
-        views.append(ServerView(open_sensors(), seconds))
-        return describe(views[0])
-
-    yield from examine(subject, check, watch)
-    for view in views:
-        yield from view.examine(subject)
-
-
-def _through_server(holder: Holder, address: Address, seconds: float) -> Iterator[Finding]:
+def _through_server(holder: Holder, address: Address, seconds: float) -> Iterator[CheckResult]:
     """What the server that uses the interface says."""
 
-    def describe(view: ServerView) -> Finding:
+    def describe(view: ServerView) -> CheckResult:
         why = "the bus is not accessed while it streams; these are the server's figures"
         hours = (view.after.uptime_s or 0.0) / 3600
         return ok(f"{holder} serves it at {address}, up {hours:.1f} h", why, **address._asdict())
 
-    yield from _watched("server", "server", lambda: Sensors.through(address), seconds, describe)
+    yield from watched("server", "server", lambda: Sensors.through(address), seconds, describe)
 
 
-def _measured(machine: Machine, seconds: float) -> Iterator[Finding]:
-    """What a server measures here, with the sensors set as they are."""
-
-    def open_sensors() -> Sensors:
-        return Sensors.on_interface(
-            machine.ifname, allow_ip=machine.allow_ip, rt_priority=machine.rt_priority, cpu=machine.cpu
-        )
-
-    def describe(view: ServerView) -> Finding:
-        return scheduling(machine.rt_priority, real_time=view.real_time)
-
-    yield from _watched("measurement", "scheduling", open_sensors, seconds, describe)
-
-
-def _on_bus(machine: Machine, seconds: float, announce: Callable[[str], None]) -> Iterator[Finding]:
+def _on_bus(machine: Host, seconds: float, announce: Callable[[str], None]) -> Iterator[CheckResult]:
     """The slaves, as they are; then what a server of the doctor's own measures, and the new errors."""
-    of_card, found = _card_counters(machine.ifname), list[Slave]()
+    of_card, found = _card_counters(machine.ifname), list[ExaminedSlave]()
     try:
         with open_interface(machine.ifname, allow_ip=machine.allow_ip) as bus:
             count = yield from _slaves(machine, bus, found)
@@ -508,9 +485,16 @@ def _on_bus(machine: Machine, seconds: float, announce: Callable[[str], None]) -
         yield _not_measured("there is no sensor to measure with, or another master has the bus")
         return
     announce(f"measuring for {seconds:g} s ...")
-    yield from _measured(machine, seconds)
+    open_sensors = functools.partial(
+        Sensors.on_interface, machine.ifname,
+        allow_ip=machine.allow_ip, rt_priority=machine.rt_priority, cpu=machine.cpu,
+    )  # fmt: skip
+    yield from watched(
+        "measurement", "scheduling", open_sensors, seconds,
+        lambda view: scheduling(machine.rt_priority, real_time=view.real_time),
+    )  # fmt: skip
 
-    def meanwhile() -> Finding:
+    def meanwhile() -> CheckResult:
         before = {slave.looked.position: slave.errors for slave in found}
         with open_interface(machine.ifname, allow_ip=machine.allow_ip) as bus:
             return new_errors(before, {position: _read_errors(bus, position) for position in before}, count)
@@ -522,12 +506,12 @@ def _on_bus(machine: Machine, seconds: float, announce: Callable[[str], None]) -
 
 def _card_counters(ifname: str) -> Mapping[str, int]:
     """The present counters of the interface; empty if they cannot be read."""
-    with contextlib.suppress(Exception):  # pyroute2's errors share no base
+    with contextlib.suppress(OSError, struct.error):
         return next((row.counters for row in links() if row.name == ifname), {})
     return {}
 
 
-def _slaves(machine: Machine, bus: Bus, found: list[Slave]) -> Generator[Finding, None, int]:
+def _slaves(machine: Host, bus: Bus, found: list[ExaminedSlave]) -> Generator[CheckResult, None, int]:
     """Those that answer, which are added to `found`; returns how many there are."""
     count = max(0, *(bus.count_slaves(_PROBE_SIZE, _FIND_TIMEOUT_S) for _ in range(_FIND_ATTEMPTS)))
     silent = CHECK_CABLE if count else bus.backend.why_silent()
@@ -535,8 +519,8 @@ def _slaves(machine: Machine, bus: Bus, found: list[Slave]) -> Generator[Finding
     in_use = any(scan.look_at(bus, position).at_work for position in range(count))
     for position in range(count):
 
-        def identify(position: int = position) -> Finding:
-            found.append(Slave.look_at(bus, position, in_use=in_use))
+        def identify(position: int = position) -> CheckResult:
+            found.append(ExaminedSlave.read(bus, position, in_use=in_use))
             return identity(found[-1])
 
         yield from examine("bus", f"slave {position}", identify)

@@ -22,9 +22,9 @@ from ethercat_server.access.adapters import find_holder, is_elsewhere, server_he
 from ethercat_server.daemon.options import SERVER_SETTINGS, VIRTUAL_INTERFACE
 from ethercat_server.doctor import trace
 from ethercat_server.doctor.bus_checks import examine_bus
-from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.machine_checks import examine_machine
-from ethercat_server.doctor.report import CannotLookError, Finding, Report, as_json, worst
+from ethercat_server.doctor.report import CannotLookError, CheckResult, Report, as_json, worst
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP, name_trouble, own_name
 from ethercat_server.process import command_line
@@ -111,11 +111,9 @@ def _run(args: argparse.Namespace) -> int:
     return command_line.FAILED if worst(findings) is Level.TROUBLE else 0
 
 
-def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iterator[Finding]:
+def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iterator[CheckResult]:
     """What is found on this machine and the interface; on a virtual bus for `virtual`."""
-    machine = Machine(
-        args.iface, args.iface, rt_priority=args.rt_priority, cpu=args.cpu, allow_ip=args.allow_ip
-    )
+    machine = Host(args.iface, args.iface, rt_priority=args.rt_priority, cpu=args.cpu, allow_ip=args.allow_ip)
     with contextlib.ExitStack() as cleanup:
         if is_elsewhere(args.iface) and find_holder(args.iface) is not None:
             machine.facts["link"] = CannotLookError("it is in a network namespace of its server's own")

@@ -8,8 +8,6 @@ network namespace that it was mounted in.
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import errno
 import re
 import shlex
@@ -23,41 +21,27 @@ from typing import Any, Final
 
 from ethercat_server.access.adapters import Adapter, links
 from ethercat_server.doctor.report import CannotLookError
-from ethercat_server.ethercat.nic import find_routes, look_up
+from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.nic import ethtool, find_routes, link_settings, look_up
 
 NOT_SUPPORTED: Final = "the driver does not support it"
-_UNKNOWN_SPEEDS: Final = frozenset({0, 0xFFFF, 0xFFFFFFFF})
 _DUPLEX: Final = {0: "half", 1: "full"}
-# Requests that pyroute2 lacks, from linux/ethtool.h: number, and layout of the answer.
+# Requests of linux/ethtool.h: number, and layout of the answer.
 _GET_DRIVER: Final = 0x03, struct.Struct("=4x32s32x32x32s64x")  # driver, bus
+_GET_COALESCING: Final = 0x0E, struct.Struct("=4xI12xI16xII44x")
+_COALESCING: Final = (
+    "rx_coalesce_usecs", "tx_coalesce_usecs", "use_adaptive_rx_coalesce", "use_adaptive_tx_coalesce",
+)  # fmt: skip
 _GET_EEE: Final = 0x44, struct.Struct("=16xII16x")  # active, enabled
 
 
-def _ethtool(ifname: str, ask: Callable[[Any], Any]) -> Any:
-    from pyroute2.ethtool.ioctl import IoctlEthtool  # noqa: PLC0415 - takes a moment
-
-    with contextlib.closing(IoctlEthtool(ifname)) as asked:
-        return ask(asked)
-
-
-def _request(ifname: str, command: int, layout: struct.Struct) -> tuple[Any, ...]:
-    buffer = ctypes.create_string_buffer(struct.pack("=I", command), layout.size)
-
-    def ask(asked: Any) -> None:
-        asked.ifreq.gstats = ctypes.cast(buffer, ctypes.c_void_p)
-        asked.ioctl()
-
-    _ethtool(ifname, ask)
-    return layout.unpack(buffer.raw)
-
-
 def _settings(ifname: str) -> tuple[int | None, str | None]:
-    found = _ethtool(ifname, lambda asked: asked.get_link_settings())
-    return None if found.speed in _UNKNOWN_SPEEDS else int(found.speed), _DUPLEX.get(found.duplex)
+    mbits, duplex = link_settings(ifname)
+    return mbits or None, _DUPLEX.get(duplex)
 
 
 def _driver(ifname: str) -> tuple[str, ...]:
-    texts = _request(ifname, *_GET_DRIVER)
+    texts = ethtool(ifname, *_GET_DRIVER)
     return tuple(text.split(b"\0")[0].decode("ascii", errors="replace") for text in texts)
 
 
@@ -67,8 +51,8 @@ FACTS: Final[Mapping[str, Callable[[str], Any]]] = {
     "routes": lambda ifname: find_routes(look_up(ifname).ifindex),
     "settings": _settings,  # speed in Mbit/s and duplex
     "driver": _driver,  # its name, and the bus the card is on
-    "coalescing": lambda ifname: dict(_ethtool(ifname, lambda asked: asked.get_coalesce())),
-    "EEE": lambda ifname: tuple(map(bool, _request(ifname, *_GET_EEE)))[::-1],  # switched on, in use
+    "coalescing": lambda ifname: dict(zip(_COALESCING, ethtool(ifname, *_GET_COALESCING), strict=True)),
+    "EEE": lambda ifname: tuple(map(bool, ethtool(ifname, *_GET_EEE)))[::-1],  # switched on, in use
 }
 
 _MOST_BYTES: Final = 4 << 20
@@ -77,7 +61,7 @@ _MOST_PROCESSORS: Final = 8192
 
 
 @dataclass
-class Machine:
+class Host:
     """One machine, and the interface in question."""
 
     ifname: str
@@ -98,12 +82,9 @@ class Machine:
         if name not in self.facts:
             try:
                 self.facts[name] = FACTS[name](self.ifname)
-            except Exception as error:  # noqa: BLE001 - pyroute2's errors share no base
-                lacks = (
-                    "NotSupported" in type(error).__name__ or getattr(error, "errno", 0) == errno.EOPNOTSUPP
-                )
-                text = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
-                text = NOT_SUPPORTED if lacks else text.replace("\0", "").strip()
+            except (OSError, struct.error, InterfaceError) as error:
+                lacks = getattr(error, "errno", 0) == errno.EOPNOTSUPP
+                text = NOT_SUPPORTED if lacks else getattr(error, "strerror", None) or str(error)
                 self.facts[name] = CannotLookError(text)
         found = self.facts[name]
         if isinstance(found, CannotLookError):
@@ -112,7 +93,6 @@ class Machine:
 
     @property
     def link(self) -> Adapter:
-        """The interface itself."""
         found: Adapter | None = self.fact("link")
         if found is None:
             raise CannotLookError("there is no such interface")
@@ -140,7 +120,6 @@ class Machine:
         return found
 
     def number(self, name: str) -> int:
-        """The whole number in a file."""
         text = self.text(name)
         try:
             return int(text)
@@ -156,11 +135,9 @@ class Machine:
 
     @cached_property
     def processors(self) -> list[int]:
-        """The online processors."""
         return processor_list(self.text("/sys/devices/system/cpu/online"))
 
     def commands_running(self) -> dict[int, str]:
-        """The visible processes by PID, with their short names."""
         pids = [int(name) for name in self.names("/proc") if name.isdecimal()]
         return {pid: name for pid in pids if (name := self.text(f"/proc/{pid}/comm", ""))}
 

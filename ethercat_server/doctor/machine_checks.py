@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from ethercat_server.access.adapters import Adapter
+from ethercat_server.access.adapters import Adapter, is_wireless
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE
-from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.report import (
     CannotLookError,
-    Finding,
+    CheckResult,
     bad,
     examine,
     graded,
@@ -35,10 +35,10 @@ from ethercat_server.ethercat.nic import (
     network_trouble,
 )
 
-Look = Callable[[Machine], Finding | Iterable[Finding]]
+Look = Callable[[Host], CheckResult | Iterable[CheckResult]]
 
 
-def examine_machine(machine: Machine) -> Iterator[Finding]:
+def examine_machine(machine: Host) -> Iterator[CheckResult]:
     """All checks that need no bus."""
     there = True
     for (subject, name), look in CHECKS.items():
@@ -59,7 +59,7 @@ def examine_machine(machine: Machine) -> Iterator[Finding]:
 _SWITCH: Final = "/sys/kernel/debug/sched/preempt"
 
 
-def _preemption(machine: Machine) -> Finding:
+def _preemption(machine: Host) -> CheckResult:
     version, switch = machine.text("/proc/version", ""), machine.text(_SWITCH, "")
     if machine.text("/sys/kernel/realtime", "") == "1" or "PREEMPT_RT" in version:
         return ok("fully preemptible (PREEMPT_RT)", model="rt")
@@ -88,7 +88,7 @@ def _preemption(machine: Machine) -> Finding:
 _CAPABILITIES: Final = NEEDED_CAPABILITIES | {14: "CAP_IPC_LOCK", 23: "CAP_SYS_NICE"}
 
 
-def _capabilities(machine: Machine) -> Finding:
+def _capabilities(machine: Host) -> CheckResult:
     missing = missing_capabilities(machine.text("/proc/self/status"), _CAPABILITIES)
     held = [name for name in _CAPABILITIES.values() if name not in missing]
     without = (
@@ -113,7 +113,7 @@ _LIGHT_US: Final = 10
 _PERMANENT: Final = "to make it permanent: 'tuned-adm profile latency-performance'"
 
 
-def _governor(machine: Machine) -> Finding:
+def _governor(machine: Host) -> CheckResult:
     files = (f"{_CPUS}/cpu{number}/cpufreq/scaling_governor" for number in machine.processors)
     found = Counter(name for file in files if (name := machine.text(file, "")))
     slow = "an idle processor runs slowly at first, just when the server wakes"
@@ -126,7 +126,7 @@ def _governor(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _idle_states(machine: Machine) -> Finding:
+def _idle_states(machine: Host) -> CheckResult:
     states: dict[tuple[str, str], int] = {}
     for number in machine.processors:
         folder = f"{_CPUS}/cpu{number}/cpuidle"
@@ -154,7 +154,7 @@ def _idle_states(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _latency_limit_us(machine: Machine) -> int | None:
+def _latency_limit_us(machine: Host) -> int | None:
     """The limit that programs set in /dev/cpu_dma_latency; None if none, or only root can see it."""
     try:
         with machine.path(_LATENCY_FILE).open("rb") as file:
@@ -179,7 +179,7 @@ _LIST: Final = "ethercat-sensor adapters"
 _CORRUPTED: Final = "corrupted: check cable, connectors, shield and sources of interference"
 
 
-def _link_state(machine: Machine) -> Finding:
+def _link_state(machine: Host) -> CheckResult:
     if machine.fact("link") is None:
         return bad(
             f"no network interface {machine.ifname!r}",
@@ -200,7 +200,7 @@ def _link_state(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _speed(machine: Machine) -> Finding:
+def _speed(machine: Host) -> CheckResult:
     if not machine.link.carrier:
         raise CannotLookError("no carrier")
     mbits, duplex = machine.fact("settings")
@@ -218,10 +218,9 @@ def _speed(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _driver(machine: Machine) -> Finding:
-    kind, folder = machine.link.kind, f"/sys/class/net/{machine.ifname}"
-    found, bus = machine.fact("driver")
-    wireless = any(machine.path(f"{folder}/{mark}").exists() for mark in ("wireless", "phy80211"))
+def _driver(machine: Host) -> CheckResult:
+    kind, (found, bus) = machine.link.kind, machine.fact("driver")
+    wireless = is_wireless(machine.path(f"/sys/class/net/{machine.ifname}"))
     text = f"{found} on {bus}" if bus and bus != "N/A" else found
     return graded(
         text + (f", {kind}" if kind and kind != found else ""),
@@ -233,7 +232,7 @@ def _driver(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _coalescing(machine: Machine) -> Finding:
+def _coalescing(machine: Host) -> CheckResult:
     found = machine.fact("coalescing")
     adaptive = [name.split("_")[2] for name in _ADAPTIVE if found.get(name)]
     on = [f"{name[:2]} {found[name]} µs" for name in _DELAYS if found.get(name)]
@@ -247,7 +246,7 @@ def _coalescing(machine: Machine) -> Finding:
     )
 
 
-def _energy_efficient_ethernet(machine: Machine) -> Finding:
+def _energy_efficient_ethernet(machine: Host) -> CheckResult:
     enabled, active = machine.fact("EEE")
     mend = f"sudo ethtool --set-eee {machine.shown} eee off"
     return graded(
@@ -258,7 +257,7 @@ def _energy_efficient_ethernet(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def rising(before: Mapping[str, int], after: Mapping[str, int]) -> Finding:
+def rising(before: Mapping[str, int], after: Mapping[str, int]) -> CheckResult:
     """Errors that the card counted during the measurement."""
     if not before or not after:
         raise CannotLookError("the kernel provides no counters")
@@ -280,7 +279,7 @@ _DHCP_CLIENTS: Final = frozenset({"dhclient", "dhcpcd", "udhcpc", "connmand", "w
 _LEFT_ALONE: Final = frozenset({"unmanaged", "initialized", "pending", "linger"})  # by systemd-networkd
 
 
-def _managers(machine: Machine) -> Iterator[Finding]:
+def _managers(machine: Host) -> Iterator[CheckResult]:
     index, name, found = machine.link.ifindex, machine.shown, {}
     state = machine.text(f"/run/NetworkManager/devices/{index}", "")
     if re.search(r"^managed=(true|1)$", state, re.MULTILINE):
@@ -310,7 +309,7 @@ def _managers(machine: Machine) -> Iterator[Finding]:
         )
 
 
-def _addresses(machine: Machine) -> Finding:
+def _addresses(machine: Host) -> CheckResult:
     found: Routes = machine.fact("routes")
     name, delays = machine.shown, "IP traffic delays the sensor's frames"
     text = ", ".join([*found.addresses, *(f"route to {route}" for route in found.others)])
@@ -331,7 +330,7 @@ def _addresses(machine: Machine) -> Finding:
     )  # fmt: skip
 
 
-def _membership(machine: Machine) -> Iterator[Finding]:
+def _membership(machine: Host) -> Iterator[CheckResult]:
     link, name = machine.link, machine.shown
     if link.master:
         yield bad(

@@ -1,4 +1,4 @@
-"""Findings: the result of a check, with its severity, effect and remedy; and their output as text or JSON."""
+"""What a check finds, with its severity, effect and remedy; and their output as text or JSON."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _COLORS: Final = dict(zip(NAMES, ("\x1b[32m", "\x1b[2m", "\x1b[36m", "\x1b[33m",
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckResult:
     """One line of the report."""
 
     level: Level
@@ -41,14 +41,13 @@ class Finding:
     check: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """Its JSON form."""
         names = ("subject", "check", "level", "found", "why", "commands", "values")
         return {name: getattr(self, name) for name in names} | {"level": NAMES[self.level]}
 
 
-def finding(level: Level, found: str, why: str = "", /, *commands: str, **values: Any) -> Finding:
+def finding(level: Level, found: str, why: str = "", /, *commands: str, **values: Any) -> CheckResult:
     """A finding of any level."""
-    return Finding(level, found, why, commands, values)
+    return CheckResult(level, found, why, commands, values)
 
 
 ok = functools.partial(finding, Level.GOOD)  # nothing to fix
@@ -57,10 +56,10 @@ warning = functools.partial(finding, Level.LOOK)  # loses samples or increases t
 bad = functools.partial(finding, Level.TROUBLE)  # sensors cannot be read, or not reliably
 
 # Whether it applies, and what is found then: the level's function above, the effect, commands.
-Limit = tuple[object, Callable[..., Finding], str, *tuple[str, ...]]
+Grade = tuple[object, Callable[..., CheckResult], str, *tuple[str, ...]]
 
 
-def graded(found: str, *limits: Limit, why: str = "", **values: Any) -> Finding:
+def graded(found: str, *limits: Grade, why: str = "", **values: Any) -> CheckResult:
     """The finding by the first of the `limits` that applies; `ok`, and `why`, if none does."""
     for applies, make, effect, *commands in limits:
         if applies:
@@ -68,9 +67,9 @@ def graded(found: str, *limits: Limit, why: str = "", **values: Any) -> Finding:
     return ok(found, why, **values)
 
 
-def skipped(why: str) -> Finding:
+def skipped(why: str, *, subject: str = "", check: str = "") -> CheckResult:
     """Not checked."""
-    return finding(Level.NOT_POSSIBLE, f"not checked: {why}")
+    return CheckResult(Level.NOT_POSSIBLE, f"not checked: {why}", subject=subject, check=check)
 
 
 class CannotLookError(Exception):
@@ -78,12 +77,12 @@ class CannotLookError(Exception):
 
 
 def examine(
-    subject: str, check: str, look: Callable[..., Finding | Iterable[Finding]], *arguments: object
-) -> Iterator[Finding]:
+    subject: str, check: str, look: Callable[..., CheckResult | Iterable[CheckResult]], *arguments: object
+) -> Iterator[CheckResult]:
     """What `look(*arguments)` finds, with the check's name; an error in the check is a finding too."""
     try:
         found = look(*arguments)
-        for each in (found,) if isinstance(found, Finding) else found:
+        for each in (found,) if isinstance(found, CheckResult) else found:
             each = replace(each, found=_here(each.found), why=_here(each.why))  # noqa: PLW2901
             yield replace(each, subject=subject, check=check)
         return
@@ -106,18 +105,18 @@ def _here(text: str) -> str:
 _SEE: Final = "see the checks of machine and bus"
 
 
-def worst(findings: Iterable[Finding]) -> Level:
+def worst(findings: Iterable[CheckResult]) -> Level:
     """The worst level, skipped checks aside."""
     return max((f.level for f in findings if f.level is not Level.NOT_POSSIBLE), default=Level.GOOD)
 
 
-def verdict(findings: Iterable[Finding]) -> Level:
+def verdict(findings: Iterable[CheckResult]) -> Level:
     """What all findings come to; notes are nothing to look at."""
     found = worst(findings)
     return found if found >= Level.LOOK else Level.GOOD
 
 
-def as_json(header: Mapping[str, Any], findings: Sequence[Finding]) -> str:
+def as_json(header: Mapping[str, Any], findings: Sequence[CheckResult]) -> str:
     """The whole report as one object."""
     found = {**header, "verdict": verdict(findings).key, "worst": NAMES[worst(findings)]}
     found |= {"findings": [f.as_json() for f in findings]}
@@ -161,8 +160,7 @@ class Report:
             self._stream.flush()
             self._waiting = True
 
-    def write(self, finding: Finding) -> None:
-        """One finding, under its subject."""
+    def write(self, finding: CheckResult) -> None:
         if finding.subject != self._subject:
             self.say(("\n" if self._subject else "") + self._painted(finding.subject, "\x1b[1m"))
             self._subject = finding.subject
@@ -172,7 +170,7 @@ class Report:
         for line in (*rest, *self._lines(finding.why), *(f"$ {visible(each)}" for each in finding.commands)):
             self.say(_INDENT + line)
 
-    def summary(self, findings: Sequence[Finding]) -> None:
+    def summary(self, findings: Sequence[CheckResult]) -> None:
         """The verdict, with what matters once more, for the rest may have scrolled away."""
         counts = {level: sum(f.level is level for f in findings) for level in reversed(NAMES)}
         text = ", ".join(f"{count} {_counted(level, count)}" for level, count in counts.items() if count)

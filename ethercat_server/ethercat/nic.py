@@ -21,7 +21,7 @@ import time
 from array import array
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.wire import ETHERTYPE
@@ -117,7 +117,16 @@ _ATTRIBUTE: Final = struct.Struct("=HH")
 _TYPE: Final = 0x3FFF
 _BUFFER: Final = 65536
 _LINK: Final = struct.Struct("=BxHiII")  # family, type, index, flags, change mask
-_IFLA_ADDRESS, _IFLA_NAME, _IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_INFO = 1, 3, 4, 5, 10, 18
+_ETHERNET: Final = 1
+_IFLA_ADDRESS, _IFLA_NAME, _IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_INFO, _IFLA_STATS = (
+    1,
+    3,
+    4,
+    5,
+    10,
+    18,
+    23,
+)
 _IFLA_CARRIER, _IFLA_LINK_NAMESPACE, _IFLA_NAMESPACE, _IFLA_ALTERNATIVE_NAME = 33, 37, 46, 53
 _INFO_KIND: Final = 1
 _IFF_UP, _IFF_LOOPBACK, _IFF_RUNNING = 0x1, 0x8, 0x40
@@ -130,9 +139,10 @@ _RTA_DST, _RTA_OIF = 1, 4
 _MAIN_TABLE: Final = 254
 _MADE_BY_KERNEL: Final = 2
 _LINK_SCOPE: Final = 253
-_SIOCETHTOOL, _GET_SETTINGS = 0x8946, 0x1
+_SIOCETHTOOL: Final = 0x8946
 _IFREQ: Final = struct.Struct("16sP16x")
-_SETTINGS: Final = struct.Struct("=I8xH14xH14x")  # command; the speed's low and high half
+# A request of linux/ethtool.h, and its answer: the speed's low half, duplex, the speed's high half.
+_GET_SETTINGS: Final = 0x01, struct.Struct("=12xHB13xH14x")
 _UNKNOWN_MBITS: Final = frozenset({0, 0xFFFF, 0xFFFFFFFF})
 _ETHERCAT_MBITS: Final = 100
 _BRIDGE: Final = "bridge"
@@ -154,6 +164,8 @@ class Interface(NamedTuple):
     kind: str  # of a virtual one, such as veth or bridge; empty for a network card
     link: int  # index of what it stands on, or of a veth pair's other end
     namespace: bytes  # of that, as the kernel numbers namespaces; empty if it is this one
+    is_ethernet: bool
+    stats: bytes  # struct rtnl_link_stats64
 
 
 def look_up(interface: str | int) -> Interface:
@@ -174,7 +186,18 @@ def _look_up(interface: str | int, namespace: bytes = b"") -> Interface:
     index, attributes = (interface, b"") if isinstance(interface, int) else (0, _named(interface))
     if namespace:
         attributes += _attribute(_IFLA_NAMESPACE, namespace)
-    (_, _, index, flags, _), found = next(_ask(_GET_LINK, _LINK, 0, 0, index, 0, 0, attributes=attributes))
+    return _interface(
+        *next(_ask(_GET_LINK, _LINK, 0, 0, index, 0, 0, attributes=attributes, dump=False)), namespace
+    )
+
+
+def interfaces() -> list[Interface]:
+    """All of this network namespace; OSError or struct.error."""
+    return [_interface(*found) for found in _ask(_GET_LINK, _LINK, *(0,) * 5)]
+
+
+def _interface(fixed: tuple[int, ...], found: dict[int, bytes], namespace: bytes = b"") -> Interface:
+    _, kind, index, flags, _ = fixed
     mtu, link, master, carrier = (
         int.from_bytes(found.get(name, b""), sys.byteorder)
         for name in (_IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_CARRIER)
@@ -191,6 +214,8 @@ def _look_up(interface: str | int, namespace: bytes = b"") -> Interface:
         kind=_text(_attributes(found.get(_IFLA_INFO, b"")).get(_INFO_KIND, b"")),
         link=link,
         namespace=found.get(_IFLA_LINK_NAMESPACE, namespace),
+        is_ethernet=kind == _ETHERNET,
+        stats=found.get(_IFLA_STATS, b""),
     )
 
 
@@ -270,18 +295,27 @@ def in_between(interface: str | int) -> str | None:
     return None
 
 
-def _link_mbits(name: str) -> int:
-    """Speed of a card's link; 0 if the driver does not say."""
-    settings = array("B", _SETTINGS.pack(_GET_SETTINGS, 0, 0))
-    request = _IFREQ.pack(os.fsencode(name), settings.buffer_info()[0])
+def ethtool(name: str, command: int, layout: struct.Struct) -> tuple[Any, ...]:
+    """The answer to a request of linux/ethtool.h; OSError if the driver does not know it."""
+    answer = array("B", struct.pack("=I", command).ljust(layout.size, b"\0"))
+    request = _IFREQ.pack(os.fsencode(name), answer.buffer_info()[0])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
-        try:
-            fcntl.ioctl(asked, _SIOCETHTOOL, request)
-        except OSError:
-            return 0
-    _, low, high = _SETTINGS.unpack(settings)
-    mbits: int = low | high << 16
-    return 0 if mbits in _UNKNOWN_MBITS else mbits
+        fcntl.ioctl(asked, _SIOCETHTOOL, request)
+    return layout.unpack(answer)
+
+
+def link_settings(name: str) -> tuple[int, int]:
+    """Mbit/s, 0 if the driver does not say, and duplex (0 half, 1 full); OSError."""
+    low, duplex, high = ethtool(name, *_GET_SETTINGS)
+    mbits = low | high << 16
+    return 0 if mbits in _UNKNOWN_MBITS else mbits, duplex
+
+
+def _link_mbits(name: str) -> int:
+    try:
+        return link_settings(name)[0]
+    except OSError:
+        return 0
 
 
 def why_silent(interface: str | int) -> str:
@@ -355,12 +389,11 @@ def network_trouble(ifname: str, routes: Routes) -> str | None:
 
 
 def _ask(
-    kind: int, layout: struct.Struct, *values: int, attributes: bytes = b""
+    kind: int, layout: struct.Struct, *values: int, attributes: bytes = b"", dump: bool = True
 ) -> Iterator[tuple[tuple[int, ...], dict[int, bytes]]]:
     """The kernel's answers: fixed part and attributes, by type. OSError or struct.error if it refuses."""
-    flags = _REQUEST if kind == _GET_LINK else _REQUEST | _DUMP
     request = layout.pack(*values) + attributes
-    request = _HEADER.pack(_HEADER.size + len(request), kind, flags, 0, 0) + request
+    request = _HEADER.pack(_HEADER.size + len(request), kind, _REQUEST | _DUMP * dump, 0, 0) + request
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as asked:
         asked.setblocking(False)  # the kernel answers before send returns
         asked.send(request)
@@ -376,7 +409,7 @@ def _ask(
                 body = data[at + _HEADER.size : at + size]
                 yield layout.unpack_from(body), _attributes(body[layout.size :])
                 at += size + 3 & ~3
-            if kind == _GET_LINK:
+            if not dump:
                 return
 
 

@@ -1,1 +1,1 @@
-"""The process itself: signals, scheduling, log, systemd. Imports only `ethercat_server.errors`."""
+"""The process itself: scheduling, log, privileges. Imports only `ethercat_server.errors`."""

@@ -31,7 +31,6 @@ class QueuedHandler(logging.Handler):
         self._writer: threading.Thread | None = None
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Have the line of an event written."""
         if self._waiting.qsize() >= MOST_LINES:
             self._dropped += 1
             return
@@ -118,7 +117,6 @@ class OneLine(logging.Formatter):
         self._program = program
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line of one event."""
         text = " | ".join(line.strip() for line in super().format(record).splitlines())
         priority = next((number for level, number in _PRIORITIES if record.levelno >= level), 7)
         return f"{self._program}: {text}" if self._program else f"<{priority}>{text}"
@@ -137,7 +135,6 @@ class Repetitions(logging.Filter):
         self._seen: dict[object, tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether `record` is to be logged."""
         now, key = time.monotonic(), (record.msg, getattr(record, "kind", ""))
         if len(self._seen) > _MOST_KINDS:
             self._seen.clear()

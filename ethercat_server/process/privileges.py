@@ -22,7 +22,6 @@ class User(NamedTuple):
     name: str  # empty for one that this machine does not know
 
     def __str__(self) -> str:
-        """Its description in messages."""
         return self.name or f"uid {self.uid}"
 
 

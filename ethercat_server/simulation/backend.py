@@ -1,6 +1,6 @@
 """The backend in memory (see `ethercat.backend`): virtual sensors on a simulated wire.
 
-Frames are processed by `virtual_sensor.bus.Bus` as those of a network interface are.
+Frames are processed by `virtual_sensor.bus.SlaveChain` as those of a network interface are.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class MemoryBackend:
         self.ifname = "memory"
         self.clock = SimulatedClock(machine)
         self.wire = Wire(machine)
-        self.sensors = virtual.Bus(slaves or (SensorOptions(),), self.clock.now_ns)
+        self.sensors = virtual.SlaveChain(slaves or (SensorOptions(),), self.clock.now_ns)
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
         self._free_at_ns = 0
@@ -38,25 +38,19 @@ class MemoryBackend:
         return obey(self.sensors, line)
 
     def become(self, machine: Machine) -> None:
-        """Run on this machine from now on."""
         self.clock.become(machine)
         self.wire.become(machine)
 
-    def open(self) -> None:
-        """See `Backend`."""
+    def open(self) -> None: ...
 
-    def close(self) -> None:
-        """See `Backend`."""
+    def close(self) -> None: ...
 
-    def check_present(self) -> None:
-        """See `Backend`."""
+    def check_present(self) -> None: ...
 
     def why_silent(self) -> str:
-        """See `Backend`."""
         return CHECK_CABLE
 
     def send(self, frame: bytes | bytearray) -> None:
-        """See `Backend`."""
         if (times := self.wire.carry()) is None:
             return
         outward_ns, round_trip_ns = times
@@ -77,7 +71,6 @@ class MemoryBackend:
         heapq.heappush(self._on_the_wire, (self.clock.now_ns, self._sent, frame))
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """See `Backend`."""
         clock, until_ns = self.clock, self.clock.now_ns + round(max(timeout_s, 0) * 1e9)
         if self._on_the_wire and self._on_the_wire[0][0] <= until_ns:
             arrives_ns, _, frame = heapq.heappop(self._on_the_wire)
@@ -89,5 +82,4 @@ class MemoryBackend:
         return None
 
     def arrived_ns(self) -> int:
-        """See `Backend`."""
         return self._arrived_ns

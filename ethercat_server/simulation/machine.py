@@ -48,16 +48,13 @@ class SimulatedClock:
         self._stall_at_ns = self._next_stall()
 
     def monotonic_ns(self) -> int:
-        """See `Clock`."""
         self.now_ns += _CALL_NS
         return self.now_ns
 
     def time_ns(self) -> int:
-        """See `Clock`."""
         return self.now_ns + self._ahead_ns
 
     def sleep(self, seconds: float) -> None:
-        """See `Clock`."""
         self.wake_at(self.now_ns + round(seconds * 1e9))
 
     def wake_at(self, due_ns: int) -> None:
@@ -68,16 +65,13 @@ class SimulatedClock:
             self._stall_at_ns = self._next_stall()
 
     def stall(self, duration_ns: float) -> None:
-        """The machine runs something else."""
         self.advance(self.now_ns + round(duration_ns))
 
     def become(self, machine: Machine) -> None:
-        """Be this machine from now on."""
         self._machine = machine
         self._stall_at_ns = self._next_stall()
 
     def set_realtime_back(self, seconds: float) -> None:
-        """CLOCK_REALTIME is set back."""
         self._ahead_ns -= round(seconds * 1e9)
 
     def at(self, due_ns: int, action: Callable[[], object]) -> None:
@@ -105,7 +99,6 @@ class Wire:
         self._chance = random.Random(machine.seed + 1)
 
     def become(self, machine: Machine) -> None:
-        """Be this machine's from now on."""
         self._machine = machine
 
     def carry(self) -> tuple[int, int] | None:

@@ -38,26 +38,21 @@ class InMemoryStream:
         self._told = True  # of that: the next call raises an error if not
 
     def fileno(self) -> int:
-        """See `Stream`."""
         return -1 if self.closed else self.number
 
     def peer_uid(self) -> int | None:
-        """See `Stream`."""
         over = self._ended and self._end_sent
         return None if self.closed or self._gone or self.other.closed or over else self.uid
 
     @property
     def readable(self) -> bool:
-        """Whether `recv` would not block."""
         return bool(self._received) or self._ended or self._gone
 
     @property
     def writable(self) -> bool:
-        """Whether `send` would not block."""
         return self._gone or self._end_sent or self.other.closed or self._room() > 0
 
     def recv(self, size: int, /) -> bytes:
-        """See `Stream`."""
         self._check_open()
         if not self._received:
             if not self._ended:
@@ -73,7 +68,6 @@ class InMemoryStream:
         return self.recv(len(self._received)) if self._received or not self._told else b""
 
     def send(self, data: bytes | memoryview, /) -> int:
-        """See `Stream`."""
         self._check_open()
         self._tell()
         if self._gone or self._end_sent:
@@ -87,12 +81,10 @@ class InMemoryStream:
         return count
 
     def end_sending(self) -> None:
-        """See `Stream`."""
         if not (self.closed or self._gone):
             self._end_sent = self.other._ended = True
 
     def close(self) -> None:
-        """See `Stream`."""
         if self._received:
             self.reset()
         elif not self.closed:
@@ -148,11 +140,9 @@ class InMemoryTransport:
         return client_end
 
     def listening(self) -> Sequence[int]:
-        """See `Transport`."""
         return tuple(self._arriving)
 
     def accept(self, fd: int) -> InMemoryStream | None:
-        """See `Transport`."""
         if not (arriving := self._arriving[fd]):
             return None
         stream = arriving.popleft()
@@ -164,7 +154,6 @@ class InMemoryTransport:
     def wait(
         self, readers: Collection[int], writers: Collection[int], seconds: float
     ) -> tuple[Sequence[int], Sequence[int]]:
-        """See `Transport`."""
         ready = self._ready(readers, writers)
         if ready[0] or ready[1] or seconds <= 0:
             return ready
@@ -172,14 +161,12 @@ class InMemoryTransport:
         return self._ready(readers, writers)
 
     def stop_listening(self) -> None:
-        """See `Transport`."""
         for arriving in self._arriving.values():
             for stream in arriving:
                 stream.reset()
         self._arriving.clear()
 
     def close(self) -> None:
-        """See `Transport`."""
         self.stop_listening()
 
     def _ready(self, readers: Collection[int], writers: Collection[int]) -> tuple[list[int], list[int]]:

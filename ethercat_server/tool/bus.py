@@ -18,7 +18,7 @@ from ethercat_server.ethercat.slave import sii
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.scan import NoSlaveError, look_safely, read_image
 from ethercat_server.sensor.sensor import Found, Identity
-from ethercat_server.tool.command import DONE, Command, chosen, columns, say, say_json, sensor_arguments
+from ethercat_server.tool.command import DONE, Subcommand, chosen, columns, say, say_json, sensor_arguments
 
 
 def _adapters(args: argparse.Namespace) -> int:
@@ -45,7 +45,7 @@ def _adapters(args: argparse.Namespace) -> int:
 
 
 def _find(args: argparse.Namespace) -> int:
-    found = [_look(row) for row in adapters()]
+    found = [_search(row) for row in adapters()]
     if args.json:
         say_json({"interfaces": found})
     else:
@@ -54,7 +54,7 @@ def _find(args: argparse.Namespace) -> int:
     return DONE if any(row["sensors"] for row in found) else FAILED
 
 
-def _look(row: Adapter) -> dict[str, Any]:
+def _search(row: Adapter) -> dict[str, Any]:
     """What is on an interface where looking disturbs nobody; the server that uses it is asked.
 
     `looked`: whether frames were sent, or its server was asked.
@@ -152,9 +152,9 @@ def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 COMMANDS = (
-    Command("adapters", "list the network adapters of this machine", (), _adapters),
-    Command("find", "look for sensors on all interfaces, without disturbing others", (), _find),
-    Command(
+    Subcommand("adapters", "list the network adapters of this machine", (), _adapters),
+    Subcommand("find", "look for sensors on all interfaces, without disturbing others", (), _find),
+    Subcommand(
         "eeprom", "read the slaves' SII (EEPROM): decoded, and raw words",
         sensor_arguments(all_if_none=True), _eeprom,
     ),

@@ -13,14 +13,12 @@ from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server.process import command_line
 from ethercat_server.tool import bus, filters, objects, settings
-from ethercat_server.tool.command import Command, say_json
+from ethercat_server.tool.command import Subcommand, say_json
 
 _PROGRAM: Final = "ethercat-sensor"
-_EXIT_CODES: Final = (
-    "exit codes: 0 done (plan: nothing to change), 1 failed, 2 wrong arguments, 3 plan: there are changes"
-)
+_EXIT_CODES: Final = "exit codes: 0 done, 1 failed, 2 wrong arguments, 3 apply --dry-run: there are changes"
 
-COMMANDS: Final[Mapping[str, Command]] = {
+COMMANDS: Final[Mapping[str, Subcommand]] = {
     command.name: command for module in (bus, objects, settings, filters) for command in module.COMMANDS
 }
 

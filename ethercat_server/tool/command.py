@@ -17,7 +17,7 @@ from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.sensor.sensor import Found
 
 DONE: Final = 0
-CHANGES: Final = 3  # exit code of `plan` when there is something to change
+CHANGES: Final = 3  # exit code of `apply --dry-run` when there is something to change
 _FORCE: Final = "--force"
 
 Argument = Callable[[Any], object]  # adds it to a parser
@@ -30,7 +30,7 @@ def argument(name: str, help_text: str, **options: Any) -> Argument:
     return lambda parser: parser.add_argument(name, help=help_text, **options)
 
 
-class Command(NamedTuple):
+class Subcommand(NamedTuple):
     """One subcommand."""
 
     name: str

@@ -14,7 +14,7 @@ from bota_ethercat.program.arguments import number
 from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS, SHORT_SINC, noise_limit
 from bota_ethercat.sensor.response import Response, Source, force_torque_response, noise_bandwidth
 from bota_ethercat.settings import start_up_defaults
-from ethercat_server.tool.command import DONE, Command, argument, columns, say, say_json, value_text
+from ethercat_server.tool.command import DONE, Subcommand, argument, columns, say, say_json, value_text
 
 FREQUENCIES_HZ: Final = (5, 10, 20, 50)
 DESIGNED_DEG: Final = 60.0  # phase margin of the loop if its sensor were ideal
@@ -41,7 +41,6 @@ class Choice(NamedTuple):
         return [self.response.phase_deg(hz) or 0.0 for hz in FREQUENCIES_HZ]
 
     def as_json(self) -> dict[str, Any]:
-        """For programs."""
         return {
             **{name: getattr(self, name) for name in Choice._fields if name != "response"},
             "delay_ms": self.response.delay_ms,
@@ -50,7 +49,6 @@ class Choice(NamedTuple):
         }
 
     def cells(self) -> tuple[str, ...]:
-        """A row of the table."""
         limit = "" if self.noise_limit_n is None else f"{self.noise_limit_n:.2f}"
         return (
             str(self.sinc_length), "on" if self.fir else "off", str(self.rate_hz), f"{self.cutoff_hz:g}",
@@ -117,7 +115,7 @@ def _filters(args: argparse.Namespace) -> int:
 
 
 COMMANDS = (
-    Command(
+    Subcommand(
         "filters", "filters for a control loop: noise, delay, phase margin; needs no sensor",
         (
             argument("--loop", "rate of the control loop", metavar="HZ", type=_HERTZ, required=True),

@@ -25,7 +25,7 @@ from ethercat_server.sensor.sensor import Found
 from ethercat_server.sensor.set_up import read_sinc
 from ethercat_server.tool.command import (
     DONE,
-    Command,
+    Subcommand,
     argument,
     chosen,
     columns,
@@ -157,8 +157,8 @@ def _line(row: dict[str, Any]) -> tuple[str, ...]:
 _SENSORS: Final = sensor_arguments(all_if_none=True)
 _NAME: Final = "object: a name such as 'Sampling rate' or 'Force/Torque Offset', a setting, or 0x8006:1"
 COMMANDS: Final = (
-    Command("objects", "read and decode every object of the dictionary", _SENSORS, _objects),
-    Command(
+    Subcommand("objects", "read and decode every object of the dictionary", _SENSORS, _objects),
+    Subcommand(
         "read", "read and decode some objects by name",
         (*_SENSORS, argument("names", _NAME, nargs="+", metavar="NAME")), _read,
     ),

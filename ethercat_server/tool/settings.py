@@ -1,4 +1,4 @@
-"""`plan`, `apply`, `save`, `tare`, `snapshot` and `restore`: everything that is written to a sensor, and the
+"""`apply`, `save`, `tare`, `snapshot` and `restore`: everything that is written to a sensor, and the
 file that has all readable objects of one.
 
 What cannot be done as a whole is taken back: the former settings and offsets are in force then.
@@ -18,6 +18,7 @@ from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
 from bota_ethercat.errors import SettingError
 from bota_ethercat.pdo import AXES
 from bota_ethercat.program.new_file import NewFile
+from bota_ethercat.program.signals import signals_held_back
 from bota_ethercat.program.tare_memory import former, remember
 from bota_ethercat.sensor.meaning import meaning, value_meaning
 from bota_ethercat.settings import SETTINGS, SettingValue, check_settings
@@ -27,7 +28,6 @@ from ethercat_server.daemon.options import EMPTY, ServerOptions, parse_assignmen
 from ethercat_server.errors import BusError, SdoAbortError, ServerError, UsageError
 from ethercat_server.ethercat.datagrams import Steps, finish
 from ethercat_server.ethercat.slave.coe import Sdo
-from ethercat_server.process.signals import signals_held_back
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, KNOWN_OBJECTS, OBJECTS, Access, ObjectEntry
 from ethercat_server.sensor.sensor import Found, Identity, Sensor
@@ -37,7 +37,7 @@ from ethercat_server.sensor.undo import or_undone
 from ethercat_server.tool.command import (
     CHANGES,
     DONE,
-    Command,
+    Subcommand,
     argument,
     columns,
     report,
@@ -61,7 +61,7 @@ _TARE_IN_SERVER: Final = (
 )
 
 
-# -- plan, apply, save
+# -- apply, save
 
 
 def _changes(sensor: Sensor, settings: Mapping[str, SettingValue]) -> list[dict[str, Any]]:
@@ -90,7 +90,6 @@ def _changes(sensor: Sensor, settings: Mapping[str, SettingValue]) -> list[dict[
 
 
 def _change_lines(found: list[dict[str, Any]]) -> str:
-    """The changes as a table."""
     if not found:
         return "  nothing to change: all requested settings are in force"
     rows = [("setting", "now", "then", "meaning")]
@@ -98,66 +97,46 @@ def _change_lines(found: list[dict[str, Any]]) -> str:
     return columns(rows, indent=2)
 
 
-def _lasts(opened: Sensors, in_server: str = _UNSAVED_IN_SERVER) -> str:
-    """How long a change lasts that is not saved."""
-    return in_server if opened.private is None else _UNSAVED
-
-
-def _asked(args: argparse.Namespace) -> ServerOptions:
-    """The requested settings, parsed as the server does."""
-    if not args.assignments and args.config is None:
-        raise UsageError("no settings given: use --set NAME=VALUE or --config FILE.toml")
-    config = read_config(args.config) if args.config else EMPTY
-    return ServerOptions(args.iface or "", 0, file=config, assigned=parse_assignments(args.assignments))
-
-
-def _look(
-    opened: Sensors, found: Found, args: argparse.Namespace, options: ServerOptions
-) -> tuple[dict[str, SettingValue], Sensor, list[dict[str, Any]]]:
-    """The settings requested for a sensor, those in force, and the changes."""
-    options.check_sensors({sensor.number: sensor.identity for sensor in opened.sensors})
-    asked = options.asked_settings(found.number, found.identity.name, found.identity.serial)
-    if not asked:
-        raise UsageError(f"{args.config} has no settings for {found}: correct its tables, or use --set")
-    sensor = opened.in_force(found, asked)
-    return asked, sensor, _changes(sensor, asked)
-
-
-def _plan(args: argparse.Namespace) -> int:
-    options = _asked(args)
-    with sensor_of(args) as (opened, found):
-        _, sensor, changed = _look(opened, found, args, options)
-    now, changes = meaning(sensor.settings, sensor.rate_hz), {row["name"]: row["then"] for row in changed}
-    rate_hz = None if changes.keys() & {"sinc_length", "chop"} else sensor.rate_hz
-    then = meaning({**sensor.settings, **changes}, rate_hz)
-    lines = [_change_lines(changed)]
-    if changed:
-        lines.append("settings afterwards:\n  " + "\n  ".join(then.lines()))
-    if any(row["preop_only"] for row in changed):
-        lines.append("written in PREOP only: a stream through a server pauses for about 50 ms")
-    values = {"changes": changed, "now": now.as_json(), "then": then.as_json()}
-    report(args.json, opened, found, values, *lines)
-    return CHANGES if changed else DONE
+def _lasts(opened: Sensors, saved: bool = False, in_server: str = _UNSAVED_IN_SERVER) -> str:
+    """How long a change lasts."""
+    return _SAVED if saved else in_server if opened.private is None else _UNSAVED
 
 
 def _apply(args: argparse.Namespace) -> int:
-    options = _asked(args)
+    if not args.assignments and args.config is None:
+        raise UsageError("no settings given: use --set NAME=VALUE or --config FILE.toml")
+    config = read_config(args.config) if args.config else EMPTY
+    # Parsed as the server does.
+    options = ServerOptions(args.iface or "", 0, file=config, assigned=parse_assignments(args.assignments))
     with sensor_of(args) as (opened, found):
-        settings, after, changed = _look(opened, found, args, options)
-        if changed or args.save:
-            opened.configure(found.number, settings, args.save)
-        if changed:
-            after = opened.in_force(found, settings)
-    in_force = meaning(after.settings, after.rate_hz)
-    values = {
-        "changes": changed, "saved": args.save, "settings": after.settings, "rate_hz": after.rate_hz,
-        "meaning": in_force.as_json(),
-    }  # fmt: skip
-    lines = [_change_lines(changed), "in force:\n  " + "\n  ".join(in_force.lines())]
-    if changed or args.save:
-        lines.append(_SAVED if args.save else _lasts(opened))
+        options.check_sensors({sensor.number: sensor.identity for sensor in opened.sensors})
+        asked = options.asked_settings(found.number, found.identity.name, found.identity.serial)
+        if not asked:
+            raise UsageError(f"{args.config} has no settings for {found}: correct its tables, or use --set")
+        sensor = opened.in_force(found, asked)
+        changed = _changes(sensor, asked)
+        settings, rate_hz = sensor.settings, sensor.rate_hz
+        if args.dry_run:
+            changes = {row["name"]: row["then"] for row in changed}
+            settings = {**settings, **changes}
+            rate_hz = 0 if changes.keys() & {"sinc_length", "chop"} else rate_hz
+        elif changed or args.save:
+            opened.configure(found.number, asked, args.save)
+            if changed:
+                after = opened.in_force(found, asked)
+                settings, rate_hz = after.settings, after.rate_hz
+    means = meaning(settings, rate_hz)
+    what, lines = "settings afterwards" if args.dry_run else "in force", [_change_lines(changed)]
+    if changed or not args.dry_run:
+        lines.append(f"{what}:\n  " + "\n  ".join(means.lines()))
+    if args.dry_run and any(row["preop_only"] for row in changed):
+        lines.append("written in PREOP only: a stream through a server pauses for about 50 ms")
+    if (changed or args.save) and not args.dry_run:
+        lines.append(_lasts(opened, args.save))
+    values = {"changes": changed, "saved": args.save and not args.dry_run, "settings": settings}
+    values |= {"rate_hz": rate_hz or means.rate_hz, "meaning": means.as_json()}
     report(args.json, opened, found, values, *lines)
-    return DONE
+    return CHANGES if args.dry_run and changed else DONE
 
 
 def _save_now(opened: Sensors, found: Found) -> None:
@@ -201,7 +180,7 @@ def _tare(args: argparse.Namespace) -> int:
     rows: list[tuple[str, ...]] = [("", *(key.replace("_", " ") for key in keys), "")]
     for n, axis in enumerate(AXES):
         rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
-    lines = columns(rows, indent=2), _lasts(opened, _TARE_IN_SERVER)
+    lines = columns(rows, indent=2), _lasts(opened, in_server=_TARE_IN_SERVER)
     report(args.json, opened, found, {key: tared[key] for key in keys}, *lines)
     return DONE
 
@@ -307,7 +286,14 @@ def _as_json(address: Address, values: dict[str, Any]) -> dict[str, Any]:
 def _restore(args: argparse.Namespace) -> int:
     snapshot = read_snapshot(args.file)
     with sensor_of(args) as (opened, found):
-        _check_whose(found.identity, snapshot.identity, args)
+        sensor_is, file_is = found.identity, snapshot.identity
+        if (sensor_is.name, sensor_is.serial) != (file_is.name, file_is.serial) and not args.force:
+            raise ServerError(
+                f"{args.file} belongs to the {file_is}, but this is the {sensor_is}: connect that one, or "
+                "use --force"
+            )
+        if sensor_is.firmware != file_is.firmware:
+            note(f"{args.file} is of firmware {file_is.firmware}, the sensor now has {sensor_is.firmware}")
         sensor, sdo = opened.in_force(found, snapshot.settings), opened.sdo(found.number)
         settings = {name: value for name, value in snapshot.settings.items() if name in sensor.settings}
         missing = sorted(snapshot.settings.keys() - settings.keys())
@@ -331,22 +317,13 @@ def _restore(args: argparse.Namespace) -> int:
     if not changed and not differing:
         lines.append("  nothing to restore: the sensor already matches the file")
     if changed or differing or args.save:
-        lines.append(_SAVED if args.save else _lasts(opened))
+        lines.append(_lasts(opened, args.save))
     written = [
         _as_json(address, {"now": old.hex(), "then": new.hex()}) for address, (old, new) in differing.items()
     ]
     values = {"changes": changed, "objects": written, "left_alone": missing, "saved": args.save}
     report(args.json, opened, found, values, *lines)
     return DONE
-
-
-def _check_whose(sensor: Identity, file: Identity, args: argparse.Namespace) -> None:
-    if (sensor.name, sensor.serial) != (file.name, file.serial) and not args.force:
-        raise ServerError(
-            f"{args.file} belongs to the {file}, but this is the {sensor}: connect that one, or use --force"
-        )
-    if sensor.firmware != file.firmware:
-        note(f"{args.file} was taken with firmware {file.firmware}, the sensor now has {sensor.firmware}")
 
 
 def _put_back(
@@ -393,12 +370,14 @@ _SENSOR: Final = sensor_arguments()
 _SET: Final = "a setting; may be given more than once: " + "; ".join(
     f"{row.name} ({row.meaning})" for row in SETTINGS.values()
 )
+_SAVE: Final = argument("--save", "store it in the sensor's flash")
 _SETTINGS: Final = (
     *_SENSOR,
     argument("--set", _SET, action="append", default=[], metavar="NAME=VALUE", dest="assignments"),
     argument("--config", "settings from [sensor] or [sensor.0] of a file", type=Path, metavar="FILE.toml"),
+    _SAVE,
+    argument("--dry-run", "only show what it would do; exit code 3 if there is something to change"),
 )
-_SAVE: Final = argument("--save", "store it in the sensor's flash")
 # Here `--force` is for the file: replacing one must not stop a machine.
 _FILE: Final = (
     *sensor_arguments(take_over="--take-over"),
@@ -410,10 +389,9 @@ _TARGET: Final = "wrench the sensor is to read, in N and Nm (default: zeros)"
 
 
 COMMANDS: Final = (
-    Command("plan", "show what a change of settings would do, without doing it", _SETTINGS, _plan),
-    Command("apply", "change settings, all or none, and verify them", (*_SETTINGS, _SAVE), _apply),
-    Command("save", "store the sensor's parameters in its flash", _SENSOR, _save),
-    Command(
+    Subcommand("apply", "change settings, all or none, and verify them", _SETTINGS, _apply),
+    Subcommand("save", "store the sensor's parameters in its flash", _SENSOR, _save),
+    Subcommand(
         "tare", "set the force/torque offset so that the mean reading becomes zero",
         (
             *_SENSOR,
@@ -424,11 +402,11 @@ COMMANDS: Final = (
         ),
         _tare,
     ),
-    Command(
+    Subcommand(
         "snapshot", "write all readable objects to a file",
         (*_FILE, argument("--force", "replace an existing file")), _snapshot,
     ),
-    Command(
+    Subcommand(
         "restore", "write back what differs from a snapshot",
         (*_FILE, _SAVE, argument("--force", "accept a file of another sensor")), _restore,
     ),

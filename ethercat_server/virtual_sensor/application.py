@@ -10,13 +10,12 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, Final
 
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.coe import CoeServer, ObjectTable, SdoInformation
 from ethercat_server.virtual_sensor.device import Device, build_image
 from ethercat_server.virtual_sensor.esc import Esc
-from ethercat_server.virtual_sensor.mailbox import Mailbox
-from ethercat_server.virtual_sensor.options import EEPROM_MS
+from ethercat_server.virtual_sensor.mailbox import CoeServer, Mailbox, ObjectTable
+from ethercat_server.virtual_sensor.options import EEPROM_MS, SlaveOptions
 
 _ERROR: Final = 0x10  # error bit of AL status, acknowledge bit of AL control
 _ORDER: Final = (AlState.INIT, AlState.PREOP, AlState.SAFEOP, AlState.OP)
@@ -65,7 +64,7 @@ class Application:
         self.state = AlState.INIT
         self.error = False  # the error bit of AL status
         self.code = 0  # the AL status code
-        coe = CoeServer(objects, lambda: self.state, SdoInformation(objects, device).answer)
+        coe = CoeServer(objects, lambda: self.state)
         managers = self.esc.sync_managers
         self.mailbox = Mailbox(managers[0], managers[1], coe.answer, device.protocols)
         self._outputs = [(entry.address, entry.type.size) for entry in device.output_entries]
@@ -73,7 +72,6 @@ class Application:
         self._show_state()
 
     def inputs(self) -> bytes:
-        """The newest process data."""
         return b"".join(self.objects.read(*entry.address) for entry in self.device.input_entries)
 
     def outputs(self, data: bytes) -> None:
@@ -81,13 +79,9 @@ class Application:
         self._fed = self.clock()
         self.esc.memory[reg.WATCHDOG_STATUS] = 1
         if self.state is AlState.OP:
-            self.take_outputs(data)
-            if self.esc.sync_managers[_OUTPUTS].latches_pdi:
-                now = self.esc.clock.settle()
-                self.esc.clock.events.taken(now, reg.DC_PDI_START_EVENT, reg.DC_PDI_CHANGE_EVENT)
+            self.store_outputs(data)
 
-    def take_outputs(self, data: bytes) -> None:
-        """The master wrote the outputs, in OP."""
+    def store_outputs(self, data: bytes) -> None:
         at = 0
         for address, size in self._outputs:
             self.objects.values[address] = data[at : at + size]
@@ -96,11 +90,9 @@ class Application:
     def prepare(self, expected: int) -> None:
         """Compute what a frame at the time `expected` will read, while there is time."""
 
-    def state_changed(self) -> None:
-        """The AL state has changed."""
+    def state_changed(self) -> None: ...
 
     def al_control(self, control: int) -> None:
-        """The master asks for a state."""
         before, wanted = self.state, control & 0x0F
         if self.error and (control & _ERROR or wanted < before or wanted == AlState.INIT):
             self.error, self.code = False, 0
@@ -149,10 +141,8 @@ class Application:
         for manager, on in zip(managers, wanted[-len(self.device.sync_managers) :], strict=False):
             if on == manager.locked:
                 manager.allow(on)
-        latched = any(
-            m.latches_pdi and m.active and not (m.locked or m.mailbox or m.master_writes) for m in managers
-        )
-        self.esc.clock.events.latch(latched, self.clock())
+        inputs = managers[len(self.device.sync_managers) - 1]
+        self.esc.clock.events.latch(inputs.latches and inputs.active and not inputs.locked, self.clock())
         if self.esc.set_al_status(state | (_ERROR if self.error else 0), self.code):
             self.state_changed()
 
@@ -182,19 +172,40 @@ class Application:
             self.fail(AlState.SAFEOP, AlCode.SYNC_MANAGER_WATCHDOG)
 
     def mailbox_exchanged(self) -> None:
-        """A request has arrived, or the last reply has been taken."""
         self.mailbox.work()
 
     def repeat_requested(self) -> None:
-        """The last reply was lost on the way."""
         self.mailbox.repeat()
 
 
-def al_statistics(life: Application | None) -> dict[str, Any]:
-    """A slave's part of what the command `stats` reports of its power and AL state."""
-    return {
-        "powered": life is not None,
-        "al_state": life.state.name if life else None,
-        "al_error": life is not None and life.error,
-        "al_status_code": life.code if life else 0,
-    }
+class VirtualSlave:
+    """A slave, powered or not. `clock` gives the time in ns.
+
+    Attributes:
+        life: what runs in it from power-on to power-off.
+    """
+
+    options: SlaveOptions
+    life: Application | None = None
+
+    def __init__(self, clock: Callable[[], int]) -> None:
+        self._clock = clock
+
+    def power(self, on: bool) -> None:
+        """Switch it off or on; no effect if it already is."""
+        if not on:
+            self.life = None
+        elif self.life is None:
+            self.life = self._switched_on()
+
+    def _switched_on(self) -> Application:
+        raise NotImplementedError
+
+    def statistics(self) -> dict[str, Any]:
+        life = self.life
+        return {
+            "powered": life is not None,
+            "al_state": life.state.name if life else None,
+            "al_error": life is not None and life.error,
+            "al_status_code": life.code if life else 0,
+        }

@@ -2,7 +2,7 @@
 
 Time is an argument, in ns of any clock that only goes forward; nothing in here asks for it elsewhere:
 
-    bus = Bus((SensorOptions(serial=1), SensorOptions(serial=2)), now=0)
+    bus = SlaveChain((SensorOptions(serial=1), SensorOptions(serial=2)), now=0)
     if bus.process(frame, len(frame), now)  # an Ethernet frame, in place; False if it is lost on the bus
     bus.idle(now)                           # no frame for a while: watchdogs expire, power returns
     faults.obey(bus, "power off @1")        # a fault, as one line of text; answers "ok" or "error: ..."
@@ -17,53 +17,41 @@ from __future__ import annotations
 import contextlib
 import operator
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any, Final
 
 from ethercat_server.ethercat import wire
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.application import Application
+from ethercat_server.virtual_sensor.application import Application, VirtualSlave
 from ethercat_server.virtual_sensor.device import size_of
 from ethercat_server.virtual_sensor.esc import Esc, pass_through
 from ethercat_server.virtual_sensor.foreign import ForeignSlave, leave_in
 from ethercat_server.virtual_sensor.options import SensorOptions, SlaveOptions, UsageError
 from ethercat_server.virtual_sensor.sensor import VirtualSensor
 
-Slave = VirtualSensor | ForeignSlave
-
 _LONGEST_PERIOD_NS = 50_000_000
 _FIRST_STATION: Final = 0x1001  # where another master begins
 
 
-@dataclass(slots=True)
-class Damage:
-    """Frames that arrive corrupted at one port of one slave."""
-
-    slave: Slave
-    port: int  # 0: on the way out; 1: on the way back, from the slave behind
-    frames: int  # how many more
-
-
-class Bus:
+class SlaveChain:
     """Slaves in the order in which frames reach them. All times are in ns, on the caller's clock."""
 
     def __init__(self, slaves: Iterable[SlaveOptions], now: int) -> None:
         """All slaves are switched on at `now`."""
         self.now = now  # time of the latest call, or at which the latest datagram passed
-        self.slaves: list[Slave] = [
+        self.slaves: list[VirtualSlave] = [
             VirtualSensor(options, lambda: self.now)
             if isinstance(options, SensorOptions)
             else ForeignSlave(options, lambda: self.now)
             for options in slaves
         ]
         self.sensors = [slave for slave in self.slaves if isinstance(slave, VirtualSensor)]
-        self.disconnected: set[Slave] = set()  # those whose cable at port 0 is unplugged
+        self.disconnected: set[VirtualSlave] = set()  # those whose cable at port 0 is unplugged
         self.due: list[Callable[[], object]] = []  # for the end of the frame that is being processed
         self.frames = self.frames_lost = 0
         self.quit = False  # the program is to end
         self.repair()
-        self._power_events: list[tuple[int, Slave]] = []
+        self._power_events: list[tuple[int, VirtualSlave]] = []
         self._alive: list[Application] = []
         self._escs: list[Esc] = []
         self._last_frame = 0
@@ -71,10 +59,9 @@ class Bus:
         self._leave_behind()
 
     def repair(self) -> None:
-        """End what loses or damages frames."""
         self.lost: tuple[float, float] = (0, 0)  # the numbers of the frames that are: from this, before that
         self.deaf_until: float = 0  # no frame comes back before this time
-        self.damage: Damage | None = None  # of the next frames on the cable
+        self.damage: tuple[VirtualSlave, int] | None = None  # which gets so many more frames corrupted
 
     def _leave_behind(self) -> None:
         """Take slaves to the state of their options as another master does: all outputs, then all inputs."""
@@ -103,7 +90,6 @@ class Bus:
             life.esc.set_line(position, len(self._alive) - 1 - position)
 
     def lose(self, frames: float, after: int = 0) -> None:
-        """Lose so many frames, after so many that come back."""
         self.lost = self.frames + after, self.frames + after + frames
 
     def set_time(self, now: int) -> None:
@@ -115,8 +101,7 @@ class Bus:
             self.rewire()
         self.now = now
 
-    def power(self, slave: Slave, on: bool, seconds: float | None = None) -> None:
-        """Switch a slave on or off; on again after `seconds` unless None."""
+    def power(self, slave: VirtualSlave, on: bool, seconds: float | None = None) -> None:
         self._power_events = [event for event in self._power_events if event[1] is not slave]
         slave.power(on)
         if seconds is not None:
@@ -124,7 +109,7 @@ class Bus:
             self._power_events.sort(key=operator.itemgetter(0))
         self.rewire()
 
-    def connect(self, slave: Slave, connected: bool) -> None:
+    def connect(self, slave: VirtualSlave, connected: bool) -> None:
         """Plug or unplug the cable at port 0 of a slave, which keeps its power."""
         if connected:
             self.disconnected.discard(slave)
@@ -171,35 +156,28 @@ class Bus:
     def _damaged_at(self) -> int | None:
         """Count a corrupted frame in the error counters; how many slaves received it intact, None for all.
 
-        The slave that detects the error marks the frame; those it passes afterwards, on the way out at
-        port 0 and on the way back at port 1, count it as forwarded.
+        The slave that detects the error marks the frame; those it passes afterwards count it as forwarded, on
+        the way out at port 0 and on the way back at port 1.
         """
-        damage = self.damage
-        if damage is None or damage.slave.life not in self._alive:
+        if self.damage is None or self.damage[0].life not in self._alive:
             return None
-        damage.frames -= 1
-        if damage.frames <= 0:
-            self.damage = None
-        position = self._alive.index(damage.slave.life)
+        slave, frames = self.damage
+        self.damage = (slave, frames - 1) if frames > 1 else None
+        position = [life is slave.life for life in self._alive].index(True)
         for counter in (0, 1):
-            self._alive[position].esc.count(reg.RX_ERRORS + 2 * damage.port + counter)
-        if damage.port == 1:
-            back = self._alive[:position]
-        else:
-            for life in self._alive[position + 1 :]:
-                life.esc.count(reg.FORWARDED_ERRORS)
-            back = self._alive[:-1]
-        for life in back:
-            life.esc.count(reg.FORWARDED_ERRORS + 1)
-        return len(self._alive) if damage.port == 1 else position
+            self._escs[position].count(reg.RX_ERRORS + counter)
+        for esc in self._escs[position + 1 :]:
+            esc.count(reg.FORWARDED_ERRORS)
+        for esc in self._escs[:-1]:
+            esc.count(reg.FORWARDED_ERRORS + 1)
+        return position
 
-    def flap(self, slave: Slave, port: int) -> None:
-        """A link is lost and returns: the controllers at both ends count it."""
+    def flap(self, slave: VirtualSlave) -> None:
+        """The link at port 0 is lost and returns: the controllers at both ends count it."""
         position = self.slaves.index(slave)
-        ends = ((position, 0), (position - 1, 1)) if port == 0 else ((position, 1), (position + 1, 0))
-        for end, its_port in ends:
+        for end, port in ((position, 0), (position - 1, 1)):
             if 0 <= end < len(self._alive):
-                self._alive[end].esc.count(reg.LOST_LINKS + its_port)
+                self._escs[end].count(reg.LOST_LINKS + port)
 
     def prepare(self) -> None:
         """All waiting frames are answered: check the watchdogs, and compute the next samples ahead.
@@ -221,7 +199,6 @@ class Bus:
                 slave.life.check_watchdog(now)
 
     def statistics(self) -> dict[str, Any]:
-        """What the command `stats` reports."""
         return {
             "frames": self.frames,
             "frames_lost": self.frames_lost,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 import threading
@@ -11,13 +10,14 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
-from bota_ethercat.program.arguments import Parser, number
+from bota_ethercat.program.arguments import Parser, number, whole
 from bota_ethercat.program.output import ends_with_its_reader
+from bota_ethercat.program.real_time import make_real_time
+from bota_ethercat.program.signals import signals_call
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import look_up
 from ethercat_server.process.realtime import DEFAULT_PRIORITY
-from ethercat_server.process.signals import signals_call
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_clock
@@ -29,7 +29,6 @@ from ethercat_server.virtual_sensor.options import (
     SlaveOptions,
     UsageError,
     model_name,
-    whole,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
 from ethercat_server.virtual_sensor.world import FAULT, LOST, ExternalWorld
@@ -152,11 +151,8 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
 
 def _get_priority() -> None:
     """That of SCHED_FIFO above a master's: real sensors do not wait for a CPU."""
-    priority = DEFAULT_PRIORITY + 1
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except PermissionError:
-        _say(f"not granted: real-time priority {priority} (CAP_SYS_NICE); samples may come late")
+    if refused := make_real_time(DEFAULT_PRIORITY + 1).refused:
+        _say(f"not granted: {', '.join(refused)}; samples may come late")
 
 
 @ends_with_its_reader

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave import sii
 from ethercat_server.sensor.objects.dictionary import (
     Access,
@@ -18,12 +19,12 @@ from ethercat_server.sensor.objects.dictionary import (
     ObjectType,
     with_highest_subindices,
 )
-from ethercat_server.virtual_sensor import registers as reg
 
 MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS = range(1, 5)  # kinds of sync managers, as in object 0x1C00
 _NO_MAILBOX: Final = sii.MailboxProtocol(0)
 _COE_SDO, _COE_SDO_INFORMATION = 0x01, 0x02
 _IMAGE_SIZE: Final = 2048
+PDI_TYPE: Final = 0x05  # SPI slave, as the register says too
 
 
 class SyncManagerRow(NamedTuple):
@@ -76,12 +77,10 @@ class Device:
 
     @property
     def output_entries(self) -> list[ObjectEntry]:
-        """What the outputs carry, in their order."""
         return [entry for pdo in self.outputs for entry in pdo.entries]
 
     @property
     def input_entries(self) -> list[ObjectEntry]:
-        """What the inputs carry, in their order."""
         return [entry for pdo in self.inputs for entry in pdo.entries]
 
 
@@ -153,7 +152,7 @@ def build_image(device: Device) -> bytes:
         for row in device.sync_managers
     )
     head = bytearray(sii.CATEGORIES_WORD * 2)
-    head[0] = reg.PDI_TYPE
+    head[0] = PDI_TYPE
     head[sii.CHECKED_BYTES] = sii.checksum(head[: sii.CHECKED_BYTES])
     sii.IDENTITY.pack_into(
         head, sii.IDENTITY_BYTE, device.vendor, device.product, device.revision, device.serial

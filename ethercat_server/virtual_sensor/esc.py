@@ -11,15 +11,75 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import BYTE_NS, Command, Datagram
-from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, DistributedClock
+from ethercat_server.virtual_sensor.device import PDI_TYPE
+from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, DcUnit
 
 _U16, _AL_STATUS = struct.Struct("<H"), struct.Struct("<HHH")
 _REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
 _DC_SYSTEM_TIME, _DC_RECEIVE_TIME = reg.DC_SYSTEM_TIME, reg.DC_RECEIVE_TIME
-_DC_ECAT_EVENT, _DC_CHANGE_EVENT = reg.DC_ECAT_EVENT, reg.DC_PDI_CHANGE_EVENT
+_DC_CHANGE_EVENT = reg.DC_PDI_CHANGE_EVENT
 _LINE_GOES_ON, _LINE_ENDS = 0x5A33, 0x5613  # DL status: ports 0 and 1 have a link, or only port 0
+
+
+# The controller has two ports, these, 4 KB of process data memory, and a distributed clock of 64 bits.
+FMMU_COUNT: Final = 3
+SYNC_MANAGER_COUNT: Final = 4
+MEMORY_KB: Final = 4
+MEMORY_END: Final = reg.REGISTERS_END + MEMORY_KB * 1024
+# Repeat request in a sync manager's activate register, repeat acknowledge in its PDI control register.
+REPEAT: Final = 0x02
+
+# Counters: a write of any value to one of a group sets the whole group to zero.
+CLEARED_BY_WRITE: Final = (
+    range(reg.RX_ERRORS, reg.FORWARDED_ERRORS + reg.PORT_COUNT),
+    range(reg.PROCESSING_UNIT_ERRORS, reg.PROCESSING_UNIT_ERRORS + 1),
+    range(reg.PDI_ERRORS, reg.PDI_ERRORS + 1),
+    range(reg.LOST_LINKS, reg.LOST_LINKS + reg.PORT_COUNT),
+    range(reg.WATCHDOG_COUNTER, reg.WATCHDOG_COUNTER + 2),
+)
+_SYNC_MANAGERS = range(
+    reg.SYNC_MANAGER, reg.SYNC_MANAGER + SYNC_MANAGER_COUNT * reg.SYNC_MANAGER_SIZE, reg.SYNC_MANAGER_SIZE
+)
+# Register, bytes, and which bits of each a master may write.
+_WRITABLE: Final = (
+    (reg.STATION_ADDRESS, 2, 0xFF), (reg.DL_CONTROL, 4, 0xFF), (reg.AL_CONTROL, 2, 0xFF),
+    *((counters.start, len(counters), 0xFF) for counters in CLEARED_BY_WRITE),
+    (reg.WATCHDOG_DIVIDER, 2, 0xFF), (reg.WATCHDOG_TIME, 2, 0xFF),
+    (reg.SII_OWNER, 1, 0x03), (reg.SII_CONTROL, 1, 0x01), (reg.SII_CONTROL + 1, 1, 0x07),
+    (reg.SII_ADDRESS, 8, 0xFF),
+    *((reg.FMMU + number * reg.FMMU_SIZE, 13, 0xFF) for number in range(FMMU_COUNT)),
+    *((manager, 5, 0xFF) for manager in _SYNC_MANAGERS),
+    *((manager + reg.SM_ACTIVATE, 1, 0xC3) for manager in _SYNC_MANAGERS),
+    (reg.DC_RECEIVE_TIMES, 4, 0xFF), (reg.DC_SYSTEM_TIME, 8, 0xFF), (reg.DC_OFFSET, 12, 0xFF),
+    (reg.DC_ACTIVATION, 2, 0xFF),
+    (reg.USER_RAM, reg.REGISTERS_END - reg.USER_RAM, 0xFF),
+)  # fmt: skip
+
+
+def _write_mask() -> bytearray:
+    """For every register byte, the bits that a master may write."""
+    mask = bytearray(reg.REGISTERS_END)
+    for start, length, bits in _WRITABLE:
+        mask[start : start + length] = bytes([bits]) * length
+    return mask
+
+
+def _power_on_values() -> bytearray:
+    """Registers and memory of a controller that has just been switched on."""
+    memory = bytearray(MEMORY_END)
+    # Type, revision, build, FMMUs, sync managers, RAM in KB, ports 0 and 1 MII, features: FMMUs of bytes,
+    # distributed clock, of 64 bits, separate counting of check sum errors.
+    struct.pack_into(
+        "<BBHBBBBH", memory, reg.DL_INFORMATION,
+        0xC0, 2, 0, FMMU_COUNT, SYNC_MANAGER_COUNT, MEMORY_KB, 0x0F, 0x008D,
+    )  # fmt: skip
+    memory[reg.DL_CONTROL] = memory[reg.AL_CONTROL] = memory[reg.AL_STATUS] = memory[reg.WATCHDOG_STATUS] = 1
+    memory[reg.PDI_CONTROL] = PDI_TYPE
+    struct.pack_into("<H", memory, reg.WATCHDOG_DIVIDER, 2498)  # (2498 + 2) * 40 ns = 100 µs a tick
+    struct.pack_into("<H", memory, reg.WATCHDOG_TIME, 1000)
+    return memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +94,6 @@ class Fmmu:
 
     @classmethod
     def decode(cls, memory: bytearray, number: int) -> Fmmu | None:
-        """FMMU `number` from the registers; None if it is not active, or maps nothing, or single bits."""
         logical, length, first, last, physical, bit, kind, active = reg.FMMU_LAYOUT.unpack_from(
             memory, reg.FMMU + number * reg.FMMU_SIZE
         )
@@ -72,7 +131,6 @@ class SyncManager:
         self.reload()
 
     def reload(self) -> None:
-        """Take over what the registers say."""
         self.start, self.length, self.control = struct.unpack_from("<HHB", self._memory, self.registers)
         self.end = self.start + self.length
         self.mailbox = self.control & 0x03 == reg.SM_MAILBOX
@@ -80,8 +138,7 @@ class SyncManager:
         self.watched = bool(self.control & 0x40)  # writes to it trigger the process data watchdog
         activate = self._memory[self._activate]
         self.enabled = bool(activate & 1)
-        self.latches_ecat = bool(activate & reg.SM_LATCH_ECAT)
-        self.latches_pdi = bool(activate & reg.SM_LATCH_PDI)
+        self.latches = bool(activate & reg.SM_LATCH_PDI)
         self._refresh(self.enabled)
 
     def allow(self, allowed: bool) -> None:
@@ -92,7 +149,7 @@ class SyncManager:
     def _refresh(self, on: bool) -> None:
         # Switched off by the firmware, a sync manager goes on guarding its memory: nobody gets in.
         self.locked = bool(self._memory[self._pdi_control] & 1)
-        inside = self.start >= reg.REGISTERS_END and self.end <= reg.MEMORY_END
+        inside = self.start >= reg.REGISTERS_END and self.end <= MEMORY_END
         self.active = self.enabled and self.length > 0 and inside
         if not on:
             self.full = self.open = False
@@ -102,10 +159,10 @@ class SyncManager:
 
     def repeat_asked(self) -> bool:
         """Whether the master has newly asked for the last mailbox again, by a toggle bit; acknowledges it."""
-        asked = self._memory[self._activate] & reg.REPEAT
-        if asked == self._memory[self._pdi_control] & reg.REPEAT:
+        asked = self._memory[self._activate] & REPEAT
+        if asked == self._memory[self._pdi_control] & REPEAT:
             return False
-        self._set(self._pdi_control, reg.REPEAT, bool(asked))
+        self._set(self._pdi_control, REPEAT, bool(asked))
         return True
 
     @property
@@ -127,13 +184,11 @@ class SyncManager:
         return may
 
     def load(self, message: bytes) -> None:
-        """The firmware fills the read mailbox."""
         self._memory[self.start : self.end] = message.ljust(self.length, b"\0")[: self.length]
         self.open = False
         self.full = True
 
     def content(self) -> bytes:
-        """The whole buffer, as the firmware sees it."""
         return bytes(self._memory[self.start : self.end])
 
 
@@ -181,7 +236,6 @@ class SiiInterface:
             self._end(0)
 
     def command(self) -> None:
-        """Execute the command in the control register at the word in the address register."""
         control, word = struct.unpack_from("<HI", self._memory, reg.SII_CONTROL)
         self.advance()
         operation = control >> 8 & 0x07
@@ -219,14 +273,13 @@ class Esc:
     """Registers and memory of one controller."""
 
     def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
-        """`sii_read_ns` is how long reading from the EEPROM takes."""
         self._pdi = pdi
-        self.memory = reg.power_on_values()
+        self.memory = _power_on_values()
         self.memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = sii_image[8:10]
-        self._write_mask = reg.write_mask()
+        self._write_mask = _write_mask()
         self.sii = SiiInterface(self.memory, sii_image, pdi.clock, sii_read_ns)
-        self.clock = DistributedClock(self.memory, self._write_mask, pdi.clock)
-        self.sync_managers = [SyncManager(self.memory, n) for n in range(reg.SYNC_MANAGER_COUNT)]
+        self.clock = DcUnit(self.memory, self._write_mask, pdi.clock)
+        self.sync_managers = [SyncManager(self.memory, n) for n in range(SYNC_MANAGER_COUNT)]
         self.fmmus: list[Fmmu] = []  # the active ones
         # What each logical command copies, by address and length; emptied when an FMMU changes.
         self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
@@ -250,7 +303,6 @@ class Esc:
             _U16.pack_into(self.memory, reg.DL_STATUS, status)
 
     def set_al_status(self, status: int, code: int) -> bool:
-        """Show AL status (state and error bit) and AL status code; False if they are as before."""
         was, _, code_was = _AL_STATUS.unpack_from(self.memory, reg.AL_STATUS)
         if (was, code_was) == (status, code):
             return False
@@ -290,11 +342,10 @@ class Esc:
         owner = self._owner(address, end)
         if owner is not None:
             return self._write_manager(owner, address - owner.start, data)
-        self.memory[address:end] = data[: reg.MEMORY_END - address]
-        return address < reg.MEMORY_END and bool(data)
+        self.memory[address:end] = data[: MEMORY_END - address]
+        return address < MEMORY_END and bool(data)
 
     def _owner(self, start: int, end: int) -> SyncManager | None:
-        """The first active sync manager that guards any of this memory."""
         return next((m for m in self.sync_managers if m.active and m.start < end and start < m.end), None)
 
     def _read_manager(self, manager: SyncManager, offset: int, length: int) -> bytes | None:
@@ -318,8 +369,6 @@ class Esc:
 
     def _exchanged(self, manager: SyncManager) -> None:
         """The master has read or written the last byte of a buffer."""
-        if manager.latches_ecat and self.clock.present:
-            self.clock.events.taken(self.clock.frame_start + self.clock.way_ns, reg.DC_ECAT_EVENT)
         if manager.mailbox:
             manager.full = manager.master_writes
             self._pdi.mailbox_exchanged()
@@ -327,13 +376,12 @@ class Esc:
             self._pdi.outputs(manager.content())
 
     def read_registers(self, start: int, end: int) -> bytes | bytearray:
-        """Registers `start` to `end`, as a master reads them."""
         clock = self.clock
         if end > _DC_SYSTEM_TIME and start < _DC_END and clock.present:
             if start < _DC_RECEIVE_TIME:
                 clock.show_system_time()
-            if end > _DC_ECAT_EVENT:
-                clock.events.update(self._pdi.clock() + clock.way_ns, starts=start < _DC_CHANGE_EVENT)
+            if end > _DC_CHANGE_EVENT:
+                clock.events.update(self._pdi.clock() + clock.way_ns)
         if start > _DC_RECEIVE_TIMES:
             return self.memory[start:end]
         if start < reg.SII_DATA and end > reg.SII_CONTROL:
@@ -350,7 +398,7 @@ class Esc:
             if not mask or any(first <= at < first + reg.SM_STATUS for first in locked):
                 continue  # a sync manager's area can be changed only while it is disabled
             self.memory[at] = self.memory[at] & ~mask | value & mask
-        for counters in reg.CLEARED_BY_WRITE:
+        for counters in CLEARED_BY_WRITE:
             if address < counters.stop and end > counters.start:
                 self.memory[counters.start : counters.stop] = bytes(len(counters))
         self._after_write(address, end)
@@ -366,23 +414,18 @@ class Esc:
             (self.station,) = _U16.unpack_from(self.memory, reg.STATION_ADDRESS)
         if touched(reg.SII_CONTROL, 2):
             self.sii.command()
-        if touched(reg.FMMU, reg.FMMU_COUNT * reg.FMMU_SIZE):
+        if touched(reg.FMMU, FMMU_COUNT * reg.FMMU_SIZE):
             self.plans.clear()
-            every = (Fmmu.decode(self.memory, n) for n in range(reg.FMMU_COUNT))
+            every = (Fmmu.decode(self.memory, n) for n in range(FMMU_COUNT))
             self.fmmus = [fmmu for fmmu in every if fmmu is not None]
-        if touched(reg.SYNC_MANAGER, reg.SYNC_MANAGER_COUNT * reg.SYNC_MANAGER_SIZE):
+        if touched(reg.SYNC_MANAGER, SYNC_MANAGER_COUNT * reg.SYNC_MANAGER_SIZE):
             for manager in self.sync_managers:
                 manager.reload()
             self._pdi.sync_managers_changed()
             if self.sync_managers[1].repeat_asked():
                 self._pdi.repeat_requested()
-        if self.clock.present and end > reg.DC_RECEIVE_TIMES and start < reg.DC_END:
-            if touched(reg.DC_RECEIVE_TIMES, 4):
-                self.clock.latch()
-            if touched(reg.DC_SPEED_START, 2):
-                self.clock.reset()
-            if touched(reg.DC_SYSTEM_TIME, 1):
-                self.clock.compare()
+        if self.clock.present and touched(reg.DC_RECEIVE_TIMES, 4):
+            self.clock.latch()
         if touched(reg.AL_CONTROL, 2):
             self._pdi.al_control(_U16.unpack_from(self.memory, reg.AL_CONTROL)[0])
 

@@ -14,13 +14,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from bota_ethercat.program.arguments import number
+from bota_ethercat.program.arguments import number, whole
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.virtual_sensor.application import Application
-from ethercat_server.virtual_sensor.bus import Bus, Damage, Slave
+from ethercat_server.virtual_sensor.application import Application, VirtualSlave
+from ethercat_server.virtual_sensor.bus import SlaveChain
 from ethercat_server.virtual_sensor.distributed_clock import parse_word
 from ethercat_server.virtual_sensor.esc import SiiInterface
-from ethercat_server.virtual_sensor.options import Command, UsageError, model_name, whole
+from ethercat_server.virtual_sensor.options import Fault, UsageError, model_name
 from ethercat_server.virtual_sensor.sampler import CHANNELS, MOST_SKIPPED
 from ethercat_server.virtual_sensor.sensor import Firmware, VirtualSensor
 from ethercat_server.virtual_sensor.signals import SIGNALS
@@ -33,37 +33,26 @@ PPM_LIMIT: Final = 100_000.0
 class Call:
     """A command for a slave of a bus."""
 
-    bus: Bus
-    slave: Slave
+    bus: SlaveChain
+    slave: VirtualSlave
 
     @property
     def sensor(self) -> VirtualSensor:
-        """The sensor it is for; UsageError if it is for a foreign slave."""
         if not isinstance(self.slave, VirtualSensor):
             raise UsageError("that slave is no sensor: choose one with `@N`")
         return self.slave
 
     @property
     def application(self) -> Application:
-        """What runs in the slave; UsageError if it has no power."""
         if self.slave.life is None:
             raise UsageError("it has no power: use `power on` first")
         return self.slave.life
 
     @property
     def firmware(self) -> Firmware:
-        """The sensor's firmware; UsageError if it has no power, or is for a foreign slave."""
         if self.sensor.life is None:
             raise UsageError("the sensor has no power: use `power on` first")
         return self.sensor.life
-
-    def _port(self, port: int) -> int:
-        if port == 1 and self.slave is self.bus.slaves[-1]:
-            raise UsageError("port 1 of the last slave is not connected")
-        return port
-
-    def _damage(self, frames: int, port: int = 0) -> None:
-        self.bus.damage = Damage(self.slave, self._port(port), frames) if frames else None
 
     def _power(self, how: str, seconds: float | None = None) -> None:
         if how not in ("on", "off", "cycle") or (how == "cycle") == (seconds is None):
@@ -106,7 +95,7 @@ class Call:
         apply(self.application.esc.clock)
 
 
-_COUNT, _LONG, _WORD, _BYTE, _PORT = (whole(0, most) for most in (2**31, 2**32 - 1, 0xFFFF, 0xFF, 1))
+_COUNT, _LONG, _WORD, _BYTE = (whole(0, most) for most in (2**31, 2**32 - 1, 0xFFFF, 0xFF))
 _AMOUNT = number(0, 1e6)
 
 
@@ -129,78 +118,77 @@ def _one_of(what: str, known: Sequence[str]) -> Callable[[str], str]:
 _CHANNEL = _one_of("channel", CHANNELS)
 
 
-COMMANDS: Final[tuple[Command, ...]] = (
-    Command("lose N", "lose the next N frames", lambda c, n: c.bus.lose(n), (_COUNT,)),
-    Command("deaf [SECONDS]", "lose every frame, until `hear` or for a time",
+COMMANDS: Final[tuple[Fault, ...]] = (
+    Fault("lose N", "lose the next N frames", lambda c, n: c.bus.lose(n), (_COUNT,)),
+    Fault("deaf [SECONDS]", "lose every frame, until `hear` or for a time",
             lambda c, seconds=math.inf: setattr(c.bus, "deaf_until", c.bus.now + seconds * 1e9), (_AMOUNT,)),
-    Command("deaf-after N", "lose every frame after the next N", lambda c, n: c.bus.lose(math.inf, n),
+    Fault("deaf-after N", "lose every frame after the next N", lambda c, n: c.bus.lose(math.inf, n),
             (_COUNT,)),
-    Command("hear", "end `deaf`, `deaf-after`, `lose` and `damage`", lambda c: c.bus.repair()),
-    Command("damage N [PORT] [@N]", "corrupt the next N frames on the cable at port 0 or 1 of this slave",
-            Call._damage, (_COUNT, _PORT)),
-    Command("flap [PORT] [@N]", "interrupt the link at port 0 or 1 for a moment",
-            lambda c, port=0: c.bus.flap(c.slave, c._port(port)), (_PORT,)),
-    Command("power off|on|cycle [SECONDS] [@N]",
+    Fault("hear", "end `deaf`, `deaf-after`, `lose` and `damage`", lambda c: c.bus.repair()),
+    Fault("damage N [@N]", "corrupt the next N frames on the cable before this slave",
+            lambda c, n: setattr(c.bus, "damage", (c.slave, n) if n else None), (_COUNT,)),
+    Fault("flap [@N]", "interrupt the link before this slave for a moment", lambda c: c.bus.flap(c.slave)),
+    Fault("power off|on|cycle [SECONDS] [@N]",
             "switch a slave off or on; those behind one without power are cut off",
             Call._power, (str, _AMOUNT)),
-    Command("disconnect [@N]", "unplug the cable at port 0", lambda c: c.bus.connect(c.slave, False)),
-    Command("connect [@N]", "end `disconnect`", lambda c: c.bus.connect(c.slave, True)),
-    Command("swap MODEL SERIAL [@N]", "replace the sensor by another one", Call._swap, (model_name, _LONG)),
-    Command("safeop CODE [@N]", "fall to SAFEOP with this AL status code",
+    Fault("disconnect [@N]", "unplug the cable at port 0", lambda c: c.bus.connect(c.slave, False)),
+    Fault("connect [@N]", "end `disconnect`", lambda c: c.bus.connect(c.slave, True)),
+    Fault("swap MODEL SERIAL [@N]", "replace the sensor by another one", Call._swap, (model_name, _LONG)),
+    Fault("safeop CODE [@N]", "fall to SAFEOP with this AL status code",
             lambda c, code: c.application.fail(AlState.SAFEOP, code), (_WORD,)),
-    Command("error CODE [@N]", "set the error bit and this AL status code",
+    Fault("error CODE [@N]", "set the error bit and this AL status code",
             lambda c, code: c.application.fail(c.application.state, code), (_WORD,)),
-    Command("abort INDEX SUBINDEX CODE [@N]", "abort the next SDO on that entry",
+    Fault("abort INDEX SUBINDEX CODE [@N]", "abort the next SDO on that entry",
             lambda c, index, sub, code: c.firmware.dictionary.aborts.update({(index, sub): code}),
             (_WORD, _BYTE, _LONG)),
-    Command("on-write INDEX SUBINDEX COMMAND ...", "execute a command after the next SDO write to that entry",
+    Fault("on-write INDEX SUBINDEX COMMAND ...", "execute a command after the next SDO write to that entry",
             Call._on_write, (_WORD, _BYTE, str)),
-    Command("saving SECONDS [STATUS] [@N]", "duration and final status of the save command (0 = success)",
+    Fault("saving SECONDS [STATUS] [@N]", "duration and final status of the save command (0 = success)",
             Call._saving, (_AMOUNT, whole(0, 0xFE))),
-    Command("cut-save N [@N]", "lose power in the next save after N entries", Call._cut_save,
+    Fault("cut-save N [@N]", "lose power in the next save after N entries", Call._cut_save,
             (whole(0, 1000),)),
-    Command("mute-mailbox N [@N]", "drop the next N mailbox requests",
+    Fault("mute-mailbox N [@N]", "drop the next N mailbox requests",
             lambda c, n: setattr(c.application.mailbox, "mute", n), (_COUNT,)),
-    Command("emergency CODE [REGISTER [HEX]] [@N]", "send a CoE emergency before all that the mailbox holds",
+    Fault("emergency CODE [REGISTER [HEX]] [@N]", "send a CoE emergency before all that the mailbox holds",
             Call._emergency, (_WORD, _BYTE, _hex)),
-    Command("sii error|busy|ok [@N]", "result of reading the EEPROM",
+    Fault("sii error|busy|ok [@N]", "result of reading the EEPROM",
             lambda c, result: c.application.esc.sii.fail(SiiInterface.FAULTS[result]),
             (_one_of("result", tuple(SiiInterface.FAULTS)),)),
-    Command("warn BITS [SAMPLES] [@N]", "set warnings, permanently or for some samples",
+    Fault("warn BITS [SAMPLES] [@N]", "set warnings, permanently or for some samples",
             lambda c, bits, samples=None: c.firmware.sampler.set_warnings(bits, samples),
             (_LONG, whole(1, 2**31))),
-    Command("stick [@N]", "repeat the same process data",
+    Fault("stick [@N]", "repeat the same process data",
             lambda c: setattr(c.firmware.sampler, "stuck", c.firmware.sampler.newest())),
-    Command("unstick [@N]", "end `stick`", lambda c: setattr(c.firmware.sampler, "stuck", b"")),
-    Command("noise CHANNEL DEVIATION [@N]", "add noise of this standard deviation to a channel; 0 ends it",
+    Fault("unstick [@N]", "end `stick`", lambda c: setattr(c.firmware.sampler, "stuck", b"")),
+    Fault("noise CHANNEL DEVIATION [@N]", "add noise of this standard deviation to a channel; 0 ends it",
             lambda c, channel, value: c._channel_fault("noise", channel, value, value > 0),
             (_CHANNEL, _AMOUNT)),
-    Command("limit CHANNEL VALUE|off [@N]", "saturate a channel at plus and minus VALUE",
+    Fault("limit CHANNEL VALUE|off [@N]", "saturate a channel at plus and minus VALUE",
             lambda c, channel, value: c._channel_fault("limits", channel, value, value is not None),
             (_CHANNEL, lambda text: None if text == "off" else _AMOUNT(text))),
-    Command("freeze CHANNEL [@N]", "freeze a channel at its next value",
+    Fault("freeze CHANNEL [@N]", "freeze a channel at its next value",
             lambda c, channel: c._channel_fault("frozen", channel, None, True), (_CHANNEL,)),
-    Command("thaw CHANNEL [@N]", "end `freeze`",
+    Fault("thaw CHANNEL [@N]", "end `freeze`",
             lambda c, channel: c._channel_fault("frozen", channel, None, False), (_CHANNEL,)),
-    Command("skip PERCENT [@N]", "skip this percentage of the samples at random; 0 ends it",
+    Fault("skip PERCENT [@N]", "skip this percentage of the samples at random; 0 ends it",
             lambda c, percent: c.firmware.sampler.set_skip(percent),
             (number(0, MOST_SKIPPED),)),
-    Command("ppm X [@N]", "set the error of the sensor's clock", lambda c, ppm: c.sensor.set_ppm(ppm),
+    Fault("ppm X [@N]", "set the error of the sensor's clock", lambda c, ppm: c.sensor.set_ppm(ppm),
             (number(-PPM_LIMIT, PPM_LIMIT),)),
-    Command("signal NAME [@N]", "measure another signal, from its beginning",
+    Fault("signal NAME [@N]", "measure another signal, from its beginning",
             lambda c, name: c.sensor.set_signal(name), (_one_of("signal", SIGNALS),)),
-    Command("dc WORD [VALUE] ... [@N]", "a fault of the distributed clock, as in --dc; `dc ok` ends it",
+    Fault("dc WORD [VALUE] ... [@N]", "a fault of the distributed clock, as in --dc; `dc ok` ends it",
             Call._dc, (str, str)),
-    Command("stats", "counters and states, as JSON",
+    Fault("stats", "counters and states, as JSON",
             lambda c: json.dumps(c.bus.statistics(), separators=(",", ":"))),
-    Command("help", "this list", lambda _: " | ".join(f"{c.usage}: {c.meaning}" for c in COMMANDS)),
-    Command("quit", "end the program", lambda c: setattr(c.bus, "quit", True)),
+    Fault("help", "this list", lambda _: " | ".join(f"{c.usage}: {c.meaning}" for c in COMMANDS)),
+    Fault("quit", "end the program", lambda c: setattr(c.bus, "quit", True)),
 )  # fmt: skip
 
 BY_NAME: Final = {command.name: command for command in COMMANDS}
 
 
-def obey(bus: Bus, line: str) -> str:
+def obey(bus: SlaveChain, line: str) -> str:
     """Execute one command; returns the answer without a line end."""
     try:
         result = _parse(bus, line.split(), None)()
@@ -209,7 +197,7 @@ def obey(bus: Bus, line: str) -> str:
     return f"ok {result}" if result else "ok"
 
 
-def _parse(bus: Bus, line: Sequence[str], slave: Slave | None) -> Callable[[], str | None]:
+def _parse(bus: SlaveChain, line: Sequence[str], slave: VirtualSlave | None) -> Callable[[], str | None]:
     """The command in `line`, for `slave` unless it names another; UsageError if it is invalid.
 
     What it returns executes it, and returns the text after `ok`.
@@ -225,7 +213,7 @@ def _parse(bus: Bus, line: Sequence[str], slave: Slave | None) -> Callable[[], s
     if len(positions) > 1:
         raise UsageError("more than one slave: use `@N` or `#N` once")
     for position in positions:
-        slaves: Sequence[Slave] = bus.sensors if position[0] == "@" else bus.slaves
+        slaves: Sequence[VirtualSlave] = bus.sensors if position[0] == "@" else bus.slaves
         slave = slaves[whole(0, len(slaves) - 1)(position[1:])]
     call = Call(bus, slave or (bus.sensors or bus.slaves)[0])
     return lambda: command.run(call, *arguments)

@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.sii import MailboxProtocol
 from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry, ObjectType
-from ethercat_server.virtual_sensor import registers as reg
-from ethercat_server.virtual_sensor.application import Application, al_statistics
-from ethercat_server.virtual_sensor.coe import ObjectTable
+from ethercat_server.virtual_sensor.application import Application, VirtualSlave
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
+from ethercat_server.virtual_sensor.mailbox import ObjectTable
 from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions, SlaveOptions, UsageError
 
 _RO, _RW = Access.RO, Access.RW
@@ -100,7 +100,6 @@ class Drive(Application):
     """A servo drive, which the controlword enables in one step, and the end of process data disables."""
 
     def state_changed(self) -> None:
-        """See `Application`."""
         if self.state is not AlState.OP:
             self.objects.values[_CONTROLWORD.address] = bytes(2)
 
@@ -110,7 +109,6 @@ class InputTerminal(Application):
     count tenths of a second."""
 
     def inputs(self) -> bytes:
-        """See `Application`."""
         ms = self.clock() // 1_000_000
         if self.device.name == "EL1008":
             return bytes([ms // 100 & 0xFF])
@@ -122,27 +120,25 @@ _WRITES_REMEMBERED: Final = 1000
 _VELOCITY_AT_WORK: Final = 1000
 
 
-class ForeignSlave:
-    """A foreign slave, powered or not. `clock` gives the time in ns."""
+class ForeignSlave(VirtualSlave):
+    """A foreign slave."""
+
+    options: ForeignOptions
 
     def __init__(self, options: ForeignOptions, clock: Callable[[], int]) -> None:
+        super().__init__(clock)
         self.options = options
-        self._clock = clock
         # Address and data of the latest register and memory writes that reached it; the number of all.
         self.writes: deque[tuple[int, bytes]] = deque(maxlen=_WRITES_REMEMBERED)
         self.write_count = 0
-        self.life: Application | None = None  # from power-on to power-off
         self.power(True)
 
-    def power(self, on: bool) -> None:
-        """Switch it off or on; no effect if it already is."""
-        if not on:
-            self.life = None
-        elif self.life is None:
-            device = KINDS[self.options.kind]
-            kind = Drive if device is _DRIVE else InputTerminal if device.inputs else Application
-            self.life = kind(device, self._clock, _objects_of(device))
-            self.life.esc.record = self._remember
+    def _switched_on(self) -> Application:
+        device = KINDS[self.options.kind]
+        kind = Drive if device is _DRIVE else InputTerminal if device.inputs else Application
+        life = kind(device, self._clock, _objects_of(device))
+        life.esc.record = self._remember
+        return life
 
     def _remember(self, address: int, data: bytes) -> None:
         self.writes.append((address, bytes(data)))
@@ -151,26 +147,20 @@ class ForeignSlave:
     def left_at_work(self) -> None:
         """Another master has left it in the AL state it is in: record from now on."""
         if isinstance(self.life, Drive) and self.life.state is AlState.OP:
-            self.life.take_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
+            self.life.store_outputs(struct.pack("<Hi", _ENABLE, _VELOCITY_AT_WORK))
         self.writes.clear()
         self.write_count = 0
 
     @property
     def turning(self) -> bool:
-        """Whether it is a drive whose motor moves."""
         objects = self.life.objects if self.life else None
         return (
             isinstance(objects, _DriveObjects) and objects.enabled and objects.number(_VELOCITY.address) != 0
         )
 
     def statistics(self) -> dict[str, Any]:
-        """Its part of what the command `stats` reports."""
-        return {
-            "kind": self.options.kind,
-            **al_statistics(self.life),
-            "turning": self.turning,
-            "write_count": self.write_count,
-        }
+        own = {"turning": self.turning, "write_count": self.write_count}
+        return {"kind": self.options.kind, **super().statistics(), **own}
 
 
 def leave_in(life: Application, state: AlState, station: int, outputs_at: int, inputs_at: int) -> None:

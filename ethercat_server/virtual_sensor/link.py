@@ -24,7 +24,7 @@ from bota_ethercat.world import DATAGRAM, decode
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import arrived_ns, look_up, master_sockets
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
-from ethercat_server.virtual_sensor.bus import Bus
+from ethercat_server.virtual_sensor.bus import SlaveChain
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, obey
 from ethercat_server.virtual_sensor.options import SlaveOptions
 from ethercat_server.virtual_sensor.world import ExternalWorld
@@ -107,7 +107,7 @@ def run(
         shown = stack.enter_context(open_interface(ifname, ETHERTYPE))
         shown.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
         on_open()
-        bus = Bus(slaves, time.monotonic_ns())
+        bus = SlaveChain(slaves, time.monotonic_ns())
         poller = select.poll()
         poller.register(raw, select.POLLIN)
         heard: dict[int, Callable[[], object]] = {}  # besides the frames: what to do, by descriptor
@@ -142,7 +142,7 @@ def run(
                 raise LinkError(f"interface {ifname} has disappeared: create it again, and restart")
 
 
-def _obey(control: socket.socket, bus: Bus) -> None:
+def _obey(control: socket.socket, bus: SlaveChain) -> None:
     """Execute the command in the next datagram; who sent it gets the answer, if it has an address."""
     bus.set_time(time.monotonic_ns())
     with contextlib.suppress(OSError):
@@ -152,7 +152,9 @@ def _obey(control: socket.socket, bus: Bus) -> None:
             control.sendto(answer.encode(), sender)
 
 
-def obey_lines(descriptor: int, begun: bytearray, bus: Bus, poller: select.poll, exit_on_eof: bool) -> None:
+def obey_lines(
+    descriptor: int, begun: bytearray, bus: SlaveChain, poller: select.poll, exit_on_eof: bool
+) -> None:
     """Execute the commands that were typed; `begun` is the line that has not ended yet."""
     bus.set_time(time.monotonic_ns())
     try:
@@ -170,7 +172,7 @@ def obey_lines(descriptor: int, begun: bytearray, bus: Bus, poller: select.poll,
         bus.quit |= exit_on_eof
 
 
-def _hear(world: socket.socket, bus: Bus) -> None:
+def _hear(world: socket.socket, bus: SlaveChain) -> None:
     """Tell the sensors what waiting datagrams say, some at a time; what is none of ours is dropped."""
     with contextlib.suppress(BlockingIOError):
         for _ in range(_DATAGRAMS_PER_TURN):
@@ -178,7 +180,7 @@ def _hear(world: socket.socket, bus: Bus) -> None:
             if content is not None and content[0] < len(bus.sensors):
                 sensor, time_s, felt = content
                 if isinstance(external := bus.sensors[sensor].options.world, ExternalWorld):
-                    external.take(time_s, felt, time.monotonic())
+                    external.update(time_s, felt, time.monotonic())
 
 
 def own_socket() -> str:
@@ -232,7 +234,7 @@ class _Answers:
     slaves take no time, the way out is then as long as the way back.
     """
 
-    def __init__(self, raw: socket.socket, bus: Bus, ifname: str) -> None:
+    def __init__(self, raw: socket.socket, bus: SlaveChain, ifname: str) -> None:
         self._raw, self._bus, self._ifname = raw, bus, ifname
         self._buffer = bytearray(_BUFFER)
         self._half_ns = _FIRST_HALF_NS

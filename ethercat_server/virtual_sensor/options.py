@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from bota_ethercat.program.arguments import typed
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import MODELS
 from ethercat_server.virtual_sensor.world import World
@@ -51,17 +50,6 @@ class ForeignOptions:
 SlaveOptions = SensorOptions | ForeignOptions
 
 
-def whole(lowest: int, highest: int) -> Callable[[str], int]:
-    """Parses a whole number, decimal or 0x...; UsageError if it is invalid or out of range."""
-
-    def within(text: str) -> int:
-        if lowest <= (value := int(text, 0)) <= highest:
-            return value
-        raise ValueError
-
-    return typed(within, f"a whole number from {lowest} to {highest}")
-
-
 def model_name(text: str) -> str:
     """Parses the name of a model; UsageError if a sensor cannot have it."""
     if not text.isascii() or len(text) > 20:
@@ -70,7 +58,7 @@ def model_name(text: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class Fault:
     """A fault command, or a word of a distributed clock: `run` takes what it is for, and the arguments.
 
     Each is parsed by one of `arguments`. Those in brackets in `usage` can be left out; the last one may be
@@ -84,11 +72,9 @@ class Command:
 
     @property
     def name(self) -> str:
-        """Its first word."""
         return self.usage.split()[0]
 
     def parse(self, words: Sequence[str]) -> list[Any]:
-        """The arguments; UsageError if they are wrong."""
         least = len(self.arguments) - self.usage.replace("[@N]", "").count("[")
         most = math.inf if "..." in self.usage else len(self.arguments)
         if not least <= len(words) <= most:

@@ -15,13 +15,13 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import FORMULAS, SCENES, Formula, Reading, reading_of
+from ethercat_server.virtual_sensor.signals import FORMULAS, SCENES, Formula, Measurement, measurement_of
 from ethercat_server.virtual_sensor.world import ExternalWorld, Measured
 
 _PPM_SCALE = 10**12  # ppm in steps of one millionth
 
 
-class SampleClock:
+class SamplingClock:
     """The sensor's own clock: sample numbers and their instants, independent of the master.
 
     The instant of sample k is the anchor plus (k - k0) * T, with T = SINC / 51200 s / (1 + ppm * 1e-6).
@@ -39,14 +39,12 @@ class SampleClock:
         self._denominator = BASE_SAMPLING_RATE_HZ * (_PPM_SCALE + round(ppm * 1e6))
 
     def number_at(self, now: int) -> int:
-        """Number of the newest sample at the time `now`, ns."""
         elapsed = now - self._anchor
         if elapsed < 0:
             return self._anchor_number
         return self._anchor_number + ((elapsed + 1) * self._denominator - 1) // self._numerator
 
     def instant(self, number: int) -> int:
-        """Instant of sample `number`, ns."""
         return self._anchor + (number - self._anchor_number) * self._numerator // self._denominator
 
     def change(self, now: int, *, sinc_length: int | None = None, ppm: float | None = None) -> None:
@@ -111,7 +109,7 @@ class Sampler:
         self._dictionary = dictionary
         self._now = now
         self._layout = layout_for(options.pdo_size)
-        self.clock = SampleClock(now(), dictionary.sinc_in_effect, options.ppm)
+        self.clock = SamplingClock(now(), dictionary.sinc_in_effect, options.ppm)
         self.made = 0  # number of samples computed
         self.stuck = b""  # process data to be repeated until it is empty again: a fault
         # Faults of channels by position, in their units; call `changed` after changing them: standard
@@ -148,7 +146,6 @@ class Sampler:
         return number
 
     def newest(self, later: int = 0) -> bytes:
-        """The newest process data, `later` ns from now."""
         if self.stuck:
             return self.stuck
         now = self._now() + later
@@ -178,16 +175,16 @@ class Sampler:
         warnings = self._warnings if number < self._warnings_until else 0
         return self._pack(reading, warnings, saturated)
 
-    def _with_last_bit(self, reading: Reading, number: int) -> Reading:
+    def _with_last_bit(self, reading: Measurement, number: int) -> Measurement:
         """The reading of sample `number` with up to the last bit of each converter added or subtracted."""
         values = [*reading.force_torque, *reading.acceleration, *reading.angular_rate]
         chance = _scattered(number, self._seed)
         for position, bit in enumerate(_LAST_BITS):
             values[position] += bit * ((chance % _STEPS + 0.5) / _STEPS * 2 - 1)
             chance //= _STEPS
-        return reading_of(values, reading.temperature, reading.orientation)
+        return measurement_of(values, reading.temperature, reading.orientation)
 
-    def _disturb(self, reading: Reading) -> tuple[Reading, int]:
+    def _disturb(self, reading: Measurement) -> tuple[Measurement, int]:
         """The reading with every fault in it, and which channels are saturated, as bits."""
         if not (self.noise or self.limits or self.frozen):
             return reading, 0
@@ -201,9 +198,9 @@ class Sampler:
                 bits |= 1 << position
         for position, kept in self.frozen.items():
             self.frozen[position] = values[position] = values[position] if kept is None else kept
-        return reading_of(values, reading.temperature, reading.orientation), bits
+        return measurement_of(values, reading.temperature, reading.orientation), bits
 
-    def _pack(self, reading: Reading, warnings: int, saturated: int) -> bytes:
+    def _pack(self, reading: Measurement, warnings: int, saturated: int) -> bytes:
         """Process data of one sample, as the settings have it.
 
         Offsets are added; values beyond the range are clipped and set the saturation fields and warnings; the
@@ -241,7 +238,6 @@ class Sampler:
         self._prepared_number = -1
 
     def settings_changed(self) -> None:
-        """Settings or offsets in the dictionary have changed."""
         sinc_length = self._dictionary.sinc_in_effect
         if sinc_length != self.clock.sinc_length:
             self.clock.change(self._now(), sinc_length=sinc_length)
@@ -259,12 +255,10 @@ class Sampler:
         self.changed()
 
     def set_ppm(self, ppm: float) -> None:
-        """Set the error of the clock from the newest sample on."""
         self.clock.change(self._now(), ppm=ppm)
         self.changed()
 
     def set_warnings(self, bits: int, samples: int | None) -> None:
-        """OR `bits` into the warnings of the next `samples` samples, or of all."""
         self._warnings = bits
         self._warnings_until = 2**63 if samples is None else self.clock.number_at(self._now()) + 1 + samples
         self.changed()

@@ -9,66 +9,14 @@ from typing import Any, Final
 
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import BY_SETTING, FACTORY_CALIBRATION
-from ethercat_server.virtual_sensor.application import Application, al_statistics
-from ethercat_server.virtual_sensor.coe import Address, SdoAbortError
-from ethercat_server.virtual_sensor.dictionary import Dictionary, Flash, sensor_device
+from ethercat_server.virtual_sensor.application import Application, VirtualSlave
+from ethercat_server.virtual_sensor.dictionary import Dictionary, Flash, OnWrite, sensor_device
 from ethercat_server.virtual_sensor.distributed_clock import parse_clock
+from ethercat_server.virtual_sensor.mailbox import Address
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sampler import Sampler
 
-_REPETITION_NS: Final = 300_000_000
 _WRITES_REMEMBERED: Final = 200
-
-
-OnWrite = Callable[[int, int, bytes, AlState, int], None]
-
-
-class WatchedDictionary(Dictionary):
-    """Has `on_write` called for every SDO write: index, sub-index, data, AL state, abort code or 0.
-
-    The next transfer of an entry in `aborts` is aborted with the code there.
-    """
-
-    def __init__(self, on_write: OnWrite, *of_dictionary: Any) -> None:
-        super().__init__(*of_dictionary)
-        self._on_write = on_write
-        self.aborts: dict[Address, int] = {}
-        # Code and until when, by write.
-        self._aborted: dict[tuple[Address, bytes | None], tuple[int | None, int]] = {}
-
-    def _check_abort(self, address: Address, data: bytes | None = None) -> None:
-        code, until = self._aborted.get((address, data), (None, 0))
-        if self._now() >= until:
-            code = self.aborts.pop(address, None)
-            if code is not None and data is not None:  # if it is repeated soon after, its answer was lost
-                self._aborted = {(address, data): (code, self._now() + _REPETITION_NS)}
-        if code is not None:
-            raise SdoAbortError(code)
-
-    def read(self, index: int, subindex: int) -> bytes:
-        """See `ObjectTable`."""
-        self._check_abort((index, subindex))
-        return super().read(index, subindex)
-
-    def check_download(self, index: int, subindex: int, length: int, state: AlState) -> None:
-        """See `ObjectTable`."""
-        try:
-            super().check_download(index, subindex, length, state)
-        except SdoAbortError as error:
-            self._on_write(index, subindex, b"", state, error.code)
-            raise
-
-    def write(self, index: int, subindex: int, data: bytes, state: AlState) -> None:
-        """See `ObjectTable`."""
-        abort = 0
-        try:
-            self._check_abort((index, subindex), data)
-            super().write(index, subindex, data, state)
-        except SdoAbortError as error:
-            abort = error.code
-            raise
-        finally:
-            self._on_write(index, subindex, data, state, abort)
 
 
 class Firmware(Application):
@@ -81,7 +29,7 @@ class Firmware(Application):
         clock: Callable[[], int],
         on_write: OnWrite,
     ) -> None:
-        self.dictionary = WatchedDictionary(on_write, options, flash, self.inputs, clock)
+        self.dictionary = Dictionary(options, flash, self.inputs, clock, on_write)
         self.sampler = Sampler(options, self.dictionary, clock)
         self.dictionary.changed = self.sampler.settings_changed
         device = sensor_device(options.model, options.serial, options.pdo_size)
@@ -95,16 +43,18 @@ class Firmware(Application):
         return self.sampler.newest(self.esc.clock.way_ns + self.esc.into_ns)
 
     def prepare(self, expected: int) -> None:
-        """Compute the sample that a frame at the time `expected` will read."""
         self.sampler.prepare(expected)
 
 
-class VirtualSensor:
-    """A sensor, powered or not. `clock` gives the time in ns."""
+class VirtualSensor(VirtualSlave):
+    """A sensor."""
+
+    options: SensorOptions  # its current ones
+    life: Firmware | None
 
     def __init__(self, options: SensorOptions, clock: Callable[[], int]) -> None:
-        self._clock = clock
-        self.options = options  # its current ones
+        super().__init__(clock)
+        self.options = options
         # The latest, oldest first, across power cycles, as `stats` reports them.
         self.sdo_writes: deque[dict[str, Any]] = deque(maxlen=_WRITES_REMEMBERED)
         self.sdo_write_count = self.calibration_writes = 0
@@ -116,7 +66,7 @@ class VirtualSensor:
         if self.options.sinc_length is not None:
             row = BY_SETTING["sinc_length"]
             self.flash.entries[row.address] = row.type.pack(self.options.sinc_length)
-        self.life: Firmware | None = None  # from power-on to power-off
+        self.life = None
         self.power(True)
 
     def _remember(self, index: int, subindex: int, data: bytes, state: AlState, abort: int) -> None:
@@ -134,13 +84,13 @@ class VirtualSensor:
         if (action := self.on_write.pop((index, subindex), None)) is not None:
             action()
 
+    def _switched_on(self) -> Firmware:
+        return Firmware(self.options, self.flash, self._clock, self._remember)
+
     def power(self, on: bool) -> None:
-        """Switch it off or on; no effect if it already is."""
+        super().power(on)
         if not on:
-            self.life = None
             self.flash.power_cut(self._clock())
-        elif self.life is None:
-            self.life = Firmware(self.options, self.flash, self._clock, self._remember)
 
     def swap(self, model: str, serial: int) -> None:
         """Replace it by a new sensor of another model or serial number, just switched on."""
@@ -148,25 +98,22 @@ class VirtualSensor:
         self._begin()
 
     def set_ppm(self, ppm: float) -> None:
-        """Set the error of its clock, now and after a power cycle."""
         self.options = replace(self.options, ppm=ppm)
         if self.life is not None:
             self.life.esc.clock.settle()
             self.life.sampler.set_ppm(ppm)
 
     def set_signal(self, signal: str) -> None:
-        """Measure another signal, now and after a power cycle."""
         self.options = replace(self.options, signal=signal, world=None)
         if self.life is not None:
             self.life.sampler.measure(self.options)
 
     def statistics(self) -> dict[str, Any]:
-        """Its part of what the command `stats` reports."""
         life = self.life
         return {
             "model": self.options.model,
             "serial": self.options.serial,
-            **al_statistics(life),
+            **super().statistics(),
             "sample": life.sampler.clock.number_at(self._clock()) if life else None,
             "samples_made": life.sampler.made if life else 0,
             "sinc_length": life.sampler.clock.sinc_length if life else None,

@@ -16,7 +16,7 @@ from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.world import Felt
 
 
-class Reading(NamedTuple):
+class Measurement(NamedTuple):
     """One sample before settings act on it, in the units of the process data."""
 
     force_torque: tuple[float, ...]  # N, Nm
@@ -26,9 +26,11 @@ class Reading(NamedTuple):
     orientation: tuple[float, ...]  # x, y, z, w: turns vectors of the sensor's frame into the world's
 
 
-def reading_of(values: Sequence[float], temperature: float, orientation: tuple[float, ...]) -> Reading:
+def measurement_of(
+    values: Sequence[float], temperature: float, orientation: tuple[float, ...]
+) -> Measurement:
     """A reading from force, torque, acceleration and angular rate one after another."""
-    return Reading(tuple(values[:6]), tuple(values[6:9]), tuple(values[9:12]), temperature, orientation)
+    return Measurement(tuple(values[:6]), tuple(values[6:9]), tuple(values[9:12]), temperature, orientation)
 
 
 CONSTANT: Final = (1.5, -2.25, -9.75, 0.125, -0.0625, 0.03125)  # exact in REAL32
@@ -42,10 +44,9 @@ class Formula:
     temperature: Callable[[int], float] = lambda _: 35.0
     is_exact: bool = False  # noise would make its numbers unreadable
 
-    def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
-        """The reading of sample `number`, taken at `instant` ns, `seconds` after power-on."""
+    def reading(self, number: int, instant: int, seconds: float) -> Measurement:  # noqa: ARG002
         load, temperature = tuple(self.load(number, instant)), self.temperature(number)
-        return Reading(load, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), temperature, (0.0, 0.0, 0.0, 1.0))
+        return Measurement(load, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), temperature, (0.0, 0.0, 0.0, 1.0))
 
 
 def _clock(number: int, instant: int) -> Iterable[float]:
@@ -61,7 +62,6 @@ def _clock(number: int, instant: int) -> Iterable[float]:
 
 FORMULAS: Final = {
     "clock": Formula(_clock, is_exact=True),
-    "ramp": Formula(lambda k, _: (((k + 100 * i) % 1024) / 64 - 8 for i in range(6)), is_exact=True),
     "constant": Formula(lambda *_: CONSTANT),
     # The sample number in the temperature: steps of 2**-18 °C, from 32 to 48 °C, are exact in REAL32.
     "rest": Formula(lambda *_: CONSTANT, lambda k: 32 + k % 2**22 / 2**18),

@@ -22,6 +22,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+from bota_ethercat.program.real_time import HIGHEST_PRIORITY, make_real_time
 from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.nic import missing_capabilities
 from ethercat_server.process.privileges import become, user_to_become
@@ -47,7 +48,7 @@ class VirtualBus:
         its interface is open its process becomes `user`, or who ran sudo, as the master does, which could not
         end it otherwise. The default serial numbers go by `number`, unless it is 0.
         """
-        self._priority = min(99, master_priority + 1) if master_priority else 0
+        self._priority = min(HIGHEST_PRIORITY, master_priority + 1) if master_priority else 0
         self.ifname = f"ecat{os.getpid()}"
         self._arguments = shlex.split(arguments)
         self._user = user or ""
@@ -56,7 +57,6 @@ class VirtualBus:
 
     @property
     def pid(self) -> int:
-        """Process id of the sensor; 0 while the bus is down."""
         return self._process.pid if self._process else 0
 
     def __enter__(self) -> VirtualBus:
@@ -94,7 +94,6 @@ class VirtualBus:
                 raise ServerError(f"cannot enter the namespaces of the virtual sensor ({why}): use root")
 
     def __exit__(self, *_: object) -> None:
-        """End the sensor's process, and with it the bus."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -175,9 +174,9 @@ def main(argv: Sequence[str]) -> int:
             return 1
 
         def opened() -> None:
-            if int(priority):
-                with contextlib.suppress(PermissionError):  # the master says what it was not granted itself
-                    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(priority)))
+            make_real_time(
+                int(priority), keeps_rights=False
+            )  # the master says what it was not granted itself
             # Deleting an interface in the server's namespace takes rights.
             if far == _FAR_END and (found := user_to_become(user or None)):
                 become(found)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import bisect
+import functools
 import math
 import operator
 import random
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
-from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS
+from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS, ImuFilter
+from bota_ethercat.sensor.response import FIR_TAPS, fir_taps
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
 from bota_ethercat.world import REST, Felt
-from ethercat_server.virtual_sensor.filters import LoadFilter, filtered, imu_filter
-from ethercat_server.virtual_sensor.signals import Reading, quaternion, reading_of
+from ethercat_server.virtual_sensor.signals import Measurement, measurement_of, quaternion
 
 World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MONOTONIC if it is external
 
@@ -39,7 +40,7 @@ class ExternalWorld:
         self._moments = deque([(-math.inf, REST)], maxlen=_REMEMBERED)
         self.counts = {"taken": 0, "refused": 0}  # moments
 
-    def take(self, time_s: float, felt: Felt, now_s: float) -> None:
+    def update(self, time_s: float, felt: Felt, now_s: float) -> None:
         """A moment later than the one before; any other, or one far from now, is refused."""
         is_good = time_s > self._moments[-1][0] and abs(time_s - now_s) <= LOST_AFTER_S
         self.counts["taken" if is_good else "refused"] += 1
@@ -51,10 +52,70 @@ class ExternalWorld:
         return self._lost == FAULT and LOST_AFTER_S < now_s - self._moments[-1][0] < math.inf
 
     def __call__(self, seconds: float) -> Felt:
-        """What the sensor feels."""
         at = bisect.bisect_right(self._moments, seconds, key=operator.itemgetter(0))
         begin_s, felt = self._moments[max(0, at - 1)]
         return REST if self._lost == ZERO and seconds - begin_s > LOST_AFTER_S else felt
+
+
+# The sensor's own filters make what it measures late, with the response that is derived in
+# `bota_ethercat.sensor.response`: they add up a signal's values at some instants before the sample.
+Signal = Callable[[float], Sequence[float]]
+Past = Sequence[tuple[float, float]]  # instants, s before a sample, and their weights
+_STEPS: Final = 4  # instants in a sample period
+# The third-order sinc filter: three moving averages over a period, one after the other.
+_SINC: Final = [
+    (x * x / 2 if x < 1 else (3 - x) ** 2 / 2 if x > 2 else (6 - 2 * x) * x / 2 - 1.5) / _STEPS
+    for x in ((n + 0.5) / _STEPS for n in range(3 * _STEPS))
+]
+# Gauss-Laguerre: for a signal that is slow, the mean over the past of a first-order low-pass filter.
+_EXPONENTIAL: Final = (
+    (0.4157745568, 0.7110930099),
+    (2.2942803603, 0.2785177336),
+    (6.2899450829, 0.0103892565),
+)
+
+
+def weighted(weights: Sequence[float], vectors: Sequence[Sequence[float]]) -> tuple[float, ...]:
+    """The sum of vectors times weights."""
+    return tuple(sum(map(operator.mul, weights, axis)) for axis in zip(*vectors, strict=True))
+
+
+class LoadFilter:
+    """Of force and torque: `signal` through the sinc filter, `noise` added, and through the FIR filter."""
+
+    def __init__(
+        self, signal: Signal, noise: Callable[[], Sequence[float]], period_s: float, *, fir: bool
+    ) -> None:
+        self._signal, self._noise, self._period_s = signal, noise, period_s
+        self._taps = fir_taps() if fir else (1.0,)
+        self._begin_s = 0.0  # time of sample 0
+        remember = functools.lru_cache(2 * FIR_TAPS)  # what following samples need too
+        self._values, self._sinc = remember(self._before), remember(self._add_up)
+
+    def at(self, number: int, seconds: float) -> tuple[float, ...]:
+        """N, Nm: of sample `number`, at this time."""
+        self._begin_s = seconds - number * self._period_s
+        return weighted(self._taps, [self._sinc(number - n) for n in range(len(self._taps))])
+
+    def _add_up(self, number: int) -> tuple[float, ...]:
+        values = [value for n in range(3) for value in self._values(number - n)]
+        return tuple(map(operator.add, weighted(_SINC, values), self._noise()))
+
+    def _before(self, number: int) -> list[Sequence[float]]:
+        end_s, step_s = self._begin_s + number * self._period_s, self._period_s / _STEPS
+        return [self._signal(end_s - (n + 0.5) * step_s) for n in range(_STEPS)]
+
+
+def imu_filter(row: ImuFilter) -> Past:
+    """Of accelerometer or gyroscope: a first-order low-pass filter, and the rest of the table's delay."""
+    constant_s = 1 / (math.tau * row.bandwidth_hz)
+    rest_s = row.delay_ms * 1e-3 - constant_s
+    return [(rest_s + constant_s * x, weight) for x, weight in _EXPONENTIAL]
+
+
+def filtered(signal: Signal, past: Past, seconds: float) -> tuple[float, ...]:
+    """The signal as it is measured at this time."""
+    return weighted([weight for _, weight in past], [signal(seconds - s) for s, _ in past])
 
 
 class Measured:
@@ -66,7 +127,6 @@ class Measured:
         self._settings: tuple[SettingValue, ...] = ()  # of the filters
 
     def set_filters(self, sinc_length: int, settings: Mapping[str, SettingValue]) -> None:
-        """Measure through these filters; `sinc_length` is that in effect."""
         wanted = sinc_length, *(settings[name] for name in _FILTERS)
         if wanted == self._settings:
             return
@@ -85,8 +145,7 @@ class Measured:
     def _load_noise(self) -> list[float]:
         return [self._gauss(0.0, deviation) if self._noise else 0.0 for deviation in self.deviations]
 
-    def reading(self, number: int, instant: int, seconds: float) -> Reading:  # noqa: ARG002
-        """See `Formula`."""
+    def reading(self, number: int, instant: int, seconds: float) -> Measurement:  # noqa: ARG002
         world = self._world
         felt = world(seconds)
         load = self._load_filter.at(number, seconds)
@@ -98,4 +157,4 @@ class Measured:
                 values[axis] += self._gauss(0.0, _ACCELERATION_NOISE)
                 values[axis + 3] += self._gauss(0.0, _ANGULAR_RATE_NOISE)
         orientation = (0.0, 0.0, 0.0, 0.0) if felt.attitude is None else quaternion(felt.attitude)
-        return reading_of(values, felt.temperature, orientation)
+        return measurement_of(values, felt.temperature, orientation)

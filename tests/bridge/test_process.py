@@ -38,7 +38,7 @@ from tests.server.running import Program, free_port, full_listener
 def test_a_missing_module_is_named(
     missing: str, remedy: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(process, "StopSignals", lambda: None)
+    monkeypatch.setattr(client, "StopSignals", lambda: None)  # which blocks them in this process
     for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bridge"}]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
@@ -199,7 +199,7 @@ def test_a_refusal_is_a_warning_and_no_change(
         asked.append((priority, cpu, thread))
         return Scheduling(refused=(f"SCHED_FIFO {priority} (a remedy)",))
 
-    monkeypatch.setattr("bota_ethercat.client.real_time.make_real_time", refuse)
+    monkeypatch.setattr("bota_ethercat.program.real_time.make_real_time", refuse)
     lines = Log(None)
     process.prepare(0, -1, lines)  # nothing is asked for
     assert not lines.lines

@@ -24,7 +24,7 @@ from ethercat_server.ethercat.clock import Clock
 from ethercat_server.ethercat.exchange import Exchange
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sensor.sensor import Identity, Sensor
-from ethercat_server.virtual_sensor.bus import Bus
+from ethercat_server.virtual_sensor.bus import SlaveChain
 from ethercat_server.virtual_sensor.faults import obey
 from ethercat_server.virtual_sensor.options import SensorOptions
 
@@ -52,7 +52,7 @@ def simulate(
     `options` are `SensorOptions`'. In the signal `scene` there is a contact 5 s after power-on.
     """
     sensor = SensorOptions(**{"sinc_length": 64, **options})
-    bus = Bus([sensor], START_NS)
+    bus = SlaveChain([sensor], START_NS)
     todo = sorted([*((0.0, line) for line in commands), *script.commands])
     chance = random.Random(sensor.seed)
     now = start = START_NS + round(begin * 1e9)

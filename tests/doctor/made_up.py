@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ethercat_server.access.adapters import Adapter
-from ethercat_server.doctor.machine import Machine
+from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.report import CannotLookError
 from ethercat_server.ethercat.nic import Routes
 
@@ -46,10 +46,10 @@ def write(root: Path, files: Files) -> None:
             path.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def machine(root: Path, files: Files | None = None, facts: Facts = FACTS) -> Machine:
+def machine(root: Path, files: Files | None = None, facts: Facts = FACTS) -> Host:
     """The good machine but for these files (None: not there), which are below `root`, and facts."""
     write(root, {**GOOD, **(files or {})})
-    return Machine("ens5", facts=dict(facts), root=root)
+    return Host("ens5", facts=dict(facts), root=root)
 
 
 def but(**changes: Any) -> Facts:

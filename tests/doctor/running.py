@@ -10,19 +10,17 @@ from typing import Any
 from bota_ethercat.health.verdict import Level
 from ethercat_server.doctor.bus_checks import examine_bus
 from ethercat_server.doctor.cli import main
-from ethercat_server.doctor.report import NAMES, Finding, worst
+from ethercat_server.doctor.report import NAMES, CheckResult, worst
 from tests import rights
 from tests.doctor.made_up import FACTS, Facts, Files, machine
-from tests.ended import Result, run, run_here
+from tests.ended import Result, patiently, run, run_here
 from tests.rights import NOBODY
 from tests.simulation import SimulatedBus
 
 MODULE = "ethercat_server.doctor.cli"
 
-
 STARVED = ("no EtherCAT slave answers", "does not answer")
 """What it finds too when a busy machine lets the virtual sensor's process wait for too long."""
-ATTEMPTS = 3
 
 
 class Examined(Result):
@@ -33,27 +31,22 @@ class Examined(Result):
         return {row["check"]: row for row in self.json["findings"] if row["subject"] == subject}
 
 
-def _patiently(examine: Callable[[], Result]) -> Examined:
-    """What it found, but for a starved sensor."""
-    for _ in range(ATTEMPTS):
-        ended = Examined(*examine())
-        if not any(words in ended.out for words in STARVED):
-            break
-    assert "error in ethercat-doctor" not in ended.out, ended.out
-    return ended
-
-
 def doctor(*arguments: object, under: tuple[str, ...] = (), python: str | Path = sys.executable) -> Examined:
     """Run `ethercat-doctor arguments...`."""
-    return _patiently(lambda: run(MODULE, *arguments, under=under, python=python))
+    return _without_errors(patiently(lambda: run(MODULE, *arguments, under=under, python=python), STARVED))
 
 
 def doctor_here(*arguments: object) -> Examined:
     """Run `ethercat-doctor arguments...` in this process, with ordinary scheduling."""
-    return _patiently(lambda: run_here(main, *arguments, "--rt-priority", 0))
+    return _without_errors(patiently(lambda: run_here(main, *arguments, "--rt-priority", 0), STARVED))
 
 
-class BusFindings(list[Finding]):
+def _without_errors(ended: Result) -> Examined:
+    assert "error in ethercat-doctor" not in ended.out, ended.out
+    return Examined(*ended)
+
+
+class BusFindings(list[CheckResult]):
     """What was found on a simulated bus."""
 
     @property
@@ -61,7 +54,7 @@ class BusFindings(list[Finding]):
         """Decides on the exit code."""
         return worst(self)
 
-    def of(self, subject: str) -> dict[str, Finding]:
+    def of(self, subject: str) -> dict[str, CheckResult]:
         """The findings of a subject by check; the last one where there are two."""
         return {finding.check: finding for finding in self if finding.subject == subject}
 

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import pytest
 
 from bota_ethercat.health.verdict import Level
-from ethercat_server.doctor.machine import FACTS, Machine, processor_list
+from ethercat_server.doctor.machine import FACTS, Host, processor_list
 from ethercat_server.doctor.machine_checks import CHECKS, examine_machine, rising
-from ethercat_server.doctor.report import CannotLookError, Finding, bad, examine, ok
+from ethercat_server.doctor.report import CannotLookError, CheckResult, bad, examine, ok
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.nic import Routes
 from tests.doctor.made_up import CPUS, GOOD, Facts, Files, but, machine
@@ -173,7 +173,7 @@ SOFTWARE = [
 ]  # fmt: skip
 
 
-def looks(name: str, subject: Machine) -> list[Finding]:
+def looks(name: str, subject: Host) -> list[CheckResult]:
     """What a check finds."""
     ((check, look),) = (row for row in CHECKS.items() if row[0][1] == name)
     found = list(examine(*check, look, subject))
@@ -181,7 +181,7 @@ def looks(name: str, subject: Machine) -> list[Finding]:
     return found
 
 
-def faults(findings: Sequence[Finding]) -> list[Finding]:
+def faults(findings: Sequence[CheckResult]) -> list[CheckResult]:
     return [finding for finding in findings if "error in ethercat-doctor" in finding.found]
 
 
@@ -236,13 +236,13 @@ def test_counters_that_rise_while_the_doctor_looks() -> None:
 
 
 def test_the_facts_of_a_real_interface() -> None:
-    lo = Machine("lo")
+    lo = Host("lo")
     assert (lo.link.loopback, lo.link.ifindex) == (True, socket.if_nametoindex("lo"))
     assert isinstance(lo.fact("routes"), Routes)
     for fact in ("settings", "EEE"):
         with pytest.raises(CannotLookError, match=UNSUPPORTED):
             lo.fact(fact)
-    assert Machine("nosuch0").fact("link") is None
+    assert Host("nosuch0").fact("link") is None
 
 
 def test_lists_of_processors() -> None:
@@ -264,7 +264,7 @@ def test_garbage_in_every_file(tmp_path: Path, number: int) -> None:
 
 def test_no_files_at_all(tmp_path: Path) -> None:
     unknown = but(**dict.fromkeys(FACTS, "no") | {"link": {"counters": {}}})
-    found = list(examine_machine(Machine("ens5", facts=dict(unknown), root=tmp_path)))
+    found = list(examine_machine(Host("ens5", facts=dict(unknown), root=tmp_path)))
     assert {finding.check for finding in found} == {name for _, name in CHECKS}
     assert {finding.level for finding in found} <= {FINE, SKIP}
     skipped = [finding.found for finding in found if finding.level is SKIP]
@@ -275,7 +275,7 @@ def test_no_files_at_all(tmp_path: Path) -> None:
 def test_files_that_are_folders_or_endless(tmp_path: Path) -> None:
     for name in GOOD:
         (tmp_path / "folders" / name.lstrip("/")).mkdir(parents=True)
-    assert not faults(list(examine_machine(Machine("ens5", facts=dict(but()), root=tmp_path / "folders"))))
+    assert not faults(list(examine_machine(Host("ens5", facts=dict(but()), root=tmp_path / "folders"))))
     endless = machine(tmp_path / "endless", {"/proc/version": None})
     (tmp_path / "endless/proc/version").symlink_to("/dev/zero")
     assert not faults(list(examine_machine(endless)))
@@ -291,7 +291,7 @@ def test_files_that_are_folders_or_endless(tmp_path: Path) -> None:
     ],
 )
 def test_a_check_that_fails_is_one_finding_more(error: Exception, level: Level, said: str) -> None:
-    def look() -> Iterator[Finding]:
+    def look() -> Iterator[CheckResult]:
         yield ok("first")
         raise error
 

@@ -14,13 +14,15 @@ from collections.abc import Iterator
 import pytest
 
 from tests import rights
-from tests.doctor.running import ATTEMPTS, MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
+from tests.doctor.running import MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
 from tests.rights import NOBODY
 from tests.server.running import (
+    ATTEMPTS,
     PATIENCE_S,
     Veth,
     VirtualSensor,
     needs_bus,
+    starved,
     virtual_sensor,
     wait_until,
 )
@@ -66,26 +68,18 @@ def test_the_whole_doctor(bench: Bench) -> None:
 
 @contextlib.contextmanager
 def measuring(ifname: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A doctor that has found two slaves and measures until it is stopped, and what it said so far.
-
-    Started again where a busy machine let the virtual sensor's process wait for too long.
-    """
+    """A doctor that has found two slaves and measures until it is stopped, and what it said so far."""
+    command, pipe = [sys.executable, "-m", MODULE, ifname, "--seconds", "600"], subprocess.PIPE
     for _ in range(ATTEMPTS):
-        command = [sys.executable, "-m", MODULE, ifname, "--seconds", "600"]
-        pipe = subprocess.PIPE
         with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as running:
             assert running.stdout is not None
             said = ""
-            try:
-                while not any(words in said for words in ("slave 1 errors", *STARVED)):
-                    line = running.stdout.readline()
-                    assert line, said
-                    said += line
+            while (line := running.stdout.readline()) and not starved(said, STARVED):
+                said += line
                 if "slave 1 errors" in said:
                     yield running, said
                     return
-            finally:
-                running.kill()
+            running.kill()
     pytest.fail(said)
 
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from bota_ethercat.replies import Delays, Description, SensorInfo, SensorStatus, Status
 from ethercat_server.access.sensors import Sensors
-from ethercat_server.doctor.bus_checks import ServerView
+from ethercat_server.doctor.bus_checks import watched
+from ethercat_server.doctor.report import ok
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from tests.simulation import Simulation
 
@@ -89,6 +90,6 @@ def test_the_doctor_and_the_tool_survive_what_a_server_makes_up(row: Any) -> Non
     assert [found.number for found in sensors.sensors] == [0]
     sensors.clock = SYSTEM_CLOCK
     sensors.wait_settled([0])
-    found = list(ServerView(sensors, 0.0).examine("server"))
+    found = list(watched("server", "server", lambda: sensors, 0.0, lambda _: ok("")))
     assert found
     assert not [each for each in found if "Error" in each.found]

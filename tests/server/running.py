@@ -257,7 +257,7 @@ def server(
 
 
 # What it says at start where a busy machine lets the virtual sensor's process wait for too long.
-_STARVED = (
+STARVED = (
     "no EtherCAT slave answers",
     "stopped answering",
     "did not answer",
@@ -273,9 +273,9 @@ _STARVED = (
 ATTEMPTS = 5
 
 
-def starved(said: str) -> bool:
+def starved(said: str, signs: Sequence[str] = STARVED) -> bool:
     """Whether the sensor may have been."""
-    return any(words in said for words in _STARVED)
+    return any(words in said for words in signs)
 
 
 def _streaming(ifname: str, *arguments: str, port: int, under: Sequence[str], python: str | Path) -> Server:

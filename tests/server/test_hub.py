@@ -614,7 +614,7 @@ CLOCK = SensorOptions(signal="clock", ppm=150.0)
 
 @pytest.mark.parametrize("size", [61, 77])
 def test_process_data_is_byte_for_byte_what_the_sensor_sent(size: int) -> None:
-    simulation = Simulation(SensorOptions(pdo_size=size, signal="ramp", noise=False))
+    simulation = Simulation(SensorOptions(pdo_size=size, signal="clock"))
     client = simulation.subscribe()
     assert client.described()["pdo_size"] == size
     layout = LAYOUTS[size]

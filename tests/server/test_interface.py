@@ -18,13 +18,13 @@ from pathlib import Path
 
 import pytest
 
+from bota_ethercat.program.signals import Signals
 from ethercat_server.access.adapters import Adapter, adapters
 from ethercat_server.daemon.server import serve
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.nic import Routes, claimed, look_up, network_trouble, why_silent
 from ethercat_server.ethercat.soem import SoemBackend, packet_sockets
-from ethercat_server.process.signals import Signals
 from tests import rights
 from tests.doctor.running import doctor_here
 from tests.rights import NOBODY, as_user, needs_another_user

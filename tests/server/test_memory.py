@@ -15,8 +15,7 @@ import pytest
 
 from bota_ethercat.control import ACTIONS, Parameter
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.daemon.server import every_second
-from ethercat_server.daemon.service import Notifier
+from ethercat_server.daemon.server import Notifier, every_second
 from ethercat_server.serving.connection import Connection
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import Client, Simulation, more_if_long

@@ -66,11 +66,11 @@ def test_wrong_arguments_are_refused_by_name(arguments: list[str], complaint: st
     [
         (["ens5"], "required: PORT"),
         (["a", "b", "1", "d"], "unrecognized arguments: d"),
-        (["ens5", "port"], "PORT: must be a whole number from 1 to 65535, not 'port'"),
-        (["ens5", "0"], "not '0'"),
+        (["ens5", "port"], "PORT: 'port': it must be a whole number from 1 to 65535"),
+        (["ens5", "0"], "'0': it must be"),
         (
             ["ens5", "1", "--rt-priority", "100"],
-            "--rt-priority: must be a whole number from 0 to 99, not '100'",
+            "--rt-priority: '100': it must be a whole number from 0 to 99",
         ),
     ],
 )

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.daemon.service import Notifier
+from ethercat_server.daemon.server import Notifier
 from tests.server.running import WATCHDOG_US, Manager
 from tests.simulation import Bench
 

@@ -223,7 +223,7 @@ def test_only_inputs_are_mapped_and_no_memory_but_the_mailbox_is_written() -> No
     assert [(row[1], row[4], row[6]) for row in rows if row[7]] == [(6, 0x1180, reg.FMMU_READ)]
     outputs = reg.SYNC_MANAGER + 2 * reg.SYNC_MANAGER_SIZE
     assert image[outputs : outputs + reg.SM_ACTIVATE + 1] == bytes(7)
-    assert max(address for address, _ in slave.writes) == 0x1000  # type: ignore[union-attr]
+    assert max(address for address, _ in slave.writes) == 0x1000  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("choice", ["1", f"{ANALOG}@1"])

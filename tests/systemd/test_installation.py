@@ -89,11 +89,6 @@ def test_a_dash_is_escaped_for_systemd_only_and_a_package_has_a_name_that_dpkg_a
     assert "\nservices='ethercat-server@Enp3_s0\\x2d1.service'\n" in files["/DEBIAN/prerm"]
 
 
-def test_no_network_manager_has_the_virtual_interface(tmp_path: Path) -> None:
-    _, files = interface_package(tmp_path, "virtual")
-    assert [path for path in files if "DEBIAN" not in path] == ["/etc/ethercat-server/virtual.env"]
-
-
 def test_a_dry_run_says_what_would_be_done() -> None:
     done = install_service("--dry-run", "--bridge", "ens5")
     assert done.returncode == 0, done.stderr

@@ -10,8 +10,8 @@ import pytest
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import AbortCode
 from ethercat_server.virtual_sensor import application, device, dictionary
-from ethercat_server.virtual_sensor.coe import SdoAbortError
 from ethercat_server.virtual_sensor.device import Device
+from ethercat_server.virtual_sensor.mailbox import TransferRefusedError
 from ethercat_server.virtual_sensor.sensor import Firmware
 
 REFUSED = {(0x8006, 1): b"\x80\0", (0x8000, 5): struct.pack("<f", 0.5)}
@@ -30,7 +30,7 @@ def refusing(patch: pytest.MonkeyPatch) -> None:
     def refuse(self: dictionary.Dictionary, index: int, subindex: int, data: bytes, state: AlState) -> None:
         check(self, self.entry(index, subindex), len(data), state)
         if REFUSED.get((index, subindex)) == data:
-            raise SdoAbortError(AbortCode.INVALID_VALUE)
+            raise TransferRefusedError(AbortCode.INVALID_VALUE)
         write(self, index, subindex, data, state)
 
     patch.setattr(dictionary.Dictionary, "write", refuse)
@@ -79,7 +79,7 @@ def _lack(patch: pytest.MonkeyPatch, addresses: Collection[tuple[int, int]], cod
 
     def read_some(self: dictionary.Dictionary, index: int, subindex: int) -> bytes:
         if (index, subindex) in addresses:
-            raise SdoAbortError(code)
+            raise TransferRefusedError(code)
         return read(self, index, subindex)
 
     patch.setattr(dictionary.Dictionary, "read", read_some)

@@ -5,18 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from ethercat_server.tool.cli import main
-from tests.ended import Result, run, run_here
-from tests.server.running import ATTEMPTS, starved
+from tests.ended import Result, patiently, run, run_here
 
 MODULE = "ethercat_server.tool.cli"
 
 
 def tool(*arguments: object, code: int | None = 0) -> Result:
     """Run `ethercat-sensor arguments...` as a process; it must end with `code` (None: any)."""
-    for _ in range(ATTEMPTS):
-        result = run(MODULE, *arguments)
-        if not starved(result.err):
-            break
+    result = patiently(lambda: run(MODULE, *arguments))
     assert code is None or result.code == code, result
     return result
 

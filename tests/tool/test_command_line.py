@@ -86,11 +86,11 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
         (["objects", "ens5", "--server", "localhost:12001"], "either an interface"),
         (["objects", "--server", "localhost:port"], "HOST:PORT"),
         (["objects", "--server", "localhost:0"], "0 is no port"),
-        (["plan", "ens5"], "no settings given"),
-        (["plan", "ens5", "--set", "sinc_length"], "NAME=VALUE"),
+        (["apply", "ens5"], "no settings given"),
+        (["apply", "ens5", "--set", "sinc_length"], "NAME=VALUE"),
         (["apply", "ens5", "--set", "colour=1"], "no setting 'colour'"),
         (["apply", "ens5", "--set", "sinc_length=0"], "from 32 to 2048"),
-        (["plan", "ens5", "--config", "/nonexistent.toml"], "/nonexistent.toml"),
+        (["apply", "ens5", "--config", "/nonexistent.toml"], "/nonexistent.toml"),
         (["read", "ens5"], "a NAME is missing, or the interface beside 'ens5'"),
         (["tare", "ens5", "--target", "-1e-3", "-.5", "0", "0", "0", "-inf"], "six finite numbers"),
         (["tare", "ens5", "--samples", "0"], "from 1 to 20000"),
@@ -229,13 +229,6 @@ def test_an_image_is_read_to_the_end_of_its_categories_and_no_further() -> None:
     assert not decode(image[:2] + bytes([image[2] ^ 1]) + image[3:])["check_byte_right"]
 
 
-def test_an_erased_eeprom_has_nothing() -> None:
-    read = reader(b"")
-    found = decode(read)
-    assert (found["name"], found["sync_managers"], found["categories"]) == ("", [], {})
-    assert raw_lines(read)[0] == "0000: ff|ff|ff|ff"
-
-
 @pytest.mark.parametrize("blank", [b"\0", b"\xff"])
 def test_blank_memory_ends_an_image_as_the_end_mark_does(blank: bytes) -> None:
     whole = reader(build_image(sensor_device("BFT-ROKS-ECAT-M8", 7, 61)))
@@ -247,6 +240,7 @@ def test_blank_memory_ends_an_image_as_the_end_mark_does(blank: bytes) -> None:
 
 def test_a_category_that_no_eeprom_has_room_for_is_not_read() -> None:
     assert len(reader(b"\xaa" * 0x8000)) == 0x100
+    assert raw_lines(reader(b""))[0] == "0000: ff|ff|ff|ff"
 
 
 @given(st.binary(max_size=600))

@@ -65,10 +65,10 @@ def test_the_first_name_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None
 def test_plan_apply_save(bench: Bench) -> None:
     bus, server = bench
     asked = ("--sensor", "20", "--set", "sinc_length=128", *SERVER)
-    assert told("plan", *asked, code=3)["changes"][0]["then"] == 128
+    assert told("apply", "--dry-run", *asked, code=3)["changes"][0]["then"] == 128
     applied = told("apply", *asked)
     assert (applied["rate_hz"], applied["settings"]["sinc_length"]) == (400, 128)
-    assert "nothing to change" in tool_here("plan", *asked).out
+    assert "nothing to change" in tool_here("apply", "--dry-run", *asked).out
     tool_here("save", "--sensor", 1, *SERVER)
     assert ("0x8030", 1, "01") in bus.written(1)
     assert [row["rate_hz"] for row in server.client().ask("describe")["sensors"]] == [RATE_HZ, 400]
@@ -86,7 +86,10 @@ def test_what_is_said_to_last_outlasts_the_sensors_power(bench: Bench) -> None:
     after = server.client().ask("describe")["sensors"][0]
     assert (after["settings"]["sinc_length"], after["offset"]) == (128, before["offset"])
     assert any(after["offset"])
-    assert "nothing to change" in tool_here("plan", "--sensor", 0, "--set", "sinc_length=128", *SERVER).out
+    assert (
+        "nothing to change"
+        in tool_here("apply", "--dry-run", "--sensor", 0, "--set", "sinc_length=128", *SERVER).out
+    )
 
 
 def test_a_tare_that_is_stopped_tells_what_came_of_it(bench: Bench) -> None:

@@ -1,4 +1,4 @@
-"""`plan`, `apply`, `save`, `tare`, `snapshot` and `restore` without a server, on simulated sensors."""
+"""`apply`, `save`, `tare`, `snapshot` and `restore` without a server, on simulated sensors."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def single() -> Iterator[SimulatedBus]:
 def test_plan_says_what_would_change_and_writes_nothing(bench: SimulatedBus) -> None:
     near = bench.near
     asked = ("--set", "sinc_length=128", "--set", "fir=on", "--set", "imu_active=1")
-    shown = tool_here("plan", near, *asked, code=3).out
+    shown = tool_here("apply", "--dry-run", near, *asked, code=3).out
     assert "sinc_length  64     128   400 Hz; cut-off 105 Hz with FIR off, 16 Hz with FIR on" in shown
     assert "cut-off 16 Hz, delay 30 ms (derived" in shown
-    found = told("plan", near, *asked, code=3)
+    found = told("apply", "--dry-run", near, *asked, code=3)
     changes = [(row["name"], row["now"], row["then"]) for row in found["changes"]]
     assert changes == [("fir", False, True), ("sinc_length", 64, 128)]
-    assert (found["now"]["cutoff_hz"], found["then"]["cutoff_hz"]) == (209.5, 16.0)
-    assert told("plan", near, "--set", "sinc_length=64")["changes"] == []
+    assert (found["meaning"]["cutoff_hz"], found["rate_hz"], found["saved"]) == (16.0, 400, False)
+    assert told("apply", "--dry-run", near, "--set", "sinc_length=64")["changes"] == []
     assert bench.written() == []
 
 
@@ -62,13 +62,12 @@ def test_apply_does_what_plan_says_and_a_file_says_it_too(bench: SimulatedBus, t
     asked = {"sinc_length": 205, "acceleration_range_g": 8, "chop": True, "fir": False}
     assert asked.items() <= applied["settings"].items()
     assert "nothing to change" in tool_here("apply", near, "--config", config).out
-    tool_here("plan", near, "--config", config)
+    tool_here("apply", "--dry-run", near, "--config", config)
     bench.power_cycle()
-    tool_here("plan", near, "--config", config, code=3)  # it was not saved
+    tool_here("apply", "--dry-run", near, "--config", config, code=3)  # it was not saved
     config.write_text("[sensor]\nsinc_length = 205\n[sensor.7]\nfir = true\n")
-    for name in ("plan", "apply"):
-        said = refused(name, near, "--config", config, code=2)
-        assert "has settings for sensor 7, but the bus has only 0: BFT-SENS-ECAT-M8 with serial 4711" in said
+    said = refused("apply", near, "--config", config, code=2)
+    assert "has settings for sensor 7, but the bus has only 0: BFT-SENS-ECAT-M8 with serial 4711" in said
 
 
 def test_apply_and_save_keep_it_over_a_power_cut(bench: SimulatedBus) -> None:
@@ -79,7 +78,7 @@ def test_apply_and_save_keep_it_over_a_power_cut(bench: SimulatedBus) -> None:
     assert bench.written().count(("0x8030", 1, "01")) == 2
     bench.power_cycle()
     asked = ("--set", "sinc_length=256", "--set", "temperature_compensation=true")
-    assert "nothing to change" in tool_here("plan", near, *asked).out
+    assert "nothing to change" in tool_here("apply", "--dry-run", near, *asked).out
 
 
 def test_a_chain_wants_a_choice(chain: SimulatedBus) -> None:
@@ -109,7 +108,7 @@ def test_apply_that_fails_half_way_takes_everything_back(
     path.write_text(json.dumps(content))
     assert "the former settings are in force" in refused("restore", near, path)
     assert ("0x8000", 1, "0000003f") in single.written()
-    assert len(told("plan", near, *asked, code=3)["changes"]) == 3
+    assert len(told("apply", "--dry-run", near, *asked, code=3)["changes"]) == 3
     assert offset(near) == [0.0] * 6
 
 
@@ -300,12 +299,12 @@ def test_what_is_said_of_it_follows_the_rate(bus: SimulatedBus, length: int) -> 
 def test_a_length_that_chop_hides_is_not_overwritten(bus: SimulatedBus) -> None:
     let_chop_divide(bus)
     assert told("apply", bus.near, "--set", "chop=on")["rate_hz"] == 400
-    assert told("plan", bus.near, "--set", "imu_active=3", code=3)["then"]["rate_hz"] == 400
+    assert told("apply", "--dry-run", bus.near, "--set", "imu_active=3", code=3)["rate_hz"] == 400
     written = bus.written()
     assert told("apply", bus.near, "--set", "imu_active=3")["rate_hz"] == 400
     assert {row[0] for row in bus.written()[len(written) :]} == {"0x8010"}
     asked = ("--set", "sinc_length=64")
-    assert "nothing to change" in tool_here("plan", bus.near, *asked).out
+    assert "nothing to change" in tool_here("apply", "--dry-run", bus.near, *asked).out
     (read,) = told("read", bus.near, "sinc_length")["sensors"][0]["objects"]
     assert (read["value"], read["meaning"]) == (768, "400 Hz; cut-off not in the table" + UNMATCHED)
 
@@ -313,9 +312,9 @@ def test_a_length_that_chop_hides_is_not_overwritten(bus: SimulatedBus) -> None:
 @pytest.mark.parametrize("length", more_if_long([32, 342], [32, 128, 341, 342, 1000]))
 def test_plan_and_restore_end(bus: SimulatedBus, length: int, tmp_path: Path) -> None:
     asked = ("--set", f"sinc_length={length}")
-    tool_here("plan", bus.near, *asked, code=3)
+    tool_here("apply", "--dry-run", bus.near, *asked, code=3)
     tool_here("apply", bus.near, *asked)
-    assert "nothing to change" in tool_here("plan", bus.near, *asked).out
+    assert "nothing to change" in tool_here("apply", "--dry-run", bus.near, *asked).out
     path = tmp_path / "a.json"
     tool_here("snapshot", bus.near, path)
     content = json.loads(path.read_text())

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.wire import Command
-from ethercat_server.virtual_sensor.bus import Bus
+from ethercat_server.virtual_sensor.bus import SlaveChain
 from ethercat_server.virtual_sensor.faults import obey
 from ethercat_server.virtual_sensor.options import SensorOptions, SlaveOptions
 
@@ -35,7 +35,7 @@ class RawMaster:
 
     def __init__(self, *slaves: SlaveOptions, start: int = 5_000_000_123) -> None:
         self.now = start
-        self.bus = Bus(slaves or (SensorOptions(),), start)
+        self.bus = SlaveChain(slaves or (SensorOptions(),), start)
         self.count = len(slaves) or 1
         self.mailbox_counter = 0
         self.pdo_size = self.bus.sensors[0].options.pdo_size if self.bus.sensors else 0

@@ -47,39 +47,30 @@ def test_an_error_has_to_be_acknowledged_but_on_the_way_down() -> None:
 
 
 OUT, IN = sync_manager(0x1000, 128, 0x26), sync_manager(0x1080, 128, 0x22)
-
-
-@pytest.mark.parametrize(
-    "managers",
-    [
-        bytes(16), OUT, OUT + sync_manager(0x1080, 64, 0x22), sync_manager(0x1000, 128, 0x22) + IN,
-        OUT + sync_manager(0x1080, 128, 0x22, 0), sync_manager(0x1200, 128, 0x26) + IN,
-    ],
-)  # fmt: skip
-def test_a_wrong_mailbox_configuration(managers: bytes) -> None:
-    master = RawMaster()
-    master.write(0x0800, managers)
-    assert master.request(PREOP) == (INIT | ERROR, 0x0016)
-
-
 OUTPUTS, INPUTS = sync_manager(0x1100, 1, 0x64), sync_manager(0x1180, 61, 0x20)
 
 
 @pytest.mark.parametrize(
-    ("managers", "code"),
+    ("state", "managers", "code"),
     [
-        (sync_manager(0x1100, 2, 0x64) + INPUTS, 0x001D),
-        (sync_manager(0x1100, 1, 0x64, 0) + INPUTS, 0x001D),
-        (sync_manager(0x1100, 1, 0x20) + INPUTS, 0x001D),
-        (OUTPUTS + sync_manager(0x1180, 60, 0x20), 0x001E),
-        (OUTPUTS + sync_manager(0x1180, 77, 0x20), 0x001E),
-        (OUTPUTS + sync_manager(0x1180, 61, 0x20, 0), 0x001E),
+        *((PREOP, managers, 0x0016) for managers in (
+            bytes(16), OUT, OUT + sync_manager(0x1080, 64, 0x22), sync_manager(0x1000, 128, 0x22) + IN,
+            OUT + sync_manager(0x1080, 128, 0x22, 0), sync_manager(0x1200, 128, 0x26) + IN,
+        )),
+        *((SAFEOP, managers + INPUTS, 0x001D) for managers in (
+            sync_manager(0x1100, 2, 0x64), sync_manager(0x1100, 1, 0x64, 0), sync_manager(0x1100, 1, 0x20),
+        )),
+        *((SAFEOP, OUTPUTS + managers, 0x001E) for managers in (
+            sync_manager(0x1180, 60, 0x20), sync_manager(0x1180, 77, 0x20), sync_manager(0x1180, 61, 0x20, 0),
+        )),
     ],
-)
-def test_a_wrong_process_data_configuration(managers: bytes, code: int) -> None:
-    master = RawMaster().go(PREOP)
-    master.write(0x0810, managers)
-    assert master.request(SAFEOP) == (PREOP | ERROR, code)
+)  # fmt: skip
+def test_a_wrong_configuration_of_sync_managers(state: int, managers: bytes, code: int) -> None:
+    master, before = RawMaster(), INIT
+    if state == SAFEOP:
+        master.go(before := PREOP)
+    master.write(0x0800 if state == PREOP else 0x0810, managers)
+    assert master.request(state) == (before | ERROR, code)
 
 
 def test_taking_sync_managers_away_ends_the_state() -> None:

@@ -152,7 +152,7 @@ def test_a_channel_saturates_before_the_offset_is_added() -> None:
 
 
 def test_a_channel_freezes_and_thaws_and_faults_are_gone_with_the_power() -> None:
-    master = RawMaster(SensorOptions(signal="ramp")).go(OP)
+    master = RawMaster(SensorOptions(signal="clock")).go(OP)
 
     def different(axis: int) -> int:
         return len({sample.force[axis] for sample in samples(master, 50)})
@@ -160,14 +160,14 @@ def test_a_channel_freezes_and_thaws_and_faults_are_gone_with_the_power() -> Non
     do(master, "freeze force.x")
     frozen = samples(master, 1)[0].force[0]
     do(master, "freeze force.x")
-    assert (different(0), different(1), samples(master, 1)[0].force[0]) == (1, 50, frozen)
+    assert (different(0), different(2), samples(master, 1)[0].force[0]) == (1, 50, frozen)
     do(master, "thaw force.x")
     assert different(0) == 50
     for line in ("noise force.y 1", "limit force.z 0", "freeze force.x", "skip 50", "power off", "power on"):
         do(master, line)
     master.go(OP)
     assert different(0) == 50
-    assert all((s.force[1] * 64).is_integer() and s.warnings == 0 for s in samples(master, 50))
+    assert all(s.force[1].is_integer() and s.warnings == 0 for s in samples(master, 50))
 
 
 def test_skipped_samples_never_show() -> None:
@@ -217,58 +217,17 @@ def test_a_command_waits_for_a_write() -> None:
         assert obey(master.bus, line).startswith("error: ")
 
 
-SAVE, STATUS = (0x8030, 1), (0x8030, 2)
-
-
-def test_saving_takes_its_time_and_a_power_cut_leaves_the_rest() -> None:
+def test_a_save_takes_its_time_and_is_lost_with_the_power() -> None:
     master = RawMaster().go(PREOP)
-    do(master, "saving 0.37")  # ten milliseconds each
-    for subindex, data in ((1, b"\x80\0"), (2, b"\0"), (4, b"\1")):
-        master.download(0x8006, subindex, data)
-    master.download(*SAVE, b"\1")
-    assert master.upload(*STATUS) == b"\xff"
-    master.wait(265_000_000)
-    do(master, "power off", "power on")
-    master.go(PREOP)
-    assert [master.upload(0x8006, n) for n in (1, 2, 3, 4)] == [b"\0\3", b"\0", b"\0", b"\0"], "768"
-    assert master.upload(*STATUS) == b"\0"
-    master.download(*SAVE, b"\1")
-    master.wait(371_000_000)
-    assert master.upload(*STATUS) == b"\0"
-
-
-def test_a_save_may_end_with_a_status_or_with_the_power() -> None:
-    master = RawMaster().go(PREOP)
-    do(master, "saving 0 7")
-    master.download(0x8006, 4, b"\1")
-    master.download(*SAVE, b"\1")
-    assert master.upload(*STATUS) == b"\x07"
-    do(master, "power cycle 0")
-    master.go(PREOP)
-    assert master.upload(0x8006, 4) == b"\0"
-    do(master, "saving 0")
-    master.download(0x8006, 2, b"\0")
-    master.download(0x8006, 4, b"\1")
-    do(master, "cut-save 27")
-    with pytest.raises(AssertionError):
-        master.download(*SAVE, b"\1")
-    assert answering(master) == 0
-    do(master, "power on")
-    master.go(PREOP)
-    assert [master.upload(0x8006, n) for n in (2, 4)] == [b"\0", b"\0"]
-
-
-def test_an_eeprom_that_cannot_be_read() -> None:
-    master = RawMaster(SensorOptions(eeprom_ms=0))
-
-    def status() -> int:
-        master.write(0x0502, struct.pack("<HI", 0x0100, 8))
-        return master.read16(0x0502) & 0xE000
-
-    for result, bits in (("ok", 0), ("error", 0x2000), ("busy", 0x8000), ("ok", 0)):
-        do(master, f"sii {result}")
-        assert status() == bits
-    assert obey(master.bus, "sii sometimes").startswith("error: ")
+    for milliseconds, status, kept in ((200, b"\xff", b"\0"), (371, b"\0", b"\1")):
+        do(master, "saving 0.37")
+        master.download(0x8006, 4, b"\1")
+        master.download(0x8030, 1, b"\1")
+        master.wait(milliseconds * 1_000_000)
+        assert master.upload(0x8030, 2) == status
+        do(master, "power off", "power on")
+        master.go(PREOP)
+        assert master.upload(0x8006, 4) == kept
 
 
 def test_another_signal_begins_with_the_next_sample_and_outlasts_a_power_cycle() -> None:
@@ -286,20 +245,6 @@ def test_another_signal_begins_with_the_next_sample_and_outlasts_a_power_cycle()
         do(master, "power cycle 0")
         master.wait(10**6)
         master.go(OP)
-
-
-def test_stats_tell_what_was_written() -> None:
-    master = RawMaster().go(OP)
-    master.download(0x2000, 1, bytes(4))
-    with pytest.raises(Abort):
-        master.download(0x8006, 1, b"\x40\0")
-    [sensor] = stats(master)["sensors"]
-    assert sensor["al_state"] == "OP"
-    assert sensor["calibration_writes"] == 1
-    assert sensor["sdo_writes"] == [
-        {"index": "0x2000", "subindex": 1, "hex": "00000000", "state": "OP", "abort": None},
-        {"index": "0x8006", "subindex": 1, "hex": "4000", "state": "OP", "abort": "0x08000022"},
-    ]
 
 
 @pytest.mark.parametrize(
@@ -374,13 +319,6 @@ def test_a_damaged_frame_is_lost_and_counted_where_it_was_damaged() -> None:
     do(master, "damage 1 @1")
     assert master.frame(NOTE) is None
     assert noted(master) == [b"!", b"\0", b"\0"], "it reached only those before the damage"
-    master = RawMaster(*chain(3))
-    do(master, "damage 1 1 @1")
-    assert master.frame(NOTE) is None
-    assert noted(master) == [b"!"] * 3, "on its way back it has done its work"
-    assert [counters(master, n) for n in range(3)] == [
-        {"forwarded": (0, 1)}, {"invalid": (0, 1), "physical": (0, 1)}, {},
-    ]  # fmt: skip
 
 
 def test_a_link_that_flaps_is_counted_at_both_ends() -> None:
@@ -391,10 +329,10 @@ def test_a_link_that_flaps_is_counted_at_both_ends() -> None:
 
     do(master, "flap")
     assert lost_links() == [(1, 0), (0, 0)]
-    do(master, "flap 1", "flap @1")
-    assert lost_links() == [(1, 2), (2, 0)]
+    do(master, "flap @1")
+    assert lost_links() == [(1, 1), (1, 0)]
     do(master, "power off @1")
-    assert counters(master)["lost links"] == (1, 3)
+    assert counters(master)["lost links"] == (1, 2)
 
 
 def test_error_counters_stop_at_255_and_a_write_clears_their_group() -> None:
@@ -410,11 +348,9 @@ def test_error_counters_stop_at_255_and_a_write_clears_their_group() -> None:
     assert master.write(0x030E, b"\0\0", 1) == 0, "nothing there"
 
 
-def test_hear_ends_damage_and_the_last_port_is_open() -> None:
+def test_hear_ends_damage() -> None:
     master = RawMaster(*chain(2))
     do(master, "damage 5", "hear")
     assert answering(master) == 2
-    assert obey(master.bus, "damage 1 1 @1").startswith("error: port 1 of the last slave")
-    assert obey(master.bus, "damage 1 2").startswith("error: ")
     do(master, "power off @1", "damage 1 @1")
     assert answering(master) == 1, "nobody there to find it damaged"

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ethercat_server.ethercat import wire
+from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import Command
-from ethercat_server.virtual_sensor import registers as reg
 from ethercat_server.virtual_sensor.esc import Esc, execute, pass_through
 from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
 from ethercat_server.virtual_sensor.options import SensorOptions

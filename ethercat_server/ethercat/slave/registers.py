@@ -31,7 +31,6 @@ LOST_LINKS: Final = 0x0310  # a byte a port
 PORT_COUNT: Final = 4
 ERROR_COUNTERS_SIZE: Final = LOST_LINKS + PORT_COUNT - RX_ERRORS
 WATCHDOG_DIVIDER: Final = 0x0400
-WATCHDOG_TIME_PDI: Final = 0x0410
 WATCHDOG_TIME: Final = 0x0420
 WATCHDOG_STATUS: Final = 0x0440
 WATCHDOG_COUNTER: Final = 0x0442
@@ -47,9 +46,7 @@ SYNC_MANAGER_SIZE: Final = 8
 # Offsets within a sync manager.
 SM_STATUS: Final = 5
 SM_ACTIVATE: Final = 6
-# In a sync manager's activate register: a frame that exchanges its buffer is a DC event.
-SM_LATCH_ECAT: Final = 0x40
-SM_LATCH_PDI: Final = 0x80  # likewise the firmware that begins or ends an access to its buffer
+SM_LATCH_PDI: Final = 0x80  # in SM_ACTIVATE: an access of the firmware to its buffer is a DC event
 SM_PDI_CONTROL: Final = 7
 # Bits of the control byte: it is a mailbox (else buffered), the master writes.
 SM_MAILBOX, SM_WRITE = 0x02, 0x04
@@ -60,15 +57,8 @@ DC_RECEIVE_TIMES: Final = 0x0900  # four bytes a port, ns: when the frame that w
 DC_SYSTEM_TIME: Final = 0x0910
 DC_RECEIVE_TIME: Final = 0x0918  # eight bytes: the same, at the processing unit
 DC_OFFSET: Final = 0x0920
-DC_DIFFERENCE: Final = 0x092C
-DC_SPEED_START: Final = 0x0930
-DC_SPEED_DIFFERENCE: Final = 0x0932
-DC_FILTERS: Final = 0x0934  # two bytes: filter depths of the differences of the system time, and of the speed
 DC_ACTIVATION: Final = 0x0980  # two bytes: who controls the SYNC signals, which are active
-# Four bytes, local time: the frame came that exchanged the buffer of a sync manager.
-DC_ECAT_EVENT: Final = 0x09F0
-DC_PDI_START_EVENT: Final = 0x09F8  # likewise the firmware began to access a buffer
-DC_PDI_CHANGE_EVENT: Final = 0x09FC  # likewise it exchanged one: new inputs
+DC_PDI_CHANGE_EVENT: Final = 0x09FC  # four bytes, local time: the firmware exchanged a buffer, new inputs
 DC_END: Final = 0x0A00
 USER_RAM: Final = 0x0F80
 REGISTERS_END: Final = 0x1000  # process data memory begins here

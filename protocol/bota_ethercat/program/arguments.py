@@ -81,4 +81,15 @@ def number(low: float, high: float, what: str = "") -> Callable[[str], float]:
     return typed(within, what or f"from {low:g} to {high:g}")
 
 
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """The type of an argument that is a whole number, decimal or 0x..., from `low` to `high`."""
+
+    def within(text: str) -> int:
+        if low <= (value := int(text, 0)) <= high:
+            return value
+        raise ValueError
+
+    return typed(within, f"a whole number from {low} to {high}")
+
+
 seconds = number(1e-9, 1e9, "a number of seconds, such as 60")

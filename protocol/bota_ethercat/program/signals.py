@@ -2,13 +2,14 @@
 """What SIGINT and SIGTERM do once a program is loaded; before, `start` has them end it at once.
 
 Either they are remembered (`Signals`), by programs that have something to finish, or they raise
-KeyboardInterrupt (`interrupt_on_signals`).
+KeyboardInterrupt (`interrupt_on_signals`), but within `signals_held_back` and `signals_call`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 
@@ -44,6 +45,28 @@ def interrupt_on_signals() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     _unblock()
+
+
+@contextlib.contextmanager
+def signals_held_back() -> Iterator[None]:
+    """Defer SIGINT and SIGTERM during a change."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def signals_call(handle: Callable[[], None]) -> Iterator[None]:
+    """SIGINT and SIGTERM only call `handle`."""
+    numbers = signal.SIGINT, signal.SIGTERM
+    before = {number: signal.signal(number, lambda *_: handle()) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _unblock() -> None:
