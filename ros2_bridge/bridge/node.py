@@ -24,17 +24,16 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from bota_ethercat.client.channel import Channel
+from bridge.compensating.compensation import Compensation
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
 from bridge.parameters.declare import LiveParameters, SettingsParameters, declare, warn_of_others
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import StopSignals, Worker, prepare, refuse
-from bridge.publishing.compensated_wrench import CompensatedOutput
 from bridge.publishing.messages import Stamps, make_measured
 from bridge.publishing.terminals import TerminalTopics
-from bridge.rclpy_internals import is_about_arguments, make_executors, refuse_what_raises
+from bridge.rclpy_internals import Spinner, is_about_arguments, make_executors, refuse_what_raises
 from bridge.services import BiasServices, IdentifyServices, SensorServices
-from bridge.spinning import Spinner
 from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
 
@@ -127,7 +126,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         """Make everything; nothing runs yet. Errors as at the start."""
         self.parameters = parameters = self.live.gather({})
         self.stamps = stamps = Stamps(self.get_logger())
-        compensated = CompensatedOutput(
+        compensated = Compensation(
             self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock, self.fail
         )
         wrench, *others = make_measured(self, parameters, stamps)
@@ -170,7 +169,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         if not self.is_open:
             return True
         ended = self.monitor.stop() & self.reader.stop() & self.compensation.output.frames.stop()
-        self.compensation.choice.close()
+        self.compensation.stop()
         return ended
 
     def close(self) -> None:

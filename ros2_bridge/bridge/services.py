@@ -28,10 +28,10 @@ from bota_ethercat.control import MAX_TARE_SAMPLES, known_six
 from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.program import state
+from bridge.compensating.compensation import RestWindow
 from bridge.compensating.control import CompensationControl
 from bridge.parameters.declare import SettingsParameters
 from bridge.parameters.table import AUTO, ParameterError
-from bridge.publishing.compensated_wrench import RestWindow
 from bridge.rclpy_internals import filling
 from bridge.stream.link import (
     CONFIGURE_TIMEOUT_S,
@@ -215,7 +215,7 @@ class IdentifyServices:
         self._poses, self._result = [], None
         self._sensor = self._sensor_now()
         return (
-            f"identification started{before}; gravity is known by {self._control.choice.source.describe}; "
+            f"identification started{before}; gravity is known by {self._control.source.name}; "
             f"{coverage([]).next_pose}, hold it still with nothing touching the tool, and call "
             "identify/add_pose"
         )
@@ -346,11 +346,11 @@ def take_window(control: CompensationControl, *, needs_tool: bool, samples: int 
         raise CompensationError(f"there are no samples: {link.absence}")
     _wait_settled(link)
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
-    window = RestWindow(seconds, limits, control.choice.source)
+    window = RestWindow(seconds, limits, control.source)
     if samples:
         limits = replace(limits, least_samples=_bounded(samples))
         seconds = limits.least_samples / (link.info.rate_hz or _USUAL_HZ)
-        window = RestWindow(0.0, limits, control.choice.source)
+        window = RestWindow(0.0, limits, control.source)
     patience_s = 1.5 * seconds + _PATIENCE_S
     deadline_s = clock.monotonic() + patience_s
     info, offset, bad = link.info, link.info.offset, control.reader.not_finite

@@ -23,7 +23,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from bridge.node import BridgeNode, spin
-from bridge.spinning import Spinner
+from bridge.rclpy_internals import Spinner
 from tests.server.running import Program, wait_until
 
 PATIENCE_S = 45.0

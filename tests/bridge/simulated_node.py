@@ -285,7 +285,7 @@ class Node(Asking):
     def close(self) -> None:
         assert self.node.exit_code != 1, self.log
         self.node.reader.client.close()
-        self.node.compensation.choice.close()
+        self.node.compensation.stop()
         retire(self.node)
 
     @property
@@ -322,7 +322,7 @@ class Node(Asking):
         reader.client._reader = None  # who asks the server waits as another thread does
         while self._triggered and not self._is_busy:
             self._triggered.pop(0)()
-        self.node.compensation.output.frames.look()
+        self.node.compensation.output.frames.publish_waiting()
 
     def run(self, seconds: float) -> None:
         """Let so much simulated time pass."""

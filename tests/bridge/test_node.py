@@ -198,7 +198,7 @@ def test_a_managed_node(server: ScriptedServer, listener: Listener, start: Start
     node.says("the transition failed: ZeroDivisionError")
     del node.node.open
     change(Transition.TRANSITION_CONFIGURE)
-    setting = threading.Thread(target=lambda: node.node.live.put(**{"filter.cutoff": 20.0}))
+    setting = threading.Thread(target=lambda: node.node.live.put(temperature_variance=0.5))
 
     def set_meanwhile() -> object:
         if not setting.ident:
@@ -209,7 +209,8 @@ def test_a_managed_node(server: ScriptedServer, listener: Listener, start: Start
     node.node.get_logger = set_meanwhile  # type: ignore[method-assign]
     change(Transition.TRANSITION_ACTIVATE)
     setting.join()
-    assert change(Transition.TRANSITION_ACTIVE_SHUTDOWN) == topics | {"wrench_filtered"}
+    assert node.node.compensation.parameters.temperature_variance == 0.5
+    assert change(Transition.TRANSITION_ACTIVE_SHUTDOWN) == topics
 
 
 def test_both_names_of_the_port() -> None:

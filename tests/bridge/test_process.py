@@ -23,7 +23,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
 from bridge import client, process
-from bridge.spinning import Spinner
+from bridge.rclpy_internals import Spinner
 from tests import without_ipv6
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer

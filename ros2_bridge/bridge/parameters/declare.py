@@ -95,6 +95,11 @@ class LiveParameters:
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._after_set)
 
+    def check_values(self, **values: Any) -> None:
+        """ParameterError if one of these cannot be."""
+        for name, value in values.items():
+            _ROWS[name].check(value)
+
     def put(self, **values: Any) -> None:
         """Set parameters from within; ParameterError if that is refused."""
         parameters = [Parameter(name, value=value) for name, value in values.items()]
