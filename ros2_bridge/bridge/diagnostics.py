@@ -89,7 +89,6 @@ class Monitor:
         self.thread = Worker("monitor", self._run, on_failure)
 
     def stop(self) -> bool:
-        """Stop and wait for the thread; False if it does not end in time."""
         self._stopping.set()
         return self.thread.has_ended()
 
@@ -98,7 +97,6 @@ class Monitor:
             self.tick()
 
     def tick(self) -> None:
-        """Publish if it is time or a level has changed."""
         self._outputs.refresh()
         now_s = self._clock.monotonic()
         regular = now_s - self._published_s >= _REPORT_S
@@ -119,7 +117,6 @@ class Monitor:
             self._begin_interval(now_s)
 
     def _measure(self, now_s: float) -> None:
-        """Work out rate and ages of the interval that ends."""
         ages, link = self._reader.take_ages(), self._link
         self._age_us = None
         if ages and link.is_connected and link.client.session.same_machine:
@@ -343,7 +340,6 @@ class Monitor:
 
 
 def text_of(value: object) -> str:
-    """A value as a KeyValue carries it; empty if it is not known."""
     if value is None:
         return ""
     return str(value).lower() if isinstance(value, bool) else printable(value)

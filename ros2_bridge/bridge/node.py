@@ -66,7 +66,6 @@ def _sentences() -> Iterator[None]:
 
 
 def _text_of(error: Exception) -> str:
-    """What ROS says, in one line and without the places in its source."""
     return re.sub(r", at /\S+:\d+", "", " ".join(str(error).split()))
 
 
@@ -158,7 +157,6 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.is_open = True
 
     def start(self) -> None:
-        """Start the threads."""
         self.reader.thread.start()
         self.monitor.thread.start()
         self.compensation.output.frames.thread.start()
@@ -197,7 +195,6 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
 
     @classmethod
     def create(cls, arguments: Sequence[str] | None = None) -> Self:
-        """A node that is ready to `spin`; StartError."""
         with _sentences():
             return cls(arguments)
 
@@ -228,7 +225,6 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             self.reader.link.cancel()
 
     def fail(self, reason: str) -> None:
-        """End the node with exit code 1, from any thread."""
         self.get_logger().error(reason)
         self.finish(1)
 
@@ -251,7 +247,6 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
 
 
 def run(arguments: Sequence[str], signals: StopSignals | None = None) -> int:
-    """Run the node with these command-line arguments until it ends; returns the exit code."""
     try:
         unknown = remove_ros_args(["bridge-client", *arguments])[1:]
         if unknown:

@@ -44,14 +44,12 @@ class Worker(threading.Thread):
         self._work, self._on_failure = work, on_failure
 
     def run(self) -> None:
-        """Work."""
         try:
             self._work()
         except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a dead node
             self._on_failure(f"the {self.name} failed: {type(error).__name__}: {error}")
 
     def has_ended(self, within_s: float = 5.0) -> bool:
-        """Wait for it; False if it does not end in time."""
         self.join(within_s)
         return not self.is_alive()
 
@@ -76,7 +74,6 @@ def environment_problem() -> str:
 
 
 def refuse(text: str, exit_code: int) -> int:
-    """Say why the node does not start; returns the exit code."""
     sys.stderr.write(f"bridge-client: {text}\n")
     return exit_code
 
@@ -146,7 +143,6 @@ def prepare(rt_priority: int, cpu: int, log: Any) -> None:
 
 
 def _beside() -> Iterator[int]:
-    """The threads whose locks the stream needs."""
     yield from (thread.native_id or 0 for thread in threading.enumerate() if thread.name in BESIDE)
     for task in Path("/proc/self/task").iterdir():
         with contextlib.suppress(OSError):

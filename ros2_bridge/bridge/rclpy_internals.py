@@ -27,7 +27,6 @@ _THREADS: Final = 4  # of the documented executor: a service, the supervisor, an
 
 
 def is_known() -> bool:
-    """Whether rclpy's version is one of RIGHT_FOR."""
     with suppress(PackageNotFoundError):
         return version("rclpy").startswith(RIGHT_FOR)
     return False
@@ -156,8 +155,6 @@ class _PartExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy has 
 
 
 class _Part:
-    """A node as an executor sees it, with the entities whose callback groups it wants."""
-
     def __init__(self, node: Node, wants: Callable[[Any], bool]) -> None:
         self._node, self._wants = node, wants
 

@@ -106,7 +106,6 @@ def _create(node: Node, prefix: str, *acts: Callable[..., str | Done]) -> None:
 
 
 def _target(request: Any) -> Wrench:
-    """What a tare is to make of the reading; CompensationError if that is not finite."""
     parts = request.target.force, request.target.torque
     try:
         return Wrench(*(vector((part.x, part.y, part.z), "a target") for part in parts))
@@ -115,8 +114,6 @@ def _target(request: Any) -> Wrench:
 
 
 class SensorServices:
-    """What the server does, for every client."""
-
     def __init__(self, node: Node, link: Link, settings: SettingsParameters) -> None:
         self._link, self._settings = link, settings
         acts = self._sensor_tare, self._get_settings, self._apply_settings, self._save_settings
@@ -153,8 +150,6 @@ class SensorServices:
 
 
 class BiasServices:
-    """Take, clear and undo the node's bias."""
-
     def __init__(self, node: Node, control: CompensationControl) -> None:
         self._control = control
         _create(node, "", self._tare, self._clear_tare, self._undo_tare)

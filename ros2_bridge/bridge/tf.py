@@ -18,8 +18,6 @@ class UnusableError(Exception):
 
 
 class Pose(NamedTuple):
-    """The pose of a frame in another."""
-
     translation: Vector3  # m
     rotation: Quaternion
     stamp_ns: int  # since the Unix epoch; 0: static, it holds at any time

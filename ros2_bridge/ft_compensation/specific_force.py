@@ -119,12 +119,10 @@ class QuaternionGravity:
         self._rates: deque[tuple[float, Vector3]] = deque(maxlen=_MOST_RATES)
 
     def reset(self) -> None:
-        """Forget everything."""
         self._newest_s, self._gravity = -math.inf, None
         self._rates.clear()
 
     def follow(self, angular_rate: Vector3, time_s: float) -> None:
-        """Take a sample's angular rate, rad/s."""
         rates = self._rates
         if rates and not 0.0 <= time_s - rates[-1][0] <= self.stale_after_s:
             rates.clear()  # a gap, or a clock that was set: the orientation is held until the next one

@@ -36,7 +36,7 @@ from tests.bridge.simulated_node import (
     weight,
 )
 from tests.compensation.making import BIAS, TOOL
-from tests.compensation.motion import Felt, feel, guided, waypoints
+from tests.compensation.motion import Felt, feel, guided
 
 START: dict[str, Any] = {
     "tool_mass": TOOL.mass,
@@ -87,13 +87,6 @@ def test_what_is_subtracted_stands_beside_it(stages: Stages, node: Node) -> None
         assert {part.header.frame_id for part in parts} == {"ft_sensor"}
         total = [sum(axis) for axis in zip(*map(six, parts), strict=True)]
         assert six(wrench) == pytest.approx(total, abs=1e-9)
-
-
-def test_the_weight_goes_along_with_the_pose(stages: Stages, server: Server) -> None:
-    for up in (SIDE, OVER, (1, 1, 1)):
-        stages.at(up)
-    # What the environment does is left as it is.
-    stages.at(OVER, force_x=3.0, torque_y=0.25, wanted=[3.0, 0.0, 0.0, 0.0, 0.25, 0.0])
 
 
 def test_a_tare_takes_the_offset_and_leaves_the_tool(stages: Stages, server: Server, node: Node) -> None:
@@ -457,22 +450,6 @@ def moved(arm: Arm) -> Iterator[Node]:
 
 def forces(stages: Stages) -> Array:
     return np.array([np.linalg.norm(six(message)[:3]) for message in stages.final])
-
-
-@pytest.mark.parametrize("radians", [0.0, 1.0])
-def test_a_move_is_no_contact(arm: Arm, moved: Node, radians: float) -> None:
-    """From the first sample on, of which none is withheld; the weight alone would leave more than 2 N."""
-    stages = Stages(moved)
-    felt = feel(waypoints(0.8, 0.5, 3, metres=0.5, radians=radians), HEAVY, 6.0, 1.0 / STEP_S)
-    arm.play(felt)
-    moved.run(6.0)
-    assert np.ptp(np.linalg.norm(felt.force, axis=1)) > 2.0
-    assert len(stages.final) >= 599
-    left = forces(stages)
-    assert math.sqrt(float((left**2).mean())) < 0.35
-    assert float(np.quantile(left, 0.99)) < 1.0
-    told = values(moved.until(compensation="ok")["compensation"])
-    assert (told["withheld"], told["gravity_source"]) == ("0", "imu")
 
 
 @pytest.mark.parametrize("set_by_s", [-0.45, 0.1, 3600.0])

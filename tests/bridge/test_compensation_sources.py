@@ -17,7 +17,6 @@ from sensor_msgs.msg import Imu
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import SettingValue
-from bota_ethercat.text.json_text import JsonObject
 from bridge.compensating.sources import ImuSource, RobotSource
 from bridge.node import StartError
 from tests.bridge.fake_tf import FakeTf
@@ -192,25 +191,6 @@ def test_a_tare_goes_by_the_topic(robot: Robot, stages: Stages, node: Node) -> N
     stages.settle(ZERO6)
     robot.quaternion = TILTED
     stages.at(SIDE, bias=BIAS)
-
-
-def test_the_orientation_is_taken_in_while_a_service_waits(robot: Robot, stages: Stages, node: Node) -> None:
-    asked: list[JsonObject] = []
-    robot.answers["tare"] = asked.append  # the reply is kept back
-
-    def turn() -> None:
-        robot.quaternion = ROLLED
-        robot.hold(OVER)
-
-    def reply() -> None:
-        stages.settle(ZERO6)
-        refused = {"ok": False, "error": {"code": "denied", "message": "no"}}
-        robot.send_json({"reply": "tare", "id": asked[0]["id"], **refused})
-
-    node.at(0.8, turn)  # longer than an orientation holds
-    node.at(1.6, reply)
-    assert node.trigger("sensor_tare") == (False, "no (denied)")
-    assert is_near(stages.tool[-1], weight(OVER))
 
 
 @pytest.mark.parametrize(

@@ -124,6 +124,9 @@ def test_events_reach_the_log_and_the_link(node: Node, quiet: Server) -> None:
         ({"event": "sensor_lost", "reason": "wkc"}, "the sensor is lost"),
         ({"event": "sensor_back", "lost_s": 1.25}, "the sensor is back after 1.25 s"),
         ({"event": "sensor_back", "lost_s": "long"}, "the sensor is back"),
+        ({"event": "emergency", "code": 4096}, "the sensor reports an emergency"),
+        ({"event": "emergency", "message": "too hot"}, "too hot"),
+        ({"event": "shutting_down"}, "the server is shutting down"),
         (
             {"event": "reconfigured", "settings": {"fir": True, "sinc_length": 128, "chop": False}},
             "the settings of the sensor have changed: fir true, sinc_length 128",
@@ -134,9 +137,6 @@ def test_events_reach_the_log_and_the_link(node: Node, quiet: Server) -> None:
             "Mz 0.3000 (N, Nm)",
         ),
         ({"event": "offset_changed"}, "the offset of the sensor has changed: it is unknown"),
-        ({"event": "emergency", "code": 4096}, "the sensor reports an emergency"),
-        ({"event": "emergency", "message": "too hot"}, "too hot"),
-        ({"event": "shutting_down"}, "the server is shutting down"),
     ],
 )
 def test_an_event_is_a_sentence(message: JsonObject, said: str) -> None:

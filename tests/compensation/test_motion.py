@@ -74,13 +74,6 @@ def test_at_every_filter_they_leave_less_than_the_bias_alone(sinc_length: int, f
         assert left.percentile(0.99) < 0.8
 
 
-def test_a_vibration_under_a_long_filter_is_not_subtracted_twice() -> None:
-    chosen = settings(512)
-    felt = motion.filtered(motion.moves(3)["vibration"], HEAVY, 3.0, chosen)
-    assert left_over(felt, HEAVY, align({}, 100.0)).rms > 2.5
-    assert left_over(felt, HEAVY, align(chosen, 100.0), settling_s=0.5).rms < 0.4
-
-
 def test_the_inertia_of_a_tool_is_subtracted_too() -> None:
     """A bar of 2 kg and 0.3 m."""
     tool = HEAVY._replace(inertia=(0.015, 0.015, 0.001, 0.002, -0.001, 0.0005))
@@ -226,17 +219,6 @@ def test_a_tare_in_any_pose_is_right_in_all_poses_and_with_every_tool(seed: int)
     again = estimate_bias(means, second, imu.known.correct(means.acceleration))
     change, _ = Taken(second, imu.known.correct(means.acceleration)).weighed(first)
     assert again.plus(change).values == pytest.approx(tared.values)
-
-
-def test_a_tare_takes_the_accelerometers_offset_off_in_every_pose() -> None:
-    """It is a constant force in the sensor's frame, as the bias is."""
-    imu = Imperfection(acceleration_offset=(0.4, -0.3, 0.2))
-    left = left_over(
-        motion.feel(motion.waypoints(0.6, 1.0, 8), HEAVY, 6.0, imu=imu), HEAVY, align({}, RATE_HZ)
-    )
-    tared = left._replace(force=left.force - left.force[:400].mean(axis=0))  # half a second of rest
-    assert left.size.max() > 1.0
-    assert tared.percentile(0.99) < 0.7
 
 
 @pytest.mark.parametrize("is_tared", [False, True])

@@ -31,8 +31,6 @@ _STAGES: Final = {"wrench_compensated": "final", "compensation/bias": "bias", "c
 
 
 class Plan(NamedTuple):
-    """What is done with a sample."""
-
     source: Source = Source()
     compensator: Compensator = Compensator()
     ramp: BiasRamp = BiasRamp()
@@ -40,15 +38,12 @@ class Plan(NamedTuple):
 
 
 class RestWindow(StationaryWindow):
-    """Samples of some time at rest, and the specific force meanwhile."""
-
     def __init__(self, seconds: float, limits: StationaryLimits, source: Source) -> None:
         super().__init__(seconds, limits)
         self.source, self.done = source, threading.Event()
         self._specific_forces, self._unknown = list[Vector3](), ""
 
     def take(self, sample: Sample, time_s: float, stamp_s: float, specific_force: Vector3 | None) -> None:
-        """Take a sample and its specific force, for the reader."""
         if specific_force is None:
             self._unknown = self._unknown or self.source.why_none(sample, stamp_s) or "not in every sample"
         else:
@@ -83,7 +78,6 @@ class Compensation:
         self, node: Node, parameters: Parameters, stamps: Stamps, rate_hz: Callable[[], float],
         clock: Clock, on_failure: Callable[[str], object],
     ) -> None:  # fmt: skip
-        """ParameterError if a frame cannot be had."""
         frames = make_frames(node, parameters, stamps, clock)
         self.frames = TfFrames(node, frames, clock, on_failure)
         final, *subtracted = (
@@ -105,7 +99,6 @@ class Compensation:
         self.configure(parameters)
 
     def is_wanted(self) -> bool:
-        """Whether anybody has subscribed to any of the topics, or a window is open."""
         self._wanted = [topic for topic in self._all if topic.is_wanted()]
         self.frames.want(self._wanted)
         self.has_subscribers = bool(self._wanted)
@@ -118,7 +111,6 @@ class Compensation:
         return "; ".join(topic.problem for topic in self._all if topic.problem)
 
     def configure(self, parameters: Parameters) -> None:
-        """Take what parameters say of the topics; for the executor's thread."""
         self._stops_on_saturation = parameters.on_saturation == "stop"
         for topic in self._all:
             topic.configure(parameters)

@@ -41,8 +41,6 @@ _DEPENDS_ON: Final = (
 
 
 class BiasChange(NamedTuple):
-    """A bias that is to be put in force."""
-
     bias: Wrench
     origin: str
     taken: Taken = Taken()  # what a tare took it with
@@ -55,7 +53,6 @@ class CompensationControl:
     def __init__(
         self, node: Node, parameters: Parameters, output: Compensation, reader: Reader, live: LiveParameters
     ) -> None:
-        """ParameterError if the parameters cannot be had here."""
         self.parameters, self.output = parameters, output
         self.reader, self.link, self._live = reader, reader.link, live
         self.origin = _FROM_PARAMETER  # where the bias in force comes from
@@ -81,7 +78,6 @@ class CompensationControl:
         self._change()
 
     def stop(self) -> None:
-        """Stop listening."""
         self.source.close()
         self.source, self._source_of = Source(), None
 
@@ -112,7 +108,6 @@ class CompensationControl:
         return self.reader.accounting.new_ns * 1e-9
 
     def state(self) -> CompensationState:
-        """For the diagnostics' thread."""
         output, source, parameters = self.output, self.source, self.parameters
         payload, bias, has_subscribers = parameters.payload, self.bias, output.has_subscribers
         bound = None
@@ -242,7 +237,6 @@ class CompensationControl:
         return ramp
 
     def _show(self) -> None:
-        """Make the parameters what is in force."""
         offset = self.own_offset.of_bias if self.own_offset.has_bias else None
         shown = self.parameters.bias, self.parameters.sensor_offset
         bias, offset_values = self.bias.values, (math.inf,) * 6 if offset is None else offset.values
@@ -259,7 +253,6 @@ class CompensationControl:
     # -- parameters
 
     def _check(self, wanted: Parameters) -> None:
-        """ParameterError if they cannot be had here."""
         check_source(self._node, wanted)
         cutoff_hz, was_hz = wanted.filter_cutoff, self.parameters.filter_cutoff
         if (cutoff_hz > 0) is not (was_hz > 0):
@@ -272,7 +265,6 @@ class CompensationControl:
             raise ParameterError(problem)
 
     def apply(self, wanted: Parameters) -> None:
-        """Take other parameters."""
         was, self.parameters = self.parameters, wanted
         self._open_source(is_late=True)
         if self._is_showing:

@@ -52,7 +52,6 @@ class Source:
     turning: Turning = STILL  # of the latest sample, if `is_imu`
 
     def __init__(self, why: str = "gravity_source is none") -> None:
-        """`why` there is none."""
         self._why = why
         self.close: Callable[[], object] = lambda: None
 
@@ -79,7 +78,6 @@ class ImuSource(Source):
     is_imu = True
 
     def __init__(self, parameters: Parameters, link: Link) -> None:
-        """`link` knows the sensor's model and filters."""
         super().__init__()
         x, y, z = parameters.imu_position
         if not (x or y or z):  # as the drawings of the model have it
@@ -120,7 +118,6 @@ class RobotSource(Source):
         self._taken: object = None
 
     def take(self, read: Callable[[], tuple[Quaternion, int]]) -> None:
-        """Take what `read` gives, or why it is unusable."""
         try:
             self.latest, self.problem = read(), ""
         except UnusableError as error:
@@ -153,7 +150,6 @@ class RobotSource(Source):
 
 
 def check_source(node: Node, wanted: Parameters) -> None:
-    """ParameterError if the source is not available on this machine, or its topic's name is invalid."""
     if wanted.gravity_source == "tf":
         check_tf()
     if wanted.gravity_source not in TOPIC_SOURCES:
@@ -229,7 +225,6 @@ def read_message(message: Any, wanted: Parameters) -> tuple[Quaternion, int]:
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """The rotation that first turns by `b`, then by `a`."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (

@@ -64,7 +64,6 @@ def warn_of_others(node: Node) -> None:
 
 
 def descriptor(row: Row) -> ParameterDescriptor:
-    """What `ros2 param describe` shows."""
     described = ParameterDescriptor(description=row.description, read_only=not row.live)
     if row.choices or isinstance(row.default, tuple):
         described.additional_constraints = row.allowed()
@@ -83,7 +82,6 @@ class LiveParameters:
     is_fixed = False  # whether those that are not live are read-only
 
     def __init__(self, node: Node) -> None:
-        """The parameters must have been declared."""
         self._node = node
         self.group = MutuallyExclusiveCallbackGroup()  # of requests: they do not wait for other services
         for service in node.services:
@@ -96,12 +94,10 @@ class LiveParameters:
         node.add_post_set_parameters_callback(self._after_set)
 
     def check_values(self, **values: Any) -> None:
-        """ParameterError if one of these cannot be."""
         for name, value in values.items():
             _ROWS[name].check(value)
 
     def put(self, **values: Any) -> None:
-        """Set parameters from within; ParameterError if that is refused."""
         parameters = [Parameter(name, value=value) for name, value in values.items()]
         result = self._node.set_parameters_atomically(parameters)
         if not result.successful:
@@ -125,7 +121,6 @@ class LiveParameters:
             self.apply(self.gather({}))
 
     def gather(self, changed: dict[str, Any]) -> Parameters:
-        """The values, with these changed; ParameterError if they cannot be."""
         values = {row.name: self._node.get_parameter(row.name).value for row in PARAMETERS} | changed
         return gather({row.name: row.check(values[row.name]) for row in PARAMETERS})
 
@@ -201,7 +196,6 @@ class SettingsParameters:
         self._node.declare_parameter(name, None, _descriptor(setting), ignore_override=True)
 
     def _follow(self) -> None:
-        """Make the parameters what the settings are."""
         in_force = self.link.info.settings if self.link else {}
         with self._node.setting:
             self._following = True

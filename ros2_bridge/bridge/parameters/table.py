@@ -98,7 +98,6 @@ class Row(NamedTuple):
         return self.low <= (abs(item) if several and not self.low else item) <= self.high
 
     def allowed(self) -> str:
-        """The values that it may have, in words."""
         if self.choices:
             return " or ".join(self.choices)
         if isinstance(self.default, tuple):
@@ -121,7 +120,6 @@ class WrenchFrame(NamedTuple):
 
 
 def _row(default: Any, description: str, *bounds: float, **more: Any) -> Any:
-    """A field of `Parameters`: the parameter's row but for its name."""
     return field(default=default, metadata={"row": (default, description, *bounds), "more": more})
 
 
@@ -234,27 +232,22 @@ class Parameters:
 
     @cached_property
     def frames(self) -> tuple[WrenchFrame, ...]:
-        """Of `wrench_frames`; ParameterError."""
         return parse_frames(self.wrench_frames)
 
     @cached_property
     def limits(self) -> Limits:
-        """Of the verdicts."""
         return LIMITS._replace(**self._group("diagnostics_"))
 
     @cached_property
     def payload(self) -> Payload:
-        """The tool."""
         return Payload(self.tool_mass, self.tool_center_of_gravity, self.tool_inertia)
 
     @cached_property
     def accelerometer(self) -> Accelerometer:
-        """What is known of it."""
         return Accelerometer(**self._group("accelerometer_"))
 
     @cached_property
     def rest(self) -> StationaryLimits:
-        """The limits, without the duration."""
         given = self._group("rest_")
         return StationaryLimits(**{name: given[name] for name in given if name != "duration"})
 

@@ -52,7 +52,6 @@ class Topic:
         self._send: Send = self._publisher.publish
 
     def is_wanted(self) -> bool:
-        """Whether anybody has subscribed."""
         return bool(self._publisher.get_subscription_count())
 
     def close(self) -> None:
@@ -70,7 +69,6 @@ class Stamps:
         self._log = log
 
     def update(self, kind: str, link: Link) -> None:
-        """The parameter or the filters may have changed; from any thread."""
         self.kind = kind
         if not link.is_connected:
             return
@@ -100,7 +98,6 @@ class MeasuredTopic(Topic):
         self.configure(parameters)
 
     def configure(self, parameters: Parameters) -> None:
-        """Take these covariances."""
         self.publish = self._make(self._send, parameters, self._stamps)
 
     def follow(self, sample: Sample, frame: DataMessage) -> None:
@@ -108,7 +105,6 @@ class MeasuredTopic(Topic):
 
 
 def make_measured(node: Node, parameters: Parameters, stamps: Stamps) -> list[Output]:
-    """The topics of what the sensor measures, `wrench` first."""
     wrench, motion = ("force", "torque"), ("acceleration", "angular_rate")
     topics: tuple[tuple[str, Any, Sequence[str], Make], ...] = (
         ("wrench", WrenchStamped, wrench, _wrench),
@@ -164,5 +160,4 @@ def _temperature(send: Send, parameters: Parameters, _: Stamps) -> Publish:
 
 
 def _covariance(variances: Numbers) -> Numbers:
-    """The nine numbers of a covariance, row by row."""
     return tuple(variances[position // 4] if position % 4 == 0 else 0.0 for position in range(9))

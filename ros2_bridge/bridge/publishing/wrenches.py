@@ -49,13 +49,10 @@ class WrenchTopic(Topic):
         """Take other parameters from the next sample on; for the executor's thread."""
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        """Publish a force, N, and a torque, Nm."""
         self._send(self._pack(frame.stamp_ns - self._stamps.wrench_ns, *force, *torque))
 
 
 class FixedFrameTopic(WrenchTopic):
-    """`wrench_compensated/NAME`: in a frame fixed to the sensor's."""
-
     def __init__(self, node: Node, name: str, transform: WrenchTransform, stamps: Stamps) -> None:
         super().__init__(node, f"wrench_compensated/{name}", name, stamps)
         self._transform = transform
@@ -86,7 +83,6 @@ class FilteredTopic(WrenchTopic):
         return super().is_wanted()
 
     def _is_ready(self) -> bool:
-        """Whether there is a filter for the current settings and sampling rate."""
         cutoff_hz, rate_hz = wanted = self._cutoff_hz, self._rate_hz()
         if wanted != self._designed:
             self._designed, self.problem = wanted, ""
@@ -135,7 +131,6 @@ class TfFrameTopic(WrenchTopic):
         self._limit_s, self._wait_s = parameters.orientation_stale_after, parameters.tf_wait
 
     def forget(self) -> None:
-        """Forget what was, and what waits."""
         self._waiting.clear()
         # Stamps of the newest pose used and of the newest sample that was looked up for.
         self._found_ns = self._asked_ns = 0
@@ -266,7 +261,6 @@ class TfFrames:
                 pass
 
     def stop(self) -> bool:
-        """Stop and wait for the thread; False if it does not end in time."""
         self._stopping.set()
         self._arrived.set()
         return self.thread.has_ended()

@@ -72,7 +72,6 @@ class Link:
         self.epoch = 0  # raised by everything that interrupts the stream or changes its rate
 
     def connected(self, description: JsonObject) -> None:
-        """The stream begins."""
         self.info, self.lost = find_sensor(description, self.sensor), None
         self.connects, self.epoch = self.connects + 1, self.epoch + 1
         self.since_s, self.is_connected = self.clock.monotonic(), True
@@ -86,7 +85,6 @@ class Link:
         return no_server(self.address, self.problem)
 
     def disconnected(self, event: Disconnected) -> None:
-        """There is no connection (any more)."""
         had, self.is_connected = self.is_connected, False
         self._change(settings={})
         self.problem, self.lost = event.reason, None
@@ -169,7 +167,6 @@ class Link:
 
 
 def offset_text(offset: object) -> str:
-    """An offset from a message for people."""
     known = known_six(offset)
     return "unknown" if known is None else wrench_text(Wrench.of(known))
 

@@ -107,7 +107,6 @@ class Reader:
         self, parameters: Parameters, outputs: Outputs, log: Any, on_failure: Callable[[str], object], *,
         channel: Channel | None = None, clock: Clock = SYSTEM_CLOCK,
     ) -> None:  # fmt: skip
-        """Tests give `channel` and `clock`."""
         self._sensor, self._outputs, self._log = parameters.sensor, outputs, log
         units = ImuUnits(parameters.imu_raw_units)
         self._decode = {size: SampleDecoder(size, units).decode for size in LAYOUTS}
@@ -132,7 +131,6 @@ class Reader:
         self.thread = Worker("reader", self.run, on_failure)
 
     def stop(self) -> bool:
-        """Stop reading and wait for the thread; False if it does not end in time."""
         self.client.close()
         return self.thread.has_ended()
 
@@ -157,7 +155,6 @@ class Reader:
         return sorted(taken)
 
     def run(self) -> None:
-        """Connect and read, again and again, until `stop`."""
         with contextlib.suppress(ConnectionFailedError):
             while True:
                 self.read(_WAIT_S)

@@ -34,8 +34,6 @@ _SMOOTHED: Final = 1.0  # times the ratio of the force's motion to its rate of c
 
 
 class Lag(NamedTuple):
-    """What a recording shows."""
-
     seconds: float  # by which force and torque come later than the accelerometer; negative: earlier
     interval_s: float  # 95 % interval: plus and minus
     explained: float  # part of the force's variance that the motion explains, 0 to 1
@@ -113,18 +111,15 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
 
 
 def hann_window(seconds: float, period: float) -> Array:
-    """Weights of a Hann window that is so long."""
     window = np.hanning(max(3, round(seconds / period) | 1) + 2)[1:-1]
     return np.asarray(window / window.sum())
 
 
 def smoothed(columns: Array, window: Array) -> Array:
-    """Columns convolved with a window."""
     return np.stack([np.convolve(column, window, "same") for column in columns.T], axis=1)
 
 
 def at_times(looks: Array, times: Array, columns: Array) -> Array:
-    """Columns at other times."""
     return np.stack([np.interp(looks, times, column) for column in columns.T], axis=1)
 
 
