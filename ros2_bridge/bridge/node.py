@@ -126,7 +126,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.parameters = parameters = self.live.gather({})
         self.stamps = stamps = Stamps(self.get_logger())
         compensated = Compensation(
-            self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock, self.fail
+            self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock
         )
         wrench, *others = make_measured(self, parameters, stamps)
         self.outputs = Outputs([wrench, compensated, *others])  # control loops' topics first
@@ -159,14 +159,13 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
     def start(self) -> None:
         self.reader.thread.start()
         self.monitor.thread.start()
-        self.compensation.output.frames.thread.start()
         prepare(self.parameters.rt_priority, self.parameters.cpu, self.get_logger())
 
     def stop(self) -> bool:
         """Stop the threads and all that listens; False if a thread does not end in time."""
         if not self.is_open:
             return True
-        ended = self.monitor.stop() & self.reader.stop() & self.compensation.output.frames.stop()
+        ended = self.monitor.stop() & self.reader.stop()
         self.compensation.stop()
         return ended
 

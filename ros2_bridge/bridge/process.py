@@ -7,9 +7,8 @@ Python, which it does not while it waits inside ROS for the next message.
 
 The stream's thread gets `rt_priority` and `cpu`. It takes locks that know no priorities, Python's (GIL) and
 the middleware's: whoever holds one while another program has its CPU delays the stream, beside endless loops
-by 2 to 5 ms. So the threads that do so all the time get the priority just below: the monitor, frames by
-TF, the callbacks that wait for no others, Fast DDS. The executor of the services stays ordinary: what it does
-may take long.
+by 2 to 5 ms. So the threads that often hold them get the priority just below: the monitor, the callbacks
+that wait for no others, Fast DDS. The executor of the services stays ordinary.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
 _SAME_S: Final = 1.0
 _HIGHEST_DOMAIN: Final = 232  # of DDS: the ports of others are too high
 STREAM: Final = "reader"
-BESIDE: Final = ("monitor", "listener", "frames")  # threads that share Python's lock with the stream's
+BESIDE: Final = ("monitor", "listener")  # threads that share Python's lock with the stream's
 _MIDDLEWARE: Final = "dds."  # how Fast DDS names its threads
 # Longest time that the stream waits for Python's lock. A sample takes less, so it is not interrupted.
 _SWITCH_S: Final = 0.0002

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from rclpy.node import Node
 from rclpy.time import Time
@@ -11,6 +11,8 @@ from rclpy.time import Time
 from bota_ethercat.pdo import Vector3
 from bridge.parameters.table import ParameterError
 from ft_compensation.quantities import Quaternion, unit_quaternion
+
+TF_PERIOD_S: Final = 0.005  # how often poses are looked up
 
 
 class UnusableError(Exception):
@@ -43,12 +45,12 @@ class Tf:
         self._buffer = Buffer()
         self.close = TransformListener(self._buffer, node, spin_thread=False).unregister
 
-    def look_up(self, base: str, frame: str, at_ns: int = 0) -> Pose:
-        """The pose of `frame` in `base` at this time, ns since 1970; 0: the latest. UnusableError."""
+    def look_up(self, base: str, frame: str) -> Pose:
+        """The latest pose of `frame` in `base`; UnusableError."""
         from tf2_ros import TransformException  # noqa: PLC0415
 
         try:
-            found = self._buffer.lookup_transform(base, frame, Time(nanoseconds=at_ns))
+            found = self._buffer.lookup_transform(base, frame, Time())
             t, q = found.transform.translation, found.transform.rotation
             rotation = unit_quaternion((q.x, q.y, q.z, q.w))
         except (TransformException, ValueError) as error:

@@ -158,7 +158,6 @@ def test_a_tool_that_is_set_during_a_tare(stages: Stages, server: Server, node: 
 
 
 def put(node: Node, **named: Any) -> Any:
-    """Set parameters at once; the result."""
     messages = [Parameter(name, value=value).to_parameter_msg() for name, value in named.items()]
     request = SetParametersAtomically.Request(parameters=messages)
     return node.call("set_parameters_atomically", request).result
@@ -214,7 +213,6 @@ def test_a_tare_is_refused(
 
 
 def with_bits(**fields: int) -> bytes:
-    """Process data of the sensor at rest with these fields."""
     data = bytearray(sensed(UP))
     for name, bits in fields.items():
         data[layout_for(len(data)).offsets[name]] = bits
@@ -222,7 +220,6 @@ def with_bits(**fields: int) -> bytes:
 
 
 def every_other(server: Server, **bad: Any) -> None:
-    """Every other sample of the next second is so."""
     good = server.changes
     for _ in range(50):
         server.once(**good)

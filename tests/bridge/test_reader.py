@@ -40,7 +40,6 @@ def node(quiet: Server) -> Iterator[Node]:
 
 
 def feed(node: Node, server: Server, *chunks: bytes) -> list[float]:
-    """The numbers of all samples that are published, once these bytes have arrived one after the other."""
     for chunk in chunks:
         server.send_raw(chunk)
         node.settle()
@@ -177,12 +176,10 @@ class Selecting:
         self.select = FrameSelector(self.counts, same_clock=same_clock, limit_hz=limit_hz)
 
     def of(self, numbers: Iterable[int], now_ns: int) -> list[int]:
-        """Those that are selected of these frames, which are read at once."""
         frames = [DataMessage(number, 0, number * PERIOD_NS, 0, 0, 3, b"") for number in numbers]
         return [frame.sequence for frame in self.select.select(frames, now_ns)]
 
     def one_by_one(self, begin: int, end: int, age_ns: int = 0) -> list[int]:
-        """Likewise of frames that are read one after the other, of this age."""
         return [n for i in range(begin, end) for n in self.of([i], age_ns + i * PERIOD_NS)]
 
 

@@ -31,7 +31,6 @@ RATE = 800
 def window(
     make: Callable[[int], Sample], seconds: float = 1.0, limits: StationaryLimits | None = None
 ) -> StationaryWindow:
-    """A window that was fed until it was complete."""
     collected = StationaryWindow(seconds, limits)
     for number in range(100_000):
         if collected.add(make(number), number / RATE):
@@ -131,7 +130,6 @@ def test_a_window_that_is_too_short_or_whose_clock_is_set_back() -> None:
 
 
 def felt(up: Sequence[float]) -> Vector3:
-    """What the accelerometer reads at rest when `up` points up, m/s²."""
     x, y, z = gravity_for(up)
     return -x, -y, -z
 

@@ -75,11 +75,10 @@ class Compensation:
     fields = ("force", "torque")
 
     def __init__(
-        self, node: Node, parameters: Parameters, stamps: Stamps, rate_hz: Callable[[], float],
-        clock: Clock, on_failure: Callable[[str], object],
-    ) -> None:  # fmt: skip
+        self, node: Node, parameters: Parameters, stamps: Stamps, rate_hz: Callable[[], float], clock: Clock
+    ) -> None:
         frames = make_frames(node, parameters, stamps, clock)
-        self.frames = TfFrames(node, frames, clock, on_failure)
+        self.frames = TfFrames(node, frames)
         final, *subtracted = (
             WrenchTopic(node, topic, parameters.frame_id, stamps, stage) for topic, stage in _STAGES.items()
         )

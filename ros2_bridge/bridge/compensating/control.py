@@ -78,6 +78,10 @@ class CompensationControl:
         self._change()
 
     def stop(self) -> None:
+        self._close_source()
+        self.output.frames.close()
+
+    def _close_source(self) -> None:
         self.source.close()
         self.source, self._source_of = Source(), None
 
@@ -236,15 +240,19 @@ class CompensationControl:
             self.own_offset.begin(bias, offset or self.offset, is_measured=is_measured or offset is not None)
         return ramp
 
-    def _show(self) -> None:
+    @property
+    def _offset_values(self) -> tuple[float, ...]:
+        """The sensor's offset that the bias goes with, as the parameter has it."""
         offset = self.own_offset.of_bias if self.own_offset.has_bias else None
-        shown = self.parameters.bias, self.parameters.sensor_offset
-        bias, offset_values = self.bias.values, (math.inf,) * 6 if offset is None else offset.values
-        if shown == (bias, offset_values):
+        return (math.inf,) * 6 if offset is None else offset.values
+
+    def _show(self) -> None:
+        bias, offset = self.bias.values, self._offset_values
+        if (self.parameters.bias, self.parameters.sensor_offset) == (bias, offset):
             return
         self._is_showing = True
         try:
-            self._live.put(bias=[*bias], sensor_offset=[*offset_values])
+            self._live.put(bias=[*bias], sensor_offset=[*offset])
         except ParameterError as error:
             self._log.error(str(error))
         finally:
@@ -270,8 +278,9 @@ class CompensationControl:
         if self._is_showing:
             return
         # Nobody asks for the bias that is shown, even if the bias in force has been shifted since.
-        offset = None if wanted.sensor_offset == was.sensor_offset else _known(wanted.sensor_offset)
-        if wanted.bias not in (was.bias, self.bias.values) or offset not in (None, self.own_offset.of_bias):
+        is_other_offset = wanted.sensor_offset not in (was.sensor_offset, self._offset_values)
+        if is_other_offset or wanted.bias not in (was.bias, self.bias.values):
+            offset = _known(wanted.sensor_offset) if is_other_offset else None
             self._changes.append(BiasChange(Wrench.of(wanted.bias), _FROM_PARAMETER, offset=offset))
         is_given, before, warning = bool(self._changes), self.bias, ""
         self._change(self._take_changes)
@@ -287,7 +296,7 @@ class CompensationControl:
         depends_on = [getattr(self.parameters, name) for name in _DEPENDS_ON] + [self.link.info.name]
         if depends_on == self._source_of:
             return
-        self.stop()
+        self._close_source()
         try:
             self.source = open_source(self._node, self.parameters, self._group, self.link)
             self._source_of = depends_on

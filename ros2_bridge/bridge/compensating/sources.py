@@ -24,13 +24,12 @@ from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.settings import SettingValue
 from bridge.parameters.table import TOPIC_SOURCES, ParameterError, Parameters
 from bridge.stream.link import Link
-from bridge.tf import Tf, UnusableError, check_tf, stale_text, stamp_ns
+from bridge.tf import TF_PERIOD_S, Tf, UnusableError, check_tf, stale_text, stamp_ns
 from ft_compensation.alignment import align
 from ft_compensation.quantities import STILL, Quaternion, Turning, unit_quaternion
 from ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
 from ft_compensation.stream import IMU_IS_OFF
 
-_TF_PERIOD_S: Final = 0.005
 # How long an executor may take to release the previous subscription: DDS has one type per topic.
 _RELEASE_S: Final = 1.0
 # Type of the messages, and the quaternion in one, by the value of the parameter `gravity_source`.
@@ -179,7 +178,7 @@ def _open_tf(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSourc
         _, rotation, stamp = tf.look_up(base, frame)
         return rotation, stamp or time.time_ns()  # static transforms hold at any time, so now
 
-    timer = node.create_timer(_TF_PERIOD_S, lambda: source.take(read), group)
+    timer = node.create_timer(TF_PERIOD_S, lambda: source.take(read), group)
     source.close = lambda: (node.destroy_timer(timer), tf.close())
     return source
 

@@ -156,8 +156,6 @@ class Parameters:
     wrench_frames: tuple[str, ...] = _row(NO_TEXTS,
         "Frames of wrench_compensated/NAME: NAME (by TF), or 'NAME x y z [qx qy qz qw]' in frame_id, m",
         live=False)
-    tf_wait: float = _row(0.02,
-        "Longest wait for TF's pose at the sample's stamp, s; then, and with 0, the latest is used", 0, 0.5)
     imu_frame_id: str = _row("ft_sensor_imu", "Frame of the IMU's messages", live=False)
     imu_raw_units: str = _row(ImuUnits.G_DPS.value, "What the sensor sends acceleration and angular rate in",
         choices=tuple(units.value for units in ImuUnits), live=False)
