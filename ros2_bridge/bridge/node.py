@@ -33,7 +33,7 @@ from bridge.process import StopSignals, Worker, prepare, refuse
 from bridge.publishing.messages import Stamps, make_measured
 from bridge.publishing.terminals import TerminalTopics
 from bridge.rclpy_internals import Spinner, is_about_arguments, make_executors, refuse_what_raises
-from bridge.services import BiasServices, IdentifyServices, SensorServices
+from bridge.services import create_services
 from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
 
@@ -140,9 +140,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.monitor = Monitor(
             self, parameters.limits, self.reader, self.compensation.state, self.outputs, stamps, self.fail
         )
-        SensorServices(self, link, self.sensor_settings)
-        BiasServices(self, self.compensation)
-        IdentifyServices(self, self.compensation)
+        create_services(self)
         link.on_change = self._on_link_change
         if parameters.supervisor_topic:
             self.create_subscription(
