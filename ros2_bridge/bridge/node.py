@@ -30,8 +30,7 @@ from bridge.diagnostics import Monitor
 from bridge.parameters.declare import LiveParameters, SettingsParameters, declare, warn_of_others
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import StopSignals, Worker, prepare, refuse
-from bridge.publishing.messages import Stamps, make_measured
-from bridge.publishing.terminals import TerminalTopics
+from bridge.publishing.messages import Stamps, TerminalTopics, make_measured
 from bridge.rclpy_internals import Spinner, is_about_arguments, make_executors, refuse_what_raises
 from bridge.services import create_services
 from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError

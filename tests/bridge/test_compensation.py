@@ -280,7 +280,7 @@ def test_what_is_subtracted_is_told(stages: Stages, server: Server, node: Node) 
     status = node.until(compensation="ok")["compensation"]
     assert status.message == "subtracted: weight and inertia of the tool"
     told = values(status)
-    assert (told["tool_mass"], told["gravity_source"], told["orientation_age_s"]) == ("0.8", "imu", "")
+    assert (told["gravity_source"], told["orientation_age_s"], told["bias_ramping"]) == ("imu", "", "false")
     server.changes["process_data"] = with_bits(acceleration_saturated=0b10)
     node.until("the IMU's range was exceeded", compensation="warn")
 

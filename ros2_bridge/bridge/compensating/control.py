@@ -130,10 +130,7 @@ class CompensationControl:
                 "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
                 "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
                 "accelerometer_force": "" if bound is None else round(bound, 3),
-                "tool_mass": round(payload.mass, 4),
-                "tool_center_of_gravity": _numbers(payload.center),
                 "tared": bias != NO_WRENCH,
-                "bias": _numbers(bias.values),
                 "bias_from": self.origin,
                 "bias_ramping": not self._ramp.arrived(self._sample_s),
                 "subscribed": has_subscribers,
@@ -351,7 +348,3 @@ class CompensationControl:
 def _known(offset: tuple[float, ...]) -> Wrench | None:
     """Of the parameter `sensor_offset`, which is infinite where there is none."""
     return Wrench.of(offset) if all(map(math.isfinite, offset)) else None
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return " ".join(f"{value:.4f}" for value in values)
