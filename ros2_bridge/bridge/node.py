@@ -27,7 +27,7 @@ from bota_ethercat.client.channel import Channel
 from bridge.compensating.compensation import Compensation
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
-from bridge.parameters.declare import LiveParameters, SettingsParameters, declare, warn_of_others
+from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import StopSignals, Worker, prepare, refuse
 from bridge.publishing.messages import Stamps, TerminalTopics, make_measured
@@ -103,11 +103,8 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         Node.__init__(self, "bridge", cli_args=arguments, use_global_arguments=arguments is None)
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
-        self.parameters = declare(self)
-        # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
-        self.sensor_settings = SettingsParameters(self)
-        self.live = LiveParameters(self)
-        warn_of_others(self)
+        self.live = NodeParameters(self)
+        self.parameters = self.live.given
         if self.parameters.lifecycle:
             LifecycleNodeMixin.__init__(self)
         refuse_what_raises(self)
@@ -133,7 +130,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
         self.reader.on_terminal = TerminalTopics(self, parameters.terminals, self.reader.client).publish
-        self.sensor_settings.link = link = self.reader.link
+        self.live.link = link = self.reader.link
         self.compensation = CompensationControl(self, parameters, compensated, self.reader, self.live)
         self.live.apply = self._apply
         self.monitor = Monitor(
@@ -174,8 +171,8 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             self.compensation.forget_bias()
         self.is_open = False
         self.live.check = self.live.apply = lambda _: None
-        self.sensor_settings.link = None
-        self.sensor_settings.changed()
+        self.live.link = None
+        self.live.settings_changed()
         for kind, destroy in _KINDS.items():
             for entity in {*getattr(self, kind)} - self._kept:
                 getattr(self, destroy)(entity)
@@ -210,7 +207,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
     def _on_link_change(self) -> None:
         self.stamps.update(self.compensation.parameters.stamp, self.reader.link)
         self.compensation.link_changed()
-        self.sensor_settings.changed()
+        self.live.settings_changed()
 
     def finish(self, exit_code: int) -> None:
         """End the node, from any thread; the first call counts."""

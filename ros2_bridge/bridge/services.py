@@ -30,7 +30,7 @@ from bota_ethercat.pdo import Vector3
 from bota_ethercat.program import state
 from bridge.compensating.compensation import RestWindow
 from bridge.compensating.control import CompensationControl
-from bridge.parameters.declare import SettingsParameters
+from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import AUTO, ParameterError
 from bridge.rclpy_internals import filling
 from bridge.stream.link import (
@@ -75,7 +75,7 @@ class Done(NamedTuple):
 
 def create_services(node: Any) -> None:
     """All services of the node `bridge`."""
-    sensor = SensorServices(node.reader.link, node.sensor_settings)
+    sensor = SensorServices(node.reader.link, node.live)
     bias, identifying = BiasServices(node.compensation), IdentifyServices(node, node.compensation)
     acts: dict[str, Callable[..., Done]] = {
         "sensor_tare": sensor.tare, "get_settings": sensor.get_settings,
@@ -122,8 +122,8 @@ def _target(request: Any) -> Wrench:
 class SensorServices:
     """What the server does, for every client."""
 
-    def __init__(self, link: Link, settings: SettingsParameters) -> None:
-        self._link, self._settings = link, settings
+    def __init__(self, link: Link, parameters: NodeParameters) -> None:
+        self._link, self._parameters = link, parameters
 
     def tare(self, request: Any = _AS_USUAL) -> Done:
         """The sensor's own offset."""
@@ -149,7 +149,7 @@ class SensorServices:
         return Done(json.dumps({**info.settings, "rate_hz": info.rate_hz}), fields)
 
     def apply_settings(self) -> Done:
-        in_force = json.dumps(self._settings.apply())
+        in_force = json.dumps(self._parameters.apply_settings())
         return Done(f"sensor {self._link.sensor} has these settings now: {in_force}")
 
     def save_settings(self) -> Done:

@@ -21,6 +21,7 @@ import numpy as np
 
 from bota_ethercat.pdo import Vector3
 from ft_compensation.alignment import Alignment, Array, align
+from ft_compensation.outputs import WrenchTransform
 from ft_compensation.quantities import DEFAULT_GRAVITY, EXACT, STILL, ZERO, Accelerometer, Quaternion
 
 _TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
@@ -135,22 +136,14 @@ class QuaternionGravity:
 
     def update(self, orientation: Quaternion, time_s: float) -> bool:
         """Take a unit quaternion x, y, z, w of time `time_s`. False: it is older than what is known."""
-        x, y, z, w = orientation
         # Messages may overtake each other; a clock that was set back is another matter.
         if 0.0 < self._newest_s - time_s <= self.stale_after_s:
             return False
-        gx, gy, gz = self.base_gravity
-        # The inverse turns base vectors into the sensor's: minus the vector part.
-        tx, ty, tz = 2.0 * (gy * z - gz * y), 2.0 * (gz * x - gx * z), 2.0 * (gx * y - gy * x)
-        gx, gy, gz = (
-            gx + w * tx + (ty * z - tz * y),
-            gy + w * ty + (tz * x - tx * z),
-            gz + w * tz + (tx * y - ty * x),
-        )
+        gravity = WrenchTransform.of(ZERO, orientation).inverse().apply(self.base_gravity, ZERO).force
         self._newest_s = time_s
         later = [each for each in self._rates if each[0] > time_s]
         known = [each for each in self._rates if each[0] <= time_s][-1:]
-        self._gravity = _carried(time_s, (gx, gy, gz), [*known, *later])
+        self._gravity = _carried(time_s, gravity, [*known, *later])
         return True
 
     def age_s(self, now_s: float) -> float:

@@ -21,7 +21,7 @@ from rclpy.node import Node
 from bridge.compensating.compensation import Compensation, Plan
 from bridge.compensating.sources import Source, check_source, open_source
 from bridge.diagnostics import CompensationState
-from bridge.parameters.declare import LiveParameters
+from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.stream.reader import Reader
 from ft_compensation.bias import BiasRamp, Taken, force_bound_95
@@ -51,7 +51,7 @@ class CompensationControl:
     """Makes the plan of `output`, from `start` on; in the executor's thread, but for `link_changed`."""
 
     def __init__(
-        self, node: Node, parameters: Parameters, output: Compensation, reader: Reader, live: LiveParameters
+        self, node: Node, parameters: Parameters, output: Compensation, reader: Reader, live: NodeParameters
     ) -> None:
         self.parameters, self.output = parameters, output
         self.reader, self.link, self._live = reader, reader.link, live

@@ -2,7 +2,7 @@
 """The node's parameters: one table, from which they are declared, checked, described and documented. No ROS.
 
 A wrong value ends the node at start, or is refused while it runs, with one sentence. The sensor's settings
-are parameters too, but the server decides about them: `declare.SettingsParameters`.
+are parameters too, but the server decides about them: `declare.NodeParameters`.
 """
 
 from __future__ import annotations
