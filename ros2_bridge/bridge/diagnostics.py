@@ -117,7 +117,7 @@ class Monitor:
             self._begin_interval(now_s)
 
     def _measure(self, now_s: float) -> None:
-        ages, link = self._reader.take_ages(), self._link
+        ages, link = self._reader.pop_ages(), self._link
         self._age_us = None
         if ages and link.is_connected and link.client.session.same_machine:
             self._age_us = ages[len(ages) // 2] / 1e3, (p99(ages) or 0) / 1e3
@@ -165,7 +165,7 @@ class Monitor:
         link, then, before = self._link, self._then, self._counts["samples"]
         counts = self._counts = self._count(withheld)
         self._new = Counter({name: max(counts[name] - then[name], 0) for name in counts})
-        self._flags = self._reader.take_flags(self._flags)
+        self._flags = self._reader.pop_flags(self._flags)
         if link.epoch != self._epoch:
             self._epoch, self._rate_hz = link.epoch, None
             self._begin_rate(now_s)

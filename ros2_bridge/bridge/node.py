@@ -42,7 +42,7 @@ _KINDS: Final = {
     "publishers": "destroy_publisher", "subscriptions": "destroy_subscription", "timers": "destroy_timer",
     "services": "destroy_service", "guards": "destroy_guard_condition",
 }  # fmt: skip
-SERVER_GOES_ON: Final = 3  # exit code: the supervisor stopped the node, but the server refused to shut down
+SERVER_NOT_STOPPED: Final = 3  # exit code: the supervisor stopped the node, but the server refused
 
 
 class StartError(Exception):
@@ -233,7 +233,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             self.get_logger().info(link.shut_server_down())
         except RequestRefusedError as error:
             self.get_logger().error(str(error))
-            self.finish(SERVER_GOES_ON)
+            self.finish(SERVER_NOT_STOPPED)
         except RequestFailedError as error:
             self.get_logger().warning(str(error))
         self.finish(0)

@@ -26,10 +26,10 @@ from pathlib import Path
 from typing import Any, Final
 
 STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
-_SAME_S: Final = 1.0
+_REPEATED_SIGNAL_S: Final = 1.0
 _HIGHEST_DOMAIN: Final = 232  # of DDS: the ports of others are too high
 STREAM: Final = "reader"
-BESIDE: Final = ("monitor", "listener")  # threads that share Python's lock with the stream's
+SHARING_LOCKS: Final = ("monitor", "listener")  # threads that share Python's lock with the stream's
 _MIDDLEWARE: Final = "dds."  # how Fast DDS names its threads
 # Longest time that the stream waits for Python's lock. A sample takes less, so it is not interrupted.
 _SWITCH_S: Final = 0.0002
@@ -110,7 +110,7 @@ class StopSignals:
         self._has_call.wait()
         signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
         self._call(signal.Signals(signal.sigwait(STOP_SIGNALS)))
-        impatient_s = time.monotonic() + _SAME_S
+        impatient_s = time.monotonic() + _REPEATED_SIGNAL_S
         while True:
             number = signal.sigwait(STOP_SIGNALS)
             if time.monotonic() >= impatient_s:
@@ -129,7 +129,7 @@ def prepare(rt_priority: int, cpu: int, log: Any) -> None:
     scheduling = make_real_time(rt_priority, cpu, thread=stream)
     if scheduling.priority:
         below = os.sched_param(max(1, scheduling.priority - 1))
-        for thread in _beside():
+        for thread in _threads_sharing_locks():
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 os.sched_setscheduler(thread, os.SCHED_FIFO, below)
         sys.setswitchinterval(_SWITCH_S)
@@ -141,8 +141,8 @@ def prepare(rt_priority: int, cpu: int, log: Any) -> None:
         log.info(f"the stream has {scheduling}")
 
 
-def _beside() -> Iterator[int]:
-    yield from (thread.native_id or 0 for thread in threading.enumerate() if thread.name in BESIDE)
+def _threads_sharing_locks() -> Iterator[int]:
+    yield from (thread.native_id or 0 for thread in threading.enumerate() if thread.name in SHARING_LOCKS)
     for task in Path("/proc/self/task").iterdir():
         with contextlib.suppress(OSError):
             if (task / "comm").read_text(encoding="utf-8", errors="replace").startswith(_MIDDLEWARE):

@@ -41,7 +41,7 @@ from bridge.stream.link import (
     find_sensor,
     offset_text,
 )
-from ft_compensation.bias import Taken, check_at_rest, estimate_bias
+from ft_compensation.bias import TareBasis, check_at_rest, estimate_bias
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
 from ft_compensation.identification.poses import Pose, coverage, pose_of
@@ -169,7 +169,7 @@ class BiasServices:
         """Measure the bias; without a tool_mass the weight of whatever hangs there is part of it."""
         control, target = self._control, _target(request)
         payload = control.parameters.payload
-        window = take_window(control, needs_tool=payload.mass > 0, samples=request.samples)
+        window = collect_window(control, needs_tool=payload.mass > 0, samples=request.samples)
         means = window.means()
         specific_force: Vector3 | None = None
         try:
@@ -183,7 +183,7 @@ class BiasServices:
         bias = estimate_bias(means, payload, specific_force or ZERO).plus(target, -1.0)
         by_imu = specific_force is not None and window.source.is_imu
         accelerometer = control.parameters.accelerometer if by_imu else None
-        control.set_bias(bias, "tare", Taken(payload, specific_force, accelerometer))
+        control.set_bias(bias, "tare", TareBasis(payload, specific_force, accelerometer))
         weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
         if not payload.mass:
             weight = (
@@ -224,7 +224,7 @@ class IdentifyServices:
 
     def add_pose(self) -> Done:
         poses = self._started()
-        window = take_window(self._control, needs_tool=True)
+        window = collect_window(self._control, needs_tool=True)
         x, y, z = window.specific_force()
         gravity = None if window.source.is_imu else (-x, -y, -z)
         poses.append(pose_of(window.means(), gravity, length(self._control.parameters.gravity)))
@@ -320,7 +320,7 @@ def _bounded(samples: int) -> int:
     return min(max(samples, _FEWEST_SAMPLES), MAX_TARE_SAMPLES)
 
 
-def take_window(control: CompensationControl, *, needs_tool: bool, samples: int = 0) -> RestWindow:
+def collect_window(control: CompensationControl, *, needs_tool: bool, samples: int = 0) -> RestWindow:
     """The samples of the next `rest.duration`, or so many, once the sensor's data has settled.
 
     CompensationError or RequestFailedError if they do not come or mean nothing.

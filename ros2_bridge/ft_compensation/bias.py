@@ -2,8 +2,8 @@
 """The bias: estimated while the sensor is stationary, ramped in, and undone.
 
 Pose-aware: with a payload, its weight at the pose of the window is not part of the bias, so it stays with
-gravity compensation and the bias holds in every pose. `Taken` is what it takes to tell the bias for another
-payload.
+gravity compensation and the bias holds in every pose. With its `TareBasis` the bias for another payload is
+known.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.
         )
 
 
-def force_bound_95(payload: Payload, accelerometer: Accelerometer, taken: Taken | None = None) -> float:
+def force_bound_95(payload: Payload, accelerometer: Accelerometer, taken: TareBasis | None = None) -> float:
     """N: in 95 % of cases what is not known of the accelerometer shows as less force, in any pose.
 
     A bias `taken` by a tare that went by this accelerometer has the part of its offset in it, and what its
@@ -73,7 +73,7 @@ def _weight(payload: Payload, specific_force: Vector3) -> Wrench:
     return Compensator(payload).compensate(ZERO, ZERO, specific_force).tool
 
 
-class Taken(NamedTuple):
+class TareBasis(NamedTuple):
     """What a bias was taken with."""
 
     payload: Payload = NO_PAYLOAD  # whose weight is not part of it
@@ -81,7 +81,7 @@ class Taken(NamedTuple):
     specific_force: Vector3 | None = ZERO
     accelerometer: Accelerometer | None = None  # as it was corrected, where that is by the sensor's own
 
-    def weighed(self, payload: Payload) -> tuple[Wrench, Taken]:
+    def for_payload(self, payload: Payload) -> tuple[Wrench, TareBasis]:
         """By how much the bias is another for this payload; nothing if the specific force is unknown."""
         if self.specific_force is None or payload == self.payload:
             return NO_WRENCH, self
@@ -89,7 +89,7 @@ class Taken(NamedTuple):
         return before.plus(now, -1.0), self._replace(payload=payload)
 
     def warning(self, change: Wrench, payload: Payload) -> str:
-        """What `weighed`, and its `change`, mean for a user, a sentence; empty if nothing."""
+        """What `for_payload`, and its `change`, mean for a user, a sentence; empty if nothing."""
         if change == NO_WRENCH:
             return self.doubt(payload)
         return (
@@ -110,7 +110,7 @@ class Taken(NamedTuple):
         )
 
 
-_OF_NO_TARE: Final = Taken()
+_NO_TARE: Final = TareBasis()
 _EARLY_S: Final = 0.1  # a sample may be this much older than the sample that a ramp began at
 
 
@@ -121,14 +121,14 @@ class BiasRamp(NamedTuple):
     """
 
     target: Wrench = NO_WRENCH
-    taken: Taken = _OF_NO_TARE  # what the target was taken with
+    taken: TareBasis = _NO_TARE  # what the target was taken with
     start: Wrench = NO_WRENCH
     begin_s: float = 0.0
     seconds: float = 0.0  # how long it takes; 0: at once
-    before: tuple[Wrench, Taken] | None = None  # the target before the last change; None: nothing to undo
+    before: tuple[Wrench, TareBasis] | None = None  # the previous target; None: nothing to undo
 
     def go(
-        self, target: Wrench, now_s: float, seconds: float = 0.0, taken: Taken = _OF_NO_TARE, *,
+        self, target: Wrench, now_s: float, seconds: float = 0.0, taken: TareBasis = _NO_TARE, *,
         may_undo: bool = True,
     ) -> BiasRamp:  # fmt: skip
         """From the bias of `now_s` (the newest sample's time) to `target`."""
@@ -149,12 +149,12 @@ class BiasRamp(NamedTuple):
             before = before[0].plus(change), before[1]
         return self._replace(start=self.start.plus(change), target=self.target.plus(change), before=before)
 
-    def weighed(self, payload: Payload) -> BiasRamp:
+    def for_payload(self, payload: Payload) -> BiasRamp:
         """The ramp for another payload."""
-        change, taken = self.taken.weighed(payload)
+        change, taken = self.taken.for_payload(payload)
         before = self.before
         if before is not None:
-            of_before, taken_before = before[1].weighed(payload)
+            of_before, taken_before = before[1].for_payload(payload)
             before = before[0].plus(of_before), taken_before
         return self._replace(
             start=self.start.plus(change), target=self.target.plus(change), taken=taken, before=before

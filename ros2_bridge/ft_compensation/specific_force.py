@@ -123,7 +123,7 @@ class QuaternionGravity:
         self._newest_s, self._gravity = -math.inf, None
         self._rates.clear()
 
-    def follow(self, angular_rate: Vector3, time_s: float) -> None:
+    def add_rate(self, angular_rate: Vector3, time_s: float) -> None:
         rates = self._rates
         if rates and not 0.0 <= time_s - rates[-1][0] <= self.stale_after_s:
             rates.clear()  # a gap, or a clock that was set: the orientation is held until the next one
@@ -132,7 +132,7 @@ class QuaternionGravity:
             return
         rates.append((time_s, angular_rate))
         if self._gravity is not None and len(rates) > 1:
-            self._gravity = _carried(*self._gravity, (rates[-2], rates[-1]))
+            self._gravity = _propagated(*self._gravity, (rates[-2], rates[-1]))
 
     def update(self, orientation: Quaternion, time_s: float) -> bool:
         """Take a unit quaternion x, y, z, w of time `time_s`. False: it is older than what is known."""
@@ -143,7 +143,7 @@ class QuaternionGravity:
         self._newest_s = time_s
         later = [each for each in self._rates if each[0] > time_s]
         known = [each for each in self._rates if each[0] <= time_s][-1:]
-        self._gravity = _carried(time_s, gravity, [*known, *later])
+        self._gravity = _propagated(time_s, gravity, [*known, *later])
         return True
 
     def age_s(self, now_s: float) -> float:
@@ -157,7 +157,7 @@ class QuaternionGravity:
         return self._gravity[1]
 
 
-def _carried(
+def _propagated(
     time_s: float, gravity: Vector3, rates: Sequence[tuple[float, Vector3]]
 ) -> tuple[float, Vector3]:
     """Gravity of `time_s` turned on by these rates (times ascending), or back, to the last of them."""

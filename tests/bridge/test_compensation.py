@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode, layout_for
-from ft_compensation.bias import Taken, force_bound_95
+from ft_compensation.bias import TareBasis, force_bound_95
 from ft_compensation.identification.weighted import Array
 from ft_compensation.quantities import Accelerometer, Payload
 from tests.bridge.simulated_node import (
@@ -472,7 +472,7 @@ def test_what_the_accelerometers_own_errors_may_make_is_told_in_newtons(arm: Arm
 
     assert told() == pytest.approx(force_bound_95(HEAVY, Accelerometer()), abs=1e-3)
     moved.do("tare")  # by this accelerometer, whose offset is part of the bias from now on
-    taken = Taken(HEAVY, None, Accelerometer())
+    taken = TareBasis(HEAVY, None, Accelerometer())
     assert told() == pytest.approx(force_bound_95(HEAVY, Accelerometer(), taken), abs=1e-3)
     assert told() < 0.5
     known = Accelerometer(

@@ -97,7 +97,7 @@ def test_a_change_of_the_sensors_own_offset_shifts_the_bias(
     node.until(compensation="ok")
 
 
-def test_a_parameter_that_the_shift_has_not_reached_is_no_wish(
+def test_setting_another_parameter_keeps_a_shift_of_the_bias(
     sensor: Sensor, node: Node, stages: Stages
 ) -> None:
     """The parameter `bias` follows when the executor gets to it; another one may be set before."""

@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from bota_ethercat.text.json_text import JsonObject
 from bridge import rclpy_internals
-from bridge.node import SERVER_GOES_ON, StartError, run
+from bridge.node import SERVER_NOT_STOPPED, StartError, run
 from bridge.rclpy_internals import RIGHT_FOR
 from ft_compensation.quantities import Wrench
 from tests.bridge.real_node import PATIENCE_S, Listener, Start, StartProcess
@@ -139,7 +139,7 @@ def test_no_supervisor_is_heard_without_a_topic() -> None:
     [
         (
             {"ok": False, "error": {"code": "denied", "message": "only root"}},
-            SERVER_GOES_ON,
+            SERVER_NOT_STOPPED,
             "refused to shut down: only root (denied)",
         ),
         (None, 0, "did not answer the request to shut down"),

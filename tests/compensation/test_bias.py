@@ -12,7 +12,7 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.sensor.warnings_register import WarningFlag
-from ft_compensation.bias import BiasRamp, Taken, check_at_rest, estimate_bias
+from ft_compensation.bias import BiasRamp, TareBasis, check_at_rest, estimate_bias
 from ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
@@ -183,14 +183,14 @@ def test_the_last_change_is_undone_once() -> None:
 
 def test_a_shift_and_another_tool_change_both_biases() -> None:
     """The one in force was taken with gravity along -x, the one before along -z."""
-    ramp = BiasRamp().go(load((0, 0, 1)), 0.0, 1.0, Taken(Payload(), felt((0, 0, 1))))
-    ramp = ramp.go(load((1, 0, 0)), 5.0, 1.0, Taken(Payload(), felt((1, 0, 0)))).shifted(NEW)
-    weighed = ramp.weighed(TOOL)
+    ramp = BiasRamp().go(load((0, 0, 1)), 0.0, 1.0, TareBasis(Payload(), felt((0, 0, 1))))
+    ramp = ramp.go(load((1, 0, 0)), 5.0, 1.0, TareBasis(Payload(), felt((1, 0, 0)))).shifted(NEW)
+    weighed = ramp.for_payload(TOOL)
     assert ramp.target == load((1, 0, 0)).plus(NEW), "it is another ramp"
     assert weighed.target.values == pytest.approx(BIAS.plus(NEW).values)
     started = load((0, 0, 1)).plus(NEW).plus(BIAS).plus(load((1, 0, 0)), -1.0)
     assert weighed.at(5.0).values == pytest.approx(started.values), "which jumps as much as the weight does"
     assert weighed.undone(10.0).target.values == pytest.approx(BIAS.plus(NEW).values)
-    assert weighed.taken == Taken(TOOL, felt((1, 0, 0)))
-    assert weighed.undone(10.0).taken == Taken(TOOL, felt((0, 0, 1)))
+    assert weighed.taken == TareBasis(TOOL, felt((1, 0, 0)))
+    assert weighed.undone(10.0).taken == TareBasis(TOOL, felt((0, 0, 1)))
     assert BiasRamp().go(NEW, 0.0).shifted(NEW).undone(1.0).target == NO_WRENCH, "none stays none"

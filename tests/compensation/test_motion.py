@@ -14,7 +14,7 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.alignment import align
-from ft_compensation.bias import Taken, estimate_bias, force_bound_95
+from ft_compensation.bias import TareBasis, estimate_bias, force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import (
     DEFAULT_GRAVITY,
@@ -216,7 +216,7 @@ def test_a_tare_in_any_pose_is_right_in_all_poses_and_with_every_tool(seed: int)
             assert math.hypot(*left.force) < 0.01
     # Its parameters were wrong during the tare, and were put right later.
     again = estimate_bias(means, second, imu.known.correct(means.acceleration))
-    change, _ = Taken(second, imu.known.correct(means.acceleration)).weighed(first)
+    change, _ = TareBasis(second, imu.known.correct(means.acceleration)).for_payload(first)
     assert again.plus(change).values == pytest.approx(tared.values)
 
 
@@ -238,7 +238,7 @@ def test_the_bound_covers_the_accelerometers_errors_in_95_percent(
     A tare, in any pose too, takes off what the accelerometer's errors make there.
     """
     draw, held, draws = np.random.default_rng([7, SEED]), 0, 4000
-    taken = Taken(NO_PAYLOAD, (1.0, 0.0, 0.0), known) if is_tared else Taken()
+    taken = TareBasis(NO_PAYLOAD, (1.0, 0.0, 0.0), known) if is_tared else TareBasis()
     for _ in range(draws):
         tool, up = Payload(draw.uniform(0.1, 5.0)), draw.normal(size=(2, 3))
         pose, of_tare = STANDARD_GRAVITY * up / np.linalg.norm(up, axis=1, keepdims=True)
@@ -284,10 +284,10 @@ def arm(turned: float) -> tuple[float, float, float, float]:
 
 def test_an_orientation_is_held_where_the_gyroscope_is_of_no_use() -> None:
     source = QuaternionGravity()
-    source.follow((2.0, 0.0, 0.0), 1.0)
+    source.add_rate((2.0, 0.0, 0.0), 1.0)
     source.update(arm(0.0), 1.0)
-    source.follow((math.nan, 0.0, 0.0), 1.01)
+    source.add_rate((math.nan, 0.0, 0.0), 1.01)
     assert source.gravity(1.05) == pytest.approx(DEFAULT_GRAVITY)
     for time_s in (1.02, 9.0, 1.0):  # a gap; and a clock that was set back
-        source.follow((2.0, 0.0, 0.0), time_s)
+        source.add_rate((2.0, 0.0, 0.0), time_s)
     assert source.gravity(1.05) == pytest.approx(DEFAULT_GRAVITY)

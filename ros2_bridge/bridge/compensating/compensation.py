@@ -43,7 +43,7 @@ class RestWindow(StationaryWindow):
         self.source, self.done = source, threading.Event()
         self._specific_forces, self._unknown = list[Vector3](), ""
 
-    def take(self, sample: Sample, time_s: float, stamp_s: float, specific_force: Vector3 | None) -> None:
+    def observe(self, sample: Sample, time_s: float, stamp_s: float, specific_force: Vector3 | None) -> None:
         if specific_force is None:
             self._unknown = self._unknown or self.source.why_none(sample, stamp_s) or "not in every sample"
         else:
@@ -123,7 +123,7 @@ class Compensation:
             return ZERO
         specific_force = plan.source.specific_force(sample, time_s, stamp_s)
         if window is not None and not window.done.is_set():
-            window.take(sample, time_s, stamp_s, specific_force)
+            window.observe(sample, time_s, stamp_s, specific_force)
         return specific_force if plan.has_tool else ZERO
 
     def publish(self, sample: Sample, frame: DataMessage) -> None:
@@ -142,7 +142,7 @@ class Compensation:
             topic.send(*stages[topic.index], frame)
         self.published += 1
 
-    def follow(self, sample: Sample, frame: DataMessage) -> None:
+    def observe(self, sample: Sample, frame: DataMessage) -> None:
         """Give source, open window and filter a sample that is not published."""
         plan = self.plan
         specific_force = self._specific_force(plan, sample, frame)

@@ -24,7 +24,7 @@ from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.stream.reader import Reader
-from ft_compensation.bias import BiasRamp, Taken, force_bound_95
+from ft_compensation.bias import BiasRamp, TareBasis, force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.outputs import cutoff_problem
 from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
@@ -43,7 +43,7 @@ _DEPENDS_ON: Final = (
 class BiasChange(NamedTuple):
     bias: Wrench
     origin: str
-    taken: Taken = Taken()  # what a tare took it with
+    taken: TareBasis = TareBasis()  # what a tare took it with
     offset: Wrench | None = None  # of the sensor, which the bias goes with; None: the current one
 
 
@@ -176,14 +176,14 @@ class CompensationControl:
 
     # -- changes of the bias
 
-    def set_bias(self, bias: Wrench, origin: str, taken: Taken = Taken()) -> None:  # noqa: B008
+    def set_bias(self, bias: Wrench, origin: str, taken: TareBasis = TareBasis()) -> None:  # noqa: B008
         """Put a bias in force, `taken` by a tare; ParameterError if it is none."""
         with self._setting:
-            change, taken = taken.weighed(self.parameters.payload)  # the tool may have been set since
+            change, taken = taken.for_payload(self.parameters.payload)  # the tool may have been set since
             bias = bias.plus(change)
             self._live.check_values(bias=bias.values)
             self._changes.append(BiasChange(bias, origin, taken))
-            self._change(self._take_changes)
+            self._change(self._apply_changes)
             self._show()
 
     def undo_bias(self) -> Wrench:
@@ -226,10 +226,10 @@ class CompensationControl:
             self._ramp = change(self._ramp)
             self.output.plan = Plan(self.source, Compensator(payload), self._ramp, payload.mass > 0.0)
 
-    def _take_changes(self, ramp: BiasRamp) -> BiasRamp:
+    def _apply_changes(self, ramp: BiasRamp) -> BiasRamp:
         """Of this ramp the one for the present tool that leads to the bias that waits."""
         parameters = self.parameters
-        ramp = ramp.weighed(parameters.payload)
+        ramp = ramp.for_payload(parameters.payload)
         while self._changes:
             bias, self.origin, taken, offset = self._changes.popleft()
             may_undo, is_measured = self.origin != _FROM_PARAMETER, self.origin in _MEASURED
@@ -280,7 +280,7 @@ class CompensationControl:
             offset = _known(wanted.sensor_offset) if is_other_offset else None
             self._changes.append(BiasChange(Wrench.of(wanted.bias), _FROM_PARAMETER, offset=offset))
         is_given, before, warning = bool(self._changes), self.bias, ""
-        self._change(self._take_changes)
+        self._change(self._apply_changes)
         if wanted.payload != was.payload and not is_given:  # the bias of a tare is another one with it
             warning = self._ramp.taken.warning(self.bias.plus(before, -1.0), wanted.payload)
         if warning:

@@ -103,7 +103,7 @@ class ImuSource(Source):
 class RobotSource(Source):
     """Gravity by the latest orientation of a topic or TF, turned on to the sample by the sensor's gyroscope.
 
-    `take` is for the subscriber's thread; `latest` and `problem` are replaced, never changed in place.
+    `update` is for the subscriber's thread; `latest` and `problem` are replaced, never changed in place.
     """
 
     def __init__(self, parameters: Parameters, name: str) -> None:
@@ -114,9 +114,9 @@ class RobotSource(Source):
         self.problem = "nothing has come yet"  # why the latest message is unusable; empty if it is not
         self._limit_s = parameters.orientation_stale_after
         self._gravity = QuaternionGravity(parameters.gravity, stale_after_s=self._limit_s)
-        self._taken: object = None
+        self._used: object = None
 
-    def take(self, read: Callable[[], tuple[Quaternion, int]]) -> None:
+    def update(self, read: Callable[[], tuple[Quaternion, int]]) -> None:
         try:
             self.latest, self.problem = read(), ""
         except UnusableError as error:
@@ -124,9 +124,9 @@ class RobotSource(Source):
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:
         gravity, latest = self._gravity, self.latest
-        gravity.follow(sample.angular_rate, time_s)
-        if latest is not self._taken and latest is not None:
-            self._taken = latest
+        gravity.add_rate(sample.angular_rate, time_s)
+        if latest is not self._used and latest is not None:
+            self._used = latest
             then_s = latest[1] * 1e-9 - stamp_s + time_s
             if not gravity.update(latest[0], then_s):
                 # The publisher's clock went back, or it is another publisher: the latest counts.
@@ -178,7 +178,7 @@ def _open_tf(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSourc
         _, rotation, stamp = tf.look_up(base, frame)
         return rotation, stamp or time.time_ns()  # static transforms hold at any time, so now
 
-    timer = node.create_timer(TF_PERIOD_S, lambda: source.take(read), group)
+    timer = node.create_timer(TF_PERIOD_S, lambda: source.update(read), group)
     source.close = lambda: (node.destroy_timer(timer), tf.close())
     return source
 
@@ -191,7 +191,7 @@ def _open_topic(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSo
     profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
     def on_message(message: Any) -> None:
-        source.take(lambda: read_message(message, wanted))
+        source.update(lambda: read_message(message, wanted))
 
     deadline_s = time.monotonic() + _RELEASE_S
     while True:

@@ -97,7 +97,7 @@ class MeasuredTopic(Topic):
     def configure(self, parameters: Parameters) -> None:
         self.publish = self._make(self._send, parameters, self._stamps)
 
-    def follow(self, sample: Sample, frame: DataMessage) -> None:
+    def observe(self, sample: Sample, frame: DataMessage) -> None:
         """Nothing: each message stands by itself."""
 
 

@@ -94,7 +94,7 @@ class Link:
             self.since_s = self.clock.monotonic()
             self.on_change()
 
-    def take_event(self, message: JsonObject) -> bool:
+    def handle_event(self, message: JsonObject) -> bool:
         """Learn from an event; False if it is of another sensor."""
         if message.get("sensor", self.sensor) != self.sensor:
             return False

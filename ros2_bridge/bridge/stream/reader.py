@@ -63,7 +63,7 @@ class Output(Protocol):
     def publish(self, sample: Sample, frame: DataMessage, /) -> None:
         """Publish `sample`, which came in `frame`: its stamp, and for intervals its monotonic time."""
 
-    def follow(self, sample: Sample, frame: DataMessage) -> None:
+    def observe(self, sample: Sample, frame: DataMessage) -> None:
         """Take note of a sample that `publishing_frequency` leaves out."""
 
     def configure(self, parameters: Parameters) -> None:
@@ -92,7 +92,7 @@ class Outputs:
 class Reader:
     """Feeds `outputs` from the server until `stop`. `on_failure` is called with an unexpected error.
 
-    The monitor reads the attributes, `take_flags` and `take_ages`: append and popleft of a deque are atomic.
+    The monitor reads the attributes, `pop_flags` and `pop_ages`: append and popleft of a deque are atomic.
 
     Attributes:
         sample, stamp_ns: the newest that was published, and its time since the Unix epoch.
@@ -140,7 +140,7 @@ class Reader:
             self._limit_hz = hz
             self._selector.limit(hz)
 
-    def take_flags(self, flags: Flags) -> Flags:
+    def pop_flags(self, flags: Flags) -> Flags:
         """`flags` and all that were set since the last call, if only for one sample, or are set now."""
         changes = self._flag_changes
         while True:
@@ -149,7 +149,7 @@ class Reader:
                 return flags
             changes.popleft()
 
-    def take_ages(self) -> list[int]:
+    def pop_ages(self) -> list[int]:
         """The ages since the last call, in ascending order."""
         taken, self._ages = self._ages, deque(maxlen=_MOST_NOTED)
         return sorted(taken)
@@ -170,7 +170,7 @@ class Reader:
             if frames:
                 self._publish(frames)
                 frames = []
-            self._take_event(item)
+            self._handle_event(item)
         if frames:
             self._publish(frames)
         while self.client.terminal_frames:
@@ -185,7 +185,7 @@ class Reader:
             sample = self._decoded(frame)
             if sample.is_finite:
                 for output in self._outputs.wanted:
-                    output.follow(sample, frame)
+                    output.observe(sample, frame)
             else:
                 self.not_finite += 1
         for frame in selected:
@@ -217,7 +217,7 @@ class Reader:
             self.saturated += 1
         return sample
 
-    def _take_event(self, event: ClientEvent) -> None:
+    def _handle_event(self, event: ClientEvent) -> None:
         link = self.link
         if isinstance(event, Connected):
             self._selector = FrameSelector(
@@ -236,7 +236,7 @@ class Reader:
             self._log_problem(event)
         else:
             before = link.info.settings
-            if not link.take_event(event):
+            if not link.handle_event(event):
                 return
             text = sentence(event, before)
             # A line of source has one severity: rclpy insists.

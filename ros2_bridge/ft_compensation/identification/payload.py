@@ -335,14 +335,14 @@ def _fit_notes(fit: Fit, name: str, unit: str) -> Iterator[str]:
 
 
 def _other_notes(
-    mass: float, mass_half: float, centre_half: float, undetermined: str, seen: Coverage
+    mass: float, mass_half: float, center_half: float, undetermined: str, seen: Coverage
 ) -> Iterator[str]:
     """Of wide intervals, kg and m, and of axes, as in "xz", whose offset of the accelerometer is open."""
     more = "take more poses, or longer ones"
     if mass_half > 0.05 * mass:
         yield f"the mass is known to ± {100 * mass_half / mass:.0f} % only: {more}"
-    if centre_half > 0.01:
-        yield f"the center of gravity is known to ± {1000 * centre_half:.0f} mm only: {more}"
+    if center_half > 0.01:
+        yield f"the center of gravity is known to ± {1000 * center_half:.0f} mm only: {more}"
     if undetermined:
         yield (
             f"the poses do not determine the accelerometer's offset along {' and '.join(undetermined)}, so "
