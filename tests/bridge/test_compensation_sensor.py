@@ -9,7 +9,7 @@ import pytest
 
 from bridge.parameters.table import Parameters
 from ft_compensation.quantities import NO_PAYLOAD, Wrench
-from tests.bridge.simulated_node import QUICK, UP, ZERO6, Node, Server, Stages, six
+from tests.bridge.simulated_node import QUICK, UP, ZERO6, Node, Server, Stages, six, values
 from tests.compensation.making import BIAS
 
 
@@ -141,6 +141,7 @@ def test_a_shift_while_the_parameters_are_made_to_show_the_bias_is_kept(
     stages.settle(ZERO6)
     shifted = [b + o for b, o in zip(BIAS.values, second, strict=True)]
     assert list(node.parameters("bias")[0]) == pytest.approx(shifted, abs=1e-4)
+    assert values(node.statuses()["compensation"])["bias_from"] == "tare"
 
 
 def test_a_bias_of_a_file_is_of_the_offset_that_the_file_names(sensor: Sensor) -> None:
