@@ -126,26 +126,18 @@ def identify(poses: Sequence[Pose]) -> Identified:
     gravity = float(np.linalg.norm(equations.gravity, axis=1).mean())
     weight = mass * gravity
     moment = weight * max(ARM, length(payload.center))
-    fits = []
-    for made, chosen in ((whole, np.ones(len(poses), bool)), (found, kept)):
-        few = [pose for pose, is_chosen in zip(poses, chosen, strict=True) if is_chosen]
-        forces, torques = made.residuals[chosen, :3], made.residuals[chosen, 3:]
-        fits.append(
-            (
-                judge(few, forces, made.degrees[:3], "force", weight),
-                judge(few, torques, made.degrees[3:], "torque", moment),
-            )
-        )
-    (of_all_force, of_all_torque), (force, torque) = fits
+    few = [pose for pose, is_kept in zip(poses, kept, strict=True) if is_kept]
+    force = judge(few, found.residuals[kept, :3], found.degrees[:3], "force", weight)
+    torque = judge(few, found.residuals[kept, 3:], found.degrees[3:], "torque", moment)
     most_force = _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight
     most_torque = _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment
-    _check_fit(of_all_force, touched, most_force, "N")
+    _check_fit(_residual(whole.residuals[:, :3], whole.degrees[:3]), touched, most_force, "N")
     if length(payload.center) > LARGEST_CENTRE:
         raise IdentificationError(
             f"the center of gravity would be {length(payload.center):.2g} m from the sensor with a mass of "
             f"{mass:.3g} kg, which cannot be: something held or touched the tool, or there is no tool"
         )
-    _check_fit(of_all_torque, touched, most_torque, "Nm")
+    _check_fit(_residual(whole.residuals[:, 3:], whole.degrees[3:]), touched, most_torque, "Nm")
     if mass_interval * gravity > most_force or length(centre_interval) * weight > most_torque:
         raise IdentificationError(
             f"the poses do not suffice: mass {mass:.2g} ± {mass_interval:.2g} kg, center of gravity "
@@ -288,19 +280,23 @@ def _check_mass(mass: float, interval: float) -> None:
         )
 
 
-def _check_fit(fit: Fit, touched: _Touched | None, limit: float, unit: str) -> None:
-    if fit.rms > limit:
+def _residual(residuals: Array, degrees: Array) -> float:
+    """Root mean square, with the degrees of freedom taken into account."""
+    return math.sqrt(float((residuals**2).sum()) / max(float(degrees.sum()), 1.0))
+
+
+def _check_fit(rms: float, touched: _Touched | None, limit: float, unit: str) -> None:
+    if rms > limit:
         again = "take all again" if touched is None else f"pose {touched.pose + 1} fits worst: take it again"
         raise IdentificationError(
-            f"the poses do not fit one payload: the residual is {fit.rms:.2g} {unit}, the limit {limit:.2g} "
+            f"the poses do not fit one payload: the residual is {rms:.2g} {unit}, the limit {limit:.2g} "
             f"{unit}; something touched the tool, or it moved; {again}"
         )
 
 
 def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, weight: float) -> Fit:
     """How `residuals` (n, 3) of "force" or "torque" fit; `weight` in N, or Nm at its arm."""
-    freedom = max(float(degrees.sum()), 1.0)
-    rms = math.sqrt(float((residuals**2).sum()) / freedom)
+    freedom, rms = max(float(degrees.sum()), 1.0), _residual(residuals, degrees)
     spread = np.array([getattr(pose, f"{name}_spread") for pose in poses])
     chi_square = None
     if spread.all():
