@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ROS messages of what the sensor measures, in serialized form, and of the server's terminals.
+"""The ROS messages of what the sensor measures, in serialized form, and of the server's terminals; the QoS
+of every topic (`create_publisher`).
 
 An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has
 subscribed, so it must not block and should not allocate.
