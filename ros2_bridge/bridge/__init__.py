@@ -2,5 +2,6 @@
 """The ROS 2 node: receives the server's stream and publishes it.
 
 Imports `bota_ethercat` and `ft_compensation`, never the server. `client` is the program, `node` the wiring.
-A sample's way: `stream`, `compensating`, `publishing`.
+A sample goes one way: `stream` decodes it; `publishing` makes the topics of what was measured;
+`compensating` takes bias and tool off, for the other topics of `publishing`.
 """

@@ -32,7 +32,6 @@ defaults: share/bota_ethercat_bridge/config/client.yaml.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until it is told to stop; returns the exit code."""
     signals = StopSignals()
     own = list(sys.argv[1:] if arguments is None else arguments)
     if own and own[0] in {"-h", "--help"}:

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """/diagnostics: a thread that checks subscribers and state ten times a second, and what it reports.
 
-A thread of its own, so that neither a service that waits for the server nor the stream holds it up. It
-publishes every second, and at once when a level changes. What happened for a moment only is kept until a
-regular report, a second after the one before, has carried it. Five statuses: a message says what is wrong, as
-`bota_ethercat.health` judges it, and what to do; the values are for those who look closer.
+It publishes every second, and at once when a level changes. What happened for a moment only is kept until a
+regular report has carried it. The five statuses say what `bota_ethercat.health` finds and what to do; their
+values are for those who look closer.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable
 from bridge.process import Worker
 from bridge.publishing.messages import Stamps, create_publisher
-from bridge.stream.reader import Flags, Outputs, Reader
+from bridge.stream.reader import NO_FLAGS, Outputs, Reader
 
 TICK_S: Final = 0.1
 _REPORT_S: Final = 1.0
@@ -40,6 +39,8 @@ _LEVELS: Final = {
     Level.NOT_POSSIBLE: DiagnosticStatus.STALE,
 }
 Problems = list[tuple[Level, str]]  # how bad, and a sentence
+_NO_CONNECTION: Final = "there is no connection to the server, see link"
+_NO_SAMPLES: Final = "there are no new samples, see stream"
 
 
 class CompensationState(NamedTuple):
@@ -58,44 +59,36 @@ class Monitor:
     """Its `thread` runs until `stop`. `on_failure` is called with an unexpected error."""
 
     def __init__(
-        self,
-        node: Node,
-        limits: Limits,
-        reader: Reader,
-        compensation: Callable[[], CompensationState],
-        outputs: Outputs,
-        stamps: Stamps,
-        on_failure: Callable[[str], object],
-    ) -> None:
+        self, node: Node, limits: Limits, reader: Reader, compensation: Callable[[], CompensationState],
+        outputs: Outputs, stamps: Stamps, on_failure: Callable[[str], object],
+    ) -> None:  # fmt: skip
         self.limits = limits  # may be replaced at any time
         self._reader, self._link, self._clock = reader, reader.link, reader.link.clock
         self._compensation, self._outputs, self._stamps = compensation, outputs, stamps
-        # Called once a second with the sensor's row of the server's `status` and its temperature.
         self._log = node.get_logger()
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
         self._published_s = now_s = self._clock.monotonic()
         self._levels: list[Level] = []
-        # The server's newest `status` reply of this connection, when it was asked, and what it owes.
-        self._server, self._said = Status(), SensorObserver()  # and of our sensor
+        # The server's newest `status` of this connection, what it says of our sensor, and what it owes.
+        self._server, self._said = Status(), SensorObserver()
         self._connects, self._asked_s, self._waiting = 0, 0.0, dict[str, Future[JsonObject]]()
-        # Since the node and, of the server's ("server_..."), the server started.
-        self._counts = self._then = self._count(0)  # now, and as of the last regular report
-        self._new = Counter[str]()  # since then
-        self._flags = Flags()  # likewise
+        # Counts since the node started: now, as of the last regular report, and the growth since.
+        self._counts = self._then = self._count(0)
+        self._new = Counter[str]()
+        self._flags = NO_FLAGS  # that were set since the last regular report
         # Of the last second, p50 and p99; None without samples, or by the clock of another machine.
         self._age_us: tuple[float, float] | None = None
         self._rate_hz: float | None = None  # measured; None while that is not possible yet
-        # Where the rate is measured from: samples, time here, and the newest one's stamp.
-        self._rate_fresh, self._rate_s, self._rate_ns = 0, now_s, -1
-        # When the number of fresh samples changed, whether that is long ago, and the link's epoch.
+        # Where the rate is measured from: samples, time here, and the newest sample's.
+        self._rate_from = 0, now_s, -1
+        # When the number of samples changed, whether that is long ago, and the link's epoch.
         self._fresh_s, self._is_silent, self._epoch = now_s, False, -1
         self._unread = 0.0, False  # the worst `take_unread` since the last regular report, or sample
         self._stopping = threading.Event()
         self.thread = Worker("monitor", self._run, on_failure)
 
     def stop(self) -> bool:
-        """Stop and wait for the thread; False if it does not end in time."""
         self._stopping.set()
         return self.thread.has_ended()
 
@@ -104,7 +97,6 @@ class Monitor:
             self.tick()
 
     def tick(self) -> None:
-        """Look once, and publish if it is time or a level has changed."""
         self._outputs.refresh()
         now_s = self._clock.monotonic()
         regular = now_s - self._published_s >= _REPORT_S
@@ -112,7 +104,7 @@ class Monitor:
             self._measure(now_s)
         self._collect()
         compensation = self._compensation()
-        self._look(now_s, compensation.withheld)
+        self._observe(now_s, compensation.withheld)
         statuses = self._judge(now_s, compensation)
         levels = [status.level for status in statuses]
         if regular or levels != self._levels:
@@ -125,73 +117,72 @@ class Monitor:
             self._begin_interval(now_s)
 
     def _measure(self, now_s: float) -> None:
-        """Work out rate and ages of the interval that ends."""
-        ages, link = self._reader.watch.take_ages(), self._link
+        ages, link = self._reader.pop_ages(), self._link
         self._age_us = None
         if ages and link.is_connected and link.client.session.same_machine:
             self._age_us = ages[len(ages) // 2] / 1e3, (p99(ages) or 0) / 1e3
         if link.epoch != self._epoch:
             return
-        fresh, elapsed_s = self._reader.counts.new, now_s - self._rate_s
-        newest_ns = self._reader.accounting.new_ns
+        (fresh, from_s, from_ns), elapsed_s = self._rate_from, now_s - self._rate_from[1]
+        self._begin_rate(now_s)
         # By the stamps, as a delay here is none of the sensor's; by the clock if it has become silent.
-        span_s = (newest_ns - self._rate_ns) * 1e-9 if self._rate_ns >= 0 else 0.0
+        span_s = (self._rate_from[2] - from_ns) * 1e-9 if from_ns >= 0 else 0.0
         span_s = span_s if span_s >= _SHORTEST_RATE_S else elapsed_s
-        self._rate_hz = (fresh - self._rate_fresh) / span_s if elapsed_s >= _SHORTEST_RATE_S else None
-        self._rate_fresh, self._rate_s, self._rate_ns = fresh, now_s, newest_ns
+        samples = self._rate_from[0] - fresh
+        self._rate_hz = samples / span_s if now_s - from_s >= _SHORTEST_RATE_S else None
+
+    def _begin_rate(self, now_s: float) -> None:
+        self._rate_from = self._reader.counts.new, now_s, self._reader.accounting.new_ns
 
     def _collect(self) -> None:
         """Take what the server has answered, without waiting; the link gets the description."""
-        link = self._link
+        link, said = self._link, self._said
         if not link.is_connected or link.connects != self._connects:
             self._server, self._waiting = Status(), {}
-            self._said.disconnected()
+            said.disconnected()
         if link.connects != self._connects:
             self._connects = link.connects
-            self._said.connected(self._clock.monotonic_ns())
+            said.connected(self._clock.monotonic_ns())
         for action in [action for action, reply in self._waiting.items() if reply.done()]:
             reply = self._waiting.pop(action)
             if reply.exception() is None and (content := reply.result()).get("ok") is True:
                 if action == "status":
                     self._server = Status.parse(content)
-                    self._said.take_status(self._server, link.sensor, self._clock.monotonic_ns())
+                    said.take_status(self._server, link.sensor, self._clock.monotonic_ns())
                 else:
                     link.described(content)
+        said.info, said.lost = link.info, link.lost
 
     def _count(self, withheld: int) -> Counter[str]:
-        """All counts of the node."""
-        seen = self._reader.counts
+        seen, reader = self._reader.counts, self._reader
         return Counter(
             connects=self._link.connects, samples=seen.new, lost=seen.missing, stale=seen.stale,
             limited=seen.limited, repeated=seen.repeated, invalid=seen.invalid,
-            not_finite=self._reader.not_finite, saturated=self._reader.watch.saturated, withheld=withheld,
+            not_finite=reader.not_finite, saturated=reader.saturated, withheld=withheld,
         )  # fmt: skip
 
-    def _look(self, now_s: float, withheld: int) -> None:
-        """Count."""
+    def _observe(self, now_s: float, withheld: int) -> None:
         link, then, before = self._link, self._then, self._counts["samples"]
         counts = self._counts = self._count(withheld)
-        self._new = Counter({name: max(counts[name] - then[name], 0) for name in counts if name in then})
-        self._flags = self._flags.merge(self._reader.watch.take_flags())
+        self._new = Counter({name: max(counts[name] - then[name], 0) for name in counts})
+        self._flags = self._reader.pop_flags(self._flags)
         if link.epoch != self._epoch:
             self._epoch, self._rate_hz = link.epoch, None
-            self._rate_fresh, self._rate_s = counts["samples"], now_s
-            self._rate_ns = self._reader.accounting.new_ns
+            self._begin_rate(now_s)
         self._unread = max(self._unread, link.client.take_unread())
         if counts["samples"] != before:
             self._fresh_s = now_s
 
     def _begin_interval(self, now_s: float) -> None:
         """A regular report was made: what is new counts from there on. Asks the server again."""
-        self._flags, link = Flags(), self._link
+        self._flags, link = NO_FLAGS, self._link
         self._unread = self._unread if self._is_silent else (0.0, False)
         self._then = self._counts
         self._said.begin()
         if link.is_connected and not self._waiting:  # unless an answer is still owed
             self._asked_s = now_s
             try:
-                for action in ("status", "describe"):
-                    self._waiting[action] = link.client.request(action)
+                self._waiting = {action: link.client.request(action) for action in ("status", "describe")}
             except ConnectionFailedError:
                 self._waiting = {}  # the reader will notice
 
@@ -199,16 +190,16 @@ class Monitor:
 
     def _judge(self, now_s: float, compensation: CompensationState) -> list[DiagnosticStatus]:
         """The five statuses, in the order in which one would look for a cause."""
-        link, new = self._link, self._new
+        link, new, said, now_ns = self._link, self._new, self._said, self._clock.monotonic_ns()
         silent_s = max(now_s - max(self._fresh_s, link.since_s), 0.0)
         # How long the server has owed an answer that this node would have seen.
         answer_s = max(now_s - self._asked_s - self._unread[0], 0.0) if self._waiting else 0.0
-        sample = self._reader.watch.sample
-        temperature = None if sample is None else sample.temperature
+        sample = self._reader.sample
+        said.note_unread(self._unread, now_ns)
         seen = Observation(
             seconds=1.0,
             samples=new["samples"],
-            lost=max(new["lost"], self._said.grown("lost_samples")),
+            lost=max(new["lost"], said.grown("lost_samples")),
             skipped=new["stale"],
             repeated=new["repeated"],
             invalid=new["invalid"],
@@ -218,14 +209,10 @@ class Monitor:
             age_p99_us=None if self._age_us is None else self._age_us[1],
             not_finite=new["not_finite"],  # of those that it publishes; the server checks all
             **{name: bits for name, bits in self._flags._asdict().items() if name != "status"},
-            temperature=temperature,
+            temperature=None if sample is None else sample.temperature,
             server_silent=answer_s > _SLOW_ANSWER_S / 2,
         )
-        said = self._said
-        said.info, said.lost = link.info, link.lost
-        said.note_unread(self._unread, self._clock.monotonic_ns())
-        seen = said.complete(seen, self._clock.monotonic_ns(), limits=self.limits)
-        findings = judge(seen, self.limits).findings
+        findings = judge(said.complete(seen, now_ns, limits=self.limits), self.limits).findings
 
         def about(subject: About) -> Problems:
             return [(finding.level, finding.sentence) for finding in findings if finding.about is subject]
@@ -237,7 +224,7 @@ class Monitor:
         return [
             self._judge_link(about(About.LINK), now_s, answer_s),
             self._judge_stream(about(About.STREAM)),
-            self._judge_sensor(about(About.SENSOR), temperature),
+            self._judge_sensor(about(About.SENSOR), seen.temperature),
             self._judge_clock(about(About.CLOCK), has_samples=has_samples),
             self._judge_compensation(compensation, has_samples=has_samples),
         ]
@@ -273,26 +260,24 @@ class Monitor:
         return self._status("link", problems, f"connected to {link.address}", values)
 
     def _judge_stream(self, problems: Problems) -> DiagnosticStatus:
-        link, counts = self._link, self._counts
+        link, counts, server = self._link, self._counts, self._server
         if not link.is_connected:
-            problems = [(Level.NOT_POSSIBLE, "no samples: there is no connection to the server, see link")]
-        recent, row = self._server.last_10s, self._said.status
-        age, wake = self._server.recent_age_us(link.sensor), recent.wake_us
+            problems = [(Level.NOT_POSSIBLE, f"no samples: {_NO_CONNECTION}")]
+        recent, row, age = server.last_10s, self._said.status, server.recent_age_us(link.sensor)
+        ages_us = [None, None] if self._age_us is None else map(round, self._age_us)
         values = {
             "rate_hz": None if self._rate_hz is None else round(self._rate_hz, 1),
             "expected_hz": link.info.rate_hz or "",
-            "age_p50_us": "" if self._age_us is None else round(self._age_us[0]),
-            "age_p99_us": "" if self._age_us is None else round(self._age_us[1]),
+            **dict(zip(("age_p50_us", "age_p99_us"), ages_us, strict=True)),
             "samples": counts["samples"],
             "lost": counts["lost"],
             "skipped": counts["stale"],
             **{name: counts[name] for name in ("limited", "repeated", "invalid", "not_finite")},
-            **{f"server_{key}": getattr(row, key) for key in ("not_finite", "recoveries")},
+            **{f"server_{name}": getattr(row, name) for name in ("not_finite", "recoveries")},
             "server_lost": row.lost_samples,
-            "server_missed_deadlines": self._server.missed_deadlines,
-            "server_lost_frames": self._server.lost_frames,
-            "server_late_p50_us": wake.p50,
-            "server_late_p99_us": wake.p99,
+            **{f"server_{name}": getattr(server, name) for name in ("missed_deadlines", "lost_frames")},
+            "server_late_p50_us": recent.wake_us.p50,
+            "server_late_p99_us": recent.wake_us.p99,
             "server_exchange_p99_us": recent.exchange_us.p99,
             "server_age_p50_us": age.p50,
             "server_age_p99_us": age.p99,
@@ -301,26 +286,25 @@ class Monitor:
         return self._status("stream", problems, good, values)
 
     def _judge_sensor(self, problems: Problems, temperature: float | None) -> DiagnosticStatus:
-        link, info, flags = self._link, self._link.info, self._flags
+        link, info, flags, status = self._link, self._link.info, self._flags, self._said.status
         if not link.is_connected:
-            problems = [(Level.NOT_POSSIBLE, "unknown: there is no connection to the server, see link")]
+            problems = [(Level.NOT_POSSIBLE, f"unknown: {_NO_CONNECTION}")]
         elif link.lost is not None:  # the server's words, with what to do if they do not say it
             lost = link.lost if "check " in link.lost else f"{link.lost}; check its cable and power"
             problems = [(Level.TROUBLE, lost)]
         elif self._is_silent:
-            problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
-        last = self._said.status.emergency
-        text = "" if last.code is None else f"emergency 0x{last.code:04X} ({last.text})"
+            problems = [(Level.NOT_POSSIBLE, f"unknown: {_NO_SAMPLES}")]
+        last = status.emergency
         values = {
             **{name: getattr(info, name) for name in ("name", "serial", "hardware", "firmware")},
             "al_state": info.state if link.is_connected else "",
-            "temperature_c": "" if temperature is None else round(temperature, 2),
+            "temperature_c": None if temperature is None else round(temperature, 2),
             "status_byte": f"{flags.status:#04x}",
             "warnings_register": f"{flags.warnings:#010x}",
             **{row.field: f"{getattr(flags, row.field):#x}" for row in SATURATIONS},
             "saturated_samples": self._counts["saturated"],
-            "emergencies": self._said.status.emergencies,
-            "last_emergency": text,
+            "emergencies": status.emergencies,
+            "last_emergency": None if last.code is None else f"emergency 0x{last.code:04X} ({last.text})",
             "last_emergency_ago_s": last.ago_s,
         }
         return self._status("sensor", problems, "as it should be", values)
@@ -328,22 +312,20 @@ class Monitor:
     def _judge_clock(self, problems: Problems, *, has_samples: bool) -> DiagnosticStatus:
         clock, delays = self._said.status.clock, self._link.info.delay_ns
         if not has_samples:
-            problems = [(Level.NOT_POSSIBLE, "unknown: there are no new samples, see stream")]
+            problems = [(Level.NOT_POSSIBLE, f"unknown: {_NO_SAMPLES}")]
         elif not clock.mode:
             problems = [(Level.NOT_POSSIBLE, "the server has not said yet")]
         elif self._stamps.problem:
             problems = [*problems, (Level.LOOK, self._stamps.problem)]
-        values = clock._asdict() | {
-            "stamp": self._stamps.kind,
-            "delay_force_torque_ms": "" if delays.force_torque is None else delays.force_torque / 1e6,
-            "delay_acceleration_ms": "" if delays.acceleration is None else delays.acceleration / 1e6,
-        }
+        values = clock._asdict() | {"stamp": self._stamps.kind}
+        for name, delay_ns in zip(delays._fields[:2], delays, strict=False):
+            values[f"delay_{name}_ms"] = None if delay_ns is None else delay_ns / 1e6
         return self._status("clock", problems, "locked to the sensor's clock", values)
 
     def _judge_compensation(self, c: CompensationState, *, has_samples: bool) -> DiagnosticStatus:
         problems, flags = Problems(), self._flags
         if not has_samples:
-            problems.append((Level.NOT_POSSIBLE, "there are no new samples, see stream"))
+            problems.append((Level.NOT_POSSIBLE, _NO_SAMPLES))
         elif c.stopped:
             problems.append((Level.TROUBLE, c.stopped))
         elif c.follows_imu and (flags.acceleration_saturated or flags.angular_rate_saturated):
@@ -358,7 +340,6 @@ class Monitor:
 
 
 def text_of(value: object) -> str:
-    """A value as a KeyValue carries it; empty if it is not known."""
     if value is None:
         return ""
     return str(value).lower() if isinstance(value, bool) else printable(value)

@@ -24,17 +24,15 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from bota_ethercat.client.channel import Channel
+from bridge.compensating.compensation import Compensation
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
-from bridge.parameters.declare import LiveParameters, SettingsParameters, declare, warn_of_others
+from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import StopSignals, Worker, prepare, refuse
-from bridge.publishing.compensated_wrench import CompensatedOutput
-from bridge.publishing.messages import Stamps, make_measured
-from bridge.publishing.terminals import TerminalTopics
-from bridge.rclpy_internals import is_about_arguments, make_executors, refuse_what_raises
-from bridge.services import BiasServices, IdentifyServices, SensorServices
-from bridge.spinning import Spinner
+from bridge.publishing.messages import Stamps, TerminalTopics, make_measured
+from bridge.rclpy_internals import Spinner, is_about_arguments, make_executors, refuse_what_raises
+from bridge.services import create_services
 from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
 
@@ -44,7 +42,7 @@ _KINDS: Final = {
     "publishers": "destroy_publisher", "subscriptions": "destroy_subscription", "timers": "destroy_timer",
     "services": "destroy_service", "guards": "destroy_guard_condition",
 }  # fmt: skip
-SERVER_GOES_ON: Final = 3  # exit code: the supervisor stopped the node, but the server refused to shut down
+SERVER_NOT_STOPPED: Final = 3  # exit code: the supervisor stopped the node, but the server refused
 
 
 class StartError(Exception):
@@ -67,7 +65,6 @@ def _sentences() -> Iterator[None]:
 
 
 def _text_of(error: Exception) -> str:
-    """What ROS says, in one line and without the places in its source."""
     return re.sub(r", at /\S+:\d+", "", " ".join(str(error).split()))
 
 
@@ -106,11 +103,8 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         Node.__init__(self, "bridge", cli_args=arguments, use_global_arguments=arguments is None)
         self.exit_code: int | None = None
         self.on_finish: Callable[[], None] = lambda: None
-        self.parameters = declare(self)
-        # rclpy asks the newest first whether parameters may be set: these ask the sensor, so they come last.
-        self.sensor_settings = SettingsParameters(self)
-        self.live = LiveParameters(self)
-        warn_of_others(self)
+        self.live = NodeParameters(self)
+        self.parameters = self.live.given
         if self.parameters.lifecycle:
             LifecycleNodeMixin.__init__(self)
         refuse_what_raises(self)
@@ -127,8 +121,8 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         """Make everything; nothing runs yet. Errors as at the start."""
         self.parameters = parameters = self.live.gather({})
         self.stamps = stamps = Stamps(self.get_logger())
-        compensated = CompensatedOutput(
-            self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock, self.fail
+        compensated = Compensation(
+            self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock
         )
         wrench, *others = make_measured(self, parameters, stamps)
         self.outputs = Outputs([wrench, compensated, *others])  # control loops' topics first
@@ -136,15 +130,13 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             parameters, self.outputs, self.get_logger(), self.fail, channel=self.channel, clock=self.clock
         )
         self.reader.on_terminal = TerminalTopics(self, parameters.terminals, self.reader.client).publish
-        self.sensor_settings.link = link = self.reader.link
+        self.live.link = link = self.reader.link
         self.compensation = CompensationControl(self, parameters, compensated, self.reader, self.live)
         self.live.apply = self._apply
         self.monitor = Monitor(
             self, parameters.limits, self.reader, self.compensation.state, self.outputs, stamps, self.fail
         )
-        SensorServices(self, link, self.sensor_settings)
-        BiasServices(self, self.compensation)
-        IdentifyServices(self, self.compensation)
+        create_services(self)
         link.on_change = self._on_link_change
         if parameters.supervisor_topic:
             self.create_subscription(
@@ -159,18 +151,16 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.is_open = True
 
     def start(self) -> None:
-        """Start the threads."""
         self.reader.thread.start()
         self.monitor.thread.start()
-        self.compensation.output.frames.thread.start()
         prepare(self.parameters.rt_priority, self.parameters.cpu, self.get_logger())
 
     def stop(self) -> bool:
         """Stop the threads and all that listens; False if a thread does not end in time."""
         if not self.is_open:
             return True
-        ended = self.monitor.stop() & self.reader.stop() & self.compensation.output.frames.stop()
-        self.compensation.choice.close()
+        ended = self.monitor.stop() & self.reader.stop()
+        self.compensation.stop()
         return ended
 
     def close(self) -> None:
@@ -181,8 +171,8 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             self.compensation.forget_bias()
         self.is_open = False
         self.live.check = self.live.apply = lambda _: None
-        self.sensor_settings.link = None
-        self.sensor_settings.changed()
+        self.live.link = None
+        self.live.settings_changed()
         for kind, destroy in _KINDS.items():
             for entity in {*getattr(self, kind)} - self._kept:
                 getattr(self, destroy)(entity)
@@ -198,7 +188,6 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
 
     @classmethod
     def create(cls, arguments: Sequence[str] | None = None) -> Self:
-        """A node that is ready to `spin`; StartError."""
         with _sentences():
             return cls(arguments)
 
@@ -218,7 +207,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
     def _on_link_change(self) -> None:
         self.stamps.update(self.compensation.parameters.stamp, self.reader.link)
         self.compensation.link_changed()
-        self.sensor_settings.changed()
+        self.live.settings_changed()
 
     def finish(self, exit_code: int) -> None:
         """End the node, from any thread; the first call counts."""
@@ -229,7 +218,6 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             self.reader.link.cancel()
 
     def fail(self, reason: str) -> None:
-        """End the node with exit code 1, from any thread."""
         self.get_logger().error(reason)
         self.finish(1)
 
@@ -245,14 +233,13 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             self.get_logger().info(link.shut_server_down())
         except RequestRefusedError as error:
             self.get_logger().error(str(error))
-            self.finish(SERVER_GOES_ON)
+            self.finish(SERVER_NOT_STOPPED)
         except RequestFailedError as error:
             self.get_logger().warning(str(error))
         self.finish(0)
 
 
 def run(arguments: Sequence[str], signals: StopSignals | None = None) -> int:
-    """Run the node with these command-line arguments until it ends; returns the exit code."""
     try:
         unknown = remove_ros_args(["bridge-client", *arguments])[1:]
         if unknown:

@@ -7,9 +7,8 @@ Python, which it does not while it waits inside ROS for the next message.
 
 The stream's thread gets `rt_priority` and `cpu`. It takes locks that know no priorities, Python's (GIL) and
 the middleware's: whoever holds one while another program has its CPU delays the stream, beside endless loops
-by 2 to 5 ms. So the threads that do so all the time get the priority just below: the monitor, frames by
-TF, the callbacks that wait for no others, Fast DDS. The executor of the services stays ordinary: what it does
-may take long.
+by 2 to 5 ms. So the threads that often hold them get the priority just below: the monitor, the callbacks
+that wait for no others, Fast DDS. The executor of the services stays ordinary.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ from pathlib import Path
 from typing import Any, Final
 
 STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
-_SAME_S: Final = 1.0
+_REPEATED_SIGNAL_S: Final = 1.0
 _HIGHEST_DOMAIN: Final = 232  # of DDS: the ports of others are too high
 STREAM: Final = "reader"
-BESIDE: Final = ("monitor", "listener", "frames")  # threads that share Python's lock with the stream's
+SHARING_LOCKS: Final = ("monitor", "listener")  # threads that share Python's lock with the stream's
 _MIDDLEWARE: Final = "dds."  # how Fast DDS names its threads
 # Longest time that the stream waits for Python's lock. A sample takes less, so it is not interrupted.
 _SWITCH_S: Final = 0.0002
@@ -44,14 +43,12 @@ class Worker(threading.Thread):
         self._work, self._on_failure = work, on_failure
 
     def run(self) -> None:
-        """Work."""
         try:
             self._work()
         except Exception as error:  # noqa: BLE001 - a thread that dies silently would leave a dead node
             self._on_failure(f"the {self.name} failed: {type(error).__name__}: {error}")
 
     def has_ended(self, within_s: float = 5.0) -> bool:
-        """Wait for it; False if it does not end in time."""
         self.join(within_s)
         return not self.is_alive()
 
@@ -76,7 +73,6 @@ def environment_problem() -> str:
 
 
 def refuse(text: str, exit_code: int) -> int:
-    """Say why the node does not start; returns the exit code."""
     sys.stderr.write(f"bridge-client: {text}\n")
     return exit_code
 
@@ -114,7 +110,7 @@ class StopSignals:
         self._has_call.wait()
         signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
         self._call(signal.Signals(signal.sigwait(STOP_SIGNALS)))
-        impatient_s = time.monotonic() + _SAME_S
+        impatient_s = time.monotonic() + _REPEATED_SIGNAL_S
         while True:
             number = signal.sigwait(STOP_SIGNALS)
             if time.monotonic() >= impatient_s:
@@ -133,7 +129,7 @@ def prepare(rt_priority: int, cpu: int, log: Any) -> None:
     scheduling = make_real_time(rt_priority, cpu, thread=stream)
     if scheduling.priority:
         below = os.sched_param(max(1, scheduling.priority - 1))
-        for thread in _beside():
+        for thread in _threads_sharing_locks():
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 os.sched_setscheduler(thread, os.SCHED_FIFO, below)
         sys.setswitchinterval(_SWITCH_S)
@@ -145,9 +141,8 @@ def prepare(rt_priority: int, cpu: int, log: Any) -> None:
         log.info(f"the stream has {scheduling}")
 
 
-def _beside() -> Iterator[int]:
-    """The threads whose locks the stream needs."""
-    yield from (thread.native_id or 0 for thread in threading.enumerate() if thread.name in BESIDE)
+def _threads_sharing_locks() -> Iterator[int]:
+    yield from (thread.native_id or 0 for thread in threading.enumerate() if thread.name in SHARING_LOCKS)
     for task in Path("/proc/self/task").iterdir():
         with contextlib.suppress(OSError):
             if (task / "comm").read_text(encoding="utf-8", errors="replace").startswith(_MIDDLEWARE):

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node knows of rclpy beyond its documentation: all of it is here, and each has a fallback.
 
-Executors and parameters are so for the versions of `RIGHT_FOR` only. A message that is serialized here must
-be read by rclpy as the one that is meant, whatever its version.
+Executors and parameters are used so with the versions RIGHT_FOR only. rclpy must read a message that is
+serialized here as the message that is meant, whatever its version.
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
@@ -15,7 +16,7 @@ from operator import setitem
 from struct import Struct
 from typing import Any, Final
 
-from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -26,7 +27,6 @@ _THREADS: Final = 4  # of the documented executor: a service, the supervisor, an
 
 
 def is_known() -> bool:
-    """Whether rclpy's version is one of RIGHT_FOR."""
     with suppress(PackageNotFoundError):
         return version("rclpy").startswith(RIGHT_FOR)
     return False
@@ -37,14 +37,10 @@ def is_about_arguments(error: Exception) -> bool:
     return type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
 
 
-# Serialized messages.
-
-
 def packer(message: Any, count: int) -> Callable[..., Any]:
-    """What makes of `count` float64, and of a stamp (ns since 1970) before them if there is a header, what
-    `publish` takes.
+    """Makes what `publish` takes from `count` float64, after a stamp (ns since 1970) if there is a header.
 
-    That is serialized here if rclpy reads it as it should, but for bytes of padding; else it is `message`.
+    The result is serialized here if rclpy reads it as `message`, but for padding; else it is `message`.
     """
     fill, numbers = filling(message), [*map(float, range(count))]
     if not hasattr(message, "header"):
@@ -67,7 +63,7 @@ def _is_read(serialized: bytes, message: Any) -> bool:
 
 
 def filling(message: Any) -> Callable[..., Any]:
-    """The documented way: the message, its float64 filled in one by one, in order; always the same object."""
+    """The documented way: fills in the message's float64 in order; always the same object."""
     puts = [*_puts(message)]
 
     def fill(*values: float) -> Any:
@@ -89,16 +85,43 @@ def _puts(part: Any) -> Iterator[Callable[[float], object]]:
             yield from _puts(value)
 
 
-# Executors.
+class Spinner:
+    """Runs an executor: `run` in one thread, `stop` from any, also before or after.
+
+    rclpy's `spin_until_future_complete` keeps a callback for every message; `spin` and `shutdown` take the
+    executor's guard condition from under a thread that waits for it.
+    """
+
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
+        self._lock = threading.Lock()
+        self._stopping = self._ended = False
+
+    def run(self) -> None:
+        """Execute callbacks until `stop`, or until the context is shut down."""
+        try:
+            while not self._stopping and self._executor.context.ok():
+                self._executor.spin_once()
+        except ExternalShutdownException:
+            pass
+        finally:
+            with self._lock:
+                self._ended = True
+
+    def stop(self) -> None:
+        """Make `run` return after the callback that it is in; then the executor may be shut down."""
+        with self._lock:
+            self._stopping = True
+            if not self._ended:
+                self._executor.create_task(lambda: None)  # something to do, so that `spin_once` returns
 
 
 def make_executors(node: Node, parameters: Any) -> tuple[Executor, dict[str, Executor]]:
-    """One for the ordinary callbacks of the node, which may block, and by a thread's name those that wait for
-    no others: for requests in the callback group `parameters`, and for all other groups.
+    """One for the callbacks of the default group, which may block; by a thread's name, one for requests in
+    the callback group `parameters` and one for all other groups.
 
-    rclpy has `MultiThreadedExecutor` for that, which hands every callback to a pool and waits for all of the
-    node's services anew each time: too much beside the reader, for an orientation 500 times a second. It is
-    what an unknown version gets, and nothing is left for the others then.
+    rclpy's `MultiThreadedExecutor`, which an unknown version gets, waits for all of the node's services anew
+    each time: too expensive beside the reader.
     """
     if is_known():
         ordinary = node.default_callback_group
@@ -116,7 +139,6 @@ class _PartExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy has 
     """For those of a node's callbacks whose groups it wants."""
 
     def __init__(self, node: Node, wants: Callable[[Any], bool], *others: _PartExecutor) -> None:
-        """With the `others` it is the one that the node knows."""
         self._others = others
         super().__init__(context=node.context)
         self._part = _Part(node, wants)
@@ -124,19 +146,15 @@ class _PartExecutor(SingleThreadedExecutor):  # type: ignore[misc]  # rclpy has 
             self.add_node(node)
 
     def get_nodes(self) -> list[Any]:
-        """The node's entities that are for this executor."""
         return [self._part]
 
     def wake(self) -> None:
-        """Wake all: the node has another entity, or one less."""
         super().wake()
         for other in self._others:
             other.wake()
 
 
 class _Part:
-    """A node as an executor sees it, with the entities whose callback groups it wants."""
-
     def __init__(self, node: Node, wants: Callable[[Any], bool]) -> None:
         self._node, self._wants = node, wants
 
@@ -145,25 +163,19 @@ class _Part:
         return [entity for entity in getattr(self._node, kind) if self._wants(entity.callback_group)]
 
 
-# Parameters.
-
-
 def given_parameters(node: Node) -> list[str]:
     """The names of all that were given to the node, declared or not; of an unknown version, none."""
     return [*node._parameter_overrides] if is_known() else []
 
 
 def refuse_what_raises(node: Node) -> None:
-    """A type of parameter that there is not, a transition that a state does not have: at that rclpy raises,
-    which would end the node. Here they grant nothing."""
-    for service in node.services if is_known() else ():
-        service.callback = _refusing(service.callback)
+    """Grant nothing where rclpy raises, which would end the node: unknown types of parameters, transitions
+    that a state does not have."""
 
-
-def _refusing(act: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    def callback(request: Any, response: Any) -> Any:
+    def refuse(act: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
         with suppress(ValueError, RuntimeError):
             return act(request, response)
         return response
 
-    return callback
+    for service in node.services if is_known() else ():
+        service.callback = partial(refuse, service.callback)

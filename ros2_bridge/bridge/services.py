@@ -28,10 +28,10 @@ from bota_ethercat.control import MAX_TARE_SAMPLES, known_six
 from bota_ethercat.errors import FileError
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.program import state
+from bridge.compensating.compensation import RestWindow
 from bridge.compensating.control import CompensationControl
-from bridge.parameters.declare import SettingsParameters
+from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import AUTO, ParameterError
-from bridge.publishing.compensated_wrench import RestWindow
 from bridge.rclpy_internals import filling
 from bridge.stream.link import (
     CONFIGURE_TIMEOUT_S,
@@ -41,7 +41,7 @@ from bridge.stream.link import (
     find_sensor,
     offset_text,
 )
-from ft_compensation.bias import Taken, check_at_rest, estimate_bias
+from ft_compensation.bias import TareBasis, check_at_rest, estimate_bias
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Identified, accelerometer_text, identify, summary
 from ft_compensation.identification.poses import Pose, coverage, pose_of
@@ -58,14 +58,11 @@ _USUAL_HZ: Final = 800.0  # where the server does not tell
 _UNKNOWN: Final = (math.nan,) * 6
 _TARE_S: Final = 0.5  # how long a tare of the sensor averages
 _FEWEST_SAMPLES: Final = 20
-# The server may take so many times as long as the samples should: it takes them twice.
-_TARE_PATIENCE: Final = 6.0
-_TARE_EXTRA_S: Final = 4.0
+# The server may take this many times as long as the samples, which it takes twice, and some time more.
+_TARE_PATIENCE, _TARE_EXTRA_S = 6.0, 4.0
 _PATIENCE_S: Final = 2.0  # a window may take this much longer than half as long again as it lasts
-_LOOK_S: Final = 0.05
+_POLL_S: Final = 0.05
 _SETTLED_WITHIN_S: Final = 10.0
-
-
 _AS_USUAL: Final = SimpleNamespace(target=WrenchMessage(), samples=0)  # what a Trigger asks for
 
 
@@ -73,14 +70,24 @@ class Done(NamedTuple):
     """What was done, a sentence, and the fields of a typed response; a tuple is a vector's, or a wrench's."""
 
     text: str
-    fields: Mapping[str, object]
+    fields: Mapping[str, object] = {}
 
 
-def _create(node: Node, prefix: str, *acts: Callable[..., str | Done]) -> None:
-    """Services named as each act, which returns what it did; an error says why it was not done."""
+def create_services(node: Any) -> None:
+    """All services of the node `bridge`."""
+    sensor = SensorServices(node.reader.link, node.live)
+    bias, identifying = BiasServices(node.compensation), IdentifyServices(node, node.compensation)
+    acts: dict[str, Callable[..., Done]] = {
+        "sensor_tare": sensor.tare, "get_settings": sensor.get_settings,
+        "apply_settings": sensor.apply_settings, "save_settings": sensor.save_settings,
+        "tare": bias.tare, "clear_tare": bias.clear, "undo_tare": bias.undo,
+        "identify/start": identifying.start, "identify/add_pose": identifying.add_pose,
+        "identify/drop_pose": identifying.drop_pose, "identify/solve": identifying.solve,
+        "identify/apply": identifying.apply,
+    }  # fmt: skip
     log = node.get_logger()
 
-    def answer(name: str, act: Callable[..., str | Done], request: Any, response: Any) -> Any:
+    def answer(name: str, act: Callable[..., Done], request: Any, response: Any) -> Any:
         is_typed = name.startswith("typed/")
         try:
             done = act(request) if is_typed else act()
@@ -88,8 +95,8 @@ def _create(node: Node, prefix: str, *acts: Callable[..., str | Done]) -> None:
             response.message = str(error)
             log.warning(f"{name} failed: {error}")
             return response
-        response.success, response.message = True, done if isinstance(done, str) else done.text
-        for field, value in done.fields.items() if is_typed and isinstance(done, Done) else ():
+        response.success, response.message = True, done.text
+        for field, value in done.fields.items() if is_typed else ():
             if isinstance(value, tuple):
                 filling(getattr(response, field))(*value)
             else:
@@ -98,15 +105,13 @@ def _create(node: Node, prefix: str, *acts: Callable[..., str | Done]) -> None:
             log.info(response.message)
         return response
 
-    for act in acts:
-        name = prefix + act.__name__.lstrip("_")
+    for name, act in acts.items():
         node.create_service(Trigger, f"~/{name}", partial(answer, name, act))
         if name in TYPED:
             node.create_service(TYPED[name], f"~/typed/{name}", partial(answer, f"typed/{name}", act))
 
 
 def _target(request: Any) -> Wrench:
-    """What a tare is to make of the reading; CompensationError if that is not finite."""
     parts = request.target.force, request.target.torque
     try:
         return Wrench(*(vector((part.x, part.y, part.z), "a target") for part in parts))
@@ -117,70 +122,70 @@ def _target(request: Any) -> Wrench:
 class SensorServices:
     """What the server does, for every client."""
 
-    def __init__(self, node: Node, link: Link, settings: SettingsParameters) -> None:
-        self._link, self._settings = link, settings
-        acts = self._sensor_tare, self._get_settings, self._apply_settings, self._save_settings
-        _create(node, "", *acts)
+    def __init__(self, link: Link, parameters: NodeParameters) -> None:
+        self._link, self._parameters = link, parameters
 
-    def _sensor_tare(self, request: Any = _AS_USUAL) -> Done:
+    def tare(self, request: Any = _AS_USUAL) -> Done:
+        """The sensor's own offset."""
         sensor, rate_hz = self._link.sensor, self._link.info.rate_hz or _USUAL_HZ
         samples = _bounded(request.samples or round(_TARE_S * rate_hz))
         timeout_s = _TARE_EXTRA_S + _TARE_PATIENCE * samples / rate_hz
         target = [*_target(request).values]
         reply = self._link.ask("tare", timeout_s, sensor=sensor, samples=samples, target=target)
-        titles = ("old_offset", "old offset"), ("new_offset", "new offset"), ("residual", "residual")
-        parts = [f"{title} {offset_text(reply.get(key))}" for key, title in titles]
+        parts = [
+            f"{key.replace('_', ' ')} {offset_text(reply.get(key))}"
+            for key in ("old_offset", "new_offset", "residual")
+        ]
         offset, spread, residual = (
             known_six(reply.get(key)) or _UNKNOWN for key in ("new_offset", "deviation", "residual")
         )
         fields = {"bias": tuple(-value for value in offset), "spread": spread, "residual": residual}
         return Done(f"sensor {sensor} tared: " + "; ".join(parts), fields)
 
-    def _get_settings(self, _: Any = None) -> Done:
+    def get_settings(self, _: Any = None) -> Done:
         info = find_sensor(self._link.ask("describe", DESCRIBE_TIMEOUT_S), self._link.sensor)
         settings = [Parameter(name, value=value).to_parameter_msg() for name, value in info.settings.items()]
         fields = {"message": f"of {info}", "rate_hz": info.rate_hz, "settings": settings}
         return Done(json.dumps({**info.settings, "rate_hz": info.rate_hz}), fields)
 
-    def _apply_settings(self) -> str:
-        return f"sensor {self._link.sensor} has these settings now: {json.dumps(self._settings.apply())}"
+    def apply_settings(self) -> Done:
+        in_force = json.dumps(self._parameters.apply_settings())
+        return Done(f"sensor {self._link.sensor} has these settings now: {in_force}")
 
-    def _save_settings(self) -> str:
+    def save_settings(self) -> Done:
         # `configure` wants at least one setting: one as it is.
         sensor, settings = self._link.sensor, dict(list(self._link.info.settings.items())[:1])
         self._link.ask("configure", CONFIGURE_TIMEOUT_S, sensor=sensor, settings=settings, save=True)
-        return f"sensor {sensor} keeps its settings and offset in its flash now"
+        return Done(f"sensor {sensor} keeps its settings and offset in its flash now")
 
 
 class BiasServices:
-    """Take, clear and undo the node's bias."""
+    """The node's own bias."""
 
-    def __init__(self, node: Node, control: CompensationControl) -> None:
+    def __init__(self, control: CompensationControl) -> None:
         self._control = control
-        _create(node, "", self._tare, self._clear_tare, self._undo_tare)
 
-    def _tare(self, request: Any = _AS_USUAL) -> Done:
+    def tare(self, request: Any = _AS_USUAL) -> Done:
+        """Measure the bias; without a tool_mass the weight of whatever hangs there is part of it."""
         control, target = self._control, _target(request)
         payload = control.parameters.payload
-        window = take_window(control, needs_tool=payload.mass > 0, samples=request.samples)
+        window = collect_window(control, needs_tool=payload.mass > 0, samples=request.samples)
         means = window.means()
         specific_force: Vector3 | None = None
         try:
             if conflict := control.conflict(needs_tool=True):
                 raise CompensationError(conflict)
-            specific_force = window.specific_force()
-            check_at_rest(specific_force, length(control.parameters.gravity))
+            check_at_rest(found := window.specific_force(), length(control.parameters.gravity))
+            specific_force = found
         except CompensationError:
             if payload.mass:
                 raise
-            specific_force = None  # not needed without a tool_mass
         bias = estimate_bias(means, payload, specific_force or ZERO).plus(target, -1.0)
         by_imu = specific_force is not None and window.source.is_imu
         accelerometer = control.parameters.accelerometer if by_imu else None
-        control.set_bias(bias, "tare", Taken(payload, specific_force, accelerometer))
-        if payload.mass:
-            weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
-        else:
+        control.set_bias(bias, "tare", TareBasis(payload, specific_force, accelerometer))
+        weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
+        if not payload.mass:
             weight = (
                 "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds in "
                 "this orientation only"
@@ -189,12 +194,12 @@ class BiasServices:
         fields = {"bias": bias.values, "spread": spread, "residual": residual.values}
         return Done(f"bias of {means.samples} samples: {wrench_text(bias)}; {weight}", fields)
 
-    def _clear_tare(self) -> str:
+    def clear(self) -> Done:
         self._control.set_bias(NO_WRENCH, "cleared")
-        return "the bias is zero"
+        return Done("the bias is zero")
 
-    def _undo_tare(self) -> str:
-        return f"back to the bias before: {wrench_text(self._control.undo_bias())}"
+    def undo(self) -> Done:
+        return Done(f"back to the bias before: {wrench_text(self._control.undo_bias())}")
 
 
 class IdentifyServices:
@@ -205,47 +210,50 @@ class IdentifyServices:
         self._poses: list[Pose] | None = None  # those taken so far; None: no identification was started
         self._sensor = self._sensor_now()  # as of its start
         self._result: Identified | None = None  # the latest solution, of the current poses
-        acts = self._start, self._add_pose, self._drop_pose, self._solve, self._apply
-        _create(node, "identify/", *acts)
 
-    def _start(self) -> str:
+    def start(self) -> Done:
         if self._control.parameters.gravity_source == "none":
             raise CompensationError("gravity_source is none, so a pose says nothing: set it, such as to imu")
         before = "" if self._poses is None else f", the {len(self._poses)} poses before are dropped"
-        self._poses, self._result = [], None
-        self._sensor = self._sensor_now()
-        return (
-            f"identification started{before}; gravity is known by {self._control.choice.source.describe}; "
+        self._poses, self._result, self._sensor = [], None, self._sensor_now()
+        return Done(
+            f"identification started{before}; gravity is known by {self._control.source.name}; "
             f"{coverage([]).next_pose}, hold it still with nothing touching the tool, and call "
             "identify/add_pose"
         )
 
-    def _add_pose(self) -> str:
+    def add_pose(self) -> Done:
         poses = self._started()
-        window = take_window(self._control, needs_tool=True)
-        means = window.means()
+        window = collect_window(self._control, needs_tool=True)
         x, y, z = window.specific_force()
-        parameters = self._control.parameters
         gravity = None if window.source.is_imu else (-x, -y, -z)
-        poses.append(pose_of(means, gravity, length(parameters.gravity)))
+        poses.append(pose_of(window.means(), gravity, length(self._control.parameters.gravity)))
         self._result = None
         x, y, z = (round(part, 2) + 0.0 for part in poses[-1].up)
-        return (
-            f"pose {len(poses)} taken (up is {x:.2f}, {y:.2f}, {z:.2f} in the sensor's frame); "
-            f"{coverage(poses).advice}"
-        )
+        up = f"up is {x:.2f}, {y:.2f}, {z:.2f} in the sensor's frame"
+        return Done(f"pose {len(poses)} taken ({up}); {coverage(poses).advice}")
 
-    def _drop_pose(self) -> str:
+    def drop_pose(self) -> Done:
         poses = self._started()
         if not poses:
             raise CompensationError("there is no pose to take back")
         poses.pop()
         self._result = None
-        return f"the pose is dropped, {len(poses)} are left; {coverage(poses).advice}"
+        return Done(f"the pose is dropped, {len(poses)} are left; {coverage(poses).advice}")
 
-    def _solve(self, _: Any = None) -> Done:
+    def solve(self, _: Any = None) -> Done:
         result = self._result = identify(self._started())
-        parts = [summary(result), *details(result)]
+        residuals = [
+            f"{position}: {length(residual.force):.2g} N {length(residual.torque):.2g} Nm"
+            for position, residual in enumerate(result.residuals, 1)
+        ]
+        parts = [
+            summary(result),
+            f"Bias {wrench_text(result.bias)}, ± {wrench_text(result.bias_interval)}",
+            *([accelerometer_text(result.accelerometer)] if result.accelerometer else []),
+            f"Residuals by pose, {', '.join(residuals)}",
+            f"One more pose would help most so: {result.coverage.next_pose}",
+        ]
         text = ". ".join([*parts, f"{self._write(result, parts)}; identify/apply puts it in force"])
         fields = {
             "poses": result.coverage.poses,
@@ -261,18 +269,17 @@ class IdentifyServices:
         }
         return Done(text, fields)
 
-    def _apply(self) -> str:
+    def apply(self) -> Done:
         if self._poses is not None:
             self._started()
-        result = self._result
-        if result is None:
+        if (result := self._result) is None:
             raise CompensationError("there is no result to apply: call identify/solve first")
         accelerometer = result.accelerometer.calibration if result.accelerometer else None
         self._control.set_payload(result.payload, result.bias, accelerometer)
-        return (
-            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias"
-            + (", accelerometer.offset and accelerometer.scale" if accelerometer else "")
-            + "; to keep the tool, start the node with the file"
+        also = ", accelerometer.offset and accelerometer.scale" if accelerometer else ""
+        return Done(
+            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias{also}; to "
+            "keep the tool, start the node with the file"
         )
 
     def _started(self) -> list[Pose]:
@@ -292,49 +299,28 @@ class IdentifyServices:
         return info.serial, info.offset
 
     def _write(self, result: Identified, comment: list[str]) -> str:
-        try:
-            path = self._path()
-            path.parent.mkdir(parents=True, exist_ok=True)
-            control = self._control
-            write_yaml(path, result, "\n".join(comment), control.parameters.gravity, control.offset)
-        except (CompensationError, FileError, OSError) as error:
-            self._log.warning(f"the result of the identification is not written: {error}")
-            return f"Not written: {error}"
-        return f"Written to {path}"
-
-    def _path(self) -> Path:
-        path = self._control.parameters.identify_file
+        control = self._control
+        path, serial = control.parameters.identify_file, control.link.info.serial
         if path == AUTO:
-            serial = self._control.link.info.serial
             name = f"sensor-{'unknown' if serial is None else serial}-payload.yaml"
             path = f"{state.folder()}/{name}"
         try:
-            return Path(path).expanduser()
-        except RuntimeError:
-            raise CompensationError(
-                f"there is no home directory for {path}: give identify.file in full"
-            ) from None
-
-
-def details(result: Identified) -> list[str]:
-    """What `summary` leaves out, a sentence each: bias, residuals by pose, next pose."""
-    left = [
-        f"{position}: {length(residual.force):.2g} N {length(residual.torque):.2g} Nm"
-        for position, residual in enumerate(result.residuals, 1)
-    ]
-    return [
-        f"Bias {wrench_text(result.bias)}, ± {wrench_text(result.bias_interval)}",
-        *([accelerometer_text(result.accelerometer)] if result.accelerometer else []),
-        f"Residuals by pose, {', '.join(left)}",
-        f"One more pose would help most so: {result.coverage.next_pose}",
-    ]
+            file = Path(path).expanduser()
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_yaml(file, result, "\n".join(comment), control.parameters.gravity, control.offset)
+        except (FileError, OSError, RuntimeError) as error:
+            if isinstance(error, RuntimeError):
+                error = RuntimeError(f"there is no home directory for {path}: give identify.file in full")
+            self._log.warning(f"the result of the identification is not written: {error}")
+            return f"Not written: {error}"
+        return f"Written to {file}"
 
 
 def _bounded(samples: int) -> int:
     return min(max(samples, _FEWEST_SAMPLES), MAX_TARE_SAMPLES)
 
 
-def take_window(control: CompensationControl, *, needs_tool: bool, samples: int = 0) -> RestWindow:
+def collect_window(control: CompensationControl, *, needs_tool: bool, samples: int = 0) -> RestWindow:
     """The samples of the next `rest.duration`, or so many, once the sensor's data has settled.
 
     CompensationError or RequestFailedError if they do not come or mean nothing.
@@ -344,19 +330,24 @@ def take_window(control: CompensationControl, *, needs_tool: bool, samples: int 
     link, clock = control.link, control.link.clock
     if not link.is_connected:
         raise CompensationError(f"there are no samples: {link.absence}")
-    _wait_settled(link)
+    # After a sensor has entered OP its data settles, which the server knows.
+    deadline_s = clock.monotonic() + _SETTLED_WITHIN_S
+    while find_sensor(link.ask("describe", DESCRIBE_TIMEOUT_S), link.sensor).settling:
+        if clock.monotonic() > deadline_s:
+            raise CompensationError(f"sensor {link.sensor} does not settle: see the server's log")
+        clock.wait(threading.Event(), _POLL_S)
     seconds, limits = control.parameters.rest_duration, control.parameters.rest
-    window = RestWindow(seconds, limits, control.choice.source)
+    window = RestWindow(seconds, limits, control.source)
     if samples:
         limits = replace(limits, least_samples=_bounded(samples))
         seconds = limits.least_samples / (link.info.rate_hz or _USUAL_HZ)
-        window = RestWindow(0.0, limits, control.choice.source)
+        window = RestWindow(0.0, limits, control.source)
     patience_s = 1.5 * seconds + _PATIENCE_S
     deadline_s = clock.monotonic() + patience_s
-    info, offset, bad = link.info, link.info.offset, control.reader.not_finite
+    info, bad = link.info, control.reader.not_finite
     control.output.window = window
     try:
-        while not clock.wait(window.done, _LOOK_S):
+        while not clock.wait(window.done, _POLL_S):
             if link.ending:
                 raise CompensationError("the node ends")
             if clock.monotonic() > deadline_s:
@@ -368,7 +359,7 @@ def take_window(control: CompensationControl, *, needs_tool: bool, samples: int 
     # By what the reader knows: the executor, which would count another sensor, is the one that waits here.
     if info.serial != link.info.serial:
         raise CompensationError("the sensor was replaced by another meanwhile: call again")
-    if offset != link.info.offset:
+    if info.offset != link.info.offset:
         raise CompensationError("the sensor's own offset was changed meanwhile: call again")
     if bad := control.reader.not_finite - bad:
         raise CompensationError(
@@ -376,12 +367,3 @@ def take_window(control: CompensationControl, *, needs_tool: bool, samples: int 
             "call again"
         )
     return window
-
-
-def _wait_settled(link: Link) -> None:
-    """After a sensor has entered OP its data settles, which the server knows."""
-    deadline_s = link.clock.monotonic() + _SETTLED_WITHIN_S
-    while find_sensor(link.ask("describe", DESCRIBE_TIMEOUT_S), link.sensor).settling:
-        if link.clock.monotonic() > deadline_s:
-            raise CompensationError(f"sensor {link.sensor} does not settle: see the server's log")
-        link.clock.wait(threading.Event(), _LOOK_S)

@@ -2,14 +2,13 @@
 """The bias: estimated while the sensor is stationary, ramped in, and undone.
 
 Pose-aware: with a payload, its weight at the pose of the window is not part of the bias, so it stays with
-gravity compensation and the bias holds in every pose. `Taken` is what it takes to tell the bias for another
-payload.
+gravity compensation and the bias holds in every pose. With its `TareBasis` the bias for another payload is
+known.
 """
 
 from __future__ import annotations
 
 import math
-import threading
 from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
@@ -44,7 +43,7 @@ def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.
         )
 
 
-def force_bound_95(payload: Payload, accelerometer: Accelerometer, taken: Taken | None = None) -> float:
+def force_bound_95(payload: Payload, accelerometer: Accelerometer, taken: TareBasis | None = None) -> float:
     """N: in 95 % of cases what is not known of the accelerometer shows as less force, in any pose.
 
     A bias `taken` by a tare that went by this accelerometer has the part of its offset in it, and what its
@@ -74,7 +73,7 @@ def _weight(payload: Payload, specific_force: Vector3) -> Wrench:
     return Compensator(payload).compensate(ZERO, ZERO, specific_force).tool
 
 
-class Taken(NamedTuple):
+class TareBasis(NamedTuple):
     """What a bias was taken with."""
 
     payload: Payload = NO_PAYLOAD  # whose weight is not part of it
@@ -82,7 +81,7 @@ class Taken(NamedTuple):
     specific_force: Vector3 | None = ZERO
     accelerometer: Accelerometer | None = None  # as it was corrected, where that is by the sensor's own
 
-    def weighed(self, payload: Payload) -> tuple[Wrench, Taken]:
+    def for_payload(self, payload: Payload) -> tuple[Wrench, TareBasis]:
         """By how much the bias is another for this payload; nothing if the specific force is unknown."""
         if self.specific_force is None or payload == self.payload:
             return NO_WRENCH, self
@@ -90,7 +89,7 @@ class Taken(NamedTuple):
         return before.plus(now, -1.0), self._replace(payload=payload)
 
     def warning(self, change: Wrench, payload: Payload) -> str:
-        """What `weighed`, and its `change`, mean for a user, a sentence; empty if nothing."""
+        """What `for_payload`, and its `change`, mean for a user, a sentence; empty if nothing."""
         if change == NO_WRENCH:
             return self.doubt(payload)
         return (
@@ -111,97 +110,67 @@ class Taken(NamedTuple):
         )
 
 
-_OF_NO_TARE: Final = Taken()
-_EARLY_S: Final = 0.1  # a sample may be so much older than the one that a ramp began at
+_NO_TARE: Final = TareBasis()
+_EARLY_S: Final = 0.1  # a sample may be this much older than the sample that a ramp began at
 
 
-class _Course(NamedTuple):
-    start: Wrench
-    target: Wrench
-    begin_s: float
-    seconds: float
-    taken: Taken  # the target
+class BiasRamp(NamedTuple):
+    """A bias that replaces another one linearly in time, and what it goes back to if it is undone.
 
-    def is_under_way(self, now_s: float) -> bool:
-        """Whether a sample of this time falls into it.
-
-        One of long before it does not: the clock was set back, and what was to be left behind is left behind.
-        """
-        return self.seconds > 0.0 and -_EARLY_S <= now_s - self.begin_s < self.seconds
-
-    def shifted(self, change: Wrench, taken: Taken) -> _Course:
-        return self._replace(start=self.start.plus(change), target=self.target.plus(change), taken=taken)
-
-
-class BiasRamp:
-    """The applied bias: moves linearly from the old to the new one; the last change can be undone.
-
-    Times are of the samples, s on any one clock. `at` may run in one thread while others change it.
+    Times are of the samples, s on any one clock. Every change is another ramp.
     """
 
-    def __init__(self, bias: Wrench = NO_WRENCH, seconds: float = 0.0) -> None:
-        """`seconds` is how long a change takes; 0 = at once."""
-        self.seconds = seconds
-        self._course = _Course(bias, bias, 0.0, 0.0, _OF_NO_TARE)
-        self._before: tuple[Wrench, Taken] | None = None
-        self._lock = threading.RLock()
+    target: Wrench = NO_WRENCH
+    taken: TareBasis = _NO_TARE  # what the target was taken with
+    start: Wrench = NO_WRENCH
+    begin_s: float = 0.0
+    seconds: float = 0.0  # how long it takes; 0: at once
+    before: tuple[Wrench, TareBasis] | None = None  # the previous target; None: nothing to undo
 
-    @property
-    def target(self) -> Wrench:
-        """The bias that it leads to."""
-        return self._course.target
-
-    @property
-    def taken(self) -> Taken:
-        """What that was taken with."""
-        return self._course.taken
-
-    def go(self, target: Wrench, now_s: float, taken: Taken = _OF_NO_TARE, *, may_undo: bool = True) -> None:
+    def go(
+        self, target: Wrench, now_s: float, seconds: float = 0.0, taken: TareBasis = _NO_TARE, *,
+        may_undo: bool = True,
+    ) -> BiasRamp:  # fmt: skip
         """From the bias of `now_s` (the newest sample's time) to `target`."""
-        with self._lock:
-            self._before = (self.target, self.taken) if may_undo else None
-            self._course = _Course(self.at(now_s), target, now_s, self.seconds, taken)
+        before = (self.target, self.taken) if may_undo else None
+        return BiasRamp(target, taken, self.at(now_s), now_s, seconds, before)
 
-    def shift(self, change: Wrench) -> None:
-        """At once, whatever it is and was: the sensor itself adds so much more from here on."""
-        with self._lock:
-            self._course = self._course.shifted(change, self.taken)
-            if self._before is not None and self._before[0] != NO_WRENCH:  # none stays none
-                self._before = self._before[0].plus(change), self._before[1]
+    def undone(self, now_s: float, seconds: float = 0.0) -> BiasRamp:
+        """Back to the target before the last change. CompensationError if there is none."""
+        if self.before is None:
+            raise CompensationError("there is no tare to undo")
+        target, taken = self.before
+        return self.go(target, now_s, seconds, taken, may_undo=False)
 
-    def weighed(self, payload: Payload) -> BiasRamp:
-        """Another ramp that is as far, for another payload."""
-        other = BiasRamp(seconds=self.seconds)
-        with self._lock:
-            other._course = self._course.shifted(*self.taken.weighed(payload))
-            if self._before is not None:
-                change, taken = self._before[1].weighed(payload)
-                other._before = self._before[0].plus(change), taken
-        return other
+    def shifted(self, change: Wrench) -> BiasRamp:
+        """The sensor itself adds this much more from here on, whatever the bias is and was."""
+        before = self.before
+        if before is not None and before[0] != NO_WRENCH:  # none stays none
+            before = before[0].plus(change), before[1]
+        return self._replace(start=self.start.plus(change), target=self.target.plus(change), before=before)
 
-    def undo(self, now_s: float) -> Wrench:
-        """Go back to the target before the last `go` and return it. CompensationError if there is none."""
-        with self._lock:
-            before = self._before
-            if before is None:
-                raise CompensationError("there is no tare to undo")
-            self.go(before[0], now_s, before[1])
-            self._before = None
-            return before[0]
+    def for_payload(self, payload: Payload) -> BiasRamp:
+        """The ramp for another payload."""
+        change, taken = self.taken.for_payload(payload)
+        before = self.before
+        if before is not None:
+            of_before, taken_before = before[1].for_payload(payload)
+            before = before[0].plus(of_before), taken_before
+        return self._replace(
+            start=self.start.plus(change), target=self.target.plus(change), taken=taken, before=before
+        )
 
     def arrived(self, now_s: float) -> bool:
-        """Whether the bias of `now_s` is the target."""
-        return not self._course.is_under_way(now_s)
+        """Whether the bias of `now_s` is the target; also of a time long before, as of a clock set back."""
+        return not (self.seconds > 0.0 and -_EARLY_S <= now_s - self.begin_s < self.seconds)
 
     def at(self, now_s: float) -> Wrench:
         """The bias of the sample of time `now_s`."""
-        course = self._course
-        if not course.is_under_way(now_s):
-            return course.target
-        start, target, begin_s, seconds, _ = course
-        share = max(0.0, (now_s - begin_s) / seconds)
-        (ax, ay, az), (au, av, aw) = start
-        (bx, by, bz), (bu, bv, bw) = target
+        if self.arrived(now_s):
+            return self.target
+        share = max(0.0, (now_s - self.begin_s) / self.seconds)
+        (ax, ay, az), (au, av, aw) = self.start
+        (bx, by, bz), (bu, bv, bw) = self.target
         return Wrench(
             (ax + share * (bx - ax), ay + share * (by - ay), az + share * (bz - az)),
             (au + share * (bu - au), av + share * (bv - av), aw + share * (bw - aw)),

@@ -47,7 +47,7 @@ class Compensator:
         tfx, tfy, tfz = -m * sx, -m * sy, -m * sz
         tmx, tmy, tmz = cy * tfz - cz * tfy, cz * tfx - cx * tfz, cx * tfy - cy * tfx
         if any(inertia):
-            ix, iy, iz = _spun(inertia, turning)
+            ix, iy, iz = _inertial_torque(inertia, turning)
             tmx, tmy, tmz = tmx - ix, tmy - iy, tmz - iz
         return Stages(
             bias,
@@ -57,7 +57,7 @@ class Compensator:
         )
 
 
-def _spun(inertia: tuple[float, ...], turning: Turning) -> Vector3:
+def _inertial_torque(inertia: tuple[float, ...], turning: Turning) -> Vector3:
     """J alpha + omega x J omega, Nm: what it takes to turn a tool so."""
     xx, yy, zz, xy, xz, yz = inertia
     (wx, wy, wz), (ax, ay, az) = turning

@@ -72,7 +72,6 @@ class WrenchFilter:
         self._longest_pause_ns = 1e9 * max(_SHORTEST_PAUSE / rate_hz, memory_s)
 
     def step(self, force: Vector3, torque: Vector3, time_ns: int) -> Wrench:
-        """The filtered wrench of this sample."""
         values: Six = force + torque
         passed_ns, self._last_ns = time_ns - self._last_ns, time_ns
         if not 0 <= passed_ns <= self._longest_pause_ns:
@@ -109,7 +108,6 @@ class WrenchTransform(NamedTuple):
         return cls(rotation, translation)
 
     def inverse(self) -> Self:
-        """From the target frame to the source frame."""
         (a, b, c), (d, e, f), (g, h, i) = self.rotation
         x, y, z = self.translation
         back = (a, d, g), (b, e, h), (c, f, i)

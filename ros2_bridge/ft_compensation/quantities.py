@@ -41,7 +41,6 @@ class Wrench(NamedTuple):
 
     @property
     def values(self) -> tuple[float, float, float, float, float, float]:
-        """Fx Fy Fz (N) Mx My Mz (Nm)."""
         return *self.force, *self.torque
 
     def plus(self, other: Wrench, times: float = 1.0) -> Wrench:
@@ -62,12 +61,10 @@ class Payload(NamedTuple):
     inertia: tuple[float, ...] = (0.0,) * 6
 
     def __str__(self) -> str:
-        """For people."""
         return f"a tool of {self.mass:.3g} kg" if self.mass else "no tool_mass"
 
 
 def wrench_text(wrench: Wrench) -> str:
-    """A wrench for people."""
     numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, wrench.values, strict=True))
     return f"{numbers} (N, Nm)"
 
@@ -146,7 +143,6 @@ def _by_axis(*limits: float) -> tuple[float, ...]:
 
 
 def length(a: Vector3) -> float:
-    """The length of a vector."""
     return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
 
 

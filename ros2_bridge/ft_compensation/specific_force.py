@@ -21,6 +21,7 @@ import numpy as np
 
 from bota_ethercat.pdo import Vector3
 from ft_compensation.alignment import Alignment, Array, align
+from ft_compensation.outputs import WrenchTransform
 from ft_compensation.quantities import DEFAULT_GRAVITY, EXACT, STILL, ZERO, Accelerometer, Quaternion
 
 _TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
@@ -119,12 +120,10 @@ class QuaternionGravity:
         self._rates: deque[tuple[float, Vector3]] = deque(maxlen=_MOST_RATES)
 
     def reset(self) -> None:
-        """Forget everything."""
         self._newest_s, self._gravity = -math.inf, None
         self._rates.clear()
 
-    def follow(self, angular_rate: Vector3, time_s: float) -> None:
-        """Take a sample's angular rate, rad/s."""
+    def add_rate(self, angular_rate: Vector3, time_s: float) -> None:
         rates = self._rates
         if rates and not 0.0 <= time_s - rates[-1][0] <= self.stale_after_s:
             rates.clear()  # a gap, or a clock that was set: the orientation is held until the next one
@@ -133,26 +132,18 @@ class QuaternionGravity:
             return
         rates.append((time_s, angular_rate))
         if self._gravity is not None and len(rates) > 1:
-            self._gravity = _carried(*self._gravity, (rates[-2], rates[-1]))
+            self._gravity = _propagated(*self._gravity, (rates[-2], rates[-1]))
 
     def update(self, orientation: Quaternion, time_s: float) -> bool:
         """Take a unit quaternion x, y, z, w of time `time_s`. False: it is older than what is known."""
-        x, y, z, w = orientation
         # Messages may overtake each other; a clock that was set back is another matter.
         if 0.0 < self._newest_s - time_s <= self.stale_after_s:
             return False
-        gx, gy, gz = self.base_gravity
-        # The inverse turns base vectors into the sensor's: minus the vector part.
-        tx, ty, tz = 2.0 * (gy * z - gz * y), 2.0 * (gz * x - gx * z), 2.0 * (gx * y - gy * x)
-        gx, gy, gz = (
-            gx + w * tx + (ty * z - tz * y),
-            gy + w * ty + (tz * x - tx * z),
-            gz + w * tz + (tx * y - ty * x),
-        )
+        gravity = WrenchTransform.of(ZERO, orientation).inverse().apply(self.base_gravity, ZERO).force
         self._newest_s = time_s
         later = [each for each in self._rates if each[0] > time_s]
         known = [each for each in self._rates if each[0] <= time_s][-1:]
-        self._gravity = _carried(time_s, (gx, gy, gz), [*known, *later])
+        self._gravity = _propagated(time_s, gravity, [*known, *later])
         return True
 
     def age_s(self, now_s: float) -> float:
@@ -166,7 +157,7 @@ class QuaternionGravity:
         return self._gravity[1]
 
 
-def _carried(
+def _propagated(
     time_s: float, gravity: Vector3, rates: Sequence[tuple[float, Vector3]]
 ) -> tuple[float, Vector3]:
     """Gravity of `time_s` turned on by these rates (times ascending), or back, to the last of them."""

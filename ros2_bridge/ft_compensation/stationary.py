@@ -63,7 +63,6 @@ class StationaryWindow:
 
     @property
     def count(self) -> int:
-        """Samples so far."""
         return len(self._rows)
 
     def add(self, sample: Sample, time_s: float) -> bool:
@@ -150,6 +149,5 @@ def _what_is_wrong(sample: Sample) -> str | None:
 
 
 def triple(values: Array) -> Vector3:
-    """Three numbers of an array, in plain floats."""
     x, y, z = values.tolist()
     return x, y, z

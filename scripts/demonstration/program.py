@@ -48,7 +48,7 @@ def listening(client: Client, measurement: Measurement, lock: threading.Lock) ->
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
     from std_msgs.msg import Float64MultiArray  # noqa: PLC0415
 
-    from bridge.spinning import Spinner  # noqa: PLC0415
+    from bridge.rclpy_internals import Spinner  # noqa: PLC0415
 
     def receive() -> None:
         for frame in client.frames():

@@ -23,7 +23,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from bridge.node import BridgeNode, spin
-from bridge.spinning import Spinner
+from bridge.rclpy_internals import Spinner
 from tests.server.running import Program, wait_until
 
 PATIENCE_S = 45.0
@@ -33,7 +33,6 @@ _ENDED: list[Any] = []
 
 
 def retire(node: Any) -> None:
-    """Destroy what a node has but for the node itself."""
     for kind in ("client", "publisher", "subscription", "service"):
         for entity in list(getattr(node, f"{kind}s")):
             getattr(node, f"destroy_{kind}")(entity)
@@ -47,17 +46,14 @@ class Asking:
         raise NotImplementedError
 
     def trigger(self, name: str) -> tuple[bool, str]:
-        """Whether a Trigger service did it, and what it says."""
         response = self.ask(Trigger, name, Trigger.Request())
         return response.success, response.message
 
     def parameters(self, *names: str) -> list[Any]:
-        """The values of the node's parameters; None is NOT_SET."""
         response = self.ask(GetParameters, "get_parameters", GetParameters.Request(names=names))
         return [parameter_value_to_python(value) for value in response.values]
 
     def set_parameter(self, name: str, value: Any) -> tuple[bool, str]:
-        """Whether the node took the value, and why not."""
         request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
         result = self.ask(SetParameters, "set_parameters", request).results[0]
         return result.successful, result.reason
@@ -120,11 +116,9 @@ class Listener(Asking):
                 self._node.destroy_client(client)
 
     def next_number(self) -> float:
-        """The first value of the next message: the number that the sample was made from."""
         return float(self.messages.get(timeout=PATIENCE_S).data[0])
 
     def supervise(self, key: str, value: str) -> None:
-        """Publish a supervisor's message as soon as the node listens."""
         wait_until(self._supervisor.get_subscription_count, "the node's subscription")
         self._supervisor.publish(KeyValue(key=key, value=value))
 
@@ -171,12 +165,9 @@ class LoggedNode(BridgeNode):
 
 
 class Started:
-    """A node that runs."""
-
     log: str  # all that it has said
 
     def says(self, words: str) -> None:
-        """Wait until it has said `words`."""
         wait_until(lambda: words in self.log, f"{words!r} in the log")
 
 
@@ -195,7 +186,6 @@ class NodeThread(Started):
         return self.node.text
 
     def ends(self) -> int:
-        """Wait until it has ended; its exit code."""
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive(), "the node goes on"
         (exit_code,) = self._ended
@@ -217,7 +207,6 @@ class NodeProcess(Program, Started):
         return self.said()
 
     def ends(self) -> int:
-        """Wait until it has ended; its exit code."""
         return self.process.wait(PATIENCE_S)
 
 

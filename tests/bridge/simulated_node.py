@@ -51,14 +51,12 @@ STEP_S = 0.01  # time passes in steps of this length: a sample each
 
 
 def streaming_description() -> JsonObject:
-    """What a server says whose sensor gives RATE_HZ samples a second."""
     content = description()
     content["sensors"][0].update(rate_hz=RATE_HZ, settings=dict(SETTINGS))
     return content
 
 
 def status(lost_samples: int = 0, mode: str = "locked") -> JsonObject:
-    """A `status` reply's content."""
     spread = {"p50": 10.0, "p99": 20.0, "p999": 30.0, "max": 40.0}
     clock = {"mode": mode, "period_us": 10000.0, "offset_ppm": 1.0, "uncertainty_us": 5.0}
     return {
@@ -151,26 +149,21 @@ class Server(Script):
         self._wire.feed(data)
 
     def once(self, **changes: Any) -> None:
-        """The next sample, and no other, is so."""
         self._once.append(changes)
 
     def forget_once(self) -> None:
-        """Forget what was to come once."""
         self._once.clear()
 
     def drop(self) -> None:
-        """Drop the connection."""
         self.subscribed.clear()
         assert self._wire is not None
         self._wire.end()
 
     def reconfigure(self, **changed: Any) -> None:
-        """Somebody has changed settings, and with them perhaps the rate and the delays."""
         values = {name: changed.pop(name) for name in ("rate_hz", "delay_ms") if name in changed}
         self.send_json(event(Event.RECONFIGURED, sensor=0, settings={**SETTINGS, **changed}, **values))
 
     def hold(self, up: Sequence[float], **changes: Any) -> None:
-        """From now on the sensor rests so."""
         self.changes = {"process_data": sensed(up, **changes)}
 
     def step(self) -> None:
@@ -285,22 +278,19 @@ class Node(Asking):
     def close(self) -> None:
         assert self.node.exit_code != 1, self.log
         self.node.reader.client.close()
-        self.node.compensation.choice.close()
+        self.node.compensation.stop()
         retire(self.node)
 
     @property
     def log(self) -> str:
-        """All that it has said."""
         return self.node.text
 
     # -- time
 
     def at(self, seconds: float, action: Callable[[], object]) -> None:
-        """Do something so many seconds from now."""
         self._agenda.append((self.server.monotonic_ns() + round(seconds * 1e9), action))
 
     def step(self) -> None:
-        """Let STEP_S pass."""
         for due in [due for due in self._agenda if due[0] <= self.server.monotonic_ns()]:
             self._agenda.remove(due)
             due[1]()
@@ -313,7 +303,6 @@ class Node(Asking):
             self.node.monitor.tick()
 
     def settle(self) -> None:
-        """Let the node do what there is to do now: its reader, which has no thread here, and the executor."""
         reader = self.node.reader
         with contextlib.suppress(ConnectionFailedError):  # the node has been told to end
             reader.read(0.0)
@@ -322,22 +311,18 @@ class Node(Asking):
         reader.client._reader = None  # who asks the server waits as another thread does
         while self._triggered and not self._is_busy:
             self._triggered.pop(0)()
-        self.node.compensation.output.frames.look()
 
     def run(self, seconds: float) -> None:
-        """Let so much simulated time pass."""
         end_s = self._clock.monotonic() + seconds - STEP_S / 2
         while self._clock.monotonic() < end_s:
             self.step()
 
     def fresh(self, messages: list[Any], seconds: float) -> list[Any]:
-        """What comes in so much time."""
         messages.clear()
         self.run(seconds)
         return messages
 
     def run_until(self, condition: Callable[[], object], what: Callable[[], str] | str) -> None:
-        """Let time pass until something is so."""
         end_s = self._clock.monotonic() + PATIENCE_S
         while not condition():
             if self._clock.monotonic() > end_s:
@@ -347,7 +332,6 @@ class Node(Asking):
     # -- services and parameters
 
     def call(self, name: str, request: Any) -> Any:
-        """The response of one of the node's services."""
         offered = [*self.node.services, *self.stand_ins]
         (service,) = [found for found in offered if found.service_name == f"{self.name}/{name}"]
         with self.busy():
@@ -368,22 +352,18 @@ class Node(Asking):
         return self.call(name, request)
 
     def do(self, name: str, *words: str, done: bool = True) -> str:
-        """What a Trigger service says that does it, or does not; these words among it."""
         did, text = self.trigger(name)
         assert did is done, text
         assert [word for word in words if word not in text] == [], text
         return text
 
     def refuse(self, name: str, *words: str) -> str:
-        """What a Trigger service says that does not do it, these words among it."""
         return self.do(name, *words, done=False)
 
     def set(self, name: str, value: Any) -> None:
-        """Set a parameter, which the node takes."""
         assert self.set_parameter(name, value) == (True, "")
 
     def refuse_value(self, name: str, value: Any, *words: str) -> None:
-        """The node does not take the value, and says these words."""
         done, reason = self.set_parameter(name, value)
         assert not done
         assert [word for word in words if word not in reason] == [], reason
@@ -391,17 +371,14 @@ class Node(Asking):
     # -- topics
 
     def hear(self, topic: str) -> list[Any]:
-        """What is published on a topic of the node's namespace from now on."""
         heard = self.topics[topic if topic.startswith("/") else f"{self.name.removesuffix('bridge')}{topic}"]
         heard.is_heard = True
         return heard.messages
 
     def unhear(self, topic: str) -> None:
-        """Subscribe no more."""
         self.topics[f"{self.name.removesuffix('bridge')}{topic}"].is_heard = False
 
     def latest(self) -> dict[str, Any]:
-        """The newest array of /diagnostics, as `statuses`."""
         return self._named(self._arrays[-1])
 
     def statuses(self) -> dict[str, Any]:
@@ -450,8 +427,6 @@ def sensed(
 
 
 class Stages:
-    """What the node publishes of the compensation."""
-
     def __init__(self, node: Node) -> None:
         self._node = node
         names = ("wrench_compensated", "compensation/bias", "compensation/tool")
@@ -462,12 +437,10 @@ class Stages:
             messages.clear()
 
     def first(self) -> list[float]:
-        """The first compensated wrench since `forget`."""
         self._node.run_until(lambda: self.final, "wrench_compensated")
         return six(self.final[0])
 
     def settle(self, wanted: Sequence[float], within: float = 1e-3) -> None:
-        """Wait until the compensated wrench is so."""
         self.forget()
         self._node.run_until(
             lambda: self.final and is_near(self.final[-1], wanted, within),
@@ -477,25 +450,21 @@ class Stages:
     def at(
         self, up: Sequence[float], wanted: Sequence[float] = ZERO6, within: float = 1e-3, **changes: Any
     ) -> None:
-        """Have the sensor rest so, and wait until the compensated wrench is `wanted`."""
         self._node.server.hold(up, **changes)
         self.settle(wanted, within)
 
     def are_silent(self) -> bool:
-        """Whether nothing is published for a while."""
         self.forget()
         self._node.run(0.5)
         return not any(self.all)
 
 
 def six(message: Any) -> list[float]:
-    """A WrenchStamped's six numbers."""
     f, m = message.wrench.force, message.wrench.torque
     return [f.x, f.y, f.z, m.x, m.y, m.z]
 
 
 def stamp_ns(message: Any) -> int:
-    """A message's time, ns since the Unix epoch."""
     return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
 
 
@@ -504,15 +473,12 @@ def is_near(message: Any, wanted: Sequence[float], within: float = 1e-3) -> bool
 
 
 def weight(up: Sequence[float], payload: Payload = TOOL) -> list[float]:
-    """What the tool's weight is in the sensor's frame."""
     return list(load(up, payload, NO_WRENCH).values)
 
 
 def values(status: Any) -> dict[str, str]:
-    """A status's values."""
     return {value.key: value.value for value in status.values}
 
 
 def level(status: Any) -> str:
-    """How bad a status is."""
     return ("ok", "warn", "error", "stale")[status.level[0]]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
-from tests.bridge.simulated_node import OVER, QUICK, SIDE, UP, ZERO6, Node, Server, Stages, sensed
+from tests.bridge.simulated_node import OVER, QUICK, SIDE, UP, ZERO6, Node, Server, Stages, sensed, values
 from tests.compensation.making import AXES, BIAS, TOOL, written_parameters
 
 Take = Callable[..., str]
@@ -68,6 +68,7 @@ def test_from_poses_to_the_contact_force(started: Node, take: Take, server: Serv
     assert mass == pytest.approx(TOOL.mass, abs=1e-4)
     assert list(center) == pytest.approx(TOOL.center, abs=1e-5)
     assert list(bias) == pytest.approx(BIAS.values, abs=1e-4)
+    assert values(started.statuses()["compensation"])["bias_from"] == "identified"
     server.hold((1, -2, 1.5), bias=BIAS, force_z=-5.0)
     Stages(started).settle([0.0, 0.0, -5.0, 0.0, 0.0, 0.0], within=2e-3)
 

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from bridge.parameters.table import Parameters
 from ft_compensation.quantities import NO_PAYLOAD, Wrench
-from tests.bridge.simulated_node import QUICK, UP, ZERO6, Node, Server, Stages, six
+from tests.bridge.simulated_node import QUICK, UP, ZERO6, Node, Server, Stages, six, values
 from tests.compensation.making import BIAS
 
 
@@ -65,6 +66,12 @@ def test_nothing_of_one_sensor_is_used_for_another(sensor: Sensor, node: Node, s
     assert node.trigger("undo_tare") == (False, "there is no tare to undo")
     node.refuse("identify/add_pose", "another sensor is there now, so the previous poses were dropped")
     node.refuse("identify/add_pose", "no identification was started")
+    with node.busy():  # the executor is: not one sample is published with what may be the other's bias
+        sensor.replace(4)
+        stages.forget()
+        node.run(0.3)
+        assert not stages.final
+    stages.settle(list(BIAS.values))
     # A bias that is given is any sensor's.
     node.set("bias", [*BIAS.values])
     sensor.replace(3)
@@ -97,7 +104,7 @@ def test_a_change_of_the_sensors_own_offset_shifts_the_bias(
     node.until(compensation="ok")
 
 
-def test_a_parameter_that_the_shift_has_not_reached_is_no_wish(
+def test_setting_another_parameter_keeps_a_shift_of_the_bias(
     sensor: Sensor, node: Node, stages: Stages
 ) -> None:
     """The parameter `bias` follows when the executor gets to it; another one may be set before."""
@@ -114,6 +121,27 @@ def test_a_parameter_that_the_shift_has_not_reached_is_no_wish(
     shifted = [b + o for b, o in zip(BIAS.values, new, strict=True)]
     assert list(node.parameters("bias")[0]) == pytest.approx(shifted, abs=1e-4)
     assert max(abs(value) for message in stages.final for value in six(message)) < 1e-3
+
+
+def test_a_shift_while_the_parameters_are_made_to_show_the_bias_is_kept(
+    sensor: Sensor, node: Node, stages: Stages
+) -> None:
+    first, second = [1.0] * 6, [3.0] * 6
+    check = node.node.live.check
+
+    def shift_meanwhile(wanted: Parameters) -> None:
+        node.node.live.check = check
+        sensor.set_offset(second, tell=True)
+        node.node.reader.read(0.0)
+
+    node.do("tare")
+    node.node.live.check = shift_meanwhile
+    sensor.set_offset(first, tell=True)
+    node.run(0.2)
+    stages.settle(ZERO6)
+    shifted = [b + o for b, o in zip(BIAS.values, second, strict=True)]
+    assert list(node.parameters("bias")[0]) == pytest.approx(shifted, abs=1e-4)
+    assert values(node.statuses()["compensation"])["bias_from"] == "tare"
 
 
 def test_a_bias_of_a_file_is_of_the_offset_that_the_file_names(sensor: Sensor) -> None:
@@ -168,7 +196,7 @@ def test_no_bias_is_not_shifted(sensor: Sensor, node: Node, stages: Stages) -> N
     sensor.set_offset([3.0] * 6, tell=True)
     stages.settle(ZERO6)
     node.do("undo_tare")
-    check(3.0)
+    check(4.0)
 
 
 def test_a_zero_that_was_measured_is_a_bias(sensor: Sensor, node: Node, stages: Stages) -> None:

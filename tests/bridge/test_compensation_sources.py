@@ -17,10 +17,8 @@ from sensor_msgs.msg import Imu
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import SettingValue
-from bota_ethercat.text.json_text import JsonObject
-from bridge.compensating.sources import ImuSource, Oriented, RobotSource
+from bridge.compensating.sources import ImuSource, RobotSource
 from bridge.node import StartError
-from bridge.parameters.table import PARAMETERS, gather
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import (
     DEFAULTS,
@@ -63,7 +61,6 @@ class Robot(Server):
 
     def restore(self) -> None:
         self.quaternion, self.offset_s, self.stamped, self.sending = UPRIGHT, 0.0, True, True
-        self.acceleration, self.covariance = (0.0, 0.0, 0.0), 0.0  # of the arm's IMU, m/s²
         self.hold(UP, acceleration_x=3.0)  # the sensor's own accelerometer says something else
 
     def listening(self) -> list[Any]:
@@ -80,10 +77,6 @@ class Robot(Server):
             holder = message.pose if isinstance(message, PoseStamped) else message
             q = holder.quaternion if isinstance(message, QuaternionStamped) else holder.orientation
             q.x, q.y, q.z, q.w = self.quaternion
-            if isinstance(message, Imu):
-                a = message.linear_acceleration
-                a.x, a.y, a.z = self.acceleration
-                message.linear_acceleration_covariance[0] = self.covariance
             subscription.callback(message)
 
 
@@ -163,7 +156,7 @@ def test_what_is_refused(robot: Robot, stages: Stages, node: Node, spoil: dict[s
     node.until(compensation="ok")
 
 
-def test_an_imu_without_orientation_and_acceleration(robot: Robot, stages: Stages, node: Node) -> None:
+def test_an_imu_without_orientation(robot: Robot, stages: Stages, node: Node) -> None:
     robot.sending = False
     node.set("orientation.topic", "arm/imu")
     node.set("gravity_source", "topic_imu")
@@ -176,37 +169,6 @@ def test_an_imu_without_orientation_and_acceleration(robot: Robot, stages: Stage
     )
     robot.sending = True
     stages.settle(ZERO6)
-
-
-def test_accelerations_of_the_robots_imu_are_weight_and_inertia(
-    robot: Robot, stages: Stages, node: Node
-) -> None:
-    """The arm accelerates by 1 m/s² along its x axis, the sensor's -y: the tool's mass pulls back."""
-    quarter = math.sqrt(0.5)
-    node.set("orientation.mounting", [0.0, 0.0, quarter, quarter])
-    node.set("gravity_source", "topic_imu")
-    node.until("subtracted: weight of the tool", compensation="ok")  # nothing filled in is no free fall
-    robot.quaternion = (math.nan,) * 4  # it is not asked
-    robot.acceleration = 1.0, 0.0, STANDARD_GRAVITY
-    pulled: dict[str, Any] = {"force_y": TOOL.mass, "torque_x": -TOOL.mass * TOOL.center[2]}
-    stages.at(UP, acceleration_x=3.0, torque_z=TOOL.mass * TOOL.center[0], **pulled)
-    node.until("subtracted: weight and inertia of the tool", compensation="ok")
-    robot.restore()
-    robot.acceleration, robot.covariance = (1.0, 2.0, 3.0), -1.0  # which says that it has none
-    stages.at(OVER, wanted=[a - b for a, b in zip(weight(OVER), weight(UP), strict=True)])
-    node.until("subtracted: weight of the tool", compensation="ok")
-
-
-def test_an_imu_beside_the_tool_is_moved_to_its_center_of_gravity() -> None:
-    """While the sensor turns by 2 rad/s about z: 0.4 m/s² towards the axis, 0.1 m from it."""
-    values = {row.name: row.default for row in PARAMETERS}
-    given = gather(values | {"tool_center_of_gravity": (0.0, 0.0, 0.05), "imu_position": (-0.1, 0.0, 0.05)})
-    source = RobotSource(given, "topic /imu", LINK)
-    for step in range(20):
-        t = step * 0.01
-        source.latest = Oriented(UPRIGHT, round(t * 1e9) + 10**9, (0.0, 0.0, -STANDARD_GRAVITY))
-        found = source.specific_force(sample(angular_rate=(0.0, 0.0, 2.0)), 5.0 + t, 1.0 + t)
-    assert found == pytest.approx((-0.4, 0.0, STANDARD_GRAVITY))
 
 
 def test_what_is_mounted_askew(robot: Robot, stages: Stages, node: Node) -> None:
@@ -229,25 +191,6 @@ def test_a_tare_goes_by_the_topic(robot: Robot, stages: Stages, node: Node) -> N
     stages.settle(ZERO6)
     robot.quaternion = TILTED
     stages.at(SIDE, bias=BIAS)
-
-
-def test_the_orientation_is_taken_in_while_a_service_waits(robot: Robot, stages: Stages, node: Node) -> None:
-    asked: list[JsonObject] = []
-    robot.answers["tare"] = asked.append  # the reply is kept back
-
-    def turn() -> None:
-        robot.quaternion = ROLLED
-        robot.hold(OVER)
-
-    def reply() -> None:
-        stages.settle(ZERO6)
-        refused = {"ok": False, "error": {"code": "denied", "message": "no"}}
-        robot.send_json({"reply": "tare", "id": asked[0]["id"], **refused})
-
-    node.at(0.8, turn)  # longer than an orientation holds
-    node.at(1.6, reply)
-    assert node.trigger("sensor_tare") == (False, "no (denied)")
-    assert is_near(stages.tool[-1], weight(OVER))
 
 
 @pytest.mark.parametrize(
@@ -333,7 +276,7 @@ def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque()
 def test_an_orientation_of_a_topic_is_carried_on_to_the_sample(set_by_s: float) -> None:
     """The robot turns by 2 rad/s about x and tells its pose 20 ms late, twenty times a second; meanwhile the
     wall clock, by which poses are stamped, is set."""
-    source, speed, begin_s, wall_s = RobotSource(DEFAULTS, "topic /pose", LINK), 2.0, 1000.0, 1e9
+    source, speed, begin_s, wall_s = RobotSource(DEFAULTS, "topic /pose"), 2.0, 1000.0, 1e9
     for step in range(100):
         t = step * 0.01
         if step == 50:
@@ -341,7 +284,7 @@ def test_an_orientation_of_a_topic_is_carried_on_to_the_sample(set_by_s: float) 
         if step % 5 == 2:
             half = 0.5 * speed * (t - 0.02)
             stamp_ns = round((wall_s + t - 0.02) * 1e9)
-            source.latest = Oriented((math.sin(half), 0.0, 0.0, math.cos(half)), stamp_ns)
+            source.latest = (math.sin(half), 0.0, 0.0, math.cos(half)), stamp_ns
         got = source.specific_force(sample(angular_rate=(speed, 0.0, 0.0)), begin_s + t, wall_s + t)
         if step > 2:
             wanted = 0.0, STANDARD_GRAVITY * math.sin(speed * t), STANDARD_GRAVITY * math.cos(speed * t)

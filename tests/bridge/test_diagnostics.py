@@ -170,17 +170,6 @@ def test_the_last_emergency_is_a_warning_for_a_minute(
     assert (told["emergencies"], told["last_emergency_ago_s"]) == ("7", str(ago_s))
 
 
-@pytest.mark.parametrize("last", [5, [], {}, {"code": "x", "ago_s": 1}, {"code": 0x4210, "ago_s": "now"}])
-def test_a_reply_that_makes_no_sense_is_none(node: Node, server: Server, last: object) -> None:
-    answer = status()
-    answer["sensors"][0]["emergency"] = last
-    server.answers["status"] = lambda _: answer
-    node.run(2.0)
-    assert level(node.statuses()["sensor"]) == "ok"
-    server.answers["status"] = lambda _: {"ok": True, "sensors": last, "last_10s": last, "uptime_s": last}
-    node.until("the server has not said yet", clock="stale", link="ok")
-
-
 def test_a_lost_sensor(node: Node, server: Server) -> None:
     server.send_json({"event": "sensor_lost", "sensor": 1, "message": "another one"})
     node.run(1.0)

@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from bota_ethercat.text.json_text import JsonObject
 from bridge import rclpy_internals
-from bridge.node import SERVER_GOES_ON, StartError, run
+from bridge.node import SERVER_NOT_STOPPED, StartError, run
 from bridge.rclpy_internals import RIGHT_FOR
 from ft_compensation.quantities import Wrench
 from tests.bridge.real_node import PATIENCE_S, Listener, Start, StartProcess
@@ -139,7 +139,7 @@ def test_no_supervisor_is_heard_without_a_topic() -> None:
     [
         (
             {"ok": False, "error": {"code": "denied", "message": "only root"}},
-            SERVER_GOES_ON,
+            SERVER_NOT_STOPPED,
             "refused to shut down: only root (denied)",
         ),
         (None, 0, "did not answer the request to shut down"),
@@ -198,7 +198,7 @@ def test_a_managed_node(server: ScriptedServer, listener: Listener, start: Start
     node.says("the transition failed: ZeroDivisionError")
     del node.node.open
     change(Transition.TRANSITION_CONFIGURE)
-    setting = threading.Thread(target=lambda: node.node.live.put(**{"filter.cutoff": 20.0}))
+    setting = threading.Thread(target=lambda: node.node.live.put(temperature_variance=0.5))
 
     def set_meanwhile() -> object:
         if not setting.ident:
@@ -209,7 +209,8 @@ def test_a_managed_node(server: ScriptedServer, listener: Listener, start: Start
     node.node.get_logger = set_meanwhile  # type: ignore[method-assign]
     change(Transition.TRANSITION_ACTIVATE)
     setting.join()
-    assert change(Transition.TRANSITION_ACTIVE_SHUTDOWN) == topics | {"wrench_filtered"}
+    assert node.node.compensation.parameters.temperature_variance == 0.5
+    assert change(Transition.TRANSITION_ACTIVE_SHUTDOWN) == topics
 
 
 def test_both_names_of_the_port() -> None:

@@ -57,7 +57,6 @@ def cut_power(server: Simulation) -> object:
 
 
 def recorded(path: Path, server: Simulation, seconds: float, *steps: Step) -> Path:
-    """What the recorder writes in so many simulated seconds, in which these things happen."""
     with (
         mock.patch("bota_ethercat.client.client.TcpChannel", return_value=MemoryChannel(server)),
         contextlib.closing(Source(Address("localhost", 12001), None)) as source,
@@ -115,7 +114,6 @@ def parameters(tool: Path) -> dict[str, Any]:
 
 
 def exported(run: Path, tool: Path) -> tuple[list[int], Array]:
-    """Stamps, and the compensated wrench (n, 6), of those samples that have a valid one."""
     out = run.with_suffix(".npz")
     with open_recording(run) as recording:
         table = columns(recording.frames(0))
@@ -157,7 +155,6 @@ Items = list[DataMessage | Description | Event]
 
 
 def described(items: Items) -> dict[str, Any]:
-    """What the server says of itself, first."""
     reply = next(item.reply for item in items if isinstance(item, Description))
     return {name: value for name, value in reply.items() if name not in ("reply", "id")}
 
@@ -199,8 +196,6 @@ def test_the_nodes_wrench_is_the_exported_one(heard: Recorded, tool: Path) -> No
 
 
 class Reading(Loop):
-    """The class behind the plugin."""
-
     def until_force(self, force_x: float) -> Seen:
         """The first cycle that sees a sample with this force."""
         wait_until(lambda: self.read()["force.x"] == force_x, "the sample")

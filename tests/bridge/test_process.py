@@ -23,7 +23,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
 from bridge import client, process
-from bridge.spinning import Spinner
+from bridge.rclpy_internals import Spinner
 from tests import without_ipv6
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
@@ -170,7 +170,7 @@ def test_the_stream_is_real_time_no_service_is(server: ScriptedServer, start_pro
     anywhere = os.cpu_count() == 1
     names = {name for name, *_ in found} - {"dds"}
     assert sum(found[name, os.SCHED_FIFO, PRIORITY, True] for name in names) == 1
-    assert sum(found[name, os.SCHED_FIFO, BELOW, anywhere] for name in names) == len(process.BESIDE)
+    assert sum(found[name, os.SCHED_FIFO, BELOW, anywhere] for name in names) == len(process.SHARING_LOCKS)
     assert {key[1:3] for key in found if key[0] == "dds"} == {(os.SCHED_FIFO, BELOW)}
     assert {key[1:3] for key in found} == {
         (os.SCHED_OTHER, 0), (os.SCHED_FIFO, BELOW), (os.SCHED_FIFO, PRIORITY)

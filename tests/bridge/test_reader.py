@@ -40,7 +40,6 @@ def node(quiet: Server) -> Iterator[Node]:
 
 
 def feed(node: Node, server: Server, *chunks: bytes) -> list[float]:
-    """The numbers of all samples that are published, once these bytes have arrived one after the other."""
     for chunk in chunks:
         server.send_raw(chunk)
         node.settle()
@@ -124,6 +123,9 @@ def test_events_reach_the_log_and_the_link(node: Node, quiet: Server) -> None:
         ({"event": "sensor_lost", "reason": "wkc"}, "the sensor is lost"),
         ({"event": "sensor_back", "lost_s": 1.25}, "the sensor is back after 1.25 s"),
         ({"event": "sensor_back", "lost_s": "long"}, "the sensor is back"),
+        ({"event": "emergency", "code": 4096}, "the sensor reports an emergency"),
+        ({"event": "emergency", "message": "too hot"}, "too hot"),
+        ({"event": "shutting_down"}, "the server is shutting down"),
         (
             {"event": "reconfigured", "settings": {"fir": True, "sinc_length": 128, "chop": False}},
             "the settings of the sensor have changed: fir true, sinc_length 128",
@@ -134,9 +136,6 @@ def test_events_reach_the_log_and_the_link(node: Node, quiet: Server) -> None:
             "Mz 0.3000 (N, Nm)",
         ),
         ({"event": "offset_changed"}, "the offset of the sensor has changed: it is unknown"),
-        ({"event": "emergency", "code": 4096}, "the sensor reports an emergency"),
-        ({"event": "emergency", "message": "too hot"}, "too hot"),
-        ({"event": "shutting_down"}, "the server is shutting down"),
     ],
 )
 def test_an_event_is_a_sentence(message: JsonObject, said: str) -> None:
@@ -177,12 +176,10 @@ class Selecting:
         self.select = FrameSelector(self.counts, same_clock=same_clock, limit_hz=limit_hz)
 
     def of(self, numbers: Iterable[int], now_ns: int) -> list[int]:
-        """Those that are selected of these frames, which are read at once."""
         frames = [DataMessage(number, 0, number * PERIOD_NS, 0, 0, 3, b"") for number in numbers]
         return [frame.sequence for frame in self.select.select(frames, now_ns)]
 
     def one_by_one(self, begin: int, end: int, age_ns: int = 0) -> list[int]:
-        """Likewise of frames that are read one after the other, of this age."""
         return [n for i in range(begin, end) for n in self.of([i], age_ns + i * PERIOD_NS)]
 
 

@@ -23,14 +23,12 @@ AXES = ((0, 0, 1), (0, 0, -1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
 
 
 def gravity_for(up: Sequence[float]) -> Vector3:
-    """Gravity in the sensor's frame when `up`, of any length, points up."""
     size = sum(part * part for part in up) ** 0.5
     x, y, z = (-STANDARD_GRAVITY * part / size for part in up)
     return x, y, z
 
 
 def load(up: Sequence[float], payload: Payload = TOOL, bias: Wrench = BIAS) -> Wrench:
-    """What the sensor measures at rest, from IV.1 to IV.5 turned round."""
     force = [payload.mass * part for part in gravity_for(up)]
     torque = np.cross(payload.center, force).tolist()
     return Wrench.of([a + b for a, b in zip([*force, *torque], bias.values, strict=True)])
@@ -59,7 +57,6 @@ def written_parameters(path: Path) -> dict[str, Any]:
 
 
 def sample(**changed: Any) -> Sample:
-    """A sample at rest, upright, without load; anything can be changed."""
     values: dict[str, Any] = {
         "force": (0.0, 0.0, 0.0),
         "torque": (0.0, 0.0, 0.0),

@@ -66,8 +66,6 @@ def imperfect(seed: int) -> Imperfection:
 
 
 class Felt(NamedTuple):
-    """What the sensor measures: n samples."""
-
     times: Array  # (n,) s
     force: Array  # (n, 3) N
     torque: Array  # (n, 3) Nm, about the wrench origin
@@ -149,12 +147,10 @@ def filtered(
 
 
 def later(path: Path, by_s: float) -> Path:
-    """The same motion, so much later."""
     return lambda t: path(t - by_s)
 
 
 def settings(sinc_length: int = 64, fir: bool = False, **others: SettingValue) -> dict[str, SettingValue]:
-    """Those of the sensor that the filters go by."""
     return {
         "sinc_length": sinc_length,
         "fir": fir,
@@ -167,24 +163,19 @@ def settings(sinc_length: int = 64, fir: bool = False, **others: SettingValue) -
 
 
 class Left(NamedTuple):
-    """What compensation leaves."""
-
     times: Array  # (n,) s
     force: Array  # (n, 3) N
     torque: Array  # (n, 3) Nm
 
     @property
     def size(self) -> Array:
-        """(n,) N."""
         return np.asarray(np.linalg.norm(self.force, axis=1))
 
     @property
     def rms(self) -> float:
-        """N."""
         return math.sqrt(float((self.size**2).mean()))
 
     def percentile(self, share: float) -> float:
-        """N."""
         return float(np.quantile(self.size, share))
 
 
@@ -209,7 +200,6 @@ def left_over(
 
 
 def rotations(angles: Array) -> Array:
-    """(..., 3, 3) that turn the sensor's vectors into the world's, of angles about z, y and x in turn."""
     (cz, cy, cx), (sz, sy, sx) = np.moveaxis(np.cos(angles), -1, 0), np.moveaxis(np.sin(angles), -1, 0)
     rows = (
         (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
@@ -248,7 +238,6 @@ def waypoints(move_s: float, rest_s: float, seed: int, *, metres: float = 0.25, 
 def guided(
     seed: int, *, metres: float = 0.06, radians: float = 0.4, hertz: tuple[float, float] = (0.2, 1.5)
 ) -> Path:
-    """By hand: never at rest."""
     draw = np.random.default_rng(seed)
     frequencies, phases = draw.uniform(*hertz, size=(4, 6)), draw.uniform(0, 2 * np.pi, size=(4, 6))
     sizes = np.array([metres] * 3 + [radians] * 3) / 4
@@ -261,8 +250,6 @@ def guided(
 
 
 def together(*paths: Path) -> Path:
-    """One motion on top of the other; the angles are added."""
-
     def path(t: Array) -> tuple[Array, Array]:
         each = [one(t) for one in paths]
         return sum(place for place, _ in each), sum(angles for _, angles in each)  # type: ignore[return-value]
@@ -271,7 +258,6 @@ def together(*paths: Path) -> Path:
 
 
 def shaken(hertz: float, acceleration: float = 2.0) -> Path:
-    """A vibration along x, m/s²."""
     size = acceleration / (2 * np.pi * hertz) ** 2
 
     def path(t: Array) -> tuple[Array, Array]:
@@ -283,7 +269,6 @@ def shaken(hertz: float, acceleration: float = 2.0) -> Path:
 
 
 def driven(acceleration: float = 0.5, seconds: float = 3.0) -> Path:
-    """A vehicle that speeds up and brakes along x, each for so long."""
     corners = np.arange(0.0, 60.0, seconds)
 
     def path(t: Array) -> tuple[Array, Array]:
@@ -301,7 +286,6 @@ def driven(acceleration: float = 0.5, seconds: float = 3.0) -> Path:
 
 
 def moves(seed: int) -> dict[str, Path]:
-    """What is to be survived, by name."""
     circle = guided(seed + 4, metres=0.05, radians=0.2, hertz=(1.5, 2.5))
     return {
         "pick and place": waypoints(0.6, 1.0, seed),

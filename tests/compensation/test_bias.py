@@ -12,7 +12,7 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.sensor.warnings_register import WarningFlag
-from ft_compensation.bias import BiasRamp, Taken, check_at_rest, estimate_bias
+from ft_compensation.bias import BiasRamp, TareBasis, check_at_rest, estimate_bias
 from ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
@@ -31,7 +31,6 @@ RATE = 800
 def window(
     make: Callable[[int], Sample], seconds: float = 1.0, limits: StationaryLimits | None = None
 ) -> StationaryWindow:
-    """A window that was fed until it was complete."""
     collected = StationaryWindow(seconds, limits)
     for number in range(100_000):
         if collected.add(make(number), number / RATE):
@@ -131,7 +130,6 @@ def test_a_window_that_is_too_short_or_whose_clock_is_set_back() -> None:
 
 
 def felt(up: Sequence[float]) -> Vector3:
-    """What the accelerometer reads at rest when `up` points up, m/s²."""
     x, y, z = gravity_for(up)
     return -x, -y, -z
 
@@ -156,76 +154,43 @@ def test_with_the_tool_on_only_the_offset_is_taken_in_every_pose(up: tuple[float
 OLD, NEW = Wrench.of([0, 0, 0, 0, 0, 0]), Wrench.of([1, -2, 4, 0.5, 0, -1])
 
 
-def test_the_ramp_is_straight_and_ends_exactly() -> None:
-    ramp = BiasRamp(OLD, seconds=2.0)
-    ramp.go(NEW, 10.0)
+def test_the_ramp_is_straight_ends_exactly_and_does_not_jump_when_turned_round() -> None:
+    ramp = BiasRamp(OLD).go(NEW, 10.0, seconds=2.0)
     assert ramp.at(10.0) == ramp.at(9.95) == OLD, "a sample that was on its way is as late"
-    assert not ramp.arrived(9.95)
     assert ramp.at(10.5).values == pytest.approx([0.25 * value for value in NEW.values])
-    assert not ramp.arrived(11.9)
-    assert ramp.at(12.0) == NEW
-    assert ramp.at(1e9) == NEW
-    assert ramp.arrived(12.0)
-    ramp.seconds = 0.0
-    ramp.go(OLD, 20.0)
-    assert ramp.at(20.0) == ramp.at(19.9) == OLD, "it jumps"
-
-
-@pytest.mark.parametrize("now_s", [9.0, -600.0])
-def test_a_clock_that_is_set_back_does_not_bring_the_old_bias_back(now_s: float) -> None:
-    ramp = BiasRamp(OLD, seconds=2.0)
-    ramp.go(NEW, 10.0)
-    assert ramp.at(13.0) == NEW
-    assert ramp.at(now_s) == NEW
-    assert ramp.arrived(now_s)
-
-
-def test_a_ramp_that_is_turned_round_does_not_jump() -> None:
-    ramp = BiasRamp(OLD, seconds=2.0)
-    ramp.go(NEW, 10.0)
-    before = ramp.at(10.7)
-    ramp.seconds = 1.0
-    ramp.go(OLD, 10.7)
-    assert ramp.at(10.7) == before
-    assert ramp.at(11.7) == OLD
+    assert [ramp.arrived(now_s) for now_s in (9.95, 11.9, 12.0)] == [False, False, True]
+    assert ramp.at(12.0) == ramp.at(1e9) == NEW
+    for now_s in (9.0, -600.0):  # a clock that is set back does not bring the old bias back
+        assert ramp.at(now_s) == NEW
+        assert ramp.arrived(now_s)
+    back = ramp.go(OLD, 10.7, seconds=1.0)
+    assert back.at(10.7) == ramp.at(10.7)
+    assert back.at(11.7) == OLD
+    at_once = ramp.go(OLD, 20.0)
+    assert at_once.at(20.0) == at_once.at(19.9) == OLD
 
 
 def test_the_last_change_is_undone_once() -> None:
-    ramp = BiasRamp(seconds=1.0)
     with pytest.raises(CompensationError, match="no tare to undo"):
-        ramp.undo(0.0)
-    ramp.go(NEW, 0.0)
-    ramp.go(BIAS, 5.0)
-    assert ramp.undo(10.0) == ramp.target == NEW
-    assert ramp.at(10.0) == BIAS
-    assert ramp.at(11.0) == NEW
+        BiasRamp().undone(0.0)
+    undone = BiasRamp().go(NEW, 0.0, 1.0).go(BIAS, 5.0, 1.0).undone(10.0, 1.0)
+    assert undone.target == NEW
+    assert undone.at(10.0) == BIAS
+    assert undone.at(11.0) == NEW
     with pytest.raises(CompensationError, match="no tare to undo"):
-        ramp.undo(20.0)
-
-
-def test_undoing_goes_back_to_a_bias_that_was_shifted_meanwhile() -> None:
-    """The sensor was tared: its own offset, and every bias of before with it, has changed."""
-
-    def fx(force: float) -> Wrench:
-        return Wrench.of([force, 0, 0, 0, 0, 0])
-
-    ramp = BiasRamp(fx(1.0))
-    ramp.go(fx(3.0), 0.0)
-    ramp.shift(fx(10.0))
-    assert ramp.target == fx(13.0)
-    assert ramp.undo(1.0) == ramp.at(1.0) == fx(11.0)
+        undone.undone(20.0)
 
 
 def test_a_shift_and_another_tool_change_both_biases() -> None:
     """The one in force was taken with gravity along -x, the one before along -z."""
-    ramp = BiasRamp(NO_WRENCH, seconds=1.0)
-    ramp.go(load((0, 0, 1)), 0.0, Taken(Payload(), felt((0, 0, 1))))
-    ramp.go(load((1, 0, 0)), 5.0, Taken(Payload(), felt((1, 0, 0))))
-    ramp.shift(NEW)
-    weighed = ramp.weighed(TOOL)
+    ramp = BiasRamp().go(load((0, 0, 1)), 0.0, 1.0, TareBasis(Payload(), felt((0, 0, 1))))
+    ramp = ramp.go(load((1, 0, 0)), 5.0, 1.0, TareBasis(Payload(), felt((1, 0, 0)))).shifted(NEW)
+    weighed = ramp.for_payload(TOOL)
     assert ramp.target == load((1, 0, 0)).plus(NEW), "it is another ramp"
     assert weighed.target.values == pytest.approx(BIAS.plus(NEW).values)
     started = load((0, 0, 1)).plus(NEW).plus(BIAS).plus(load((1, 0, 0)), -1.0)
     assert weighed.at(5.0).values == pytest.approx(started.values), "which jumps as much as the weight does"
-    assert weighed.undo(10.0).values == pytest.approx(BIAS.plus(NEW).values)
-    assert weighed.taken == Taken(TOOL, felt((0, 0, 1)))
+    assert weighed.undone(10.0).target.values == pytest.approx(BIAS.plus(NEW).values)
+    assert weighed.taken == TareBasis(TOOL, felt((1, 0, 0)))
+    assert weighed.undone(10.0).taken == TareBasis(TOOL, felt((0, 0, 1)))
+    assert BiasRamp().go(NEW, 0.0).shifted(NEW).undone(1.0).target == NO_WRENCH, "none stays none"

@@ -1,4 +1,4 @@
-"""docs/compensation.md: its example runs, its mistakes look as it says, its figure can be drawn."""
+"""docs/compensation.md: its example runs, its mistakes look as it says."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import NO_WRENCH, Payload
-from tests.compensation import figure
-from tests.compensation.figure import Array
 from tests.compensation.making import BIAS, TOOL, gravity_for, load
 
 ROOT = Path(__file__).parent.parent.parent
@@ -37,7 +36,7 @@ MISTAKES: dict[str, dict[str, Any]] = {
 }
 
 
-def left_over(mistake: str) -> Array:
+def left_over(mistake: str) -> NDArray[np.float64]:
     """What compensation leaves in each pose, (n, 6)."""
     known = {"bias": BIAS, "mass": TOOL.mass, "center": TOOL.center, "gravity": GRAVITY, **MISTAKES[mistake]}
     compensator = Compensator(Payload(known["mass"], known["center"]), known["bias"])
@@ -64,18 +63,3 @@ def test_the_example_runs_and_every_mistake_is_tried() -> None:
 def test_the_mistakes_look_as_the_page_says(mistake: str) -> None:
     force = np.linalg.norm(left_over(mistake)[:, :3], axis=1)
     assert table_of_mistakes()[mistake] == pytest.approx(force, abs=0.051)
-
-
-def test_the_figure_can_be_drawn_and_shows_what_its_titles_say(tmp_path: Path) -> None:
-    data = figure.samples()
-    quiet = (data.times < 19.0) | (data.times > 25.0)
-    shown = dict(figure.panels(data))
-    assert np.abs(shown["weight and inertia subtracted too (IV.5)"][quiet, :3]).mean() < 0.3
-    for title, left in shown.items():
-        assert not title.startswith("mistake") or np.abs(left[quiet, :3]).max() > 1.5, title
-    out = tmp_path / "figure.svg"
-    figure.draw(out, data, shown)
-    drawn, kept = out.read_text(), (ROOT / "docs" / "compensation.svg").read_text()
-    titles = re.findall(r">(mistake: [^<]+|[^<]*\(IV\.\d\))<", kept)
-    assert len(titles) == 8
-    assert all(title in drawn for title in titles)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethercat_server.virtual_sensor import signals
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
 from tests.compensation.making import gravity_for, load
@@ -38,17 +37,3 @@ def test_stages_add_up_and_have_their_signs() -> None:
     stages = Compensator(Payload(1.0, ZERO)).compensate((0.0, 0.0, -9.8), ZERO, (0.0, 0.0, 9.8))
     assert stages.tool.force == (0.0, 0.0, -9.8)
     assert stages.final.force == ZERO
-
-
-@pytest.mark.parametrize("seconds", [0.0, 2.7, 5.3, 11.0])
-def test_signs_are_those_of_the_sensor(seconds: float) -> None:
-    """The scene's tool, from physics written elsewhere: what is left is the contact, and nothing else."""
-    felt = signals.scene(seconds)
-    fx, fy, fz, mx, my, mz = felt.wrench
-    ax, ay, az = felt.acceleration
-    stages = Compensator(Payload(signals.TOOL_MASS, signals.TOOL_CENTRE)).compensate(
-        (fx, fy, fz), (mx, my, mz), (ax, ay, az)
-    )
-    contact = signals.contact_force(seconds)
-    assert stages.final.force == pytest.approx(contact, abs=1e-9)
-    assert stages.final.torque == pytest.approx(signals.cross(signals.CONTACT_POINT, contact), abs=1e-9)

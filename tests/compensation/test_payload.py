@@ -17,11 +17,11 @@ from bota_ethercat.pdo import STANDARD_GRAVITY
 from ft_compensation.compensator import Compensator
 from ft_compensation.identification.estimation import Estimate, Value, estimate
 from ft_compensation.identification.parameter_file import write_yaml
-from ft_compensation.identification.payload import IdentificationError, identify, summary
+from ft_compensation.identification.payload import IdentificationError, identify
 from ft_compensation.identification.poses import Pose, coverage, pose_of
 from ft_compensation.identification.weighted import Array, students_t
 from ft_compensation.quantities import NO_WRENCH, SCALE_PRIOR, CompensationError, Payload, Wrench
-from ft_compensation.stationary import StationaryMeans, triple
+from ft_compensation.stationary import StationaryMeans
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, pose, written_parameters
 from tests.simulation import more_if_long
 
@@ -65,12 +65,6 @@ def test_students_quantiles_are_those_of_the_tables() -> None:
         (1, 12.7062), (2, 4.3027), (3, 3.1824), (4.5, 2.6589), (8, 2.3060), (14, 2.1448), (1000, 1.9623),
     ):  # fmt: skip
         assert students_t(degrees) == pytest.approx(t, rel=1e-4)
-
-
-def test_the_summary() -> None:
-    text = summary(identify([pose(up) for up in AXES]))
-    assert re.search(r"mass 0\.\d+ ± 0\.\d+ kg, center of gravity \(\d", text)
-    assert "(95 % confidence) from 6 poses" in text
 
 
 class Reading:
@@ -117,37 +111,6 @@ def test_an_accelerometer_that_reads_nothing_like_g_is_not_touched(reads: float)
     assert found.accelerometer is None
     assert found.bias.values == pytest.approx(BIAS.values, abs=1e-9)
     assert not any("accelerometer" in note for note in found.notes)
-
-
-def test_by_a_robots_orientation_the_accelerometer_is_calibrated() -> None:
-    """Its axes may be turned by degrees, which force and torque alone would not tell; the intervals cover."""
-    inside = []
-    for seed in range(20):
-        reading = Reading(seed, length=0.5, crossed=0.03)
-        draw = np.random.default_rng(seed)
-        ups = [*AXES, *(tuple(row) for row in draw.normal(size=(6, 3)).tolist())]
-        poses = [
-            pose_of(
-                still(up)._replace(acceleration=triple(reading.acceleration(up) + draw.normal(0, 0.02, 3))),
-                gravity_for(up),
-            )
-            for up in ups
-        ]
-        found = identify(poses)
-        assert found.accelerometer is not None
-        calibration = found.accelerometer.calibration
-        off = np.abs(np.subtract(calibration.offset, reading.offset))
-        inside += (off <= calibration.offset_interval).tolist()
-        assert found.payload.mass == pytest.approx(TOOL.mass, rel=1e-6), "gravity was known without it"
-        x, y, z = draw.normal(size=3).tolist()
-        truth = -np.array(gravity_for((x, y, z)))
-        felt = calibration.correct(reading.acceleration((x, y, z)))
-        assert np.linalg.norm(np.subtract(felt, truth)) < 0.06
-    assert 0.85 < np.mean(inside) < 1.0
-    few = [
-        pose._replace(acceleration=reading.acceleration(up)) for pose, up in zip(poses[:4], ups, strict=False)
-    ]
-    assert identify(few).accelerometer is None, "four poses leave nothing to judge it by"
 
 
 def test_an_offset_that_the_poses_do_not_determine_stays_open_and_the_result_says_so() -> None:

@@ -46,8 +46,6 @@ ARGUMENTS = {
 
 
 class StandIn:
-    """Any action or substitution: it keeps what it is given. PyPI has neither `launch` nor `launch_ros`."""
-
     def __init__(self, *given: Any, **named: Any) -> None:
         self.given_to_it, self.named = given, named
 
@@ -90,8 +88,6 @@ class LaunchConfiguration(StandIn):
 
 
 class Module(types.ModuleType):
-    """Any module of `launch` and `launch_ros`."""
-
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
@@ -200,8 +196,6 @@ def test_a_launch_whose_server_fails_fails_unless_it_was_stopped(
 
 
 class Launched:
-    """`ros2 launch` with one of our files, in a session of its own."""
-
     def __init__(self, environment: dict[str, str], file: str, *arguments: str) -> None:
         self.environment = environment
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115
@@ -221,14 +215,12 @@ class Launched:
         return self._log.read()
 
     def says(self, *words: str, times: int = 1) -> None:
-        """Wait until it has said these words, regular expressions, so often."""
         deadline = time.monotonic() + PATIENCE_S
         while not all(len(re.findall(word, self.log)) >= times for word in words):
             assert time.monotonic() < deadline, f"waited in vain for {words} in:\n{self.log}"
             time.sleep(0.05)
 
     def stop(self) -> int:
-        """End it as Ctrl-C does; the exit code."""
         self.process.send_signal(signal.SIGINT)
         return self.process.wait(PATIENCE_S)
 

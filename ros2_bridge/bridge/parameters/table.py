@@ -2,7 +2,7 @@
 """The node's parameters: one table, from which they are declared, checked, described and documented. No ROS.
 
 A wrong value ends the node at start, or is refused while it runs, with one sentence. The sensor's settings
-are parameters too, but the server decides about them: `declare.SettingsParameters`.
+are parameters too, but the server decides about them: `declare.NodeParameters`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.health.verdict import LIMITS, Limits
@@ -25,7 +27,6 @@ from ft_compensation.quantities import (
     Payload,
     Quaternion,
     StationaryLimits,
-    Wrench,
     length,
     unit_quaternion,
 )
@@ -37,6 +38,7 @@ AUTO: Final = "auto"  # the value of a path that is for the node to choose
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
 _PORT: Final = 12001
 _LEAST_GRAVITY: Final = 0.1
+_GROUPS: Final = re.compile("^(diagnostics|orientation(?!_cov)|accelerometer|rest|filter|identify)_")
 _FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _FARTHEST_M: Final = 10.0
 _REST: Final = StationaryLimits()
@@ -96,7 +98,6 @@ class Row(NamedTuple):
         return self.low <= (abs(item) if several and not self.low else item) <= self.high
 
     def allowed(self) -> str:
-        """The values that it may have, in words."""
         if self.choices:
             return " or ".join(self.choices)
         if isinstance(self.default, tuple):
@@ -111,104 +112,6 @@ class Row(NamedTuple):
         return f"{kind} from {self.low:g} to {self.high:g}"
 
 
-PARAMETERS: Final = (
-    Row("server_host", "localhost", "Host that ethercat-server runs on", live=False),
-    Row("server_port", _PORT, "TCP port of ethercat-server", 1, 65535, live=False),
-    Row("SERVER_PORT", 0, "Another name for server_port; 0 = not used", 0, 65535, live=False),
-    Row("sensor", 0, "The sensor's position on the bus, from 0", 0, 255, live=False),
-    Row("terminals", 0, "How many of the server's terminals are published: terminal_0, terminal_1, ...",
-        0, 255, live=False),
-    Row("rt_priority", 0,
-        "SCHED_FIFO priority of the stream's thread, if allowed; 0 = as the node was started",
-        0, HIGHEST_PRIORITY, live=False),
-    Row("cpu", -1, "CPU of the stream's thread; -1 = any", -1, 1023, live=False),
-    Row("publishing_frequency", 0.0, "Most messages a second, no low-pass; 0 = every sample", 0, 1e6),
-    Row("array_topic", "sensone_sensor_data", "Topic of the Float64MultiArray", live=False),
-    Row("lifecycle", False, "Managed by transitions (configure, activate); false = active at once",
-        live=False),
-    Row("supervisor_topic", "/supervisor_status_data", "Topic that stops server and node; empty = none",
-        live=False, optional=True),
-    Row("stamp", "sample",
-        "What stamps are the time of: the sample, or the measurement, earlier by the sensor's filter delay",
-        choices=("sample", "measurement")),
-    Row("frame_id", "ft_sensor", "Frame of the wrench (its origin is the sensor's) and of the temperature",
-        live=False),
-    Row("wrench_frames", NO_TEXTS,
-        "Frames of wrench_compensated/NAME: NAME (by TF), or 'NAME x y z [qx qy qz qw]' in frame_id, m",
-        live=False),
-    Row("tf_wait", 0.02,
-        "Longest wait for TF's pose at the sample's stamp, s; then, and with 0, the latest is used", 0, 0.5),
-    Row("imu_frame_id", "ft_sensor_imu", "Frame of the IMU's messages", live=False),
-    Row("imu_raw_units", ImuUnits.G_DPS.value, "What the sensor sends acceleration and angular rate in",
-        choices=tuple(units.value for units in ImuUnits), live=False),
-    Row("orientation_covariance", ZERO, "Variances of the IMU's orientation, rad²; 0 = unknown", 0, 1e12),
-    Row("angular_velocity_covariance", ZERO, "Its variances, (rad/s)²; 0 = unknown", 0, 1e12),
-    Row("linear_acceleration_covariance", ZERO, "Its variances, (m/s²)²; 0 = unknown", 0, 1e12),
-    Row("temperature_variance", 0.0, "Of the temperature, K²; 0 = unknown", 0, 1e6),
-    # Those limits of every verdict that can be set for this node.
-    Row("diagnostics.stale_after", LIMITS.stale_after, "Error: no new sample for so many s", 0.05, 60),
-    Row("diagnostics.rate_tolerance", LIMITS.rate_tolerance, "Warning: relative error of the rate", 0, 1),
-    Row("diagnostics.age_warn", LIMITS.age_warn, "Warning: age of the samples (p99), s", 0, 60),
-    Row("diagnostics.age_error", LIMITS.age_error, "Error: age of the samples (p99), s", 0, 60),
-    Row("diagnostics.lost_warn", LIMITS.lost_warn, "Warning: samples lost or skipped in 1 s", 1, 10**6),
-    Row("diagnostics.temperature_warn", LIMITS.temperature_warn, "Warning: temperature, °C", -40, 200),
-    Row("diagnostics.temperature_error", LIMITS.temperature_error, "Error: temperature, °C", -40, 200),
-    Row("tool_mass", 0.0, "Mass of what hangs on the sensor, kg; 0 = it is not compensated", 0, 1000),
-    Row("tool_center_of_gravity", ZERO, "Its center of gravity in frame_id, m", 0, 10),
-    Row("tool_inertia", NO_PAYLOAD.inertia,
-        "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = a point mass", 0, 1e3),
-    Row("gravity", DEFAULT_GRAVITY,
-        "Gravity, m/s², in the base frame: that of the orientations", 0, 100),
-    Row("bias", (0.0,) * 6,
-        "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6),
-    Row("sensor_offset", (math.inf,) * 6,
-        "The sensor's own offset (0x8000) that bias goes with, N and Nm; infinite = that at the start; "
-        "~/identify finds it", 0, math.inf),
-    Row("bias_ramp_time", 0.5, "Seconds in which a new bias replaces the old one; 0 = at once", 0, 60),
-    Row("imu_position", ZERO,
-        "Position in frame_id of the IMU that gravity_source names, m; zeros = that of the sensor's model",
-        0, 1),
-    Row("on_saturation", "publish",
-        "What wrench_compensated does on samples whose force or torque is saturated",
-        choices=("publish", "stop")),
-    Row("gravity_source", "imu",
-        "Where the tool's weight and inertia are from: the sensor's IMU, or the robot (topics, TF)",
-        choices=("none", "imu", *TOPIC_SOURCES, "tf")),
-    Row("orientation.topic", "orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}"),
-    Row("orientation.base_frame", "base_link", "Frame that gravity is given in, for the source tf"),
-    Row("orientation.mounting", (0.0, 0.0, 0.0, 1.0),
-        "Quaternion x y z w: frame_id in the frame of the topic", 0, 1),
-    Row("orientation.stale_after", 0.1,
-        "Largest difference of the stamps of orientation and sample, s", 0.001, 10),
-    Row("accelerometer.offset", ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5),
-    Row("accelerometer.scale", EXACT.scale, "Its scale factors; ~/identify finds them", 0.5, 2),
-    Row("accelerometer.offset_interval", EXACT.offset_interval,
-        "Half of the 95 % interval of its offset, m/s²; ~/identify finds it", 0, 5),
-    Row("accelerometer.scale_interval", EXACT.scale_interval,
-        "Half of the 95 % interval of its scale; ~/identify finds it", 0, 1),
-    Row("accelerometer.cross_axis", EXACT.cross_axis,
-        "Parts of other axes to subtract: xy xz yx yz zx zy; ~/identify finds them", 0, 1),
-    Row("accelerometer.cross_axis_interval", EXACT.cross_axis_interval,
-        "Half of their 95 % intervals; ~/identify finds them", 0, 1),
-    Row("rest.duration", 1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60),
-    Row("rest.force_deviation", _REST.force_deviation, "Largest standard deviation at rest, N", 0, 1e3),
-    Row("rest.torque_deviation", _REST.torque_deviation, "Largest standard deviation at rest, Nm", 0, 1e3),
-    Row("rest.force_drift", _REST.force_drift, "Largest drift of the mean at rest, N", 0, 1e3),
-    Row("rest.torque_drift", _REST.torque_drift, "Largest drift of the mean at rest, Nm", 0, 1e3),
-    Row("rest.angular_rate", _REST.angular_rate, "Largest mean angular rate at rest, rad/s", 0, 10),
-    Row("rest.angular_rate_deviation", _REST.angular_rate_deviation,
-        "Largest standard deviation at rest, rad/s", 0, 10),
-    Row("rest.acceleration_deviation", _REST.acceleration_deviation,
-        "Largest standard deviation at rest, m/s²", 0, 100),
-    Row("rest.acceleration_drift", _REST.acceleration_drift,
-        "Largest drift of the mean at rest, m/s²", 0, 100),
-    Row("filter.cutoff", 0.0, "Low-pass of wrench_filtered, -3 dB, Hz; 0 = no such topic", 0, 1000),
-    Row("identify.file", AUTO,
-        "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bota-ethercat-bridge "
-        "of $XDG_STATE_HOME or ~/.local/state"),
-)  # fmt: skip
-
-
 class WrenchFrame(NamedTuple):
     """A frame of the compensated wrench besides the sensor's, and the end of a topic's name."""
 
@@ -216,95 +119,180 @@ class WrenchFrame(NamedTuple):
     fixed: WrenchTransform | None = None  # from `frame_id` to it; None: from TF
 
 
-class Parameters(NamedTuple):
-    """The parameters' values, checked; `a.b` is `a_b`, unless it is part of a group that has its own type."""
+def _row(default: Any, description: str, *bounds: float, **more: Any) -> Any:
+    return field(default=default, metadata={"row": (default, description, *bounds), "more": more})
 
-    server_host: str
-    server_port: int
-    sensor: int
-    terminals: int
-    rt_priority: int
-    cpu: int
-    publishing_frequency: float
-    array_topic: str
-    lifecycle: bool
-    supervisor_topic: str
-    stamp: str
-    imu_units: ImuUnits
-    frame_id: str
-    imu_frame_id: str
-    orientation_covariance: Numbers
-    angular_velocity_covariance: Numbers
-    linear_acceleration_covariance: Numbers
-    temperature_variance: float
-    limits: Limits
-    wrench_frames: tuple[WrenchFrame, ...]
-    tf_wait: float
-    payload: Payload
-    gravity: Vector3
-    bias: Wrench
-    sensor_offset: Wrench | None
-    bias_ramp_time: float
-    imu_position: Vector3
-    on_saturation: str
-    gravity_source: str
-    orientation_topic: str
-    orientation_base_frame: str
-    orientation_mounting: Quaternion
-    orientation_stale_after: float
-    accelerometer: Accelerometer
-    rest_duration: float
-    rest: StationaryLimits
-    filter_cutoff: float
-    identify_file: str
+
+@dataclass(frozen=True)
+class Parameters:
+    """All parameters with their values, checked one by one; `gather` checks them together.
+
+    The parameter of `group_name` is `group.name`, for the prefixes in _GROUPS.
+    """
+
+    # fmt: off
+    server_host: str = _row("localhost", "Host that ethercat-server runs on", live=False)
+    server_port: int = _row(_PORT, "TCP port of ethercat-server", 1, 65535, live=False)
+    SERVER_PORT: int = _row(0, "Another name for server_port; 0 = not used", 0, 65535, live=False)
+    sensor: int = _row(0, "The sensor's position on the bus, from 0", 0, 255, live=False)
+    terminals: int = _row(0, "How many of the server's terminals are published: terminal_0, terminal_1, ...",
+        0, 255, live=False)
+    rt_priority: int = _row(0,
+        "SCHED_FIFO priority of the stream's thread, if allowed; 0 = as the node was started",
+        0, HIGHEST_PRIORITY, live=False)
+    cpu: int = _row(-1, "CPU of the stream's thread; -1 = any", -1, 1023, live=False)
+    publishing_frequency: float = _row(0.0, "Most messages a second, no low-pass; 0 = every sample", 0, 1e6)
+    array_topic: str = _row("sensone_sensor_data", "Topic of the Float64MultiArray", live=False)
+    lifecycle: bool = _row(False, "Managed by transitions (configure, activate); false = active at once",
+        live=False)
+    supervisor_topic: str = _row("/supervisor_status_data", "Topic that stops server and node; empty = none",
+        live=False, optional=True)
+    stamp: str = _row("sample",
+        "What stamps are the time of: the sample, or the measurement, earlier by the sensor's filter delay",
+        choices=("sample", "measurement"))
+    frame_id: str = _row("ft_sensor",
+        "Frame of the wrench (its origin is the sensor's) and of the temperature",
+        live=False)
+    wrench_frames: tuple[str, ...] = _row(NO_TEXTS,
+        "Frames of wrench_compensated/NAME: NAME (by TF), or 'NAME x y z [qx qy qz qw]' in frame_id, m",
+        live=False)
+    imu_frame_id: str = _row("ft_sensor_imu", "Frame of the IMU's messages", live=False)
+    imu_raw_units: str = _row(ImuUnits.G_DPS.value, "What the sensor sends acceleration and angular rate in",
+        choices=tuple(units.value for units in ImuUnits), live=False)
+    orientation_covariance: Vector3 = _row(ZERO,
+        "Variances of the IMU's orientation, rad²; 0 = unknown", 0, 1e12)
+    angular_velocity_covariance: Vector3 = _row(ZERO, "Its variances, (rad/s)²; 0 = unknown", 0, 1e12)
+    linear_acceleration_covariance: Vector3 = _row(ZERO, "Its variances, (m/s²)²; 0 = unknown", 0, 1e12)
+    temperature_variance: float = _row(0.0, "Of the temperature, K²; 0 = unknown", 0, 1e6)
+    # Those limits of every verdict that can be set for this node.
+    diagnostics_stale_after: float = _row(LIMITS.stale_after, "Error: no new sample for so many s", 0.05, 60)
+    diagnostics_rate_tolerance: float = _row(LIMITS.rate_tolerance,
+        "Warning: relative error of the rate", 0, 1)
+    diagnostics_age_warn: float = _row(LIMITS.age_warn, "Warning: age of the samples (p99), s", 0, 60)
+    diagnostics_age_error: float = _row(LIMITS.age_error, "Error: age of the samples (p99), s", 0, 60)
+    diagnostics_lost_warn: int = _row(LIMITS.lost_warn, "Warning: samples lost or skipped in 1 s", 1, 10**6)
+    diagnostics_temperature_warn: float = _row(LIMITS.temperature_warn, "Warning: temperature, °C", -40, 200)
+    diagnostics_temperature_error: float = _row(LIMITS.temperature_error, "Error: temperature, °C", -40, 200)
+    tool_mass: float = _row(0.0, "Mass of what hangs on the sensor, kg; 0 = it is not compensated", 0, 1000)
+    tool_center_of_gravity: Vector3 = _row(ZERO, "Its center of gravity in frame_id, m", 0, 10)
+    tool_inertia: Numbers = _row(NO_PAYLOAD.inertia,
+        "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = a point mass", 0, 1e3)
+    gravity: Vector3 = _row(DEFAULT_GRAVITY,
+        "Gravity, m/s², in the base frame: that of the orientations", 0, 100)
+    bias: Numbers = _row((0.0,) * 6,
+        "Subtracted from the wrench: Fx Fy Fz (N) Mx My Mz (Nm); ~/tare sets it", 0, 1e6)
+    sensor_offset: Numbers = _row((math.inf,) * 6,
+        "The sensor's own offset (0x8000) that bias goes with, N and Nm; infinite = that at the start; "
+        "~/identify finds it", 0, math.inf)
+    bias_ramp_time: float = _row(0.5, "Seconds in which a new bias replaces the old one; 0 = at once", 0, 60)
+    imu_position: Vector3 = _row(ZERO,
+        "Position of the sensor's IMU in frame_id, m; zeros = that of its model", 0, 1)
+    on_saturation: str = _row("publish",
+        "What wrench_compensated does on samples whose force or torque is saturated",
+        choices=("publish", "stop"))
+    gravity_source: str = _row("imu",
+        "Where the tool's weight and inertia are from: the sensor's IMU, or the robot (topics, TF)",
+        choices=("none", "imu", *TOPIC_SOURCES, "tf"))
+    orientation_topic: str = _row("orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}")
+    orientation_base_frame: str = _row("base_link", "Frame that gravity is given in, for the source tf")
+    orientation_mounting: Quaternion = _row((0.0, 0.0, 0.0, 1.0),
+        "Quaternion x y z w: frame_id in the frame of the topic", 0, 1)
+    orientation_stale_after: float = _row(0.1,
+        "Largest difference of the stamps of orientation and sample, s", 0.001, 10)
+    accelerometer_offset: Vector3 = _row(ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5)
+    accelerometer_scale: Vector3 = _row(EXACT.scale, "Its scale factors; ~/identify finds them", 0.5, 2)
+    accelerometer_offset_interval: Vector3 = _row(EXACT.offset_interval,
+        "Half of the 95 % interval of its offset, m/s²; ~/identify finds it", 0, 5)
+    accelerometer_scale_interval: Vector3 = _row(EXACT.scale_interval,
+        "Half of the 95 % interval of its scale; ~/identify finds it", 0, 1)
+    accelerometer_cross_axis: Numbers = _row(EXACT.cross_axis,
+        "Parts of other axes to subtract: xy xz yx yz zx zy; ~/identify finds them", 0, 1)
+    accelerometer_cross_axis_interval: Numbers = _row(EXACT.cross_axis_interval,
+        "Half of their 95 % intervals; ~/identify finds them", 0, 1)
+    rest_duration: float = _row(1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60)
+    rest_force_deviation: float = _row(_REST.force_deviation, "Largest standard deviation at rest, N", 0, 1e3)
+    rest_torque_deviation: float = _row(_REST.torque_deviation,
+        "Largest standard deviation at rest, Nm", 0, 1e3)
+    rest_force_drift: float = _row(_REST.force_drift, "Largest drift of the mean at rest, N", 0, 1e3)
+    rest_torque_drift: float = _row(_REST.torque_drift, "Largest drift of the mean at rest, Nm", 0, 1e3)
+    rest_angular_rate: float = _row(_REST.angular_rate, "Largest mean angular rate at rest, rad/s", 0, 10)
+    rest_angular_rate_deviation: float = _row(_REST.angular_rate_deviation,
+        "Largest standard deviation at rest, rad/s", 0, 10)
+    rest_acceleration_deviation: float = _row(_REST.acceleration_deviation,
+        "Largest standard deviation at rest, m/s²", 0, 100)
+    rest_acceleration_drift: float = _row(_REST.acceleration_drift,
+        "Largest drift of the mean at rest, m/s²", 0, 100)
+    filter_cutoff: float = _row(0.0, "Low-pass of wrench_filtered, -3 dB, Hz; 0 = no such topic", 0, 1000)
+    identify_file: str = _row(AUTO,
+        "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bota-ethercat-bridge "
+        "of $XDG_STATE_HOME or ~/.local/state")
+    # fmt: on
+
+    @cached_property
+    def frames(self) -> tuple[WrenchFrame, ...]:
+        return parse_frames(self.wrench_frames)
+
+    @cached_property
+    def limits(self) -> Limits:
+        return LIMITS._replace(**self._group("diagnostics_"))
+
+    @cached_property
+    def payload(self) -> Payload:
+        return Payload(self.tool_mass, self.tool_center_of_gravity, self.tool_inertia)
+
+    @cached_property
+    def accelerometer(self) -> Accelerometer:
+        return Accelerometer(**self._group("accelerometer_"))
+
+    @cached_property
+    def rest(self) -> StationaryLimits:
+        given = self._group("rest_")
+        return StationaryLimits(**{name: given[name] for name in given if name != "duration"})
+
+    @cached_property
+    def mounting(self) -> Quaternion:
+        """`orientation.mounting`, exactly one long; ValueError."""
+        return unit_quaternion(self.orientation_mounting)
+
+    def _group(self, prefix: str) -> dict[str, Any]:
+        names = (each.name for each in fields(self) if each.name.startswith(prefix))
+        return {name.removeprefix(prefix): getattr(self, name) for name in names}
+
+
+PARAMETERS: Final = tuple(
+    Row(_GROUPS.sub(r"\1.", each.name), *each.metadata["row"], **each.metadata["more"])
+    for each in fields(Parameters)
+)
 
 
 def gather(given: Mapping[str, Any]) -> Parameters:
-    """From checked values by the rows' names; ParameterError if they do not go together."""
-    values = dict(given)
-    port, alias = values["server_port"], values.pop("SERVER_PORT")
-    if alias:
-        if port not in (_PORT, alias):
-            raise ParameterError(
-                f"parameters server_port is {port} and SERVER_PORT is {alias}: they are one thing, give one"
-            )
-        values["server_port"] = alias
-    for name in ("frame_id", "imu_frame_id", "orientation.base_frame"):
-        _refuse_slash(f"parameter {name} is", values[name])
-    gravity, mounting = values["gravity"], values["orientation.mounting"]
-    if length(gravity) < _LEAST_GRAVITY:
+    """From checked values by the parameters' names; ParameterError if they do not go together."""
+    values = {name.replace(".", "_"): value for name, value in given.items()}
+    port, alias = values["server_port"], values["SERVER_PORT"]
+    if alias and port not in (_PORT, alias):
         raise ParameterError(
-            f"parameter gravity is {list(gravity)}: it must be at least {_LEAST_GRAVITY} m/s² long; for no "
-            "compensation of gravity set tool_mass to 0"
+            f"parameters server_port is {port} and SERVER_PORT is {alias}: they are one thing, give one"
+        )
+    parameters = Parameters(**values | {"server_port": alias or port})
+    for name in ("frame_id", "imu_frame_id", "orientation.base_frame"):
+        _refuse_slash(f"parameter {name} is", given[name])
+    if length(parameters.gravity) < _LEAST_GRAVITY:
+        raise ParameterError(
+            f"parameter gravity is {list(parameters.gravity)}: it must be at least {_LEAST_GRAVITY} m/s² "
+            "long; for no compensation of gravity set tool_mass to 0"
         )
     try:
-        values["orientation.mounting"] = unit_quaternion(mounting)
+        assert parameters.mounting
     except ValueError as error:
-        raise ParameterError(f"parameter orientation.mounting is {list(mounting)}: {error}") from None
-    if 0.0 < (cutoff_hz := values["filter.cutoff"]) < LEAST_CUTOFF_HZ:
+        mounting = list(parameters.orientation_mounting)
+        raise ParameterError(f"parameter orientation.mounting is {mounting}: {error}") from None
+    if 0.0 < (cutoff_hz := parameters.filter_cutoff) < LEAST_CUTOFF_HZ:
         raise ParameterError(
             f"parameter filter.cutoff is {cutoff_hz:g}: it must be 0, for none, or at least "
             f"{LEAST_CUTOFF_HZ:g} Hz"
         )
-
-    def group(prefix: str) -> dict[str, Any]:
-        return {name.removeprefix(prefix): values.pop(name) for name in given if name.startswith(prefix)}
-
-    rest, offset = group("rest."), values.pop("sensor_offset")
-    groups: dict[str, Any] = {
-        "limits": LIMITS._replace(**group("diagnostics.")),
-        "imu_units": ImuUnits(values.pop("imu_raw_units")),
-        "wrench_frames": parse_frames(values.pop("wrench_frames")),
-        "payload": Payload(
-            *(values.pop(f"tool_{name}") for name in ("mass", "center_of_gravity", "inertia"))
-        ),
-        "bias": Wrench.of(values.pop("bias")),
-        "sensor_offset": Wrench.of(offset) if all(map(math.isfinite, offset)) else None,
-        "accelerometer": Accelerometer(**group("accelerometer.")),
-        "rest_duration": rest.pop("duration"),
-        "rest": StationaryLimits(**rest),
-    }
-    return Parameters(**groups, **{name.replace(".", "_"): value for name, value in values.items()})
+    parse_frames(parameters.wrench_frames)
+    return parameters
 
 
 def _refuse_slash(what: str, frame: str) -> None:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ROS messages of what the sensor measures, which are published in serialized form.
+"""The ROS messages of what the sensor measures, in serialized form, and of the server's terminals; the QoS
+of every topic (`create_publisher`).
 
 An output's `publish` runs in the reader's thread, for every selected sample and only while somebody has
 subscribed, so it must not block and should not allocate.
@@ -15,10 +16,11 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import Imu, Temperature
+from sensor_msgs.msg import Imu, JointState, Temperature
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension
 
-from bota_ethercat.framing import DataMessage
+from bota_ethercat.client.client import Client
+from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.pdo import Sample
 from bridge.parameters.table import Numbers, Parameters
 from bridge.rclpy_internals import packer
@@ -48,16 +50,11 @@ class Topic:
     """A publisher, and whether anybody has subscribed."""
 
     def __init__(self, node: Node, message_type: Any, topic: str) -> None:
-        self._node, self._publisher = node, create_publisher(node, message_type, topic)
+        self._publisher = create_publisher(node, message_type, topic)
         self._send: Send = self._publisher.publish
 
     def is_wanted(self) -> bool:
-        """Whether anybody has subscribed."""
         return bool(self._publisher.get_subscription_count())
-
-    def close(self) -> None:
-        """Advertise it no more; a message that is being published raises InvalidHandle."""
-        self._node.destroy_publisher(self._publisher)
 
 
 class Stamps:
@@ -70,7 +67,6 @@ class Stamps:
         self._log = log
 
     def update(self, kind: str, link: Link) -> None:
-        """The parameter or the filters may have changed; from any thread."""
         self.kind = kind
         if not link.is_connected:
             return
@@ -100,15 +96,13 @@ class MeasuredTopic(Topic):
         self.configure(parameters)
 
     def configure(self, parameters: Parameters) -> None:
-        """Take these covariances."""
         self.publish = self._make(self._send, parameters, self._stamps)
 
-    def follow(self, sample: Sample, frame: DataMessage) -> None:
+    def observe(self, sample: Sample, frame: DataMessage) -> None:
         """Nothing: each message stands by itself."""
 
 
 def make_measured(node: Node, parameters: Parameters, stamps: Stamps) -> list[Output]:
-    """The topics of what the sensor measures, `wrench` first."""
     wrench, motion = ("force", "torque"), ("acceleration", "angular_rate")
     topics: tuple[tuple[str, Any, Sequence[str], Make], ...] = (
         ("wrench", WrenchStamped, wrench, _wrench),
@@ -164,5 +158,31 @@ def _temperature(send: Send, parameters: Parameters, _: Stamps) -> Publish:
 
 
 def _covariance(variances: Numbers) -> Numbers:
-    """The nine numbers of a covariance, row by row."""
     return tuple(variances[position // 4] if position % 4 == 0 else 0.0 for position in range(9))
+
+
+class TerminalTopics:
+    """`terminal_N`, and `terminal_N/stamped` with names, fed by the reader's thread with valid frames."""
+
+    def __init__(self, node: Node, count: int, client: Client) -> None:
+        self._client = client
+        types = {"": Float64MultiArray, "/stamped": JointState}
+        self._topics = [
+            [create_publisher(node, kind, f"terminal_{n}{name}") for name, kind in types.items()]
+            for n in range(count)
+        ]
+
+    def publish(self, frame: TerminalMessage) -> None:
+        """All entries in the order of the process data, as numbers without a unit."""
+        values = self._client.decode_terminal(frame)
+        names, numbers, size = list(values), list(map(float, values.values())), len(values)
+        for topic in self._topics[frame.sensor] if frame.sensor < len(self._topics) else ():
+            if not topic.get_subscription_count():
+                continue
+            if topic.msg_type is JointState:
+                message = JointState(name=names, position=numbers)
+                message.header.stamp.sec, message.header.stamp.nanosec = divmod(frame.stamp_ns, 10**9)
+            else:
+                message = Float64MultiArray(data=numbers)
+                message.layout.dim = [MultiArrayDimension(label=", ".join(names), size=size, stride=size)]
+            topic.publish(message)

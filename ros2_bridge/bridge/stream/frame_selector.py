@@ -55,7 +55,6 @@ class FrameSelector:
         self.passed_over: Sequence[DataMessage] = ()
 
     def limit(self, hz: float) -> None:
-        """Select at most this many a second, 0 = all; from any thread."""
         self._limit = RateLimit(hz) if hz > 0 else None
 
     def select(self, fresh: Sequence[DataMessage], now_ns: int) -> Sequence[DataMessage]:

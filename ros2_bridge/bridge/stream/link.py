@@ -72,13 +72,9 @@ class Link:
         self.epoch = 0  # raised by everything that interrupts the stream or changes its rate
 
     def connected(self, description: JsonObject) -> None:
-        """The stream begins."""
-        self.info = find_sensor(description, self.sensor)
-        self.connects += 1
-        self.since_s = self.clock.monotonic()
-        self.lost = None
-        self.epoch += 1
-        self.is_connected = True
+        self.info, self.lost = find_sensor(description, self.sensor), None
+        self.connects, self.epoch = self.connects + 1, self.epoch + 1
+        self.since_s, self.is_connected = self.clock.monotonic(), True
         self.on_change()
 
     @property
@@ -89,7 +85,6 @@ class Link:
         return no_server(self.address, self.problem)
 
     def disconnected(self, event: Disconnected) -> None:
-        """There is no connection (any more)."""
         had, self.is_connected = self.is_connected, False
         self._change(settings={})
         self.problem, self.lost = event.reason, None
@@ -99,16 +94,13 @@ class Link:
             self.since_s = self.clock.monotonic()
             self.on_change()
 
-    def take_event(self, message: JsonObject) -> bool:
+    def handle_event(self, message: JsonObject) -> bool:
         """Learn from an event; False if it is of another sensor."""
         if message.get("sensor", self.sensor) != self.sensor:
             return False
         event = message.get("event")
-        if event == Event.SENSOR_LOST:
-            self.lost = event_sentence(message)
-            self.epoch += 1
-        elif event in (Event.SENSOR_BACK, Event.RECONFIGURED):
-            self.lost = None
+        if event in (Event.SENSOR_LOST, Event.SENSOR_BACK, Event.RECONFIGURED):
+            self.lost = event_sentence(message) if event == Event.SENSOR_LOST else None
             self.epoch += 1
         elif event != Event.OFFSET_CHANGED:
             return True
@@ -145,42 +137,36 @@ class Link:
         except RefusedError as error:
             raise RequestRefusedError(f"{error} ({error.code})") from None
         except ConnectionFailedError as error:
-            if not self.ending and not isinstance(error, NoReplyError):
-                raise RequestFailedError(f"the server at {self.address} is gone: {error}") from None
-            why = "the node ends" if self.ending else f"no reply within {timeout_s:g} s"
-            raise RequestFailedError(
-                f"the server at {self.address} did not answer {action}: {why}; "
-                "whether it was done is not known"
-            ) from None
+            text = f"is gone: {error}"
+            if self.ending or isinstance(error, NoReplyError):
+                why = "the node ends" if self.ending else f"no reply within {timeout_s:g} s"
+                text = f"did not answer {action}: {why}; whether it was done is not known"
+            raise RequestFailedError(f"the server at {self.address} {text}") from None
 
-    def shut_server_down(self, timeout_s: float = SHUTDOWN_TIMEOUT_S) -> str:
-        """Ask the server to shut down; a sentence.
+    def shut_server_down(self) -> str:
+        """Ask the server to shut down, over a connection made for this if there is none; a sentence.
 
         RequestRefusedError if it refuses, RequestFailedError if its answer is unknown.
-        Where there is no connection it makes one attempt of its own.
         """
-        client, address = self.client, self.address
+        host, port = self.client.address
         try:
             if self.is_connected:
-                client.ask("shutdown", timeout_s)
+                self.client.ask("shutdown", SHUTDOWN_TIMEOUT_S)
             else:
-                host, port = client.address
                 with Client(port, host, stream=False, reconnect=False) as own:
-                    own.connect().ask("shutdown", timeout_s)
+                    own.connect().ask("shutdown", SHUTDOWN_TIMEOUT_S)
         except RefusedError as error:
-            raise RequestRefusedError(
-                f"the server at {address} refused to shut down: {error} ({error.code})"
-            ) from None
+            text = f"the server at {self.address} refused to shut down: {error} ({error.code})"
+            raise RequestRefusedError(text) from None
         except ConnectionFailedError as error:
             why = f"could not be told to shut down: {error}"
             if isinstance(error, NoReplyError):
                 why = "did not answer the request to shut down"
-            raise RequestFailedError(f"the server at {address} {why}") from None
-        return f"the server at {address} is shutting down"
+            raise RequestFailedError(f"the server at {self.address} {why}") from None
+        return f"the server at {self.address} is shutting down"
 
 
 def offset_text(offset: object) -> str:
-    """An offset from a message for people."""
     known = known_six(offset)
     return "unknown" if known is None else wrench_text(Wrench.of(known))
 

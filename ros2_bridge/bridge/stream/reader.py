@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import struct
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, Protocol
@@ -21,7 +20,7 @@ from bota_ethercat.control import Event
 from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import no_server
-from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
+from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.replies import LONGEST_MS
 from bota_ethercat.text.untrusted import rows
 from bridge.parameters.table import Parameters
@@ -38,65 +37,17 @@ _MOST_NOTED: Final = 8192
 
 
 class Flags(NamedTuple):
-    """The fields of the process data that say how the sensor is."""
+    """The fields of a sample that say how the sensor is: its last ones."""
 
-    status: int = 0
-    warnings: int = 0
-    force_torque_saturated: int = 0
-    acceleration_saturated: int = 0
-    angular_rate_saturated: int = 0
-
-    def merge(self, other: tuple[int, ...]) -> Flags:
-        """What is set in either."""
-        return Flags(*(mine | theirs for mine, theirs in zip(self, other, strict=True)))
+    status: int
+    warnings: int
+    force_torque_saturated: int
+    acceleration_saturated: int
+    angular_rate_saturated: int
 
 
-_BASE: Final = LAYOUTS[min(LAYOUTS)]
-# Of every size of process data, which all begin alike: the flags, and nothing of the rest.
-_FLAGS: Final = struct.Struct(
-    "<" + "".join(f.type.value if f.name in Flags._fields else f"{f.type.size}x" for f in _BASE.fields)
-)
-_FORCE_TORQUE: Final = Flags._fields.index("force_torque_saturated")
-
-
-class Watch:
-    """What the hot path notes for the diagnostics: the sensor's flags and the samples' ages. No locks.
-
-    `see` is for the reader, `take_flags` and `take_ages` are for the monitor: a deque's append and popleft
-    are atomic.
-    """
-
-    def __init__(self) -> None:
-        self._seen = self._current = tuple(Flags())
-        self._changes: deque[tuple[int, ...]] = deque(maxlen=_MOST_NOTED)
-        # Nanoseconds from a sample to the end of its publication, newest last.
-        self.ages: deque[int] = deque(maxlen=_MOST_NOTED)
-        self.sample: Sample | None = None  # the newest sample that was published
-        self.stamp_ns = 0  # its time, ns since the Unix epoch
-        self.saturated = 0  # samples whose force or torque was saturated
-
-    def see(self, frames: Sequence[DataMessage]) -> None:
-        """Note the flags of new frames, whether they are to be published or not."""
-        for frame in frames:
-            flags = _FLAGS.unpack_from(frame.process_data)
-            if flags != self._seen:
-                self._seen = flags
-                self._changes.append(flags)
-            if flags[_FORCE_TORQUE]:
-                self.saturated += 1
-
-    def take_flags(self) -> Flags:
-        """All that were set since the last call, if only for one frame, and those that are set now."""
-        merged = Flags(*self._current)
-        while self._changes:
-            self._current = self._changes.popleft()
-            merged = merged.merge(self._current)
-        return merged
-
-    def take_ages(self) -> list[int]:
-        """The ages since the last call, in ascending order."""
-        taken, self.ages = self.ages, deque(maxlen=_MOST_NOTED)
-        return sorted(taken)
+NO_FLAGS: Final = Flags(0, 0, 0, 0, 0)
+_FIRST_FLAG: Final = Sample._fields.index(Flags._fields[0])
 
 
 class Output(Protocol):
@@ -112,7 +63,7 @@ class Output(Protocol):
     def publish(self, sample: Sample, frame: DataMessage, /) -> None:
         """Publish `sample`, which came in `frame`: its stamp, and for intervals its monotonic time."""
 
-    def follow(self, sample: Sample, frame: DataMessage) -> None:
+    def observe(self, sample: Sample, frame: DataMessage) -> None:
         """Take note of a sample that `publishing_frequency` leaves out."""
 
     def configure(self, parameters: Parameters) -> None:
@@ -127,7 +78,7 @@ class Outputs:
         self.wanted: tuple[Output, ...] = ()
 
     def refresh(self) -> None:
-        """Look who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
+        """Ask who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
         self.wanted = tuple(output for output in self.all if output.is_wanted())
 
     def publish_finite(self, sample: Sample, frame: DataMessage) -> None:
@@ -141,44 +92,45 @@ class Outputs:
 class Reader:
     """Feeds `outputs` from the server until `stop`. `on_failure` is called with an unexpected error.
 
-    `link` and `watch` are what other threads may read.
+    The monitor reads the attributes, `pop_flags` and `pop_ages`: append and popleft of a deque are atomic.
+
+    Attributes:
+        sample, stamp_ns: the newest that was published, and its time since the Unix epoch.
+        saturated: samples whose force or torque was saturated.
+        not_finite: samples that were not published for that.
     """
 
+    sample: Sample | None = None
+    stamp_ns = saturated = not_finite = 0
+
     def __init__(
-        self,
-        parameters: Parameters,
-        outputs: Outputs,
-        log: Any,
-        on_failure: Callable[[str], object],
-        *,
-        channel: Channel | None = None,
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> None:
-        """Tests give `channel` and `clock`."""
-        self._sensor = parameters.sensor
-        self._outputs = outputs
-        self._log = log
-        self.counts = FrameCounts()
-        self.not_finite = 0
-        self._decoders = {size: SampleDecoder(size, parameters.imu_units) for size in LAYOUTS}
+        self, parameters: Parameters, outputs: Outputs, log: Any, on_failure: Callable[[str], object], *,
+        channel: Channel | None = None, clock: Clock = SYSTEM_CLOCK,
+    ) -> None:  # fmt: skip
+        self._sensor, self._outputs, self._log = parameters.sensor, outputs, log
+        units = ImuUnits(parameters.imu_raw_units)
+        self._decode = {size: SampleDecoder(size, units).decode for size in LAYOUTS}
         self.client = Client(
             parameters.server_port, parameters.server_host, sensors=[self._sensor],
             terminals=range(parameters.terminals), channel=channel,
         )  # fmt: skip
         self._terminals = parameters.terminals
         self.on_terminal: Callable[[TerminalMessage], object] = lambda _: None  # gets their frames
+        self.counts = FrameCounts()
         self.accounting = self.client.session.state(self._sensor).accounting
         self.accounting.counts = self.counts
-        self._clock = clock
+        self._monotonic_ns = clock.monotonic_ns
         self.link = Link(self.client, self._sensor, clock)
-        self.watch = Watch()
+        self._flags: tuple[object, ...] = NO_FLAGS
+        self._flag_changes: deque[tuple[Any, ...]] = deque([NO_FLAGS], maxlen=_MOST_NOTED)
+        # Nanoseconds from a sample to the end of its publication, newest last.
+        self._ages: deque[int] = deque(maxlen=_MOST_NOTED)
         self._limit_hz = parameters.publishing_frequency
         self._selector = FrameSelector(self.counts, same_clock=True, limit_hz=self._limit_hz)
         self._problem: str | None = None
         self.thread = Worker("reader", self.run, on_failure)
 
     def stop(self) -> bool:
-        """Stop reading and wait for the thread; False if it does not end in time."""
         self.client.close()
         return self.thread.has_ended()
 
@@ -188,40 +140,56 @@ class Reader:
             self._limit_hz = hz
             self._selector.limit(hz)
 
+    def pop_flags(self, flags: Flags) -> Flags:
+        """`flags` and all that were set since the last call, if only for one sample, or are set now."""
+        changes = self._flag_changes
+        while True:
+            flags = Flags(*(mine | theirs for mine, theirs in zip(flags, changes[0], strict=True)))
+            if len(changes) == 1:
+                return flags
+            changes.popleft()
+
+    def pop_ages(self) -> list[int]:
+        """The ages since the last call, in ascending order."""
+        taken, self._ages = self._ages, deque(maxlen=_MOST_NOTED)
+        return sorted(taken)
+
     def run(self) -> None:
-        """Connect and read, again and again, until `stop`."""
         with contextlib.suppress(ConnectionFailedError):
             while True:
                 self.read(_WAIT_S)
 
     def read(self, timeout_s: float) -> None:
         """Publish what arrives within `timeout_s`; ConnectionFailedError once `client` has been closed."""
-        items = self.client.poll_all(timeout_s)
-        frames = []
-        for item in items:
+        frames: list[DataMessage] = []
+        for item in self.client.poll_all(timeout_s):
             if isinstance(item, DataMessage):
                 if item.sensor == self._sensor:
                     frames.append(item)
                 continue
+            if frames:
+                self._publish(frames)
+                frames = []
+            self._handle_event(item)
+        if frames:
             self._publish(frames)
-            frames = []
-            self._take_event(item)
-        self._publish(frames)
         while self.client.terminal_frames:
             frame = self.client.terminal_frames.popleft()
             if _FIRST_STAMP_NS <= frame.stamp_ns <= _LAST_STAMP_NS:
                 self.on_terminal(frame)
 
     def _publish(self, frames: Sequence[DataMessage]) -> None:
-        if not frames:
-            return
-        watch, monotonic_ns = self.watch, self._clock.monotonic_ns
-        watch.see(frames)
-        selected = self._selector.select(frames, monotonic_ns())
+        """Decode each sample once, and hand it on; those that are skipped as too old are not looked at."""
+        selected = self._selector.select(frames, self._monotonic_ns())
         for frame in self._selector.passed_over:
-            self._follow(frame)
+            sample = self._decoded(frame)
+            if sample.is_finite:
+                for output in self._outputs.wanted:
+                    output.observe(sample, frame)
+            else:
+                self.not_finite += 1
         for frame in selected:
-            sample = self._decoders[len(frame.process_data)].decode(frame.process_data)
+            sample = self._decoded(frame)
             if not _FIRST_STAMP_NS <= frame.stamp_ns <= _LAST_STAMP_NS:
                 self._log.warning(
                     f"a sample with the impossible time {frame.stamp_ns} ns was not published", **_SOMETIMES
@@ -229,7 +197,7 @@ class Reader:
             elif sample.is_finite:
                 for output in self._outputs.wanted:
                     output.publish(sample, frame)
-                watch.sample, watch.stamp_ns = sample, frame.stamp_ns
+                self.sample, self.stamp_ns = sample, frame.stamp_ns
             else:
                 self._outputs.publish_finite(sample, frame)
                 self.not_finite += 1
@@ -237,18 +205,19 @@ class Reader:
                     f"a sample with numbers that are not finite was not published ({self.not_finite} so far)",
                     **_SOMETIMES,
                 )
-            watch.ages.append(monotonic_ns() - frame.monotonic_ns)
+            self._ages.append(self._monotonic_ns() - frame.monotonic_ns)
 
-    def _follow(self, frame: DataMessage) -> None:
-        """A sample that the limit to the rate leaves out: some outputs go by all of them."""
-        sample = self._decoders[len(frame.process_data)].decode(frame.process_data)
-        if sample.is_finite:
-            for output in self._outputs.wanted:
-                output.follow(sample, frame)
-        else:
-            self.not_finite += 1
+    def _decoded(self, frame: DataMessage) -> Sample:
+        sample = self._decode[len(frame.process_data)](frame.process_data)
+        flags = sample[_FIRST_FLAG:]
+        if flags != self._flags:
+            self._flags = flags
+            self._flag_changes.append(flags)
+        if sample.force_torque_saturated:
+            self.saturated += 1
+        return sample
 
-    def _take_event(self, event: ClientEvent) -> None:
+    def _handle_event(self, event: ClientEvent) -> None:
         link = self.link
         if isinstance(event, Connected):
             self._selector = FrameSelector(
@@ -267,7 +236,7 @@ class Reader:
             self._log_problem(event)
         else:
             before = link.info.settings
-            if not link.take_event(event):
+            if not link.handle_event(event):
                 return
             text = sentence(event, before)
             # A line of source has one severity: rclpy insists.

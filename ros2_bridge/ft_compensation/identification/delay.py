@@ -34,8 +34,6 @@ _SMOOTHED: Final = 1.0  # times the ratio of the force's motion to its rate of c
 
 
 class Lag(NamedTuple):
-    """What a recording shows."""
-
     seconds: float  # by which force and torque come later than the accelerometer; negative: earlier
     interval_s: float  # 95 % interval: plus and minus
     explained: float  # part of the force's variance that the motion explains, 0 to 1
@@ -57,52 +55,55 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
     force, acceleration, rate = (at_times(times, stamps, columns) for columns in (force, acceleration, rate))
     products = (rate[:, :, None] * rate[:, None]).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
     turned = np.concatenate([np.gradient(rate, period, axis=0), products], axis=1)
-    # All alike, and so long that little noise is left in what the motion is regressed on: that would pull the
+    # All alike, and so long that little noise remains in what the motion is regressed on: that would pull the
     # lag. Noise would be least, and fit best, between two samples, too.
     slow = smoothed(force, hann_window(_SHORTEST_S, period))
     pace = float(np.linalg.norm(slow - slow.mean(axis=0)) / np.linalg.norm(np.gradient(slow, period, axis=0)))
     seconds = min(max(_SMOOTHED * pace, _SHORTEST_S), _LONGEST_S)
     window = hann_window(seconds, period)
     force, acceleration, turned = (smoothed(columns, window) for columns in (force, acceleration, turned))
-    looks = np.arange(times[0] + _LATEST_S + seconds, times[-1] + _EARLIEST_S - seconds, seconds / 4)
-    trend = np.linalg.qr(np.vander(looks - looks.mean(), _TREND))[0]  # a bias that drifts
+    instants = np.arange(times[0] + _LATEST_S + seconds, times[-1] + _EARLIEST_S - seconds, seconds / 4)
+    trend = np.linalg.qr(np.vander(instants - instants.mean(), _TREND))[0]  # a bias that drifts
 
-    def drawn(columns: Array) -> Array:
+    def detrended(columns: Array) -> Array:
         return np.asarray(columns - trend @ (trend.T @ columns))
 
-    force = drawn(at_times(looks, times, force))
+    force = detrended(at_times(instants, times, force))
 
-    def moved(lag: float) -> Array:
-        felt = at_times(looks - lag, times, acceleration), at_times(looks - lag + gyroscope_s, times, turned)
-        return drawn(np.concatenate(felt, axis=1))
+    def regressors(lag: float) -> Array:
+        felt = (
+            at_times(instants - lag, times, acceleration),
+            at_times(instants - lag + gyroscope_s, times, turned),
+        )
+        return detrended(np.concatenate(felt, axis=1))
 
-    def left(lag: float) -> float:
-        rows = moved(lag)
+    def residual(lag: float) -> float:
+        rows = regressors(lag)
         return float(((force - rows @ np.linalg.lstsq(rows, force, rcond=None)[0]) ** 2).sum())
 
     coarse = np.arange(_EARLIEST_S, _LATEST_S, max(period, 0.005))
-    best = lowest(left, float(coarse[np.argmin([left(lag) for lag in coarse])]), max(period, 0.005))
-    rows = moved(best)
+    best = lowest(residual, float(coarse[np.argmin([residual(lag) for lag in coarse])]), max(period, 0.005))
+    rows = regressors(best)
     tool = np.linalg.lstsq(rows, force, rcond=None)[0]
     total = float((force**2).sum())
-    explained = 1.0 - left(best) / total if total else 0.0
+    explained = 1.0 - residual(best) / total if total else 0.0
     if explained < _EXPLAINED:
         raise CompensationError(
             f"motion explains only {100 * explained:.0f} % of the force: shake the sensor with a tool on it "
             "that nothing touches"
         )
     # Of each part the lag that fits best beside it, from the slope of the specific force.
-    slope = ((moved(best - period) - moved(best + period)) / (2 * period)) @ tool
-    off = force - rows @ tool
+    slope = ((regressors(best - period) - regressors(best + period)) / (2 * period)) @ tool
+    residuals = force - rows @ tool
     lags = []
-    for part, rest in zip(np.array_split(slope, _PARTS), np.array_split(off, _PARTS), strict=True):
+    for part, rest in zip(np.array_split(slope, _PARTS), np.array_split(residuals, _PARTS), strict=True):
         steepness = float(((part - part.mean(axis=0)) ** 2).sum())
         lags.append(-float(((part - part.mean(axis=0)) * rest).sum()) / max(steepness, 1e-30))
     step = max(period, 0.002)
-    curve = max(left(best - step) - 2 * left(best) + left(best + step), 1e-300) / step**2
-    degrees = max(3 * (looks[-1] - looks[0]) / seconds - 3 * rows.shape[1], 1.0)
+    curve = max(residual(best - step) - 2 * residual(best) + residual(best + step), 1e-300) / step**2
+    degrees = max(3 * (instants[-1] - instants[0]) / seconds - 3 * rows.shape[1], 1.0)
     interval = _T_95 * max(
-        float(np.std(lags, ddof=1)) / math.sqrt(_PARTS), math.sqrt(2 * left(best) / (curve * degrees))
+        float(np.std(lags, ddof=1)) / math.sqrt(_PARTS), math.sqrt(2 * residual(best) / (curve * degrees))
     )
     if not interval < _WIDEST_S:
         raise CompensationError(
@@ -113,25 +114,22 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
 
 
 def hann_window(seconds: float, period: float) -> Array:
-    """Weights of a Hann window that is so long."""
     window = np.hanning(max(3, round(seconds / period) | 1) + 2)[1:-1]
     return np.asarray(window / window.sum())
 
 
 def smoothed(columns: Array, window: Array) -> Array:
-    """Columns convolved with a window."""
     return np.stack([np.convolve(column, window, "same") for column in columns.T], axis=1)
 
 
-def at_times(looks: Array, times: Array, columns: Array) -> Array:
-    """Columns at other times."""
-    return np.stack([np.interp(looks, times, column) for column in columns.T], axis=1)
+def at_times(instants: Array, times: Array, columns: Array) -> Array:
+    return np.stack([np.interp(instants, times, column) for column in columns.T], axis=1)
 
 
-def lowest(left: Callable[[float], float], start: float, step: float) -> float:
+def lowest(function: Callable[[float], float], start: float, step: float) -> float:
     """The minimum of a function near `start`, by parabolas."""
     for _ in range(6):
-        before, at, after = left(start - step), left(start), left(start + step)
+        before, at, after = function(start - step), function(start), function(start + step)
         curve = before - 2 * at + after
         start += step * min(max((before - after) / (2 * curve), -1.0), 1.0) if curve > 0 else 0.0
         step /= 2

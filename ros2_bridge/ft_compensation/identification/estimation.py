@@ -32,21 +32,14 @@ _LEAST_SHARE: Final = 0.3
 _NOTHING: Final = 1e-9  # kg: no mass at all has its center anywhere
 _OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
 _ROW, _OTHER = np.nonzero(~np.eye(3, dtype=bool))  # of the cross-axis terms, as CROSS_AXES
-_FARTHEST: Final = 0.3  # of an accelerometer's axes: farther off, it or the given gravity has other axes
 _LENGTH_ROUNDS: Final = 3
 _ROUNDS: Final = 9
 _CONVERGED: Final = 1e-7
 
 
 class Value(NamedTuple):
-    """Some estimated quantities."""
-
     value: Array
     half: Array  # half the width of the interval, of `CONFIDENCE`
-
-    def problem(self, which: int) -> Value:
-        """Of one of several independent problems."""
-        return Value(self.value[which], self.half[which])
 
 
 class Estimate(NamedTuple):
@@ -61,18 +54,6 @@ class Estimate(NamedTuple):
     gravity: Array  # (n, 3), m/s²: as far as known now
     residuals: Array  # (n, 6), N and Nm: measured minus modelled
     degrees: Array  # (6,): degrees of freedom of the residuals of each axis
-
-    def problem(self, which: int) -> Estimate:
-        """The answer to one of several independent problems."""
-        calibration = None
-        if self.calibration is not None:
-            offset, scale, cross = self.calibration
-            calibration = offset.problem(which), scale.problem(which), cross.problem(which)
-        return Estimate(
-            self.mass.problem(which), self.center.problem(which), self.bias.problem(which), calibration,
-            None if self.shift is None else self.shift.problem(which),
-            self.gravity[which], self.residuals[which].copy(), self.degrees[which],
-        )  # fmt: skip
 
 
 def estimate(
@@ -133,29 +114,6 @@ def estimate(
         gravity,
         wrench - np.swapaxes(_times(_design(gravity, regressor), answer[..., :linear]), -1, -2),
         solution.degrees[..., :6],
-    )
-
-
-def calibrate(acceleration: Array, gravity: Array) -> tuple[Value, Value, Value] | None:
-    """Offset, scale and cross-axis terms of an accelerometer that reads (n, 3) where gravity is known (n, 3).
-
-    Each axis of the specific force, -gravity, is an affine function of the three that are read, by least
-    squares, with an interval to first order. None where the poses do not determine them.
-    """
-    rows = np.column_stack([acceleration, np.ones(len(acceleration))])
-    degrees = len(rows) - 4
-    answer, _, rank, _ = np.linalg.lstsq(rows, -gravity, rcond=1e-3)
-    straight = answer[:3].T
-    if degrees < 1 or rank < 4 or not (np.abs(straight - np.eye(3)) < _FARTHEST).all():
-        return None
-    variance = ((gravity + rows @ answer) ** 2).sum(axis=0) / degrees
-    spread = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))[:, np.newaxis] * variance)
-    half = students_t(degrees) * spread
-    scale = 1.0 / np.diag(straight)
-    return (
-        Value(-np.linalg.solve(straight, answer[3]), half[3]),
-        Value(scale, np.diag(half) * scale**2),
-        Value(-straight[_ROW, _OTHER] * scale[_OTHER], half[_OTHER, _ROW] * scale[_OTHER]),
     )
 
 

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from ft_compensation.identification.estimation import Estimate, Value, calibrate, estimate
+from ft_compensation.identification.estimation import Estimate, Value, estimate
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
 from ft_compensation.identification.weighted import CONFIDENCE, Array
 from ft_compensation.quantities import (
@@ -55,8 +55,6 @@ class IdentificationError(CompensationError):
 
 
 class Fit(NamedTuple):
-    """How well force or torque fits."""
-
     rms: float  # of the residuals, with the degrees of freedom taken into account, N or Nm
     degrees: float  # of freedom
     # Squares of the residuals in units of what the windows' noise explains, per degree of freedom: 1 is
@@ -100,8 +98,8 @@ def identify(poses: Sequence[Pose]) -> Identified:
     """Mass, center of gravity and bias from `poses`.
 
     At least four, with gravity in directions that do not lie on one line; six with each axis of the sensor
-    once up and once down are best. If every pose has its `acceleration`, the accelerometer is identified too,
-    by gravity alone where that is from something else; if every one has its time, a drift of the bias.
+    once up and once down are best. If gravity is from the `acceleration` of every pose, the accelerometer is
+    identified too; if every pose has its time, a drift of the bias.
     IdentificationError, a sentence, where the poses do not suffice: by the intervals that result.
     """
     if len(poses) > MOST_POSES:
@@ -128,33 +126,25 @@ def identify(poses: Sequence[Pose]) -> Identified:
     gravity = float(np.linalg.norm(equations.gravity, axis=1).mean())
     weight = mass * gravity
     moment = weight * max(ARM, length(payload.center))
-    fits = []
-    for made, chosen in ((whole, np.ones(len(poses), bool)), (found, kept)):
-        few = [pose for pose, is_chosen in zip(poses, chosen, strict=True) if is_chosen]
-        forces, torques = made.residuals[chosen, :3], made.residuals[chosen, 3:]
-        fits.append(
-            (
-                judge(few, forces, made.degrees[:3], "force", weight),
-                judge(few, torques, made.degrees[3:], "torque", moment),
-            )
-        )
-    (of_all_force, of_all_torque), (force, torque) = fits
+    few = [pose for pose, is_kept in zip(poses, kept, strict=True) if is_kept]
+    force = judge(few, found.residuals[kept, :3], found.degrees[:3], "force", weight)
+    torque = judge(few, found.residuals[kept, 3:], found.degrees[3:], "torque", moment)
     most_force = _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight
     most_torque = _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment
-    _check_fit(of_all_force, touched, most_force, "N")
+    _check_fit(_residual(whole.residuals[:, :3], whole.degrees[:3]), touched, most_force, "N")
     if length(payload.center) > LARGEST_CENTRE:
         raise IdentificationError(
             f"the center of gravity would be {length(payload.center):.2g} m from the sensor with a mass of "
             f"{mass:.3g} kg, which cannot be: something held or touched the tool, or there is no tool"
         )
-    _check_fit(of_all_torque, touched, most_torque, "Nm")
+    _check_fit(_residual(whole.residuals[:, 3:], whole.degrees[3:]), touched, most_torque, "Nm")
     if mass_interval * gravity > most_force or length(centre_interval) * weight > most_torque:
         raise IdentificationError(
             f"the poses do not suffice: mass {mass:.2g} ± {mass_interval:.2g} kg, center of gravity "
             f"{_millimeters(payload.center, centre_interval)}; "
             f"{seen.next_pose if touched is None else touched}"
         )
-    accelerometer = _accelerometer(equations.calibrated(found))
+    accelerometer = _accelerometer(found.calibration)
     undetermined = accelerometer.undetermined if accelerometer else ""
     return Identified(
         payload,
@@ -180,16 +170,15 @@ def identify(poses: Sequence[Pose]) -> Identified:
 
 
 class _Equations:
-    """Those of some poses, in arrays."""
-
     def __init__(self, poses: Sequence[Pose]) -> None:
         self.wrench = np.array([pose.wrench.values for pose in poses])
         self.gravity = np.array([pose.gravity for pose in poses])
         read = [pose.acceleration for pose in poses if pose.acceleration is not None]
         self._acceleration = np.array(read) if len(read) == len(poses) else None
-        self._known = self._acceleration is not None and not np.allclose(
+        if self._acceleration is not None and not np.allclose(
             np.cross(self._acceleration, self.gravity), 0.0, atol=_PARALLEL
-        )
+        ):
+            self._acceleration = None  # gravity is known without it
         self._noise = float(
             np.mean([length(pose.acceleration_spread) ** 2 / 3.0 / pose.samples for pose in poses])
         )
@@ -200,15 +189,7 @@ class _Equations:
             self.minutes = (np.array(times) - times[-1]) / _SECONDS_A_MINUTE
 
     def solve(self, regressor: Array | None = None) -> Estimate:
-        """The estimate; of several regressors (k, n), each for itself."""
-        read = None if self._known else self._acceleration
-        return estimate(self.wrench, self.gravity, read, self._noise, regressor)
-
-    def calibrated(self, found: Estimate) -> tuple[Value, Value, Value] | None:
-        """Offset, scale and cross-axis terms of the accelerometer."""
-        if self._known and self._acceleration is not None:
-            return calibrate(self._acceleration, self.gravity)
-        return found.calibration
+        return estimate(self.wrench, self.gravity, self._acceleration, self._noise, regressor)
 
 
 class _Touched(NamedTuple):
@@ -220,7 +201,6 @@ class _Touched(NamedTuple):
     rest: Estimate  # by the others; the residuals are those of all
 
     def __str__(self) -> str:
-        """For people."""
         return (
             f"pose {self.pose + 1} does not fit the others, by {self.force:.2g} N and {self.torque:.2g} Nm, "
             "and is left out: if something touched the tool, take it again"
@@ -243,12 +223,11 @@ def _explained(equations: _Equations) -> tuple[Estimate, Wrench | None, _Touched
         if chance < min(_CHANCE, float(chances[which])):
             return drifting, Wrench.of(drifting.shift.value.tolist()), None
     assert without.shift is not None
-    off = without.shift.value[which]
+    pose, off = int(suspects[which]), without.shift.value[which]
     force, torque = float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
     weight = float(found.mass.value[0]) * STANDARD_GRAVITY
     if chances[which] < _CHANCE and force + torque / ARM > _NEGLIGIBLE * weight:
-        pose = int(suspects[which])
-        rest = without.problem(which)
+        rest = equations.solve(np.eye(count)[pose])
         rest.residuals[pose] += off
         return found, None, _Touched(pose, force, torque, rest)
     return found, None, None
@@ -301,19 +280,23 @@ def _check_mass(mass: float, interval: float) -> None:
         )
 
 
-def _check_fit(fit: Fit, touched: _Touched | None, limit: float, unit: str) -> None:
-    if fit.rms > limit:
+def _residual(residuals: Array, degrees: Array) -> float:
+    """Root mean square, with the degrees of freedom taken into account."""
+    return math.sqrt(float((residuals**2).sum()) / max(float(degrees.sum()), 1.0))
+
+
+def _check_fit(rms: float, touched: _Touched | None, limit: float, unit: str) -> None:
+    if rms > limit:
         again = "take all again" if touched is None else f"pose {touched.pose + 1} fits worst: take it again"
         raise IdentificationError(
-            f"the poses do not fit one payload: the residual is {fit.rms:.2g} {unit}, the limit {limit:.2g} "
+            f"the poses do not fit one payload: the residual is {rms:.2g} {unit}, the limit {limit:.2g} "
             f"{unit}; something touched the tool, or it moved; {again}"
         )
 
 
 def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, weight: float) -> Fit:
     """How `residuals` (n, 3) of "force" or "torque" fit; `weight` in N, or Nm at its arm."""
-    freedom = max(float(degrees.sum()), 1.0)
-    rms = math.sqrt(float((residuals**2).sum()) / freedom)
+    freedom, rms = max(float(degrees.sum()), 1.0), _residual(residuals, degrees)
     spread = np.array([getattr(pose, f"{name}_spread") for pose in poses])
     chi_square = None
     if spread.all():
@@ -327,7 +310,6 @@ def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, we
 
 
 def _misfit_notes(poses: Sequence[Pose], drift: Wrench | None, touched: _Touched | None) -> Iterator[str]:
-    """What was found that no noise explains."""
     if drift is not None:
         first, last = poses[0].up, poses[-1].up
         is_checked = sum(a * b for a, b in zip(first, last, strict=True)) > _SAME_POSE
@@ -341,7 +323,6 @@ def _misfit_notes(poses: Sequence[Pose], drift: Wrench | None, touched: _Touched
 
 
 def _fit_notes(fit: Fit, name: str, unit: str) -> Iterator[str]:
-    """Residuals that noise does not explain."""
     if fit.verdict == "large" and fit.chi_square is not None:
         yield (
             f"the residual {name}, {fit.rms:.2g} {unit}, is {math.sqrt(fit.chi_square):.0f} times what the "
@@ -350,14 +331,14 @@ def _fit_notes(fit: Fit, name: str, unit: str) -> Iterator[str]:
 
 
 def _other_notes(
-    mass: float, mass_half: float, centre_half: float, undetermined: str, seen: Coverage
+    mass: float, mass_half: float, center_half: float, undetermined: str, seen: Coverage
 ) -> Iterator[str]:
     """Of wide intervals, kg and m, and of axes, as in "xz", whose offset of the accelerometer is open."""
     more = "take more poses, or longer ones"
     if mass_half > 0.05 * mass:
         yield f"the mass is known to ± {100 * mass_half / mass:.0f} % only: {more}"
-    if centre_half > 0.01:
-        yield f"the center of gravity is known to ± {1000 * centre_half:.0f} mm only: {more}"
+    if center_half > 0.01:
+        yield f"the center of gravity is known to ± {1000 * center_half:.0f} mm only: {more}"
     if undetermined:
         yield (
             f"the poses do not determine the accelerometer's offset along {' and '.join(undetermined)}, so "

@@ -83,14 +83,12 @@ class Coverage(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """What is missing and what to do next, a sentence."""
         if self.missing is None:
             return f"the poses suffice; one more would help most: {self.next_pose}"
         return f"not enough yet: {self.missing}; {self.next_pose}"
 
 
 def coverage(poses: Sequence[Pose]) -> Coverage:
-    """What `poses` have seen."""
     if not poses:
         return Coverage(0, ZERO, "there is no pose yet", _sentence(np.array((0.0, 0.0, 1.0))))
     down = -np.array([pose.up for pose in poses])  # where gravity points in the sensor's frame
