@@ -1,4 +1,4 @@
-"""A scripted server in memory and in simulated time, and the `Channel` to it: no sockets, no threads."""
+"""A scripted server in memory and in simulated time, and the channel to it: no sockets, no threads."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable
 
+from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 from bota_ethercat.framing import FrameDecoder
 from tests.bridge.scripted_server import Script
@@ -47,18 +48,16 @@ class MemoryServer(Script):
         self.is_connected = False
 
 
-class ScriptedChannel:
-    """See `Channel`. Time passes while the client waits."""
-
-    is_near = True
-    own = ("memory", 0)
+class ScriptedChannel(TcpChannel):
+    """The channel to it. Time passes while the client waits."""
 
     def __init__(self, server: MemoryServer) -> None:
+        super().__init__("memory", 0)
+        self.is_near, self.monotonic_ns = True, server.monotonic_ns
         self._server = server
         self._requests = FrameDecoder()
-        self.monotonic_ns = server.monotonic_ns
 
-    def wait(self, event: threading.Event, seconds: float, /) -> bool:
+    def wait(self, event: threading.Event, seconds: float) -> bool:
         self._server.now_ns += math.ceil(max(seconds, 0.0) * 1e9)
         return event.is_set()
 

@@ -29,7 +29,7 @@ import pytest
 from bota_ethercat import address
 from bota_ethercat.address import boot_id
 from bota_ethercat.client import Client, Condition, Connected, Disconnected, NoSampleError, connect
-from bota_ethercat.client.channel import Channel, TcpChannel
+from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
@@ -671,7 +671,7 @@ PULLS: dict[str, tuple[Pull, str]] = {
 }
 
 
-def guard(channel: Channel | None = None, port: int = 1) -> Callable[[Callable[[str], object]], object]:
+def guard(channel: TcpChannel | None = None, port: int = 1) -> Callable[[Callable[[str], object]], object]:
     """The guard of the docs."""
     source = examples()[1]
     assert len(source.splitlines()) <= 15

@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import Final
 
 from bota_ethercat.address import Address
-from bota_ethercat.client.channel import RECEIVE_BUFFER, Channel, TcpChannel
+from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
 from bota_ethercat.client.reading import Condition, Reading
 from bota_ethercat.client.real_time import Scheduling, make_real_time
 from bota_ethercat.client.session import ClientEvent, Session, check_granted
@@ -109,7 +109,7 @@ class Client:
         imu_units: ImuUnits = ImuUnits.G_DPS,
         terminals: Sequence[int] = (),
         receive_buffer: int = RECEIVE_BUFFER,
-        channel: Channel | None = None,
+        channel: TcpChannel | None = None,
     ) -> None:
         """Nothing is sent yet.
 
@@ -129,7 +129,7 @@ class Client:
             terminals=terminals,
         )  # fmt: skip
         self.terminal_frames = self.session.terminal_frames
-        self.channel: Channel = TcpChannel(host, port, receive_buffer) if channel is None else channel
+        self.channel = TcpChannel(host, port, receive_buffer) if channel is None else channel
         self._reconnect, self._timeout_s = reconnect, timeout_s
         self._open = False
         self._failed: ProtocolError | None = None

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
-from bota_ethercat.client.channel import Channel
+from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.client.client import Client
 from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
 from bota_ethercat.control import Event
@@ -151,7 +151,7 @@ class Reader:
         log: Any,
         on_failure: Callable[[str], object],
         *,
-        channel: Channel | None = None,
+        channel: TcpChannel | None = None,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         """Tests give `channel` and `clock`."""
