@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from bota_ethercat.address import boot_id
+from bota_ethercat.address import Address, boot_id
 from bota_ethercat.control import request
 from bota_ethercat.framing import DataFlag, FrameDecoder, encode_json
 from bota_ethercat.text.json_text import JsonObject
@@ -37,7 +37,7 @@ from tests.clients.cpp_programs import (
     patient,
     start_driver,
 )
-from tests.clients.played_sensor import frame
+from tests.clients.played_sensor import described, frame, played
 from tests.golden_vectors import READ, ReadStream, odd_messages
 from tests.server.running import PATIENCE_S, free_port, full_listener, wait_until
 
@@ -281,7 +281,7 @@ def test_conversations(server: PlayedServer, options: Any, steps: list[Any]) -> 
 def test_it_subscribes_as_it_was_told(server: PlayedServer) -> None:
     with stream(server) as running:
         assert server.asked == request("subscribe", every=1, fresh_only=True)
-        assert running.info()["names"] == ["BFT-SENS-ECAT-M8"]
+        assert running.info()["sensor_count"] == 1
     with stream(server, sensor=3, every=7, fresh_only=0):
         assert server.asked == request("subscribe", every=7, fresh_only=False, sensors=[3])
 
@@ -301,7 +301,7 @@ def test_a_clock_that_is_shifted_is_another_one(server: PlayedServer) -> None:
             assert picked(running.latest(), "age_is_lower_bound") == (far,)
     finally:
         assert end_driver(process) == 0
-    name = "from bota_ethercat.address import boot_id; print(boot_id())"
+    name = "from bota_ethercat.address import Address, boot_id; print(boot_id())"
     done = subprocess.run(
         [*shifted, sys.executable, "-c", name], check=True, capture_output=True, text=True, cwd=ROOT
     )
@@ -558,3 +558,55 @@ def test_nothing_is_allocated_in_any_state(server: PlayedServer) -> None:
         told = running.info()
         assert (told["connections"], told["bad_messages"], told["link"]) == (2, 1, "down")
         assert (told["allocated"], told["allocates"]) == (0, True)
+
+
+# -- requests
+
+
+def test_describe_tare_and_refusals() -> None:
+    refused = {"ok": False, "error": {"code": "sensor", "message": "no object", "abort_code": 0x06020000}}
+    results = {
+        name: [at + n / 8 for n in range(6)]
+        for at, name in enumerate(("old_offset", "new_offset", "residual", "deviation"))
+    }
+    row = {"hardware": "h", "firmware": "f", "state": "OP"}
+    with played(**row) as sensor, driver(sensor.port) as running:
+        sensor.answers |= {
+            "tare": lambda _: {"ok": True, **results},
+            "sdo_read": lambda asked: {"ok": True, "value": 1} if asked.get("subindex") else refused,
+        }
+        told = running.do("describe")
+        wanted = {
+            name: described(**row)[name] for name in (*row, "sensor", "name", "serial", "pdo_size", "rate_hz")
+        }
+        assert (told["ok"], told["version"], told["sensors"]) == (True, "0.1.0", [wanted])
+        told = running.do("tare", 20, 1.5, -2, 0, 0.25, 0, 0)
+        assert sensor.requests[-1] == request(
+            "tare", sensor=0, samples=20, target=[1.5, -2, 0, 0.25, 0, 0]
+        )  # fmt: skip
+        assert told == {**results, "ok": True, "error": "", "code": "", "abort_code": 0}
+        told = running.do("ask", '{"action":"sdo_read","index":"0x8010","subindex":1,"id":[1,"é"]}')
+        assert (told["ok"], told["reply"]["value"], told["reply"]["id"]) == (True, 1, [1, "é"])
+        told = running.do("ask", '{"action":"sdo_read","index":"0x1234"}')
+        assert (told["ok"], told["code"], told["abort_code"]) == (False, "sensor", 0x06020000)
+        assert told["error"] == "no object"
+        assert "no JSON object" in running.do("ask", "{nonsense")["error"]
+    with driver(free_port()) as running:
+        for what in ("describe", "tare 10"):
+            told = running.do(what)
+            assert (told["ok"], "nobody listens there" in told["error"]) == (False, True)
+
+
+def test_a_server_is_named_as_in_the_other_programs() -> None:
+    texts = (
+        "robot", "robot:14101", "14101", ":14101", "[::1]", "[::1]:14101", "::1", "robot:", "robot:0", "0",
+        "robot:65535", "robot:65536", "robot:+1", "robot:1x", ":",
+    )  # fmt: skip
+    with driver(1) as running:
+        assert running.do("server") == [True, "localhost", 12001], "$BOTA_SERVER of the tests"
+        for text in texts:
+            try:
+                wanted = [True, *Address.parse(text)]
+            except ValueError:
+                wanted = [False, "localhost", 12001]
+            assert running.do("server", text) == wanted, text
