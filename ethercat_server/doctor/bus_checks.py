@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import Address
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health import history
+from bota_ethercat.health import sentences
 from bota_ethercat.health.judge import judge
 from bota_ethercat.health.observer import StreamObserver, by_sensor
 from bota_ethercat.health.verdict import LIMITS, Level
@@ -315,10 +315,10 @@ class ServerView:
                 self._take(frames, clock.monotonic_ns(), same_machine=sensors.client.session.same_machine)
                 for event in events:
                     if (position := position_of(event)) in self._observers:
-                        self._observers[position].said.take_event(event)
+                        self._observers[position].take_event(event)
                 unread = sensors.client.take_unread()
                 for each in self._observers.values():
-                    each.said.note_unread(unread, clock.monotonic_ns())
+                    each.note_unread(unread, clock.monotonic_ns())
                 if end.passed:
                     sensors.ask("unsubscribe")
                     break
@@ -328,14 +328,14 @@ class ServerView:
             self.described = sensors.describe().sensors
         for info in self.described:
             if info.sensor in self._observers:
-                self._observers[info.sensor].said.info = info
+                self._observers[info.sensor].info = info
         self._when = "" if self._own else " in the last 10 s"
         self._summaries = self.after if self._own else self.after.last_10s
 
     def _take_status(self, sensors: Sensors) -> Status:
         status = sensors.status()
         for position, observer in self._observers.items():
-            observer.said.take_status(status, position, sensors.clock.monotonic_ns())
+            observer.take_status(status, position, sensors.clock.monotonic_ns())
         return status
 
     def _take(self, frames: Sequence[DataMessage], now_ns: int, *, same_machine: bool) -> None:
@@ -371,7 +371,7 @@ class ServerView:
                 yield note(f"{text}, {lost} since its start", f"none meanwhile; {_LOG}", **values)
             else:
                 yield ok(f"{text}: {verdict.sentence[0].lower()}{verdict.sentence[1:]}", **values)
-            past, overloaded = history.overload(after)
+            past, overloaded = sentences.overload(after)
             if overloaded:
                 yield note(f"sensor {info.sensor} {past}", "have it checked")
 

@@ -6,18 +6,16 @@ Each is used if permitted; what is not is logged in one line and the server runs
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import gc
 import logging
 import os
-import resource
 import sys
 from pathlib import Path
 from typing import Final
 
+from bota_ethercat.program.real_time import make_real_time
+
 DEFAULT_PRIORITY: Final = 80  # SCHED_FIFO priority of the acquisition loop
-# MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: pages stay in memory once they have been used.
-_MLOCK: Final = 1 | 2 | 4
 _TIMER_SLACK_NS: Final = "1000"
 # Longest time the loop waits for another thread of this process; Python's default of 5 ms loses samples.
 _SWITCH_S: Final = 0.0002
@@ -33,25 +31,13 @@ def prepare(priority: int, cpu: int | None, *, becomes_user: bool = False) -> No
     `priority` is that of SCHED_FIFO, 1 to 99, or 0 for ordinary scheduling; `cpu` is the CPU to pin it to;
     `becomes_user` if the process gives up its capabilities afterwards, which ends none of it.
     """
-    refused = []
-    if cpu is not None:
-        try:
-            os.sched_setaffinity(0, {cpu})
-        except OSError:
-            refused.append(f"CPU {cpu}")
-    if priority:
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        except PermissionError:
-            refused.append(f"real-time priority {priority} (CAP_SYS_NICE)")
-        if missing := _lock_memory(becomes_user=becomes_user):
-            refused.append(f"locked memory ({missing})")
+    given = make_real_time(priority, -1 if cpu is None else cpu, drops_capabilities=becomes_user)
     if os.sched_getscheduler(0) != os.SCHED_FIFO:
         # By default an ordinary thread's sleep may end 50 µs late, a FIFO thread's not.
         with contextlib.suppress(OSError):
             Path("/proc/self/timerslack_ns").write_text(_TIMER_SLACK_NS, encoding="ascii")
-    if refused:
-        log.warning("not granted: %s; expect more jitter", ", ".join(refused))
+    if given.refused:
+        log.warning("not granted: %s; expect more jitter", "; ".join(given.refused))
     sys.setswitchinterval(_SWITCH_S)
     # The loop makes no reference cycles, so it needs no collector, which would pause it: a look at the newest
     # objects once a second is enough.
@@ -65,13 +51,3 @@ def leave() -> None:
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.sched_setaffinity(0, _ALL_CPUS)
-
-
-def _lock_memory(*, becomes_user: bool) -> str | None:
-    """The capability that is missing for it, None if memory is locked."""
-    try:
-        resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    except (OSError, ValueError):
-        if becomes_user:  # without CAP_IPC_LOCK every allocation beyond the limit would fail
-            return "CAP_SYS_RESOURCE"
-    return None if ctypes.CDLL(None).mlockall(_MLOCK) == 0 else "CAP_IPC_LOCK"

@@ -186,7 +186,7 @@ class Monitor:
         self._flags, link = Flags(), self._link
         self._unread = self._unread if self._is_silent else (0.0, False)
         self._then = self._counts
-        self._said.begin()
+        self._said.restart()
         if link.is_connected and not self._waiting:  # unless an answer is still owed
             self._asked_s = now_s
             try:

@@ -199,7 +199,7 @@ def test_a_refusal_is_a_warning_and_no_change(
         asked.append((priority, cpu, thread))
         return Scheduling(refused=(f"SCHED_FIFO {priority} (a remedy)",))
 
-    monkeypatch.setattr("bota_ethercat.client.real_time.make_real_time", refuse)
+    monkeypatch.setattr("bota_ethercat.program.real_time.make_real_time", refuse)
     lines = Log(None)
     process.prepare(0, -1, lines)  # nothing is asked for
     assert not lines.lines

@@ -34,7 +34,6 @@ patient: Final = pytest.mark.timeout(300)
 STRICT: Final = ("-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZED: Final = ("-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 FAST: Final = (*SANITIZED, "-O2", "-ffast-math")
-"""As many controllers are built: what the compiler assumes then must not hide a NaN."""
 # System calls that the driver counts, and the clock, which it can set.
 WRAPPED: Final = (
     "socket", "connect", "close", "poll", "ppoll", "setsockopt", "getsockopt", "send", "recv",

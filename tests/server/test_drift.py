@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from bota_ethercat.health import history as words
+from bota_ethercat.health import sentences as words
 from bota_ethercat.health.judge import Observation, judge
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.pdo import PDO_FIELDS

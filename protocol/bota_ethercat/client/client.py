@@ -26,12 +26,12 @@ from typing import Final
 from bota_ethercat.address import Address
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
 from bota_ethercat.client.reading import Condition, Reading
-from bota_ethercat.client.real_time import Scheduling, make_real_time
 from bota_ethercat.client.session import ClientEvent, Session, check_granted
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, ProtocolError, UnreachableError
 from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import did_not_read, no_server
 from bota_ethercat.pdo import ImuUnits, Sample
+from bota_ethercat.program.real_time import Scheduling, make_real_time
 from bota_ethercat.terminal import decode_terminal
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import rows

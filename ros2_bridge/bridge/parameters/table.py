@@ -12,9 +12,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from bota_ethercat.client.real_time import HIGHEST_PRIORITY
 from bota_ethercat.health.verdict import LIMITS, Limits
 from bota_ethercat.pdo import ImuUnits, Vector3
+from bota_ethercat.program.real_time import HIGHEST_PRIORITY
 from ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
 from ft_compensation.quantities import (
     DEFAULT_GRAVITY,

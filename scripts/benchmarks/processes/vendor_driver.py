@@ -19,7 +19,7 @@ from typing import Final
 
 import bota_driver  # type: ignore[import-not-found]
 
-from bota_ethercat.client.real_time import make_real_time
+from bota_ethercat.program.real_time import make_real_time
 from scripts.benchmarks.records import Recording, decode_clock
 
 _ATTEMPTS: Final = 5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real-time scheduling of a client: SCHED_FIFO and a CPU for one thread, memory that is never paged out.
+"""Real-time scheduling: SCHED_FIFO and a CPU for one thread, memory that is never paged out.
 
 Beside programs that use every CPU, an ordinary client has its samples some milliseconds late. Each right is
 used if the system allows it; what is not allowed is said, with what would allow it (docs/tuning.md).
@@ -36,12 +36,14 @@ class Scheduling(NamedTuple):
         return "; ".join([", ".join(granted), *(f"not granted: {what}" for what in self.refused)])
 
 
-def make_real_time(priority: int, cpu: int = -1, *, thread: int = 0) -> Scheduling:
+def make_real_time(
+    priority: int, cpu: int = -1, *, thread: int = 0, drops_capabilities: bool = False
+) -> Scheduling:
     """Give a thread SCHED_FIFO, by default the calling one, and lock the process's memory; as far as allowed.
 
     `priority` is from 1 to 98; with 0 neither is done. `cpu` is the CPU to pin it to; -1: none. `thread` is
     another thread of this process: its `threading.Thread.native_id`. Threads that the thread starts later
-    inherit its priority and CPU.
+    inherit its priority and CPU. `drops_capabilities`: the process gives its capabilities up afterwards.
     """
     if sys.platform != "linux":
         return Scheduling(refused=("real-time scheduling (there is one on Linux only)",))
@@ -61,7 +63,7 @@ def make_real_time(priority: int, cpu: int = -1, *, thread: int = 0) -> Scheduli
             refused.append(f"SCHED_FIFO {priority} ({_grants_priority(priority)})")
             priority = 0
         else:
-            locked = _lock_memory()
+            locked = _lock_memory(drops_capabilities=drops_capabilities)
             if not locked:
                 refused.append(f"locked memory ('memlock unlimited' in {_LIMITS}, LimitMEMLOCK=infinity)")
     return Scheduling(priority, cpu if cpu >= 0 else None, locked, tuple(refused))
@@ -76,15 +78,15 @@ def _grants_priority(priority: int) -> str:
     return f"'rtprio {priority}' in {_LIMITS}, LimitRTPRIO={priority} in a service's unit"
 
 
-def _lock_memory() -> bool:
+def _lock_memory(*, drops_capabilities: bool) -> bool:
     """Whether it is locked. Not up to a limit: beyond it every allocation would fail."""
     import resource  # noqa: PLC0415 - not on all systems
 
-    hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
-    if hard != resource.RLIM_INFINITY and not _may_lock_all():
-        return False
-    if hard == resource.RLIM_INFINITY:
-        resource.setrlimit(resource.RLIMIT_MEMLOCK, (hard, hard))
+    try:
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    except (OSError, ValueError):
+        if drops_capabilities or not _may_lock_all():
+            return False
     return bool(ctypes.CDLL(None).mlockall(_MLOCK) == 0)
 
 
