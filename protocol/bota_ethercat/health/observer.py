@@ -306,7 +306,8 @@ class StreamObserver(SensorObserver):
         if self._window_ns is None:
             return
         oldest_ns = now_ns - self._window_ns
-        for kept in (self._batches, self._ages, self._intervals, *self._dated):
+        all_kept: tuple[deque[Any], ...] = self._batches, self._ages, self._intervals, *self._dated
+        for kept in all_kept:
             while kept and kept[0][0] < oldest_ns:
                 kept.popleft()
 
