@@ -11,14 +11,14 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import pytest
 
-from tests.server.running import PATIENCE_S, wait_until
+from tests.server.running import PATIENCE_S
 
 ROOT: Final = Path(__file__).parents[2]
 CLIENT: Final = ROOT / "clients" / "cpp"
@@ -40,7 +40,6 @@ WRAPPED: Final = (
     "clock_gettime",
 )  # fmt: skip
 
-BUILD_TIMEOUT_S: Final = 280.0
 KEPT_S: Final = 7 * 86400.0
 """Age from which a program that was built for other contents is deleted."""
 Reading = dict[str, Any]
@@ -78,9 +77,7 @@ def build(source: Path, flags: Sequence[str], others: Sequence[Path] = (), compi
             unfinished = program.with_suffix(".new")
             sources = [str(path) for path in (source, *others)]
             command = [compiler, *STRICT, *flags, f"-I{INCLUDE}", *sources, "-o", str(unfinished)]
-            made = subprocess.run(
-                command, check=False, capture_output=True, text=True, timeout=BUILD_TIMEOUT_S
-            )
+            made = subprocess.run(command, check=False, capture_output=True, text=True, timeout=280.0)
             assert made.returncode == 0, f"{' '.join(command)}\n{made.stderr}"
             unfinished.rename(program)
     return program
@@ -130,34 +127,21 @@ class Driver(Commanded):
         return self
 
     def latest(self, position: int = 0) -> Reading:
+        """The newest sample, and what holds of every reading does."""
         reading: Reading = self.do("latest", position)
+        assert reading["fresh"] == (reading["condition"] == "fresh")
+        assert reading["has_sample"] or not (reading["fresh"] or reading["is_new"])
         return reading
 
-    def info(self, position: int = 0) -> dict[str, Any]:
-        told: dict[str, Any] = self.do("info", position)
+    def info(self) -> dict[str, Any]:
+        told: dict[str, Any] = self.do("info")
         return told
-
-    def until(self, condition: Callable[[Reading], bool], what: str) -> Reading:
-        """Ask for the latest until it is so; every reading until then must hold what all must hold."""
-        last: Reading = {}
-
-        def so() -> bool:
-            last.update(self.latest())
-            check(last)
-            return condition(last)
-
-        wait_until(so, what)
-        return last
 
 
 def start_driver(*inside: str, flags: Sequence[str] = SANITIZED) -> subprocess.Popen[str]:
     """A driver, started by the command `inside`."""
-    return subprocess.Popen(
-        [*inside, driver_program(flags)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    command = [*inside, driver_program(flags)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def end_driver(process: subprocess.Popen[str]) -> int:
@@ -191,12 +175,3 @@ def assert_no_faults() -> None:
     """End the drivers; none had a fault that a sanitizer found."""
     while _idle:
         assert end_driver(_idle.pop()) == 0
-
-
-def check(reading: Reading) -> None:
-    """What holds of every reading."""
-    if reading["fresh"]:
-        assert reading["has_sample"]
-    if reading["is_new"]:
-        assert reading["has_sample"]
-    assert reading["fresh"] == (reading["condition"] == "fresh")

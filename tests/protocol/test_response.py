@@ -50,15 +50,11 @@ def test_the_noise_that_passes() -> None:
 @pytest.mark.parametrize("fir", [False, True])
 def test_the_delay_is_the_filters_own(fir: bool) -> None:
     """A third-order sinc filter is three moving averages over a period each."""
-    steps = 64
-    average = [1 / steps] * steps
-    impulse = [1.0]
-    for taps in (
-        average,
-        average,
-        average,
-        *([[tap for each in fir_taps() for tap in [each, *[0.0] * (steps - 1)]]] if fir else []),
-    ):
+    steps, impulse = 64, [1.0]
+    stages = [[1 / steps] * steps] * 3
+    if fir:
+        stages.append([tap for each in fir_taps() for tap in [each, *[0.0] * (steps - 1)]])
+    for taps in stages:
         impulse = [
             sum(taps[at - k] * value for k, value in enumerate(impulse) if 0 <= at - k < len(taps))
             for at in range(len(impulse) + len(taps) - 1)
