@@ -256,7 +256,7 @@ class Simulation(SimulatedBus):
         """Keep the frames of an exchange."""
         for frame, _, _ in made:
             self._decoder.feed(frame)
-            self._decoder.take_data(self.frames)
+            self._decoder.next_data(self.frames)
             self.published_ns.append(self.clock.now_ns)
 
     def serves(self, until_ns: int, serve: Callable[[int], None]) -> None:
@@ -346,7 +346,7 @@ class Client(FramedClient):
         if not self.reads or not self.stream.readable:
             return
         self._decoder.feed(self.stream.recv_all())
-        while (message := self._decoder.take_data(self.frames)) is not None:
+        while (message := self._decoder.next_data(self.frames)) is not None:
             self.keep(message)
 
     @property
@@ -383,7 +383,7 @@ class MemoryChannel(TcpChannel):
 
     def __init__(self, server: Simulation) -> None:
         super().__init__("memory", 0)
-        self.is_near, self.monotonic_ns = True, server.clock.monotonic_ns
+        self.same_address, self.monotonic_ns = True, server.clock.monotonic_ns
         self.server: Simulation | None = server
         self._clock = server.clock
         self._stream: InMemoryStream | None = None

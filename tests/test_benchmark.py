@@ -18,7 +18,7 @@ import pytest
 from scripts.benchmarks import modes, statistics
 from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.chain import ScriptError, Turn
-from scripts.benchmarks.records import Recording, began
+from scripts.benchmarks.records import ArrivalRecorder, began
 from tests.server.running import needs_bus
 
 ROOT = Path(__file__).parent.parent
@@ -113,10 +113,10 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
 
 def test_recording_begins_after_the_warm_up(tmp_path: Path) -> None:
     path = tmp_path / "records"
-    recording = Recording(path, warm_up_s=1.0, seconds=2.0)
+    recording = ArrivalRecorder(path, warm_up_s=1.0, seconds=2.0)
     times = iter(range(0, 10**10, 500_000_000))
     assert not began(path).exists()
-    while recording.take(0, 0, 0, 0, next(times)):
+    while recording.add(0, 0, 0, 0, next(times)):
         pass
     recording.write()
     assert sorted(each.name for each in tmp_path.iterdir()) == ["records", "records.began"]

@@ -16,8 +16,8 @@ from bota_ethercat.address import Address
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import sentences
 from bota_ethercat.health.judge import judge
+from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.health.observer import StreamObserver, by_sensor
-from bota_ethercat.health.verdict import LIMITS, Level
 from bota_ethercat.replies import DistributionStatus, Status, position_of
 from ethercat_server.access.adapters import Holder, find_holder, links
 from ethercat_server.access.private_server import open_interface
@@ -315,7 +315,7 @@ class ServerView:
                 self._take(frames, clock.monotonic_ns(), same_machine=sensors.client.session.same_machine)
                 for event in events:
                     if (position := position_of(event)) in self._observers:
-                        self._observers[position].take_event(event)
+                        self._observers[position].add_event(event)
                 unread = sensors.client.take_unread()
                 for each in self._observers.values():
                     each.note_unread(unread, clock.monotonic_ns())
@@ -335,13 +335,13 @@ class ServerView:
     def _take_status(self, sensors: Sensors) -> Status:
         status = sensors.status()
         for position, observer in self._observers.items():
-            observer.take_status(status, position, sensors.clock.monotonic_ns())
+            observer.add_status(status, position, sensors.clock.monotonic_ns())
         return status
 
     def _take(self, frames: Sequence[DataMessage], now_ns: int, *, same_machine: bool) -> None:
         for position, batch in by_sensor(frames).items():
             if position in self._observers:
-                self._observers[position].take(batch, now_ns)
+                self._observers[position].add_frames(batch, now_ns)
                 if same_machine:
                     self._observers[position].note_age(batch[-1], now_ns)
 

@@ -120,7 +120,7 @@ class ClockStatus(NamedTuple):
     uncertainty_us: float | None = None
 
 
-class Emergency(NamedTuple):
+class EmergencyStatus(NamedTuple):
     """The newest emergency of a sensor."""
 
     code: int | None = None
@@ -128,7 +128,7 @@ class Emergency(NamedTuple):
     ago_s: float | None = None
 
 
-class Drift(NamedTuple):
+class DriftStatus(NamedTuple):
     """How far the zero has drifted."""
 
     since: str = ""  # `tare`, `change`, `return` or the start
@@ -137,7 +137,7 @@ class Drift(NamedTuple):
     wrench: Six | None = None
 
 
-class Overload(NamedTuple):
+class OverloadStatus(NamedTuple):
     """The largest loads of a sensor's past; times in seconds of the Unix epoch."""
 
     since: float | None = None
@@ -157,9 +157,9 @@ class SensorStatus(NamedTuple):
     not_finite: int | None = None
     recoveries: int | None = None
     emergencies: int | None = None
-    emergency: Emergency = Emergency()
-    drift: Drift = Drift()
-    history: Overload = Overload()
+    emergency: EmergencyStatus = EmergencyStatus()
+    drift: DriftStatus = DriftStatus()
+    history: OverloadStatus = OverloadStatus()
     clock: ClockStatus = ClockStatus()
     age_us: DistributionStatus = DistributionStatus()  # of the samples when they are sent
 

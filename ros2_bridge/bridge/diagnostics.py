@@ -20,8 +20,8 @@ from rclpy.node import Node
 
 from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.health.judge import SATURATIONS, Observation, judge
+from bota_ethercat.health.limits import About, Level, StreamLimits
 from bota_ethercat.health.observer import SensorObserver, p99
-from bota_ethercat.health.verdict import About, Level, Limits
 from bota_ethercat.replies import Status
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable
@@ -60,7 +60,7 @@ class Monitor:
     def __init__(
         self,
         node: Node,
-        limits: Limits,
+        limits: StreamLimits,
         reader: Reader,
         compensation: Callable[[], CompensationState],
         outputs: Outputs,
@@ -154,7 +154,7 @@ class Monitor:
             if reply.exception() is None and (content := reply.result()).get("ok") is True:
                 if action == "status":
                     self._server = Status.parse(content)
-                    self._said.take_status(self._server, link.sensor, self._clock.monotonic_ns())
+                    self._said.add_status(self._server, link.sensor, self._clock.monotonic_ns())
                 else:
                     link.described(content)
 

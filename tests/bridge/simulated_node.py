@@ -77,7 +77,12 @@ class Wire(TcpChannel):
 
     def __init__(self, world: Any, clock: SimulatedClock) -> None:
         super().__init__("memory", 0)
-        self.monotonic_ns, self.is_near, self._clock, self._world = clock.monotonic_ns, True, clock, world
+        self.monotonic_ns, self.same_address, self._clock, self._world = (
+            clock.monotonic_ns,
+            True,
+            clock,
+            world,
+        )
         self.arrived, self._ended = bytearray(), True
         self._send: Callable[[bytes], object] = lambda _: None
 

@@ -140,7 +140,7 @@ class Driver(Commanded):
 
 def start_driver(*inside: str, flags: Sequence[str] = SANITIZED) -> subprocess.Popen[str]:
     """A driver, started by the command `inside`."""
-    command = [*inside, driver_program(flags)]
+    command = [*inside, str(driver_program(flags))]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 

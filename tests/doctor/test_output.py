@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.machine_checks import CHECKS
 from ethercat_server.doctor.report import (

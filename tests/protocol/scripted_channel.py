@@ -53,7 +53,7 @@ class ScriptedChannel(TcpChannel):
 
     def __init__(self, server: MemoryServer) -> None:
         super().__init__("memory", 0)
-        self.is_near, self.monotonic_ns = True, server.monotonic_ns
+        self.same_address, self.monotonic_ns = True, server.monotonic_ns
         self._server = server
         self._requests = FrameDecoder()
 

@@ -193,7 +193,7 @@ def test_round_trip_in_any_pieces_one_by_one_and_in_bulk(
     one, bulk = FrameDecoder(accepts=accepts), FrameDecoder(accepts=accepts)
     found: list[Any] = []
     found_in_bulk: list[Any] = []
-    take_in_bulk = partial(bulk.take_data, found_in_bulk)
+    take_in_bulk = partial(bulk.next_data, found_in_bulk)
     at, turn = 0, 0
     while at < len(stream):
         size = sizes[turn % len(sizes)]

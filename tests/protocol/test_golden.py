@@ -66,8 +66,8 @@ def test_accounting() -> None:
                 accounting.begin()
             else:
                 sequence, monotonic_ns, flags, kind = step
-                if flags or not accounting.take_next(sequence, monotonic_ns):
-                    assert accounting.take(*step[:3]).name == kind.upper(), (stream.name, step)
+                if flags or not accounting.count_next(sequence, monotonic_ns):
+                    assert accounting.count(*step[:3]).name == kind.upper(), (stream.name, step)
         assert accounting.counts == StreamCounts(**stream.counts), stream.name
 
 

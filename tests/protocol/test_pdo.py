@@ -1,4 +1,4 @@
-"""The process data, against Table III.2 of the design note written out."""
+"""The process data, against the table of object 0x6000 in Bota's manual, written out."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import pytest
 
 from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
 from bota_ethercat.sensor.response import (
-    Source,
+    DelaySource,
     acceleration_response,
     angular_rate_response,
     delays_ms,
@@ -72,10 +72,10 @@ def test_of_what_is_not_known_no_delay_is_made_up() -> None:
     assert delays_ms(known)["force_torque"] == 15
     assert delays_ms(known, 400)["force_torque"] == 30
     for settings, source in (
-        ({**known, "fast": True}, Source.FAST),
-        ({**known, "chop": True}, Source.CHOP),
-        ({"sinc_length": 64}, Source.UNKNOWN),
-        ({}, Source.UNKNOWN),
+        ({**known, "fast": True}, DelaySource.FAST),
+        ({**known, "chop": True}, DelaySource.CHOP),
+        ({"sinc_length": 64}, DelaySource.UNKNOWN),
+        ({}, DelaySource.UNKNOWN),
     ):
         found = force_torque_response(settings)
         assert (found.delay_s, found.delay_ms, found.phase_deg(1), found.source) == (None, None, None, source)

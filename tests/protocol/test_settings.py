@@ -1,4 +1,4 @@
-"""The settings, what they mean by the note's filter tables, and the warnings register."""
+"""The settings, what they mean by the filter tables of Bota's manual, and the warnings register."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from bota_ethercat.settings import (
     start_up_defaults,
 )
 
-# As printed in the note.
-TABLE_III_4 = """
+# As printed in Bota's manual: SINC filter, gyroscope, accelerometer.
+FORCE_TORQUE = """
 32 1600 418.5 62.5
 51 1003 265.5 39.5
 64 800 209.5 31.5
@@ -30,7 +30,7 @@ TABLE_III_4 = """
 256 200 52.5 8.0
 341 150 39.5 6.0
 """
-TABLE_III_5 = """
+ANGULAR_RATE = """
 3 184 2.9 1
 4 92 3.9 1
 5 41 5.9 1
@@ -39,7 +39,7 @@ TABLE_III_5 = """
 8 5 33.48 1
 9 3600 0.17 8
 """
-TABLE_III_6 = """
+ACCELERATION = """
 1 460 1.94 1 250
 2 184 5.80 1 250
 3 92 7.80 1 250
@@ -55,10 +55,10 @@ def rows(table: str) -> list[list[float]]:
     return [[float(word) for word in line.split()] for line in table.strip().splitlines()]
 
 
-def test_the_tables_are_the_notes() -> None:
-    assert [list(row) for row in FORCE_TORQUE_FILTERS.values()] == rows(TABLE_III_4)
-    assert [list(row)[:4] for row in ANGULAR_RATE_FILTERS.values()] == rows(TABLE_III_5)
-    assert [list(row) for row in ACCELERATION_FILTERS.values()] == rows(TABLE_III_6)
+def test_the_tables_are_the_manuals() -> None:
+    assert [list(row) for row in FORCE_TORQUE_FILTERS.values()] == rows(FORCE_TORQUE)
+    assert [list(row)[:4] for row in ANGULAR_RATE_FILTERS.values()] == rows(ANGULAR_RATE)
+    assert [list(row) for row in ACCELERATION_FILTERS.values()] == rows(ACCELERATION)
     assert list(SETTINGS["acceleration_filter"].choices or ()) == list(ACCELERATION_FILTERS)
     assert list(SETTINGS["angular_rate_filter"].choices or ()) == list(ANGULAR_RATE_FILTERS)
     for length, row in FORCE_TORQUE_FILTERS.items():

@@ -17,9 +17,9 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.judge import judge, saturated_axes
+from bota_ethercat.health.limits import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
 from bota_ethercat.health.sentences import drift, event_sentence
-from bota_ethercat.health.verdict import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.replies import (
     Description,
@@ -192,12 +192,12 @@ class _Sensor:
 
     def take_status(self, status: Status, now_s: float) -> None:
         """Take a reply to `status`."""
-        self.observer.take_status(status, self.position, _ns(now_s))
+        self.observer.add_status(status, self.position, _ns(now_s))
         self._hand_out = status.recent_age_us(self.position)
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
         """Frames of this sensor as they came, oldest first."""
-        samples = self.observer.take(frames, _ns(now_s))
+        samples = self.observer.add_frames(frames, _ns(now_s))
         self._judge(now_s)
         if not samples:
             return
@@ -356,7 +356,7 @@ class Model:
             self._heard_s = now_s
             position = position_of(event)
             if position is not None and (sensor := self._sensors.get(position)) is not None:
-                sensor.observer.take_event(event)
+                sensor.observer.add_event(event)
                 if event.get("event") == Event.OFFSET_CHANGED:  # the zero has moved
                     sensor.peaks = None
             self._events.append(f"{clock_text()} {event_sentence(event)}")

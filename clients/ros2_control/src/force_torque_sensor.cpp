@@ -23,7 +23,7 @@ public:
     CallbackReturn on_init(const hardware_interface::HardwareComponentInterfaceParams& params) override {
         if (SensorInterface::on_init(params) != CallbackReturn::SUCCESS) return CallbackReturn::ERROR;
         parameters_ = Parameters();
-        std::string wrong = take_sensor();
+        std::string wrong = read_sensors();
         for (const auto& [name, value] : info_.hardware_parameters)
             if (wrong.empty()) wrong = set_parameter(parameters_, name, value);
         if (wrong.empty() && parameters_.wants_compensated && !parameters_.has_payload)
@@ -38,7 +38,10 @@ public:
                 handles_.emplace_back(get_state_interface_handle(sensor.name + "/" + interface.name), place(sensor, interface.name));
         loop_ = std::make_unique<SensorLoop>(parameters_, [this](Level level, const std::string& text) { log(level, text); });
         std::string why;
-        if (!loop_->open(why)) return loop_.reset(), refuse(why, CallbackReturn::FAILURE);
+        if (!loop_->open(why)) {
+            loop_.reset();
+            return refuse(why, CallbackReturn::FAILURE);
+        }
         introduce();
         return CallbackReturn::SUCCESS;
     }
@@ -88,7 +91,7 @@ private:
     }
 
     /// Each <sensor> of the URDF; what is wrong with it, or nothing.
-    std::string take_sensor() {
+    std::string read_sensors() {
         if (info_.sensors.empty() || info_.sensors.size() > 2 || !info_.joints.empty() || !info_.gpios.empty())
             return "its <ros2_control> tag must have one <sensor>, perhaps a second one for the compensated wrench, and nothing else";
         for (const auto& sensor : info_.sensors) {

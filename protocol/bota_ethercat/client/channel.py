@@ -56,7 +56,7 @@ class TcpChannel:
 
     Attributes:
         own: the address of this end.
-        is_near: whether both ends have one address, and so probably one machine.
+        same_address: whether both ends have one address, and so probably one machine.
         monotonic_ns: CLOCK_MONOTONIC.
     """
 
@@ -70,7 +70,7 @@ class TcpChannel:
         self._timeout_s = -1.0
         self.monotonic_ns: Callable[[], int] = time.monotonic_ns
         self.own: tuple[str, int] = ("", 0)
-        self.is_near = False
+        self.same_address = False
 
     def wait(self, event: threading.Event, seconds: float) -> bool:
         """Wait until `event` is set, `seconds` at most; whether it is."""
@@ -144,7 +144,7 @@ class TcpChannel:
         own, peer = sock.getsockname(), sock.getpeername()
         if own == peer:  # a free ephemeral port can connect to itself
             raise OSError("nothing listens there")
-        self.own, self.is_near = own[:2], own[0] == peer[0]
+        self.own, self.same_address = own[:2], own[0] == peer[0]
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # for a peer that was switched off
         for option, value in _KEEPALIVE:

@@ -196,7 +196,7 @@ class Client:
                 self._gather(left_s)
             except ConnectionFailedError:  # the only connection has ended
                 self.channel.wait(self._closing, max(left_s, 0.0))
-            self._take_items()
+            self._pop_frames()
             left_s = (deadline_ns - self.channel.monotonic_ns()) * 1e-9
             if state.unread or left_s <= 0:
                 break
@@ -217,7 +217,7 @@ class Client:
         self._looked_ns, self._unread_ns = self.channel.monotonic_ns(), 0  # what was before is its caller's
         while True:
             self._gather(left_s)
-            frames = self._take_items()
+            frames = self._pop_frames()
             left_s = (deadline_ns - self.channel.monotonic_ns()) * 1e-9
             if frames or left_s <= 0:
                 break
@@ -251,12 +251,12 @@ class Client:
     def poll(self, timeout_s: float = 0.0) -> list[DataMessage]:
         """The frames that have arrived, if any, waiting at most `timeout_s` for the first, or an event."""
         self._gather(timeout_s)
-        return self._take_items()
+        return self._pop_frames()
 
     def poll_all(self, timeout_s: float = 0.0) -> list[DataMessage | ClientEvent]:
         """As `poll`, with the events in their places between the frames."""
         self._gather(timeout_s)
-        return self.session.take_items()
+        return self.session.pop_items()
 
     def frames(self) -> Iterator[DataMessage]:
         """The frames as they come; without end, or with `reconnect` False until the connection ends."""
@@ -351,10 +351,10 @@ class Client:
                 return
             left_s = 0.0 if items else timeout_s - (monotonic_ns() - begun_ns) * 1e-9
 
-    def _take_items(self) -> list[DataMessage]:
+    def _pop_frames(self) -> list[DataMessage]:
         """The frames among the items; `events` gets the others."""
         frames = list[DataMessage]()
-        for item in self.session.take_items():
+        for item in self.session.pop_items():
             if isinstance(item, DataMessage):
                 frames.append(item)
             else:
@@ -390,7 +390,7 @@ class Client:
             elif channel.connect(min(timeout_s, _AGAIN_S)):  # which `close` does not end
                 self._open = True
                 self._looked_ns = self._watched_ns = channel.monotonic_ns()
-                self._send(session.opened(channel.monotonic_ns(), is_near=channel.is_near))
+                self._send(session.opened(channel.monotonic_ns(), same_address=channel.same_address))
         except ProtocolError as error:
             if self._failed is error:
                 raise

@@ -82,7 +82,7 @@ class Reading(NamedTuple):
         return self.condition is Condition.FRESH
 
 
-class SensorState:
+class ReceivedSensor:
     """One sensor of a `Session`."""
 
     def __init__(self, sensor: int, *, every: int, fresh_only: bool, imu_units: ImuUnits) -> None:
@@ -101,7 +101,7 @@ class SensorState:
         self.info = SensorInfo(sensor)
         self._sampled_delay_ns = Delays()
 
-    def take_info(self, info: SensorInfo) -> None:
+    def update(self, info: SensorInfo) -> None:
         """What the server says of it now."""
         self.info = info
         self.accounting.rate_hz = info.rate_hz or self.accounting.rate_hz
@@ -112,7 +112,7 @@ class SensorState:
         self.accounting.begin()
         self.lost = False
 
-    def take(self, frame: DataMessage, received_ns: int, same_clock: bool) -> DataMessage | None:
+    def add(self, frame: DataMessage, received_ns: int, same_clock: bool) -> DataMessage | None:
         """A frame that arrived at `received_ns`; itself if it brings a new, valid sample.
 
         GAP of a frame that brings none is carried to the next that does.
@@ -120,9 +120,9 @@ class SensorState:
         sequence, _, monotonic_ns, _, flags, _, process_data = frame
         accounting = self.accounting
         unusual = flags or self._reconnected or self._carried or self.lost
-        if unusual or not accounting.take_next(sequence, monotonic_ns):
+        if unusual or not accounting.count_next(sequence, monotonic_ns):
             restarts = accounting.counts.restarts
-            kind = accounting.take(sequence, monotonic_ns, flags)
+            kind = accounting.count(sequence, monotonic_ns, flags)
             if kind is FrameKind.OLD:
                 return None
             if self._reconnected or accounting.counts.restarts > restarts:
@@ -156,7 +156,7 @@ class SensorState:
             ahead = since_ns < -_CLOCK_TOLERANCE_NS
             age_ns = math.inf if ahead else max(0, since_ns)
         if sample is not None and age_ns <= max_age_ns:
-            condition = _worth(sample)
+            condition = _condition_of(sample)
         else:
             silence_ns = max(2 * max_age_ns, _LEAST_SILENCE_NS)
             condition = self.why_old(silence_ns, now_ns, connected=connected, ahead=ahead)
@@ -183,8 +183,8 @@ class SensorState:
         return Condition.BAD_CLOCK if ahead else Condition.LATE
 
 
-def _worth(sample: Sample) -> Condition:
-    """What a recent sample is worth: by force and torque."""
+def _condition_of(sample: Sample) -> Condition:
+    """The condition of a recent sample, by force and torque."""
     if not math.isfinite(sum(sample.force) + sum(sample.torque)):
         return Condition.NOT_FINITE
     saturated = sample.force_torque_saturated or sample.warnings & _SATURATED

@@ -16,8 +16,8 @@ from bota_ethercat.accounting import NOT_NEW, FrameKind, StreamAccounting, Strea
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.judge import Observation, emergency
+from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.health.sentences import drift, event_sentence
-from bota_ethercat.health.verdict import LIMITS, Limits
 from bota_ethercat.pdo import LAYOUTS, PdoLayout, is_finite
 from bota_ethercat.replies import SensorInfo, SensorStatus, Status
 
@@ -92,7 +92,7 @@ class SensorObserver:
         """Counts are not compared with those of another connection."""
         self.lost, self.status, self._missed_deadlines = None, SensorStatus(), None
 
-    def take_event(self, event: Mapping[str, Any]) -> None:
+    def add_event(self, event: Mapping[str, Any]) -> None:
         """An event of this sensor."""
         kind = event.get("event")
         if kind == Event.SENSOR_LOST:
@@ -100,7 +100,7 @@ class SensorObserver:
         elif kind in (Event.SENSOR_BACK, Event.RECONFIGURED):
             self.lost = None
 
-    def take_status(self, status: Status, position: int, now_ns: int) -> None:
+    def add_status(self, status: Status, position: int, now_ns: int) -> None:
         """A reply to `status`, in which it is the sensor at `position`."""
         before, row = self.status, status.find(position)
         counts = [(name, getattr(before, name), getattr(row, name)) for name in _COUNTED]
@@ -133,7 +133,7 @@ class SensorObserver:
         return sum(by for at_ns, what, by in self._grown if what == name and at_ns >= since_ns)
 
     def complete(
-        self, seen: Observation, now_ns: int, window_ns: int | None = None, limits: Limits = LIMITS
+        self, seen: Observation, now_ns: int, window_ns: int | None = None, limits: StreamLimits = LIMITS
     ) -> Observation:
         """`seen` of its frames, with what the server said, at most in the last `window_ns`."""
         since_ns = now_ns - window_ns if window_ns else 0
@@ -203,16 +203,16 @@ class StreamObserver(SensorObserver):
         for kept in (self._batches, self._ages, self._intervals):
             kept.clear()
 
-    def take(self, frames: Sequence[DataMessage], now_ns: int) -> list[tuple[Any, ...]]:
+    def add_frames(self, frames: Sequence[DataMessage], now_ns: int) -> list[tuple[Any, ...]]:
         """Frames that came just now, oldest first; the values of the new samples, as in COMMON."""
         if not frames:
             return []
-        counts, take, before = self._accounting.counts, self._accounting.take, self._counted()
+        counts, count, before = self._accounting.counts, self._accounting.count, self._counted()
         fresh: list[DataMessage] = []
         previous, missing = self._previous_ns, counts.missing
         apart_ns = -1 if previous is None else 0  # the longest time in which no sample was made; -1: unknown
         for frame in frames:
-            if take(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
+            if count(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
                 previous, apart_ns = None, -1
                 continue
             if previous is not None and counts.missing == missing:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from bota_ethercat.control import Event
-from bota_ethercat.health.verdict import LIMITS, Limits
+from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.pdo import AXES
 from bota_ethercat.replies import SensorStatus
 from bota_ethercat.text.untrusted import number, printable, text, whole
@@ -62,7 +62,7 @@ def event_sentence(event: Mapping[str, Any]) -> str:
     return said if lost_s is None else f"{said} after {lost_s:g} s"
 
 
-def drift(row: SensorStatus, limits: Limits | None = None) -> str:
+def drift(row: SensorStatus, limits: StreamLimits | None = None) -> str:
     """How far the zero has drifted; with `limits`, empty unless that is worth a look."""
     cause, ago_s, kelvin, wrench = row.drift
     least = limits or LIMITS

@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from bota_ethercat.health.verdict import LIMITS, Limits
+from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.program.real_time import HIGHEST_PRIORITY
 from ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
@@ -237,7 +237,7 @@ class Parameters(NamedTuple):
     angular_velocity_covariance: Numbers
     linear_acceleration_covariance: Numbers
     temperature_variance: float
-    limits: Limits
+    limits: StreamLimits
     wrench_frames: tuple[WrenchFrame, ...]
     tf_wait: float
     payload: Payload

@@ -168,7 +168,7 @@ int main() {
             reading.sample.force[0] = force;
             received.tool[0] = 0.25;
             allocations = 0;
-            const bool good = gate->take(received, std::llround(now * 1e6));
+            const bool good = gate->update(received, std::llround(now * 1e6));
             told = text_of(good, gate->values());
         } else if (command == "tool") {
             std::string model;

@@ -28,8 +28,8 @@ from bota_clients.numbers import duration
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health.limits import Level
 from bota_ethercat.health.observer import COMMON
-from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import AXES, STANDARD_GRAVITY, ImuUnits, PdoType
 from bota_ethercat.sensor.meaning import value_meaning
 from bota_ethercat.sensor_choice import MOST_PLACES

@@ -90,7 +90,7 @@ public:
 
 private:
     bool fail(std::string_view why) noexcept {
-        detail::begin_error(error_, options_).add(why);
+        detail::start_error(error_, options_).add(why);
         return false;
     }
 
