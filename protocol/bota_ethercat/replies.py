@@ -77,7 +77,6 @@ class SensorInfo(NamedTuple):
         )
 
     def __str__(self) -> str:
-        """One phrase for the log."""
         serial = "?" if self.serial is None else self.serial
         rate = f"{self.rate_hz:g}" if self.rate_hz else "?"
         return f"sensor {self.sensor} ({self.name or '?'}, serial {serial}, {rate} Hz, {self.state or '?'})"

@@ -47,7 +47,6 @@ class SensorChoice(NamedTuple):
         return 2 if self.number is not None else 1 if self.serial is not None else 0
 
     def __str__(self) -> str:
-        """As written on a command line."""
         if self.number is not None:
             return str(self.number)
         return f"{_SERIAL}{self.serial}" if self.serial is not None else str(self.name)

@@ -56,7 +56,6 @@ class Setup:
 
     @property
     def sinc(self) -> int:
-        """The SINC length that gives the rate."""
         return OVERSAMPLING_HZ // self.rate_hz
 
 
@@ -132,7 +131,6 @@ class Chain(contextlib.ExitStack):
         return child
 
     def python(self, name: str, module: str, *arguments: object) -> Child:
-        """Start a module of this project."""
         return self.start(name, sys.executable, "-m", module, *arguments)
 
     def server(self) -> Client:
@@ -192,7 +190,6 @@ class Chain(contextlib.ExitStack):
             time.sleep(0.02)
 
     def sleep(self, seconds: float) -> None:
-        """Let it run."""
         end = time.monotonic() + seconds
         self.wait(lambda: time.monotonic() > end, seconds=seconds + 5)
 
@@ -260,6 +257,5 @@ def _on_signal(_number: int, _frame: FrameType | None) -> None:
 
 
 def ignore_signals() -> None:
-    """Only the clean-up follows."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)

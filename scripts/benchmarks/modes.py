@@ -162,7 +162,6 @@ def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
 
 
 def _points(row: Figures, name: str) -> str:
-    """Median and tails."""
     return " / ".join(f"{row[name][point]:.0f}" for point in ("p50", "p99", "p999"))
 
 
@@ -188,7 +187,6 @@ TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
         "clients": lambda row: str(row["clients"]),
         "source lines": lambda row: f"{row['lines']:.0f} / {row['mean_lines']:.0f}",
         "calls": lambda row: f"{row['calls']:.0f} / {row['mean_calls']:.0f}",
-        "files": lambda row: f"{row['files']:.0f}",
         "system calls": lambda row: f"{row['system_calls']:.0f} / {row['mean_system_calls']:.1f}",
     },
 }

@@ -91,7 +91,6 @@ def measure(name: str, options: argparse.Namespace, priority: int, *, ros: bool)
 
 
 def markdown(name: str, rows: Sequence[Figures]) -> str:
-    """The table."""
     shown = TABLES[name].values()
     lines = [list(TABLES[name]), ["---"] * len(shown), *([show(row) for show in shown] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -170,7 +169,6 @@ def _benchmark() -> int:
 
 
 def main() -> int:
-    """Run; returns the exit code."""
     return stoppable(_benchmark, "benchmark", "stopped; nothing is written", 130)
 
 

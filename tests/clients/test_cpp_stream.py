@@ -23,8 +23,9 @@ import pytest
 
 from bota_ethercat.address import Address, boot_id
 from bota_ethercat.control import request
-from bota_ethercat.framing import DataFlag, FrameDecoder, encode_json
+from bota_ethercat.framing import DataFlag, encode_json
 from bota_ethercat.text.json_text import JsonObject
+from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.cpp_programs import (
     ROOT,
     Driver,
@@ -35,7 +36,7 @@ from tests.clients.cpp_programs import (
     patient,
     start_driver,
 )
-from tests.clients.played_sensor import described, frame, played
+from tests.clients.played_sensor import PlayedSensor, described, frame
 from tests.golden_vectors import READ, ReadStream, odd_messages
 from tests.server.running import PATIENCE_S, free_port, full_listener, wait_until
 
@@ -53,57 +54,26 @@ REFUSED = {"reply": "subscribe", "ok": False, "error": {"code": "busy", "message
 OURS = boot_id() or pytest.fail("this machine has no boot id")
 
 
-class PlayedServer:
-    """A listening socket; connections are accepted when the test says so."""
+class PlayedServer(ScriptedServer):
+    """Answers every request alike."""
 
-    def __init__(self, port: int = 0) -> None:
-        self.listener = socket.create_server(("127.0.0.1", port))
-        self.listener.settimeout(PATIENCE_S)
-        self.port: int = self.listener.getsockname()[1]
-        self.connection: socket.socket | None = None
-        self.asked: JsonObject = {}
+    answer: JsonObject | bytes = GRANTED
 
-    def is_asked(self, within_s: float = 0.0) -> bool:
-        """Whether a connection waits to be accepted."""
-        return bool(select.select([self.listener], [], [], within_s)[0])
-
-    def accept(self, answer: JsonObject | bytes = GRANTED) -> None:
-        """Take a connection, and what it asks, and answer."""
-        self.hang_up()
-        self.connection, _ = self.listener.accept()
-        self.connection.settimeout(PATIENCE_S)
-        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        decoder, message = FrameDecoder(), None
-        while message is None:
-            data = self.connection.recv(4096)
-            assert data, "the client closed the connection"
-            decoder.feed(data)
-            message = decoder.next_message()
-        assert isinstance(message, dict)
-        self.asked = message
-        self.send(answer)
+    def _answer(self, message: JsonObject) -> None:
+        assert self._asking is not None
+        self.streams.append(self._asking)
+        self._asking.sendall(self.answer if isinstance(self.answer, bytes) else encode_json(self.answer))
 
     def send(self, *messages: bytes | JsonObject) -> None:
         """Send messages, and wait until the client's kernel has them."""
-        connection = self.connection
-        assert connection is not None
+        stream = self.streams[-1]
 
         def unsent() -> int:
-            raw = fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
-            return int(struct.unpack("i", raw)[0])
+            return int(struct.unpack("i", fcntl.ioctl(stream.fileno(), termios.TIOCOUTQ, b"\0\0\0\0"))[0])
 
         for message in messages:
-            connection.sendall(message if isinstance(message, bytes) else encode_json(message))
+            stream.sendall(message if isinstance(message, bytes) else encode_json(message))
         wait_until(lambda: unsent() == 0, "the client's kernel")
-
-    def hang_up(self) -> None:
-        if self.connection is not None:
-            self.connection.close()
-            self.connection = None
-
-    def close(self) -> None:
-        self.hang_up()
-        self.listener.close()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -114,15 +84,13 @@ def no_faults() -> Iterator[None]:
 
 @pytest.fixture
 def server() -> Iterator[PlayedServer]:
-    with contextlib.closing(PlayedServer()) as played:
+    with PlayedServer() as played:
         yield played
 
 
 def connected(server: PlayedServer, running: Driver, answer: JsonObject | bytes = GRANTED) -> Driver:
-    running.begin("connect", int(PATIENCE_S * 1000))
-    server.accept(answer)
-    assert running.answer() == {"ok": True, "error": ""}
-    return running
+    server.answer = answer
+    return running.connect()
 
 
 @contextlib.contextmanager
@@ -132,13 +100,8 @@ def stream(server: PlayedServer, answer: JsonObject | bytes = GRANTED, **options
         yield connected(server, running, answer)
 
 
-def accept_while(
-    server: PlayedServer, running: Driver, answer: JsonObject = GRANTED, step: str = "latest"
-) -> None:
-    """Take the connection that the client makes step by step, a step in each call."""
-    wait_until(lambda: running.do(step) is not None and server.is_asked(), "a connection")
-    running.do(step)  # sends the subscription
-    server.accept(answer)
+def until_up(running: Driver, step: str = "latest") -> None:
+    """The client connects step by step, a step in each call."""
     wait_until(lambda: running.do(step) is not None and running.info()["link"] == "up", "the subscription")
 
 
@@ -163,8 +126,7 @@ class CppPlayer:
 
     def end(self) -> None:
         """Until the client's kernel has acknowledged it."""
-        connection = self.server.connection
-        assert connection is not None
+        connection = self.server.streams[-1]
         connection.shutdown(socket.SHUT_WR)
 
         def state() -> bytes:
@@ -264,10 +226,10 @@ def test_conversations(server: PlayedServer, options: Any, steps: list[Any]) -> 
 
 def test_it_subscribes_as_it_was_told(server: PlayedServer) -> None:
     with stream(server) as running:
-        assert server.asked == request("subscribe", every=1, fresh_only=True)
+        assert server.requests[-1] == request("subscribe", every=1, fresh_only=True)
         assert running.info()["sensor_count"] == 1
     with stream(server, sensor=3, every=7, fresh_only=0):
-        assert server.asked == request("subscribe", every=7, fresh_only=False, sensors=[3])
+        assert server.requests[-1] == request("subscribe", every=7, fresh_only=False, sensors=[3])
 
 
 def test_a_clock_that_is_shifted_is_another_one(server: PlayedServer) -> None:
@@ -333,7 +295,7 @@ def test_next_says_at_once_that_the_connection_is_lost(server: PlayedServer) -> 
     with stream(server, max_age_ms=0, reconnect="when_told") as running:
         running.begin("next", int(PATIENCE_S * 1000))
         began = time.monotonic()
-        server.hang_up()
+        server.drop()
         assert picked(running.answer(), "condition", "is_new") == ("disconnected", False)
         assert time.monotonic() - began < PATIENCE_S / 2
 
@@ -367,7 +329,8 @@ def test_it_does_not_connect_again_after_close(server: PlayedServer) -> None:
         assert running.info()["error"].endswith("closed by this program")
         for _ in range(20):
             assert picked(running.latest(), "condition", "has_sample") == ("disconnected", False)
-        assert not server.is_asked(0.2)
+        time.sleep(0.1)
+        assert server.connections == 1
 
 
 @pytest.mark.parametrize(
@@ -383,9 +346,8 @@ def test_it_does_not_connect_again_after_close(server: PlayedServer) -> None:
 )
 def test_a_connection_that_fails(server: PlayedServer, answer: Any, said: str, is_refused: bool) -> None:
     with driver(server.port, reconnect="when_told") as running:
-        running.begin("connect", int(PATIENCE_S * 1000) if answer else 100)
-        server.accept(answer)
-        told = running.answer()
+        server.answer = answer
+        told = running.do("connect", int(PATIENCE_S * 1000) if answer else 100)
         assert not told["ok"]
         assert said in told["error"]
         assert running.info()["refused"] is is_refused
@@ -400,9 +362,9 @@ def test_it_starts_without_the_server(step: str) -> None:
         assert running.info()["error"] == "not connected yet: call connect()"
         told = running.do("connect", 1000)
         assert (told["ok"], "nobody listens there: start ethercat-server" in told["error"]) == (False, True)
-        with contextlib.closing(PlayedServer(port)) as late:
+        with PlayedServer(port) as late:
             assert picked(running.latest(), "condition") == ("disconnected",)
-            accept_while(late, running, step=step)
+            until_up(running, step)
             late.send(frame(1))
             wait_until(lambda: running.latest()["fresh"], "the first sample")
 
@@ -423,7 +385,7 @@ def is_down(running: Driver) -> Callable[[], bool]:
 def test_it_says_why_the_connection_ended(server: PlayedServer) -> None:
     with stream(server, reconnect="when_told") as running:
         server.send({"event": "shutting_down"})
-        server.hang_up()
+        server.drop()
         wait_until(is_down(running), "the end")
         assert running.info()["error"] == f"127.0.0.1 port {server.port}: the server was shut down"
 
@@ -435,7 +397,7 @@ def test_it_reconnects_only_where_it_is_told(server: PlayedServer) -> None:
         running.latest()
         before = running.info()
         assert (before["receives"], before["other_calls"]) == (1, 0)
-        server.hang_up()
+        server.drop()
         wait_until(is_down(running), "the end")
         lost = running.info()
         assert lost["other_calls"] == 0, "not even close()"
@@ -445,8 +407,8 @@ def test_it_reconnects_only_where_it_is_told(server: PlayedServer) -> None:
             assert picked(running.do("next", 3_600_000), "is_new", "connection") == (False, 1)
         after = running.info()
         assert (after["receives"], after["other_calls"]) == (lost["receives"], 0)
-        assert (after["fd"], server.is_asked()) == (-1, False)
-        accept_while(server, running, step="reconnect")
+        assert (after["fd"], server.connections) == (-1, 1)
+        until_up(running, "reconnect")
         server.send(frame(2))
         assert picked(running.latest(), "fresh", "gap", "connection", "sequence") == (True, True, 2, 2)
         assert running.info()["other_calls"] == 0
@@ -454,11 +416,10 @@ def test_it_reconnects_only_where_it_is_told(server: PlayedServer) -> None:
 
 def test_a_refusal_does_not_stand_in_the_way_of_connect(server: PlayedServer) -> None:
     with stream(server, reconnect_every_ms=1) as running:
-        server.hang_up()
+        server.answer = REFUSED
+        server.drop()
         running.do("next", int(PATIENCE_S * 1000))  # the loss
-        running.begin("next", int(PATIENCE_S * 1000))
-        server.accept(REFUSED)
-        assert picked(running.answer(), "condition") == ("disconnected",)
+        assert picked(running.do("next", int(PATIENCE_S * 1000)), "condition") == ("disconnected",)
         assert "no 9" in running.info()["error"]
         connected(server, running)
         assert running.info()["refused"] is False
@@ -483,10 +444,11 @@ def test_it_tries_again_no_more_often_than_it_may() -> None:
     port = free_port()
     with driver(port, reconnect_every_ms=3_600_000) as running:
         running.do("connect", 1000)
-        with contextlib.closing(PlayedServer(port)) as late:
+        with PlayedServer(port) as late:
             for _ in range(200):
                 running.latest()
-            assert not late.is_asked(0.1)
+            time.sleep(0.1)
+            assert late.connections == 0
 
 
 # -- real time
@@ -494,9 +456,8 @@ def test_it_tries_again_no_more_often_than_it_may() -> None:
 
 def test_nothing_is_allocated_in_any_state(server: PlayedServer) -> None:
     with stream(server, reconnect_every_ms=1) as running:
-        assert server.connection is not None
         for n in range(1, 200):
-            server.connection.sendall(frame(n))
+            server.send_raw(frame(n))
             running.latest() if n % 2 else running.do("next", 1000)
         settings = {"calibration_matrix": False, "imu_active": 0}
         server.send(
@@ -504,9 +465,9 @@ def test_nothing_is_allocated_in_any_state(server: PlayedServer) -> None:
             frame(300, GAP),
         )  # fmt: skip
         running.latest()
-        server.hang_up()
+        server.drop()
         running.do("next", 20)
-        accept_while(server, running)
+        until_up(running)
         server.close()
         for _ in range(20):
             running.latest()
@@ -525,7 +486,7 @@ def test_describe_tare_and_refusals() -> None:
         for at, name in enumerate(("old_offset", "new_offset", "residual", "deviation"))
     }
     row: dict[str, Any] = {"hardware": "h", "firmware": "f", "state": "OP"}
-    with played(**row) as sensor, driver(sensor.port) as running:
+    with PlayedSensor(**row) as sensor, driver(sensor.port) as running:
         sensor.answers |= {
             "tare": lambda _: {"ok": True, **results},
             "sdo_read": lambda asked: {"ok": True, "value": 1} if asked.get("subindex") else refused,

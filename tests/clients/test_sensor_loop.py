@@ -31,7 +31,7 @@ from tests.clients.cpp_programs import (
     needs_gxx,
     patient,
 )
-from tests.clients.played_sensor import PlayedSensor, described, frame, played
+from tests.clients.played_sensor import PlayedSensor, described, frame
 from tests.clients.recordings import record
 from tests.clients.test_identify import posed
 from tests.ended import run_here
@@ -113,7 +113,7 @@ def running(request: pytest.FixtureRequest) -> Iterator[Loop]:
 
 @pytest.fixture
 def server(running: Loop) -> Iterator[PlayedSensor]:
-    with played() as sensor:
+    with PlayedSensor() as sensor:
         yield sensor
         running.do("stop")
 
@@ -341,7 +341,7 @@ def test_the_server_may_come_later(running: Loop) -> None:
     port = free_port()
     running.new(host="127.0.0.1", port=port, connect_timeout=60)
     running.begin("open")
-    with played(port):
+    with PlayedSensor(port):
         assert running.answer()["ok"]
         running.do("stop")
 
@@ -428,7 +428,7 @@ def test_a_tare_in_any_pose_is_right_in_every_pose(running: Loop, server: Played
 
 def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> None:
     """Two sample periods: the newest force is that of the acceleration two samples before."""
-    with played(rate_hz=100, delay_ms={"force_torque": 25.0, "acceleration": 5.0}) as server:
+    with PlayedSensor(rate_hz=100, delay_ms={"force_torque": 25.0, "acceleration": 5.0}) as server:
         loop = running.opened(server.port, tool_mass=1)
         begin_ns = time.monotonic_ns() - 50_000_000
         for number in range(1, 5):
@@ -464,17 +464,17 @@ def test_a_tare_without_a_payload_and_one_that_is_refused(running: Loop, server:
 
 
 def test_another_sensor_in_its_place_is_refused(running: Loop) -> None:
-    with played() as first:
+    with PlayedSensor() as first:
         loop = running.opened(first.port, max_age=0.3)
         first.send(frame(1))
         loop.until(FRESH)
-    with played(first.port, serial=8) as other:
+    with PlayedSensor(first.port, serial=8) as other:
         loop.logged(
             "sensor 0 is BFT-SENS-ECAT-M8, serial 8, and was BFT-SENS-ECAT-M8, serial 7, when configured"
         )
         other.send(frame(2))
         loop.until(UNCHECKED, lambda seen: seen["force.x"] is None)
-    with played(first.port) as same:
+    with PlayedSensor(first.port) as same:
         loop.logged("connected again")
         loop.until(SILENT)
         same.send(frame(2))
@@ -496,7 +496,7 @@ def test_a_cycle_makes_no_system_call(running: Loop, server: PlayedSensor) -> No
 def test_the_two_threads_under_the_thread_sanitizer() -> None:
     """Real seconds: a server that comes and goes while a loop runs at 1 kHz."""
     loop = Loop(program(THREADS))
-    with played() as first:
+    with PlayedSensor() as first:
         port = first.port
         loop.opened(port)
         loop.begin("run", 8, 1000)
@@ -506,7 +506,7 @@ def test_the_two_threads_under_the_thread_sanitizer() -> None:
                 first.send(frame(int(time.monotonic() * 1e6)))
                 first.reconfigure(rate_hz=400)
     for _ in range(20):
-        with played(port) as again:
+        with PlayedSensor(port) as again:
             wait_until(lambda: bool(again.streams), "the next connection")
             again.send(frame(int(time.monotonic() * 1e6)))
     told = loop.answer()

@@ -43,7 +43,6 @@ class _Lookup(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        """The thread."""
         try:
             found = socket.getaddrinfo(*self._where, type=socket.SOCK_STREAM)
             self.found = [(family, address) for family, _, _, _, address in found]

@@ -144,7 +144,6 @@ class Client:
         self._closing = threading.Event()
 
     def __enter__(self) -> Client:
-        """The client; `with` closes it."""
         return self
 
     def __exit__(

@@ -52,7 +52,6 @@ class _Batch(NamedTuple):
     last_ns: int = 0
 
     def then(self, later: _Batch) -> _Batch:
-        """Both, as one."""
         return _Batch(
             later.at_ns,
             tuple(map(operator.add, self.counts, later.counts)),

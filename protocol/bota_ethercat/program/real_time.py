@@ -29,7 +29,6 @@ class Scheduling(NamedTuple):
     refused: tuple[str, ...] = ()  # what was not granted, each with what would grant it
 
     def __str__(self) -> str:
-        """What was granted, then what was not."""
         granted = [f"SCHED_FIFO {self.priority}" if self.priority else "ordinary scheduling"]
         granted += [f"CPU {self.cpu}"] if self.cpu is not None else []
         granted += ["memory locked"] if self.memory_locked else []
@@ -91,7 +90,6 @@ def _lock_memory(*, drops_capabilities: bool) -> bool:
 
 
 def _may_lock_all() -> bool:
-    """Whether this process has CAP_IPC_LOCK."""
     for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
         if line.startswith("CapEff:"):
             return bool(int(line.split()[1], 16) >> _CAP_IPC_LOCK & 1)

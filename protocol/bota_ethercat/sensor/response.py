@@ -56,7 +56,6 @@ class Response(NamedTuple):
         return None if self.delay_s is None else 360.0 * hz * self.delay_s
 
     def __str__(self) -> str:
-        """The delay, for display."""
         return self.source.value if self.delay_s is None else f"{self.delay_ms:g} ms ({self.source.value})"
 
 

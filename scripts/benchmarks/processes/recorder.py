@@ -26,7 +26,6 @@ _DEPTH: Final = 50
 
 
 def tcp(recording: ArrivalRecorder, port: int = PORT) -> None:
-    """A client of ethercat-server."""
     frames, decode = FrameDecoder(), SampleDecoder(SIZE).decode
     old = DataFlag.REPEATED | DataFlag.INVALID
     with socket.create_connection(("127.0.0.1", port)) as connection:
@@ -80,7 +79,6 @@ KINDS: Final[dict[str, Callable[..., None]]] = {"tcp": tcp, "ros": ros}
 
 
 def main(kind: str, path: str, warm_up_s: str, seconds: str, priority: str, *arguments: str) -> None:
-    """Record, then end."""
     recording = ArrivalRecorder(Path(path), float(warm_up_s), float(seconds))
     gc.disable()
     make_real_time(int(priority))  # of all threads: the middleware's inherit it

@@ -26,7 +26,6 @@ _ATTEMPTS: Final = 5
 
 
 def main() -> None:
-    """Record, then end."""
     path, warm_up_s, seconds, ifname, sinc, rate_hz, priority = sys.argv[1:]
     recording = ArrivalRecorder(Path(path), float(warm_up_s), float(seconds))
     gc.disable()
