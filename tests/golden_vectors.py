@@ -21,8 +21,6 @@ Outcome = DataMessage | JsonObject | str
 
 
 class Vector(NamedTuple):
-    """A message, whole or broken."""
-
     name: str
     wire: bytes
     outcome: Outcome
@@ -115,8 +113,6 @@ class Player(Protocol):
 
 
 class ReadStream(NamedTuple):
-    """A stream of readings.json."""
-
     name: str
     steps: list[list[Any]]
     max_age_ms: int = 10
@@ -178,7 +174,6 @@ def odd_messages() -> Iterator[JsonObject]:
 
 
 def expected(vectors: Sequence[Vector]) -> list[Outcome]:
-    """What comes of these vectors, sent one behind the other."""
     found: list[Outcome] = []
     for vector in vectors:
         found.append(vector.outcome)
@@ -208,5 +203,4 @@ def outcomes(chunks: Sequence[bytes], max_json_length: int = MAX_JSON_LENGTH) ->
 
 
 def same_sample(one: Sample, other: Sample) -> bool:
-    """Whether two samples are the same to the bit, but for what kind of NaN a value is."""
     return repr(one) == repr(other)

@@ -43,7 +43,6 @@ def test_the_release_knows_which_lines_of_the_checkout_are_the_client_distributi
 
 
 def python(version: str) -> str | None:
-    """The path of this Python if it is on this machine; pyenv's are not on PATH."""
     found = shutil.which(f"python{version}", path=f"/usr/bin:{os.environ['PATH']}")
     pyenv = sorted((Path.home() / ".pyenv/versions").glob(f"{version}.*/bin/python3"))
     for candidate in [found, *map(str, pyenv)]:
@@ -107,7 +106,6 @@ def install(release: Path, interpreter: str, environment: Path, distribution: st
 
 
 def versions(environment: Path, programs: dict[str, str]) -> set[str]:
-    """What the programs print for --version."""
     return {run_quietly(environment / "bin" / name, "--version", check=True).stdout for name in programs}
 
 

@@ -1,7 +1,4 @@
-"""Real-time settings of the acquisition loop: SCHED_FIFO, locked memory, CPU affinity, timer slack.
-
-Each is used if permitted; what is not is logged in one line and the server runs without it.
-"""
+"""Real-time settings of the acquisition loop; what is not permitted is logged in one line."""
 
 from __future__ import annotations
 
@@ -31,13 +28,13 @@ def prepare(priority: int, cpu: int | None, *, becomes_user: bool = False) -> No
     `priority` is that of SCHED_FIFO, 1 to 99, or 0 for ordinary scheduling; `cpu` is the CPU to pin it to;
     `becomes_user` if the process gives up its capabilities afterwards, which ends none of it.
     """
-    given = make_real_time(priority, -1 if cpu is None else cpu, drops_capabilities=becomes_user)
-    if os.sched_getscheduler(0) != os.SCHED_FIFO:
+    scheduling = make_real_time(priority, -1 if cpu is None else cpu, keeps_rights=not becomes_user)
+    if not scheduling.priority:
         # By default an ordinary thread's sleep may end 50 µs late, a FIFO thread's not.
         with contextlib.suppress(OSError):
             Path("/proc/self/timerslack_ns").write_text(_TIMER_SLACK_NS, encoding="ascii")
-    if given.refused:
-        log.warning("not granted: %s; expect more jitter", "; ".join(given.refused))
+    if scheduling.refused:
+        log.warning("not granted: %s; expect more jitter", ", ".join(scheduling.refused))
     sys.setswitchinterval(_SWITCH_S)
     # The loop makes no reference cycles, so it needs no collector, which would pause it: a look at the newest
     # objects once a second is enough.

@@ -24,7 +24,6 @@ Answer = Callable[[JsonObject], JsonObject | None]
 
 
 def description(sensor: int = 0, **changes: Any) -> JsonObject:
-    """A `describe` reply's content."""
     row = {
         "sensor": sensor, "name": "BFT-SENS-ECAT-M8", "serial": 1, "pdo_size": 61, "rate_hz": 800,
         "state": "OP", "hardware": "h", "firmware": "f", "settings": {},
@@ -33,7 +32,6 @@ def description(sensor: int = 0, **changes: Any) -> JsonObject:
 
 
 def process_data(number: float, size: int = 61) -> bytes:
-    """Process data whose twelve values follow from `number`."""
     names = [f"{v}.{a}" for v in ("force", "torque", "acceleration", "angular_rate") for a in "xyz"]
     return encode(size, {name: number + i / 16 for i, name in enumerate(names)})
 
@@ -62,26 +60,21 @@ class Script:
         self.ahead_ns = 0
 
     def send_raw(self, data: bytes) -> None:
-        """Send these bytes."""
         raise NotImplementedError
 
     def send_json(self, message: JsonObject) -> None:
-        """Send a JSON message."""
         self.send_raw(encode_json(message))
 
     def send_sample(self, number: float, flags: int = 0, **changes: Any) -> None:
-        """Send the next frame of sensor 0."""
         self.send_raw(self.frame(number, flags, **changes))
 
     def frame(self, number: float, flags: int = 0, **changes: Any) -> bytes:
-        """The next frame of sensor 0, encoded."""
         self.sequence += 1
         moment = self.clock.monotonic_ns() + self.ahead_ns
         message = DataMessage(self.sequence, self.clock.time_ns(), moment, 0, flags, 3, process_data(number))
         return encode_data(*message._replace(**changes))
 
     def receive(self, decoder: FrameDecoder, data: bytes) -> None:
-        """Answer the requests that these bytes end."""
         decoder.feed(data)
         for message in decoder:
             assert isinstance(message, dict)
@@ -124,7 +117,6 @@ class ScriptedServer(Script):
         self.close()
 
     def close(self) -> None:
-        """Stop listening and drop the connections."""
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self.drop()
@@ -132,7 +124,6 @@ class ScriptedServer(Script):
         self._listener.close()
 
     def drop(self) -> None:
-        """Drop the connections."""
         self.subscribed.clear()
         for peer in list(self._peers.values()):
             with contextlib.suppress(OSError):

@@ -98,7 +98,6 @@ class Commanded:
     process: subprocess.Popen[str]
 
     def begin(self, *words: object) -> None:
-        """Give a command; `answer` has what comes of it."""
         assert self.process.stdin is not None
         self.process.stdin.write(" ".join(map(str, words)) + "\n")
         self.process.stdin.flush()
@@ -127,7 +126,6 @@ class Driver(Commanded):
         return self
 
     def latest(self, position: int = 0) -> Reading:
-        """The newest sample, and what holds of every reading does."""
         reading: Reading = self.do("latest", position)
         assert reading["fresh"] == (reading["condition"] == "fresh")
         assert reading["has_sample"] or not (reading["fresh"] or reading["is_new"])
@@ -139,7 +137,6 @@ class Driver(Commanded):
 
 
 def start_driver(*inside: str, flags: Sequence[str] = SANITIZED) -> subprocess.Popen[str]:
-    """A driver, started by the command `inside`."""
     command = [*inside, str(driver_program(flags))]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
@@ -172,6 +169,5 @@ def driver(port: int, /, **options: object) -> Iterator[Driver]:
 
 
 def assert_no_faults() -> None:
-    """End the drivers; none had a fault that a sanitizer found."""
     while _idle:
         assert end_driver(_idle.pop()) == 0

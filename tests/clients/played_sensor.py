@@ -22,7 +22,6 @@ SETTINGS = {
 
 
 def described(**changed: Any) -> JsonObject:
-    """A sensor as `describe` has it."""
     settings = SETTINGS | {name: changed.pop(name) for name in SETTINGS if name in changed}
     sensor = {"sensor": 0, "name": "BFT-SENS-ECAT-M8", "serial": 7, "pdo_size": 61, "rate_hz": 800}
     return sensor | changed | {"settings": settings}
@@ -38,7 +37,6 @@ class PlayedSensor(ScriptedServer):
         self.answers["tare"] = lambda _: {"ok": True, **zeros}
 
     def send(self, *messages: bytes | JsonObject) -> None:
-        """To the newest subscriber."""
         wait_until(lambda: bool(self.streams), "a subscriber")
         for message in messages:
             self.send_raw(message if isinstance(message, bytes) else encode_json(message))

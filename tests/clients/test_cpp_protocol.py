@@ -46,7 +46,6 @@ INSERTED = (
 def in_cpp(
     streams: Sequence[Stream], limit: int = 65536, units: str = "g_dps", flags: Sequence[str] = SANITIZED
 ) -> list[list[Decoded]]:
-    """What the C++ decoder makes of each stream."""
     lines = (f"{limit} {units} {' '.join(chunk.hex() for chunk in stream)}\n" for stream in streams)
     return list(by_stream(decoded("".join(lines), flags=flags)))[: len(streams)]
 

@@ -55,8 +55,6 @@ OURS = boot_id() or pytest.fail("this machine has no boot id")
 
 
 class PlayedServer(ScriptedServer):
-    """Answers every request alike."""
-
     answer: JsonObject | bytes = GRANTED
 
     def _answer(self, message: JsonObject) -> None:
@@ -95,13 +93,11 @@ def connected(server: PlayedServer, running: Driver, answer: JsonObject | bytes 
 
 @contextlib.contextmanager
 def stream(server: PlayedServer, answer: JsonObject | bytes = GRANTED, **options: object) -> Iterator[Driver]:
-    """A connected client that has time."""
     with driver(server.port, **{**PATIENT, **options}) as running:
         yield connected(server, running, answer)
 
 
 def until_up(running: Driver, step: str = "latest") -> None:
-    """The client connects step by step, a step in each call."""
     wait_until(lambda: running.do(step) is not None and running.info()["link"] == "up", "the subscription")
 
 
@@ -110,8 +106,6 @@ def picked(reading: JsonObject, *names: str) -> tuple[Any, ...]:
 
 
 class CppPlayer:
-    """See `Player`: the C++ client, over TCP, with a clock that the test sets."""
-
     def __init__(self, server: PlayedServer, running: Driver) -> None:
         self.server, self.running = server, running
 
@@ -125,7 +119,6 @@ class CppPlayer:
         self.server.send(message)
 
     def end(self) -> None:
-        """Until the client's kernel has acknowledged it."""
         connection = self.server.streams[-1]
         connection.shutdown(socket.SHUT_WR)
 
@@ -158,7 +151,6 @@ F = functools.partial(functools.partial, frame)
 
 
 def text(body: bytes) -> bytes:
-    """A JSON message, which may be none."""
     return struct.pack(">IB", 1 + len(body), 2) + body
 
 
@@ -166,7 +158,6 @@ LOST = {"event": "sensor_lost", "sensor": 0, "message": "sensor 0 is lost: cable
 
 
 def told(command: str, **expected: object) -> tuple[str, dict[str, object]]:
-    """A command to the driver, and what its answer must have."""
     return command, expected
 
 

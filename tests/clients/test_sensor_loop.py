@@ -54,8 +54,6 @@ def program(sanitized: tuple[str, ...] = SANITIZED) -> Path:
 
 
 class Loop(Commanded):
-    """tests/clients/cpp/sensor_loop.cpp, a process for many tests."""
-
     def __init__(self, path: Path) -> None:
         self.process = subprocess.Popen([path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
@@ -64,7 +62,6 @@ class Loop(Commanded):
         return bool(select.select([self.process.stdout], [], [], 0.005)[0])
 
     def new(self, *flags: str, **parameters: object) -> str:
-        """What is wrong with the parameters."""
         return str(self.do("new", *flags, *(f"{name}={value}" for name, value in parameters.items()))["why"])
 
     def opened(self, port: int, *flags: str, **parameters: object) -> Loop:
@@ -97,7 +94,6 @@ class Loop(Commanded):
         return last
 
     def logged(self, text: str, times: int = 1) -> None:
-        """Go on reading until the log has said it so many times."""
         wait_until(
             lambda: bool(self.read()) and sum(text in line for line in self.do("log")) >= times,
             f"the log to say: {text}",
@@ -238,7 +234,6 @@ def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
 
 
 def loads(running: Loop, model: str, lag_s: float, fir: bool, rate_hz: float, *samples: Any) -> Any:
-    """What the tool of `new` loads a sensor of this model with in each sample."""
     running.begin("tool", f"BFT-{model}-ECAT-M8", lag_s, int(fir), rate_hz, len(samples))
     for time_s, values in samples:
         running.begin(repr(time_s), *map(repr, values))

@@ -24,11 +24,9 @@ class MemoryServer(Script):
         self._agenda: list[tuple[int, Callable[[], object]]] = []
 
     def at(self, now_ns: int, action: Callable[[], object]) -> None:
-        """Do something at this time; one thing after the other."""
         self._agenda.append((now_ns, action))
 
     def go_on(self, seconds: float) -> None:
-        """Time passes, until something arrives."""
         until_ns = self.now_ns + math.ceil(seconds * 1e9)
         while not self.arrived and self._agenda and self._agenda[0][0] <= until_ns:
             self.now_ns, action = self._agenda.pop(0)

@@ -47,7 +47,6 @@ def server() -> MemoryServer:
 
 
 def client_of(server: MemoryServer, sensors: int = 1, **options: Any) -> Client:
-    """Connected to a server that has this number of sensors."""
     if sensors > 1:
         rows = [{"sensor": number, "rate_hz": 800} for number in range(sensors)]
         server.description = description() | {"sensors": rows}
@@ -189,7 +188,6 @@ def test_what_comes_before_a_reply_is_kept(server: MemoryServer) -> None:
 
 @pytest.mark.parametrize("rate_hz", [800, None])
 def test_reading_connects_by_itself(server: MemoryServer, rate_hz: float | None) -> None:
-    """Whether or not a rate is known."""
     server.description["sensors"][0]["rate_hz"] = rate_hz
     server.on_subscribe = lambda: server.send_sample(1.0)
     assert [frame.sequence for frame in Client(1, channel=ScriptedChannel(server)).receive()] == [1]
@@ -301,8 +299,6 @@ def test_odd_messages_cost_nothing(server: MemoryServer) -> None:
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str | None]]:
-    """`boot_id` of a machine whose kernel says these things; None: there is no such file."""
-
     def named(boot: str | None, offsets: str | None) -> str | None:
         for name, text in (("_BOOT_ID", boot), ("_CLOCK_OFFSETS", offsets)):
             path = tmp_path / name
@@ -484,7 +480,6 @@ def waits_everywhere(client: Client) -> None:
 
 @pytest.fixture
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A connection has to be made within a moment."""
     monkeypatch.setattr("bota_ethercat.client.channel.CONNECT_TIMEOUT_S", 0.2)
 
 
@@ -574,7 +569,6 @@ def test_another_thread_may_ask_while_one_receives(scripted: ScriptedServer) -> 
 
 
 def test_it_receives_beyond_1024_descriptors(scripted: ScriptedServer) -> None:
-    """Which `select` does not take."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, limits[1]), limits[1]))
     with contextlib.ExitStack() as taken:
@@ -608,7 +602,6 @@ def test_what_waits_for_a_slow_reader_is_bounded() -> None:
 
 
 def examples() -> list[str]:
-    """Of the section of the docs."""
     text = (ROOT / "docs" / "protocol.md").read_text().split("## A client in ten lines")[1].split("\n## ")[0]
     return [part.split("```")[0] for part in text.split("```python\n")[1:]]
 
@@ -643,7 +636,6 @@ PULLS: dict[str, tuple[Pull, str]] = {
 
 
 def guard(channel: TcpChannel) -> Callable[[Callable[[str], object]], object]:
-    """The guard of the docs."""
     source = examples()[1]
     assert len(source.splitlines()) <= 15
     names: dict[str, Any] = {}

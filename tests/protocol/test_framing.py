@@ -53,7 +53,6 @@ bare_side = partial(BareJsonDecoder, max_json_length=LIMIT)
 
 
 def drain(decoder: Decoder, found: list[Outcome], take: Callable[[], Outcome | None] | None = None) -> None:
-    """`take` is what to take messages with."""
     take = take or decoder.next_message
     while True:
         try:
@@ -87,7 +86,6 @@ def outcomes(decoder: Decoder, chunks: Sequence[bytes]) -> list[Outcome]:
 
 
 def kinds(found: Sequence[Outcome]) -> list[object]:
-    """Messages, and the kinds of errors."""
     return [each[0] if isinstance(each, tuple) and len(each) == 2 else each for each in found]
 
 

@@ -72,8 +72,6 @@ def test_accounting() -> None:
 
 
 class PythonPlayer:
-    """See `Player`: the Python client."""
-
     def __init__(self, stream: ReadStream) -> None:
         self.server = MemoryServer()
         self.server.now_ns = BEGIN_NS - 10**10

@@ -42,7 +42,6 @@ float32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
 def numbered(size: int) -> bytes:
-    """Every field holds its own number, counted from 1."""
     names = [row[0] for row in TABLE if row[1] < size]
     return encode(size, {name: float(n) for n, name in enumerate(names, 1)})
 

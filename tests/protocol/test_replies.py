@@ -24,7 +24,6 @@ JSON = st.recursive(
 
 
 def rows_of(row: Any) -> st.SearchStrategy[Any]:
-    """Objects with this row's keys and any values."""
     return JSON | st.fixed_dictionaries({}, optional=dict.fromkeys((*get_type_hints(row), "delay_ms"), JSON))
 
 

@@ -187,7 +187,7 @@ def test_it_streams_and_recovers_without_privileges(
 @on_a_bus
 def test_only_the_loop_has_real_time_priority(running: tuple[Server, Path]) -> None:
     found, _ = running
-    if "SCHED_FIFO" in found.said():
+    if "not granted: SCHED_FIFO" in found.said():
         pytest.skip("no real-time priority here: run it as real root")
     tasks = [int(path.name) for path in Path(f"/proc/{found.process.pid}/task").iterdir()]
     policies = {task: os.sched_getscheduler(task) & ~os.SCHED_RESET_ON_FORK for task in tasks}
@@ -364,6 +364,6 @@ def test_not_granted_is_one_line_and_it_runs_on() -> None:
     assert len(said.splitlines()) == 1
     assert said.startswith("not granted: ")
     assert f"CPU {limit}" in said
-    assert "SCHED_FIFO 40 ('rtprio 40' in a file in /etc/security/limits.d" in said
+    assert "SCHED_FIFO 40 (" in said
     assert found["gc"] is False
     assert found["slack"] == "1000", "then at least the timer is made finer"

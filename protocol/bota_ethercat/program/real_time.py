@@ -29,20 +29,19 @@ class Scheduling(NamedTuple):
     refused: tuple[str, ...] = ()  # what was not granted, each with what would grant it
 
     def __str__(self) -> str:
+        """What was granted, then what was not."""
         granted = [f"SCHED_FIFO {self.priority}" if self.priority else "ordinary scheduling"]
         granted += [f"CPU {self.cpu}"] if self.cpu is not None else []
         granted += ["memory locked"] if self.memory_locked else []
         return "; ".join([", ".join(granted), *(f"not granted: {what}" for what in self.refused)])
 
 
-def make_real_time(
-    priority: int, cpu: int = -1, *, thread: int = 0, drops_capabilities: bool = False
-) -> Scheduling:
+def make_real_time(priority: int, cpu: int = -1, *, thread: int = 0, keeps_rights: bool = True) -> Scheduling:
     """Give a thread SCHED_FIFO, by default the calling one, and lock the process's memory; as far as allowed.
 
     `priority` is from 1 to 98; with 0 neither is done. `cpu` is the CPU to pin it to; -1: none. `thread` is
     another thread of this process: its `threading.Thread.native_id`. Threads that the thread starts later
-    inherit its priority and CPU. `drops_capabilities`: the process gives its capabilities up afterwards.
+    inherit its priority and CPU. `keeps_rights`: whether the process keeps its capabilities afterwards.
     """
     if sys.platform != "linux":
         return Scheduling(refused=("real-time scheduling (there is one on Linux only)",))
@@ -62,7 +61,7 @@ def make_real_time(
             refused.append(f"SCHED_FIFO {priority} ({_grants_priority(priority)})")
             priority = 0
         else:
-            locked = _lock_memory(drops_capabilities=drops_capabilities)
+            locked = _lock_memory(keeps_rights)
             if not locked:
                 refused.append(f"locked memory ('memlock unlimited' in {_LIMITS}, LimitMEMLOCK=infinity)")
     return Scheduling(priority, cpu if cpu >= 0 else None, locked, tuple(refused))
@@ -77,19 +76,20 @@ def _grants_priority(priority: int) -> str:
     return f"'rtprio {priority}' in {_LIMITS}, LimitRTPRIO={priority} in a service's unit"
 
 
-def _lock_memory(*, drops_capabilities: bool) -> bool:
-    """Whether it is locked. Not up to a limit: beyond it every allocation would fail."""
+def _lock_memory(keeps_rights: bool) -> bool:
+    """Whether it is locked. Not up to a limit: beyond it every allocation would fail without CAP_IPC_LOCK."""
     import resource  # noqa: PLC0415 - not on all systems
 
     try:
         resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     except (OSError, ValueError):
-        if drops_capabilities or not _may_lock_all():
+        if not (keeps_rights and _may_lock_all()):
             return False
     return bool(ctypes.CDLL(None).mlockall(_MLOCK) == 0)
 
 
 def _may_lock_all() -> bool:
+    """Whether this process has CAP_IPC_LOCK."""
     for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
         if line.startswith("CapEff:"):
             return bool(int(line.split()[1], 16) >> _CAP_IPC_LOCK & 1)
