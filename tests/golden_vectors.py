@@ -77,22 +77,14 @@ class AccountedStream(NamedTuple):
     """Frames of one sensor, and what `bota_ethercat.accounting` makes of them."""
 
     name: str
-    every: int
-    fresh_only: bool
-    rate_hz: float
-    steps: list[tuple[int, int, int, str] | None]
-    """`sequence`, `monotonic_ns`, `flags` and kind of each frame; None where a new subscription begins."""
-    counts: dict[str, int]
-    """At the end; 0 where none is given."""
+    frames: list[Any]  # `sequence`, `monotonic_ns`, `flags`, kind; or `begin`: a new subscription
+    counts: dict[str, int]  # at the end; 0 where none is given
+    every: int = 1
+    fresh_only: bool = True
+    rate_hz: float = 0.0
 
 
-def _accounted(entry: JsonObject) -> AccountedStream:
-    steps = [None if step == "begin" else tuple(step) for step in entry["frames"]]
-    options = entry.get("every", 1), entry.get("fresh_only", True), entry.get("rate_hz", 0)
-    return AccountedStream(entry["name"], *options, steps, entry["counts"])
-
-
-ACCOUNTED: Final = [_accounted(entry) for entry in _read("accounting.json")]
+ACCOUNTED: Final = [AccountedStream(**entry) for entry in _read("accounting.json")]
 
 
 BEGIN_NS: Final = 10**15  # both clocks of readings.json at 0 ms

@@ -143,7 +143,7 @@ def accounted_in_cpp(streams: Sequence[AccountedStream]) -> list[tuple[list[str]
     """The kind of each frame and the counts that the C++ header makes of each stream."""
     lines = []
     for stream in streams:
-        steps = ["begin" if step is None else ",".join(map(str, step[:3])) for step in stream.steps]
+        steps = [step if step == "begin" else ",".join(map(str, step[:3])) for step in stream.frames]
         options = (stream.every, int(stream.fresh_only), stream.rate_hz)
         lines.append(" ".join([*map(str, options), *steps]))
     rows = [line.split() for line in decoded("\n".join(lines), "accounting").splitlines()]
@@ -154,7 +154,7 @@ def accounted_in_cpp(streams: Sequence[AccountedStream]) -> list[tuple[list[str]
 def test_golden_accounting() -> None:
     for stream, (kinds, counts) in zip(ACCOUNTED, accounted_in_cpp(ACCOUNTED), strict=True):
         wanted = {**dict.fromkeys(StreamCounts.__slots__, 0), **stream.counts}
-        assert kinds == [step[3] for step in stream.steps if step is not None], stream.name
+        assert kinds == [step[3] for step in stream.frames if step != "begin"], stream.name
         assert counts == StreamCounts(**wanted), stream.name
 
 

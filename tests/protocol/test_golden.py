@@ -61,8 +61,8 @@ def test_accounting() -> None:
     for stream in ACCOUNTED:
         accounting = StreamAccounting(every=stream.every, fresh_only=stream.fresh_only)
         accounting.rate_hz = stream.rate_hz
-        for step in stream.steps:
-            if step is None:
+        for step in stream.frames:
+            if step == "begin":
                 accounting.begin()
             else:
                 sequence, monotonic_ns, flags, kind = step

@@ -186,14 +186,14 @@ private:
             message["message"].get(connection_.error);
         } else if (event.is("sensor_back") || event.is("reconfigured")) {
             sensors_[place].lost = false;
-            for (std::size_t i = 0; i < description_.sensor_count; ++i)
-                if (description_.sensors[i].sensor == place) detail::read_in_force(message, description_.sensors[i]);
+            if (SensorInfo* const info = described(place)) detail::read_in_force(message, *info);
             update_sensors();
         } else if (event.is("offset_changed")) {
-            for (std::size_t i = 0; i < description_.sensor_count; ++i)
-                if (description_.sensors[i].sensor == place) detail::read_offset(message, description_.sensors[i]);
+            if (SensorInfo* const info = described(place)) detail::read_offset(message, *info);
         }
     }
+
+    SensorInfo* described(std::uint8_t place) noexcept { return const_cast<SensorInfo*>(description_.find(place)); }
 
     void handle_refusal(json::Value message) noexcept {
         detail::Message reason;
