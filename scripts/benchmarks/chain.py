@@ -163,13 +163,12 @@ class Chain(contextlib.ExitStack):
         assert self._link is not None
         return self._link
 
-    def node(self, *parameters: str, position: int = 0) -> None:
-        """Start the ROS 2 node of a sensor, with these parameters; its `wrench` is /benchmark_POSITION."""
-        name = "node" if self.setup.sensors == 1 else f"node {position}"
-        given = [word for each in (f"server_port:={PORT}", f"sensor:={position}", *parameters)
-                 for word in ("-p", each)]  # fmt: skip
-        renamed = "-r", f"__node:=bridge_{position}", "-r", f"wrench:=/benchmark_{position}"
-        self.python(name, "bridge.client", "--ros-args", *renamed, *given)
+    def node(self, priority: int, position: int = 0) -> None:
+        """Start the ROS 2 node of a sensor, with this priority; its `wrench` is /benchmark_POSITION."""
+        given = f"server_port:={PORT}", f"sensor:={position}", f"rt_priority:={priority}"
+        renamed = f"__node:=bridge_{position}", f"wrench:=/benchmark_{position}"
+        words = [*(word for each in renamed for word in ("-r", each)), *(w for p in given for w in ("-p", p))]
+        self.python(f"node {position}", "bridge.client", "--ros-args", *words)
 
     def recorder(self, kind: str, *arguments: object, priority: int = 0) -> Child:
         """Start a recorder (processes/recorder.py, or of kind `c` the program given) that ends by itself."""

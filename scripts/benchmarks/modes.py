@@ -55,7 +55,7 @@ def _start(name: str, chain: Chain) -> Child:
         chain.server()
     if name == ROS:
         for position in range(setup.sensors):
-            chain.node(f"rt_priority:={REAL_TIME}", position=position)
+            chain.node(REAL_TIME, position)
         return chain.recorder("ros", setup.sensors)
     return chain.recorder("tcp") if name == THIS else chain.recorder("c", yardstick, "client")
 
@@ -141,7 +141,7 @@ def load(setup: Setup, loops: int) -> list[Figures]:
             with Chain(setup, f"{client}, {how}, beside {loops} loops") as chain:
                 chain.server()
                 if client == "wrench":
-                    chain.node(f"rt_priority:={priority}")
+                    chain.node(priority)
                 kind = ("ros", 1) if client == "wrench" else ("tcp",)
                 recorder = chain.recorder(*kind, priority=priority)
                 for number in range(loops):
