@@ -22,7 +22,7 @@ from scripts.benchmarks.chain import PROCESSES, WARM_UP_S, Chain, Child, Figures
 from scripts.benchmarks.processes.masters import build
 from scripts.benchmarks.records import REAL_TIME
 
-_MOST_TURNS: Final = 3
+_MAX_TURNS: Final = 3
 _NONE: Final = "-"
 VENDOR: Final = Path(__file__).parents[2] / ".venv-vendor"
 # What the ROS packages set is not for another environment's Python, which has no package of this project.
@@ -83,7 +83,7 @@ def compare(setup: Setup, with_driver: bool) -> list[Figures]:
     with_driver = with_driver and setup.sensors == 1  # it knows one sensor only
     missing = find_missing(with_driver)
     alternating = [THIS] if BARE_C in missing else [THIS, C_CLIENT, BARE_C]
-    count = max(1, min(_MOST_TURNS, int(setup.seconds)))
+    count = max(1, min(_MAX_TURNS, int(setup.seconds)))
     short = replace(setup, seconds=setup.seconds / count)
     rounds = [{name: turn(short, name) for name in alternating} for _ in range(count)]
     taken = {name: together([each[name] for each in rounds]) for name in alternating}

@@ -35,7 +35,7 @@ public:
         handles_.clear();
         for (const auto& sensor : info_.sensors)
             for (const auto& interface : sensor.state_interfaces)
-                handles_.emplace_back(get_state_interface_handle(sensor.name + "/" + interface.name), place(sensor, interface.name));
+                handles_.emplace_back(get_state_interface_handle(sensor.name + "/" + interface.name), index_of(sensor, interface.name));
         loop_ = std::make_unique<SensorLoop>(parameters_, [this](Level level, const std::string& text) { log(level, text); });
         std::string why;
         if (!loop_->open(why)) {
@@ -85,8 +85,8 @@ public:
     }
 
 private:
-    /// The place in `Values` of a state interface; the second <sensor> has those of the compensated wrench.
-    std::size_t place(const hardware_interface::ComponentInfo& sensor, const std::string& name) const {
+    /// The index in `Values` of a state interface; the second <sensor> has those of the compensated wrench.
+    std::size_t index_of(const hardware_interface::ComponentInfo& sensor, const std::string& name) const {
         return signal(&sensor == &info_.sensors[0] ? name : "compensated." + name);
     }
 
@@ -97,7 +97,7 @@ private:
         for (const auto& sensor : info_.sensors) {
             if (sensor.state_interfaces.empty()) return "the <sensor> " + sensor.name + " has no <state_interface>";
             for (const auto& interface : sensor.state_interfaces) {
-                const std::size_t which = place(sensor, interface.name);
+                const std::size_t which = index_of(sensor, interface.name);
                 if (which == kSignals.size()) return detail::unknown("state interface", interface.name, kSignals);
                 if (interface.data_type != "double")
                     return "the state interface " + interface.name + " has the data type " + interface.data_type + "; it must be double";
@@ -151,7 +151,7 @@ private:
 
     Parameters parameters_;
     std::unique_ptr<SensorLoop> loop_;
-    std::vector<std::pair<hardware_interface::StateInterface::SharedPtr, std::size_t>> handles_;  // place in `Values`
+    std::vector<std::pair<hardware_interface::StateInterface::SharedPtr, std::size_t>> handles_;  // index in `Values`
     bool is_active_ = false;
 };
 

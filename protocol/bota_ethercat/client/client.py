@@ -37,8 +37,8 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import rows
 
 ANSWER_TIMEOUT_S: Final = 5.0
-_MOST_EVENTS: Final = 1000
-_MOST_READS: Final = 64  # reads in one call, so that it returns whatever arrives
+_MAX_EVENTS: Final = 1000
+_MAX_READS: Final = 64  # reads in one call, so that it returns whatever arrives
 _BACKLOG: Final = 2048  # bytes received at once that are more than any steady stream: more may be waiting
 _AGAIN_S: Final = 0.5
 _CLOSED: Final = "this client has been closed"
@@ -121,7 +121,7 @@ class Client:
         periods, at least 20 ms. `channel`: another one than TCP.
         """
         self.address = Address(host, port)
-        self.events: deque[ClientEvent] = deque(maxlen=_MOST_EVENTS)
+        self.events: deque[ClientEvent] = deque(maxlen=_MAX_EVENTS)
         self.frame: DataMessage | None = None
         self.scheduling = Scheduling()
         self.session = Session(
@@ -344,7 +344,7 @@ class Client:
         items, monotonic_ns = self.session.items, self.channel.monotonic_ns
         of_terminals = len(self.terminal_frames)
         left_s, begun_ns = 0.0 if items else timeout_s, monotonic_ns()
-        for _ in range(_MOST_READS):
+        for _ in range(_MAX_READS):
             count = self._step(left_s)
             if count < _BACKLOG and (items or left_s <= 0 or len(self.terminal_frames) != of_terminals):
                 return

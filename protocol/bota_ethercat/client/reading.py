@@ -18,7 +18,7 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
-_LEAST_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
+_MIN_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
 _WARNINGS_AT: Final = LAYOUTS[min(LAYOUTS)].offsets["warnings"]
 _WARNINGS: Final = slice(_WARNINGS_AT, _WARNINGS_AT + 4)
@@ -158,7 +158,7 @@ class ReceivedSensor:
         if sample is not None and age_ns <= max_age_ns:
             condition = _condition_of(sample)
         else:
-            silence_ns = max(2 * max_age_ns, _LEAST_SILENCE_NS)
+            silence_ns = max(2 * max_age_ns, _MIN_SILENCE_NS)
             condition = self.why_old(silence_ns, now_ns, connected=connected, ahead=ahead)
         reading = Reading(
             condition, self.sensor, sample, frame, self.unread > 0, age_ns * 1e-9,

@@ -36,13 +36,13 @@ from bota_ethercat.replies import Description, position_of
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
-_FIRST_RETRY_NS: Final = 100_000_000
-_LONGEST_RETRY_NS: Final = 1_000_000_000
+_MIN_RETRY_NS: Final = 100_000_000
+_MAX_RETRY_NS: Final = 1_000_000_000
 # After a connection that lasted this long the next attempt follows as soon as after the first.
 _LASTED_NS: Final = 1_000_000_000
-_MOST_ITEMS: Final = 65536  # kept until they are taken; a tare of 20,000 samples needs fewer
+_MAX_ITEMS: Final = 65536  # kept until they are taken; a tare of 20,000 samples needs fewer
 _HANDSHAKE_NS: Final = 5_000_000_000
-_LEAST_TIMEOUT_S: Final = 0.02
+_MIN_TIMEOUT_S: Final = 0.02
 _TIMEOUT_PERIODS: Final = 5
 # Events that say what is in force from then on.
 _IN_FORCE: Final = frozenset({Event.SENSOR_BACK, Event.RECONFIGURED, Event.OFFSET_CHANGED})
@@ -98,7 +98,7 @@ class Session:
         """What to subscribe to, `sensors` None for all; nothing unless `stream`."""
         self.wanted = None if sensors is None else tuple(sensors)
         self._terminals = list(terminals)
-        self.terminal_frames: deque[TerminalMessage] = deque(maxlen=_MOST_ITEMS // 64)
+        self.terminal_frames: deque[TerminalMessage] = deque(maxlen=_MAX_ITEMS // 64)
         self.connected = self.same_machine = False
         self.description: JsonObject = {}
         self.items: deque[DataMessage | ClientEvent] = deque()
@@ -119,7 +119,7 @@ class Session:
         # The request that is to be granted next, and what its reply goes to.
         self._handshake: tuple[Future[JsonObject], Callable[[JsonObject], bytes]] | None = None
         self._missing: tuple[int, ...] = ()
-        self._retry_ns = _FIRST_RETRY_NS
+        self._retry_ns = _MIN_RETRY_NS
         self._opened_ns = 0
         self._open = False
 
@@ -136,11 +136,11 @@ class Session:
         """The connection has ended, or none could be made."""
         was_connected = self.connected
         if self._open and now_ns - self._opened_ns >= _LASTED_NS:
-            self._retry_ns = _FIRST_RETRY_NS
+            self._retry_ns = _MIN_RETRY_NS
         self.connected = self._open = False
         self._handshake = None
         self.retry_at_ns = now_ns + self._retry_ns
-        self._retry_ns = min(self._retry_ns * 3 // 2, _LONGEST_RETRY_NS)
+        self._retry_ns = min(self._retry_ns * 3 // 2, _MAX_RETRY_NS)
         self.problem = reason
         error = ConnectionFailedError(f"the connection ended before the reply: {reason}")
         for identifier in list(self._replies):
@@ -162,7 +162,7 @@ class Session:
 
     def _drop_oldest(self) -> None:
         """Nobody takes the items: their owner waits for a reply, say."""
-        while len(self.items) > _MOST_ITEMS:
+        while len(self.items) > _MAX_ITEMS:
             item = self.items.popleft()
             if isinstance(item, DataMessage):
                 self._dropped.add(item.sensor)
@@ -301,7 +301,7 @@ class Session:
     def timeout_s(self) -> float:
         """After this time without a sample something is wrong: a few periods of the slowest sensor."""
         rates = [state.accounting.rate_hz for state in self.sensors.values() if state.accounting.rate_hz]
-        return max([_LEAST_TIMEOUT_S, *(_TIMEOUT_PERIODS * self._every / rate for rate in rates)])
+        return max([_MIN_TIMEOUT_S, *(_TIMEOUT_PERIODS * self._every / rate for rate in rates)])
 
     def state(self, sensor: int) -> ReceivedSensor:
         """What is known of a sensor, so far nothing of one that no description had."""

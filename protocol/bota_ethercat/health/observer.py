@@ -27,9 +27,9 @@ _FLAGS: Final = tuple(
     for name in ("warnings", "force_torque_saturated", "acceleration_saturated", "angular_rate_saturated")
 )
 _TEMPERATURE: Final = COMMON.index("temperature")
-_MOST_KEPT: Final = 1 << 16
+_MAX_KEPT: Final = 1 << 16
 _COUNTED: Final = ("lost_samples", "not_finite", "recoveries")  # what has grown matters
-_HIGHEST_HZ: Final = 1e6  # a rate beyond it is no sensor's, and not known
+_MAX_HZ: Final = 1e6  # a rate beyond it is no sensor's, and not known
 
 
 def by_sensor(frames: Iterable[DataMessage]) -> dict[int, list[DataMessage]]:
@@ -168,8 +168,8 @@ class StreamObserver(SensorObserver):
         self._window_ns = window_ns
         self._batches: deque[_Batch] = deque()
         # When each came, and: the age of samples, ns; the interval between samples that follow one another.
-        self._ages: deque[tuple[int, int]] = deque(maxlen=_MOST_KEPT)
-        self._intervals: deque[tuple[int, int]] = deque(maxlen=_MOST_KEPT)
+        self._ages: deque[tuple[int, int]] = deque(maxlen=_MAX_KEPT)
+        self._intervals: deque[tuple[int, int]] = deque(maxlen=_MAX_KEPT)
         self.connected(start_ns)
         self.begin(nominal_hz, start_ns)
 
@@ -188,7 +188,7 @@ class StreamObserver(SensorObserver):
 
     def begin(self, nominal_hz: float, start_ns: int) -> None:
         """Observe from here on, at this rate; the counts go on."""
-        self._nominal_hz = nominal_hz if 0 < nominal_hz <= _HIGHEST_HZ else 0.0
+        self._nominal_hz = nominal_hz if 0 < nominal_hz <= _MAX_HZ else 0.0
         self._accounting.rate_hz = self._nominal_hz
         self._start_ns = self._fresh_at_ns = start_ns
         self._forget_frames()

@@ -22,7 +22,7 @@ from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import no_server
 from bota_ethercat.pdo import LAYOUTS, Sample, SampleDecoder
-from bota_ethercat.replies import LONGEST_MS
+from bota_ethercat.replies import MAX_DELAY_MS
 from bota_ethercat.text.untrusted import rows
 from bridge.parameters.table import Parameters
 from bridge.process import Worker
@@ -31,7 +31,7 @@ from bridge.stream.link import SYSTEM_CLOCK, Clock, Link, sentence
 
 _WAIT_S: Final = 0.1  # so that silence is known to be the server's
 # Times that a ROS message can carry, less the longest delay of a filter.
-_FIRST_STAMP_NS: Final = LONGEST_MS * 10**6
+_FIRST_STAMP_NS: Final = MAX_DELAY_MS * 10**6
 _LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
 _SOMETIMES: Final = {"throttle_duration_sec": 10.0}
 _MOST_NOTED: Final = 8192

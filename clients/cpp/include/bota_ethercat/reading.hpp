@@ -250,7 +250,7 @@ public:
 
 private:
     static constexpr std::uint64_t kClockToleranceNs = 1'000'000;
-    static constexpr std::int64_t kLeastSilenceNs = 30'000'000;  // three times the pace of REPEATED frames
+    static constexpr std::int64_t kMinSilenceNs = 30'000'000;  // three times the pace of REPEATED frames
 
     /// The condition of a recent sample.
     static Condition condition_of(const Sample& sample, bool judge_imu) noexcept {
@@ -264,7 +264,7 @@ private:
         if (!connected) return Condition::disconnected;
         if (lost) return Condition::sensor_lost;
         const std::int64_t silence_ns = now_ns - received_ns_;
-        if (!accounting.begun() || (silence_ns >= kLeastSilenceNs && silence_ns / 2 >= max_age_ns)) return Condition::silent;
+        if (!accounting.begun() || (silence_ns >= kMinSilenceNs && silence_ns / 2 >= max_age_ns)) return Condition::silent;
         if ((next_.flags & kInvalid) != 0) return Condition::invalid;
         if ((next_.flags & kRepeated) != 0) return Condition::repeated;
         return ahead ? Condition::bad_clock : Condition::late;

@@ -52,7 +52,7 @@ public:
             Frame frame;
             while (link() != Link::down && read_message(frame)) frames += frame.process_data != nullptr;
             if (link() == Link::down || !may_be_more) break;
-            if (budget == 0 || reads == kMostReads) {
+            if (budget == 0 || reads == kMaxReads) {
                 more_waits_ = true;
                 break;
             }
@@ -64,16 +64,16 @@ public:
         return frames;
     }
 
-    /// The newest sample of the sensor at position `place`, after reading everything that has arrived.
-    Reading latest(std::uint8_t place = 0) noexcept {
+    /// The newest sample of the sensor at this position, after reading everything that has arrived.
+    Reading latest(std::uint8_t position = 0) noexcept {
         update();
-        return read(place);
+        return read(position);
     }
 
     /// The same without reading the socket: for the second sensor of a chain, after `latest` of the first.
-    Reading peek(std::uint8_t place = 0) noexcept {
+    Reading peek(std::uint8_t position = 0) noexcept {
         connection_.now_ns = monotonic_now_ns();
-        return read(place);
+        return read(position);
     }
 
     /// The next sample of any sensor, in order, none left out; waits at most `timeout`.
@@ -117,8 +117,8 @@ public:
     /// The server's sensors, as it described them last: when the subscription was made, and a sensor's rate, settings and
     /// offset when it came back, was reconfigured or tared.
     const Description& description() const noexcept { return description_; }
-    Counters counters(std::uint8_t place = 0) const noexcept {
-        return {sensors_[place].accounting.counts, sensors_[place].all_passed_over};
+    Counters counters(std::uint8_t position = 0) const noexcept {
+        return {sensors_[position].accounting.counts, sensors_[position].all_passed_over};
     }
     /// Connections made so far.
     std::uint32_t connections() const noexcept { return connections_; }
@@ -131,7 +131,7 @@ public:
 
 private:
     static constexpr std::size_t kPlaces = 256;    // every value of the `sensor` byte
-    static constexpr int kMostReads = 16;          // in one call of `update`
+    static constexpr int kMaxReads = 16;          // in one call of `update`
     static constexpr std::size_t kBacklog = 2048;  // received at once: more than any steady stream
 
     static std::string request(const Options& options) {
@@ -173,27 +173,27 @@ private:
     }
 
     void handle_event(json::Value event, json::Value message) noexcept {
-        std::uint8_t place = 0;
-        const bool of_a_sensor = message["sensor"].get(place);
+        std::uint8_t position = 0;
+        const bool of_a_sensor = message["sensor"].get(position);
         if (event.is("shutting_down")) connection_.is_shutting_down = true;
         if (event.is("reconfigured")) {
             const auto& wanted = connection_.options.sensors;
-            if (!of_a_sensor || wanted.empty() || std::count(wanted.begin(), wanted.end(), place) > 0) ++reconfigurations_;
+            if (!of_a_sensor || wanted.empty() || std::count(wanted.begin(), wanted.end(), position) > 0) ++reconfigurations_;
         }
         if (!of_a_sensor) return;
         if (event.is("sensor_lost")) {
-            sensors_[place].lost = true;
+            sensors_[position].lost = true;
             message["message"].get(connection_.error);
         } else if (event.is("sensor_back") || event.is("reconfigured")) {
-            sensors_[place].lost = false;
-            if (SensorInfo* const info = described(place)) detail::read_in_force(message, *info);
+            sensors_[position].lost = false;
+            if (SensorInfo* const info = described(position)) detail::read_in_force(message, *info);
             update_sensors();
         } else if (event.is("offset_changed")) {
-            if (SensorInfo* const info = described(place)) detail::read_offset(message, *info);
+            if (SensorInfo* const info = described(position)) detail::read_offset(message, *info);
         }
     }
 
-    SensorInfo* described(std::uint8_t place) noexcept { return const_cast<SensorInfo*>(description_.find(place)); }
+    SensorInfo* described(std::uint8_t position) noexcept { return const_cast<SensorInfo*>(description_.find(position)); }
 
     void handle_refusal(json::Value message) noexcept {
         detail::Message reason;
@@ -229,9 +229,9 @@ private:
         }
     }
 
-    Reading read(std::uint8_t place) noexcept {
-        Reading reading = sensors_[place].read(connection_.options, connected(), connection_.now_ns);
-        reading.sensor = place;
+    Reading read(std::uint8_t position) noexcept {
+        Reading reading = sensors_[position].read(connection_.options, connected(), connection_.now_ns);
+        reading.sensor = position;
         reading.connection = connections_;
         reading.more_waits = more_waits_;
         return reading;

@@ -58,7 +58,7 @@ using Values = std::array<double, kSignals.size()>;
 inline constexpr double kNaN = NAN, kInfinity = INFINITY;
 inline double seconds(std::int64_t ns) noexcept { return static_cast<double>(ns) / 1e9; }
 
-/// The place of a state interface in `Values`; their number if there is none of that name.
+/// The index of a state interface in `Values`; their number if there is none of that name.
 inline std::size_t signal(std::string_view name) noexcept {
     return static_cast<std::size_t>(std::find(kSignals.begin(), kSignals.end(), name) - kSignals.begin());
 }
@@ -79,7 +79,7 @@ struct Received {
 /// Three places: one is written, one is read, and the third holds the newest that was written; an atomic exchange swaps it.
 class Latest {
 public:
-    /// For the writing thread: the place to write the next one to.
+    /// For the writing thread: where to write the next one.
     Received& next() noexcept { return places_[written_]; }
     /// It is written.
     void publish() noexcept { written_ = newest_.exchange(written_ | kUnread, std::memory_order_acq_rel) & ~kUnread; }
@@ -314,7 +314,7 @@ public:
 private:
     static constexpr int kPaceMs = 5;  // without anything from the server: how soon it is seen that nothing comes
     static constexpr std::int64_t kQuietNs = 1'000'000'000;
-    static constexpr int kMostSamples = 1000;  // until they are handed over
+    static constexpr int kMaxSamples = 1000;  // until they are handed over
     static constexpr int kLoads = 100;         // samples of the load before a tare
 
     /// The load of the tool, N and Nm: the mean of some samples.
@@ -363,7 +363,7 @@ private:
             own_offset_.begin(tared_offset_);
             is_tared_ = false;
         }
-        for (int left = kMostSamples; left > 0; --left) {  // the load of the tool needs every sample
+        for (int left = kMaxSamples; left > 0; --left) {  // the load of the tool needs every sample
             received.reading = client_.next({});
             if (!received.reading.is_new) break;
             if (tool_) load_ = tool_->follow(received.reading.sample, seconds(static_cast<std::int64_t>(received.reading.monotonic_ns)));
