@@ -9,10 +9,7 @@ from ethercat_server.tool.cli import main
 COMMANDS = {
     "find_ethernet_adapters": ("adapters",),  # III.1
     "read_eeprom": ("eeprom",),  # III.3
-    "bota_ethercat_minimal_example": (
-        "read",
-        "0x6000",
-    ),  # III.5; stream: ethercat-monitor
+    "bota_ethercat_minimal_example": ("read", "0x6000"),  # III.5; stream: ethercat-monitor
     "sensor_configuration_SDO_reader": ("objects",),  # III.6
 }
 command, *names = COMMANDS[Path(__file__).stem]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,8 +21,6 @@ Outcome = DataMessage | JsonObject | str
 
 
 class Vector(NamedTuple):
-    """A message, whole or broken."""
-
     name: str
     wire: bytes
     outcome: Outcome
@@ -50,7 +47,8 @@ def _floats(values: Sequence[float | str] | None) -> Any:
 
 def _sample(fields: JsonObject) -> Sample:
     vectors = ("force", "torque", "acceleration", "angular_rate", "orientation")
-    return Sample(**{**fields, **{name: _floats(fields[name]) for name in vectors}})
+    found = {name: _floats(fields[name]) for name in vectors}
+    return Sample(**{**fields, **found, "temperature": float(fields["temperature"])})
 
 
 def _data(entry: JsonObject) -> Vector:
@@ -79,22 +77,14 @@ class AccountedStream(NamedTuple):
     """Frames of one sensor, and what `bota_ethercat.accounting` makes of them."""
 
     name: str
-    every: int
-    fresh_only: bool
-    rate_hz: float
-    steps: list[tuple[int, int, int, str] | None]
-    """`sequence`, `monotonic_ns`, `flags` and kind of each frame; None where a new subscription begins."""
-    counts: dict[str, int]
-    """At the end; 0 where none is given."""
+    frames: list[Any]  # `sequence`, `monotonic_ns`, `flags`, kind; or `begin`: a new subscription
+    counts: dict[str, int]  # at the end; 0 where none is given
+    every: int = 1
+    fresh_only: bool = True
+    rate_hz: float = 0.0
 
 
-def _accounted(entry: JsonObject) -> AccountedStream:
-    steps = [None if step == "begin" else tuple(step) for step in entry["frames"]]
-    options = entry.get("every", 1), entry.get("fresh_only", True), entry.get("rate_hz", 0)
-    return AccountedStream(entry["name"], *options, steps, entry["counts"])
-
-
-ACCOUNTED: Final = [_accounted(entry) for entry in _read("accounting.json")]
+ACCOUNTED: Final = [AccountedStream(**entry) for entry in _read("accounting.json")]
 
 
 BEGIN_NS: Final = 10**15  # both clocks of readings.json at 0 ms
@@ -106,25 +96,15 @@ _DESCRIPTION: Final = {"protocol": 1, "sensors": [{"sensor": 0, "rate_hz": 800, 
 class Player(Protocol):
     """A client, the server that it talks to, and a clock: what plays a stream of readings.json."""
 
-    def now(self, now_ns: int) -> None:
-        """It is this time."""
-
-    def connect(self, description: JsonObject) -> None:
-        """A new connection, to a server that describes itself so."""
-
-    def send(self, message: bytes) -> None:
-        """The server sends this."""
-
-    def end(self) -> None:
-        """The server closes the connection."""
-
+    def now(self, now_ns: int) -> None: ...
+    def connect(self, description: JsonObject) -> None: ...
+    def send(self, message: bytes) -> None: ...
+    def end(self) -> None: ...
     def read(self, sensor: int) -> dict[str, object]:
         """What `latest` gives, by the names of readings.json, in ns."""
 
 
 class ReadStream(NamedTuple):
-    """A stream of readings.json."""
-
     name: str
     steps: list[list[Any]]
     max_age_ms: int = 10
@@ -186,7 +166,6 @@ def odd_messages() -> Iterator[JsonObject]:
 
 
 def expected(vectors: Sequence[Vector]) -> list[Outcome]:
-    """What comes of these vectors, sent one behind the other."""
     found: list[Outcome] = []
     for vector in vectors:
         found.append(vector.outcome)
@@ -215,24 +194,5 @@ def outcomes(chunks: Sequence[bytes], max_json_length: int = MAX_JSON_LENGTH) ->
     return found
 
 
-def same_number(one: float, other: float) -> bool:
-    """Equal to the bit, but for what kind of NaN it is."""
-    if math.isnan(one) or math.isnan(other):
-        return math.isnan(one) and math.isnan(other)
-    return one == other and math.copysign(1, one) == math.copysign(1, other)
-
-
-def numbers(sample: Sample) -> list[float]:
-    """Every measured value of a sample."""
-    return [*sample.array, sample.temperature, *(sample.orientation or ())]
-
-
 def same_sample(one: Sample, other: Sample) -> bool:
-    """Whether two samples are the same to the bit."""
-    mine, others = numbers(one), numbers(other)
-    return (
-        len(mine) == len(others)
-        and all(map(same_number, mine, others))
-        and one[6:] == other[6:]
-        and (one.orientation is None) == (other.orientation is None)
-    )
+    return repr(one) == repr(other)

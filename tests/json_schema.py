@@ -17,7 +17,5 @@ def problems(name: str, value: object, part: str | None = None) -> list[str]:
     if part is not None:
         schema = {**schema["$defs"][part], "$defs": schema["$defs"]}
     jsonschema.Draft202012Validator.check_schema(schema)
-    return [
-        f"{error.json_path}: {error.message}"
-        for error in jsonschema.Draft202012Validator(schema).iter_errors(json.loads(json.dumps(value)))
-    ]
+    errors = jsonschema.Draft202012Validator(schema).iter_errors(json.loads(json.dumps(value)))
+    return [f"{error.json_path}: {error.message}" for error in errors]

@@ -32,6 +32,7 @@ from typing import Any
 import pytest
 
 from bota_ethercat import client as blocking
+from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder
 from bota_ethercat.pdo import LAYOUTS
@@ -255,7 +256,7 @@ class Simulation(SimulatedBus):
         """Keep the frames of an exchange."""
         for frame, _, _ in made:
             self._decoder.feed(frame)
-            self._decoder.take_data(self.frames)
+            self._decoder.next_data(self.frames)
             self.published_ns.append(self.clock.now_ns)
 
     def serves(self, until_ns: int, serve: Callable[[int], None]) -> None:
@@ -345,7 +346,7 @@ class Client(FramedClient):
         if not self.reads or not self.stream.readable:
             return
         self._decoder.feed(self.stream.recv_all())
-        while (message := self._decoder.take_data(self.frames)) is not None:
+        while (message := self._decoder.next_data(self.frames)) is not None:
             self.keep(message)
 
     @property
@@ -374,16 +375,15 @@ class Bench(Simulation):
         return Bench(backend=self.backend, **more)
 
 
-class MemoryChannel:
-    """A `Channel` to `server`, which may hang and be killed; time passes while its client waits.
+class MemoryChannel(TcpChannel):
+    """The channel to `server`, which may hang and be killed; time passes while its client waits.
 
     with StreamClient(12001, channel=MemoryChannel(server)).connect() as client: ...
     """
 
-    is_near = True
-    own = ("memory", 0)
-
     def __init__(self, server: Simulation) -> None:
+        super().__init__("memory", 0)
+        self.same_address, self.monotonic_ns = True, server.clock.monotonic_ns
         self.server: Simulation | None = server
         self._clock = server.clock
         self._stream: InMemoryStream | None = None
@@ -394,11 +394,7 @@ class MemoryChannel:
         if self._stream is not None:
             self._stream.other.end_sending()  # it may be just running, and must not find it closed
 
-    def monotonic_ns(self) -> int:
-        now_ns: int = self._clock.monotonic_ns()
-        return now_ns
-
-    def wait(self, event: threading.Event, seconds: float, /) -> bool:
+    def wait(self, event: threading.Event, seconds: float) -> bool:
         self._pass(event.is_set, seconds)
         return event.is_set()
 

@@ -33,9 +33,7 @@ def project(path: str) -> dict[str, Any]:
     return table
 
 
-def test_the_checkout_has_all_of_the_client_distribution_and_the_release_knows_which_lines_are_its_own() -> (
-    None
-):
+def test_the_release_knows_which_lines_of_the_checkout_are_the_client_distributions() -> None:
     whole, part = project("pyproject.toml"), project("clients/pyproject.toml")
     assert part["optional-dependencies"]["client"] == whole["optional-dependencies"]["client"]
     assert "dependencies" not in part
@@ -45,7 +43,6 @@ def test_the_checkout_has_all_of_the_client_distribution_and_the_release_knows_w
 
 
 def python(version: str) -> str | None:
-    """The path of this Python if it is on this machine; pyenv's are not on PATH."""
     found = shutil.which(f"python{version}", path=f"/usr/bin:{os.environ['PATH']}")
     pyenv = sorted((Path.home() / ".pyenv/versions").glob(f"{version}.*/bin/python3"))
     for candidate in [found, *map(str, pyenv)]:
@@ -71,9 +68,11 @@ def checkout(folder: Path, changelog: str) -> Path:
 
 
 def build(source: Path, into: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [source / "scripts/release", into], capture_output=True, text=True, check=False
-    )  # fmt: skip
+    return run_quietly(source / "scripts/release", into)
+
+
+def run_quietly(*command: str | Path, check: bool = False, **how: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, check=check, **how)
 
 
 @pytest.fixture(scope="module")
@@ -100,19 +99,14 @@ def install(release: Path, interpreter: str, environment: Path, distribution: st
     """Everything that installing this one brings into an environment of its own."""
     subprocess.run([interpreter, "-m", "venv", environment], check=True)
     pip = [f"{environment}/bin/python", "-m", "pip"]
-    before = subprocess.run([*pip, "freeze", "--all"], check=True, capture_output=True, text=True).stdout
+    before = run_quietly(*pip, "freeze", "--all", check=True).stdout
     subprocess.run([*pip, "install", "--quiet", "--find-links", str(release), distribution], check=True)
-    after = subprocess.run([*pip, "freeze", "--all"], check=True, capture_output=True, text=True).stdout
+    after = run_quietly(*pip, "freeze", "--all", check=True).stdout
     return {re.split(r"[=@ ]", line)[0].lower() for line in set(after.split("\n")) - set(before.split("\n"))}
 
 
 def versions(environment: Path, programs: dict[str, str]) -> set[str]:
-    """What the programs print for --version."""
-    printed = set()
-    for name in programs:
-        command = [f"{environment}/bin/{name}", "--version"]
-        printed.add(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    return printed
+    return {run_quietly(environment / "bin" / name, "--version", check=True).stdout for name in programs}
 
 
 @pytest.mark.long
@@ -121,10 +115,7 @@ def test_the_same_commit_gives_the_same_bytes(release: Path, tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr
     sums = (release / "SHA256SUMS").read_text()
     assert (tmp_path / "again" / "SHA256SUMS").read_text() == sums
-    assert (
-        subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=release, check=False).returncode
-        == 0
-    )
+    run_quietly("sha256sum", "--check", "--quiet", "SHA256SUMS", check=True, cwd=release)
     kinds = {name.split("-")[0] + name[name.index("0.1.0") + 5 :] for name in re.findall(r"\S+$", sums, re.M)}
     wheel, source = "-py3-none-any.whl", ".tar.gz"
     names = {f"bota_ethercat{part}{kind}" for part in ("", "_bridge") for kind in (wheel, source)}
@@ -173,9 +164,7 @@ def test_each_distribution_in_an_environment_of_its_own(release: Path, version: 
         for line in server.stderr:
             if "streaming" in line:
                 break
-        read = subprocess.run(
-            [client / "bin/python", "-c", READ.format(port)], check=False, capture_output=True, text=True
-        )
+        read = run_quietly(client / "bin/python", "-c", READ.format(port))
         server.terminate()
         server.stderr.read()
     assert (server.returncode, read.returncode) == (0, 0), read.stderr
@@ -193,5 +182,5 @@ def test_the_bridge_has_its_files_where_ros_looks(release: Path, tmp_path: Path)
     (export,) = [command for command in commands("ros2-workspace.md") if command.startswith("export")]
     shell = f'{export}; cd "${{AMENT_PREFIX_PATH%%:*}}" && for each in lib/*/client; do $each --help; done'
     environment = os.environ | {"HOME": str(tmp_path)}
-    used = subprocess.run(["bash", "-c", shell], env=environment, check=True, capture_output=True, text=True)
+    used = run_quietly("bash", "-c", shell, env=environment, check=True)
     assert used.stdout.count("usage: ros2 run bridge client") == 2

@@ -8,7 +8,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program import server_choice
 from bota_ethercat.program.arguments import typed
-from bota_ethercat.sensor_choice import MOST_PLACES
+from bota_ethercat.sensor_choice import MAX_SENSORS
 
 
 def add_server(parser: argparse.ArgumentParser, what: str = "the server") -> None:
@@ -41,10 +41,10 @@ def add_imu_units(parser: argparse.ArgumentParser) -> None:
 
 
 def _position(text: str) -> int:
-    if text.isascii() and text.isdecimal() and int(text) < MOST_PLACES:
+    if text.isascii() and text.isdecimal() and int(text) < MAX_SENSORS:
         return int(text)
     raise ValueError
 
 
 address = typed(Address.parse)
-position = typed(_position, f"a position on the bus, from 0 to {MOST_PLACES - 1}")
+position = typed(_position, f"a position on the bus, from 0 to {MAX_SENSORS - 1}")

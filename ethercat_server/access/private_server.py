@@ -145,7 +145,7 @@ class _PairChannel(TcpChannel):
 
     def __init__(self, sock: socket.socket) -> None:
         super().__init__("", 0)
-        self._sock, self.is_near = sock, True
+        self._sock, self.same_address = sock, True
 
     def _prepare(self, sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)

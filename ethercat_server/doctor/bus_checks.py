@@ -16,10 +16,10 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import Address
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health import history
+from bota_ethercat.health import sentences
 from bota_ethercat.health.judge import judge
+from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.health.observer import StreamObserver, by_sensor
-from bota_ethercat.health.verdict import LIMITS, Level
 from bota_ethercat.replies import DistributionStatus, Status, position_of
 from ethercat_server.access.adapters import Holder, find_holder, links
 from ethercat_server.access.private_server import open_interface
@@ -316,10 +316,10 @@ class ServerView:
                 self._observe(frames, clock.monotonic_ns(), same_machine=sensors.client.session.same_machine)
                 for event in events:
                     if (position := position_of(event)) in self._observers:
-                        self._observers[position].said.take_event(event)
+                        self._observers[position].add_event(event)
                 unread = sensors.client.take_unread()
                 for each in self._observers.values():
-                    each.said.note_unread(unread, clock.monotonic_ns())
+                    each.note_unread(unread, clock.monotonic_ns())
                 if end.passed:
                     sensors.ask("unsubscribe")
                     break
@@ -329,20 +329,20 @@ class ServerView:
             self.described = sensors.describe().sensors
         for info in self.described:
             if info.sensor in self._observers:
-                self._observers[info.sensor].said.info = info
+                self._observers[info.sensor].info = info
         self._when = "" if self.own else " in the last 10 s"
         self._summaries = self.after if self.own else self.after.last_10s
 
     def _read_status(self, sensors: Sensors) -> Status:
         status = sensors.status()
         for position, observer in self._observers.items():
-            observer.said.take_status(status, position, sensors.clock.monotonic_ns())
+            observer.add_status(status, position, sensors.clock.monotonic_ns())
         return status
 
     def _observe(self, frames: Sequence[DataMessage], now_ns: int, *, same_machine: bool) -> None:
         for position, batch in by_sensor(frames).items():
             if position in self._observers:
-                self._observers[position].take(batch, now_ns)
+                self._observers[position].add_frames(batch, now_ns)
                 if same_machine:
                     self._observers[position].note_age(batch[-1], now_ns)
 
@@ -370,7 +370,7 @@ class ServerView:
                 yield note(f"{text}, {lost} since its start", f"none meanwhile; {_LOG}", **values)
             else:
                 yield ok(f"{text}: {verdict.sentence[0].lower()}{verdict.sentence[1:]}", **values)
-            past, overloaded = history.overload(after)
+            past, overloaded = sentences.overload(after)
             if overloaded:
                 yield note(f"sensor {info.sensor} {past}", "have it checked")
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from bota_ethercat.program import server_choice
 from bota_ethercat.program.arguments import Parser, number
 from bota_ethercat.program.output import ends_with_its_reader

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.program.arguments import number
 from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS, SHORT_SINC, noise_limit
-from bota_ethercat.sensor.response import Response, Source, force_torque_response, noise_bandwidth
+from bota_ethercat.sensor.response import DelaySource, Response, force_torque_response, noise_bandwidth
 from bota_ethercat.settings import start_up_defaults
 from ethercat_server.tool.command import DONE, Subcommand, argument, columns, say, say_json, value_text
 
@@ -110,7 +110,7 @@ def _filters(args: argparse.Namespace) -> int:
     ideal = f"{DESIGNED_DEG:g}° of phase margin with an ideal sensor"
     say(f"loop of {args.loop:g} Hz: bandwidth {bandwidth_hz:g} Hz, {ideal}")
     say(f"recommended: --set sinc_length={best.sinc_length} --set fir={value_text(best.fir)}: {why}")
-    say(f"with FAST or CHOP the delay is {Source.UNKNOWN.value}: not for a loop")
+    say(f"with FAST or CHOP the delay is {DelaySource.UNKNOWN.value}: not for a loop")
     return DONE
 
 

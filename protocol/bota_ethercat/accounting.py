@@ -82,7 +82,7 @@ class StreamAccounting:
         """Whether a frame has come since `begin`."""
         return self._sequence >= 0
 
-    def take_next(self, sequence: int, monotonic_ns: int) -> bool:
+    def count_next(self, sequence: int, monotonic_ns: int) -> bool:
         """Count a frame without flags that is the one after the last, as nearly all are; False: not so."""
         if sequence != self._sequence + 1:
             return False
@@ -91,7 +91,7 @@ class StreamAccounting:
         self.counts.new += 1
         return True
 
-    def take(self, sequence: int, monotonic_ns: int, flags: int) -> FrameKind:
+    def count(self, sequence: int, monotonic_ns: int, flags: int) -> FrameKind:
         """Count the next frame; what it is."""
         counts, jump = self.counts, 0
         if sequence > self._sequence:

@@ -39,7 +39,6 @@ class Address(NamedTuple):
         return cls(host.strip("[]") or DEFAULT_HOST, int(port))
 
     def __str__(self) -> str:
-        """As written on a command line."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 

@@ -23,7 +23,7 @@ from bota_ethercat.text.untrusted import printable
 PROTOCOL_VERSION: Final = 1
 MAX_SDO_BYTES: Final = 112  # largest SDO that fits a mailbox of 128 bytes unsegmented
 MAX_TARE_SAMPLES: Final = 20_000
-_LONGEST_NAME: Final = 80
+_MAX_NAME_LENGTH: Final = 80
 MAX_SII_WORDS: Final = 128
 MAX_TRACE_SIZE: Final = 64 << 20  # bytes of a trace file
 
@@ -160,9 +160,9 @@ def _hex_bytes(value: object) -> bytes:
 
 
 def _object_name(value: object) -> str:
-    if isinstance(value, str) and 0 < len(value) <= _LONGEST_NAME:
+    if isinstance(value, str) and 0 < len(value) <= _MAX_NAME_LENGTH:
         return value
-    raise ValueError(f"a text of 1 to {_LONGEST_NAME} characters, such as 'Sampling rate'")
+    raise ValueError(f"a text of 1 to {_MAX_NAME_LENGTH} characters, such as 'Sampling rate'")
 
 
 _SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(number=0))

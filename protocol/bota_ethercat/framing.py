@@ -174,7 +174,7 @@ class FrameDecoder:
         while (message := self.next_message()) is not None:
             yield message
 
-    def take_data(self, into: list[DataMessage]) -> TerminalMessage | JsonObject | None:
+    def next_data(self, into: list[DataMessage]) -> TerminalMessage | JsonObject | None:
         """Append the DATA messages that are next and whole to `into`; returns the message after them.
 
         As `next_message` until it returns something else, but faster, for streams. None and errors as there.

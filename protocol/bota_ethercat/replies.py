@@ -13,12 +13,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from bota_ethercat.control import known_six
-from bota_ethercat.sensor_choice import MOST_PLACES
+from bota_ethercat.sensor_choice import MAX_SENSORS
 from bota_ethercat.settings import SettingValue, known_settings
 from bota_ethercat.text.untrusted import mapping, number, rows, text, whole
 
-LONGEST_MS: Final = 1000  # a longer delay is no filter's
-_MOST_HZ: Final = 1e6  # a higher rate is no sensor's
+MAX_DELAY_MS: Final = 1000  # a longer delay is no filter's
+_MAX_HZ: Final = 1e6  # a higher rate is no sensor's
 Six = tuple[float, ...]  # a wrench, N and Nm
 Row = TypeVar("Row", bound=tuple[Any, ...])
 
@@ -34,7 +34,9 @@ class Delays(NamedTuple):
     def parse(cls, delay_ms: object) -> Delays:
         """From `delay_ms` in a message."""
         values = (number(mapping(delay_ms).get(channel)) for channel in cls._fields)
-        return cls(*(round(ms * 1e6) if ms is not None and 0 <= ms <= LONGEST_MS else None for ms in values))
+        return cls(
+            *(round(ms * 1e6) if ms is not None and 0 <= ms <= MAX_DELAY_MS else None for ms in values)
+        )
 
 
 class SensorInfo(NamedTuple):
@@ -70,14 +72,13 @@ class SensorInfo(NamedTuple):
         """The same with what a description or an event says to be in force; the rest stays as it was."""
         rate_hz, delay_ms = number(message.get("rate_hz")), message.get("delay_ms")
         return self._replace(
-            rate_hz=rate_hz if rate_hz is not None and 0 < rate_hz <= _MOST_HZ else self.rate_hz,
+            rate_hz=rate_hz if rate_hz is not None and 0 < rate_hz <= _MAX_HZ else self.rate_hz,
             settings=known_settings(message.get("settings")) or self.settings,
             delay_ns=Delays.parse(delay_ms) if isinstance(delay_ms, dict) else self.delay_ns,
             offset=known_six(message["offset"]) if "offset" in message else self.offset,
         )
 
     def __str__(self) -> str:
-        """One phrase for the log."""
         serial = "?" if self.serial is None else self.serial
         rate = f"{self.rate_hz:g}" if self.rate_hz else "?"
         return f"sensor {self.sensor} ({self.name or '?'}, serial {serial}, {rate} Hz, {self.state or '?'})"
@@ -120,7 +121,7 @@ class ClockStatus(NamedTuple):
     uncertainty_us: float | None = None
 
 
-class Emergency(NamedTuple):
+class EmergencyStatus(NamedTuple):
     """The newest emergency of a sensor."""
 
     code: int | None = None
@@ -128,7 +129,7 @@ class Emergency(NamedTuple):
     ago_s: float | None = None
 
 
-class Drift(NamedTuple):
+class DriftStatus(NamedTuple):
     """How far the zero has drifted."""
 
     since: str = ""  # `tare`, `change`, `return` or the start
@@ -137,7 +138,7 @@ class Drift(NamedTuple):
     wrench: Six | None = None
 
 
-class Overload(NamedTuple):
+class OverloadStatus(NamedTuple):
     """The largest loads of a sensor's past; times in seconds of the Unix epoch."""
 
     since: float | None = None
@@ -157,9 +158,9 @@ class SensorStatus(NamedTuple):
     not_finite: int | None = None
     recoveries: int | None = None
     emergencies: int | None = None
-    emergency: Emergency = Emergency()
-    drift: Drift = Drift()
-    history: Overload = Overload()
+    emergency: EmergencyStatus = EmergencyStatus()
+    drift: DriftStatus = DriftStatus()
+    history: OverloadStatus = OverloadStatus()
     clock: ClockStatus = ClockStatus()
     age_us: DistributionStatus = DistributionStatus()  # of the samples when they are sent
 
@@ -248,4 +249,4 @@ def _check(hint: Any) -> Callable[[object], Any]:
 def position_of(row: Mapping[str, Any]) -> int | None:
     """The sensor's position on the bus that a row or an event has; None if it is none."""
     position = row.get("sensor")
-    return position if type(position) is int and 0 <= position < MOST_PLACES else None
+    return position if type(position) is int and 0 <= position < MAX_SENSORS else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-MOST_PLACES: Final = 256
+MAX_SENSORS: Final = 256
 _SERIAL: Final = "serial:"
 
 MEANING: Final = 'a number such as 0, "serial:1234", or a name such as "BFT-SENS-ECAT-M8"'
@@ -23,7 +23,7 @@ class SensorChoice(NamedTuple):
         """From a number or a text; the text of ValueError is what is allowed."""
         if isinstance(value, str) and value.isdecimal():
             value = int(value)
-        if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < MOST_PLACES:
+        if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < MAX_SENSORS:
             return cls(number=value)
         if isinstance(value, str) and value.startswith(_SERIAL):
             number = value.removeprefix(_SERIAL)
@@ -47,7 +47,6 @@ class SensorChoice(NamedTuple):
         return 2 if self.number is not None else 1 if self.serial is not None else 0
 
     def __str__(self) -> str:
-        """As written on a command line."""
         if self.number is not None:
             return str(self.number)
         return f"{_SERIAL}{self.serial}" if self.serial is not None else str(self.name)

@@ -91,7 +91,7 @@ SETTINGS: Final[Mapping[str, Setting]] = {
 BASE_SAMPLING_RATE_HZ: Final = 51200  # the ADC's rate: sampling rate = 51200 / SINC length
 
 # By how much CHOP may divide the sampling rate; no source says whether it does, so object 0x8011 decides.
-_MOST_DIVIDED: Final = 8
+_MAX_DIVIDED: Final = 8
 
 
 def sampling_rate_hz(sinc_length: int) -> int:
@@ -108,7 +108,7 @@ def rate_divisor(sinc_length: int, rate_hz: int, chop: SettingValue | None = Fal
     if sinc_length <= 0:
         return None
     nominal = BASE_SAMPLING_RATE_HZ / sinc_length
-    nearest = min(range(1, _MOST_DIVIDED + 1 if chop else 2), key=lambda by: abs(rate_hz - nominal / by))
+    nearest = min(range(1, _MAX_DIVIDED + 1 if chop else 2), key=lambda by: abs(rate_hz - nominal / by))
     return nearest if abs(rate_hz - nominal / nearest) < 1.0 else None
 
 

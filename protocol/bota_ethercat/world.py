@@ -11,7 +11,7 @@ from bota_ethercat.pdo import STANDARD_GRAVITY
 # All little-endian: 4 bytes of magic with the version, position of the sensor, 3 zero bytes, time, values.
 DATAGRAM: Final = struct.Struct("<4sB3x d 6d 3d 3d d")
 _MAGIC: Final = b"FTW1"
-_LARGEST: Final = 1e6  # of any value, in its unit
+_MAX_VALUE: Final = 1e6  # of any value, in its unit
 
 
 class Felt(NamedTuple):
@@ -40,7 +40,7 @@ def decode(data: bytes) -> tuple[int, float, Felt] | None:
     if len(data) != DATAGRAM.size:
         return None
     magic, sensor, *values = DATAGRAM.unpack(data)
-    if magic != _MAGIC or not all(abs(value) < _LARGEST for value in values[1:]):
+    if magic != _MAGIC or not all(abs(value) < _MAX_VALUE for value in values[1:]):
         return None
     time_s, *wrench = values[:7]
     return sensor, time_s, Felt(tuple(wrench), tuple(values[7:10]), tuple(values[10:13]), values[13])

@@ -19,8 +19,8 @@ from rclpy.node import Node
 
 from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.health.judge import SATURATIONS, Observation, judge
+from bota_ethercat.health.limits import About, Level, StreamLimits
 from bota_ethercat.health.observer import SensorObserver, p99
-from bota_ethercat.health.verdict import About, Level, Limits
 from bota_ethercat.replies import Status
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable
@@ -59,7 +59,7 @@ class Monitor:
     """Its `thread` runs until `stop`. `on_failure` is called with an unexpected error."""
 
     def __init__(
-        self, node: Node, limits: Limits, reader: Reader, compensation: Callable[[], CompensationState],
+        self, node: Node, limits: StreamLimits, reader: Reader, compensation: Callable[[], CompensationState],
         outputs: Outputs, stamps: Stamps, on_failure: Callable[[str], object],
     ) -> None:  # fmt: skip
         self.limits = limits  # may be replaced at any time
@@ -148,7 +148,7 @@ class Monitor:
             if reply.exception() is None and (content := reply.result()).get("ok") is True:
                 if action == "status":
                     self._server = Status.parse(content)
-                    said.take_status(self._server, link.sensor, self._clock.monotonic_ns())
+                    said.add_status(self._server, link.sensor, self._clock.monotonic_ns())
                 else:
                     link.described(content)
         said.info, said.lost = link.info, link.lost
@@ -178,7 +178,7 @@ class Monitor:
         self._flags, link = NO_FLAGS, self._link
         self._unread = self._unread if self._is_silent else (0.0, False)
         self._then = self._counts
-        self._said.begin()
+        self._said.restart()
         if link.is_connected and not self._waiting:  # unless an answer is still owed
             self._asked_s = now_s
             try:

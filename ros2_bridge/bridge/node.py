@@ -23,7 +23,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from bota_ethercat.client.channel import Channel
+from bota_ethercat.client.channel import TcpChannel
 from bridge.compensating.compensation import Compensation
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
@@ -91,7 +91,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
     """
 
     clock: Clock = SYSTEM_CLOCK
-    channel: Channel | None = None  # tests have a clock and a channel of their own
+    channel: TcpChannel | None = None  # tests have a clock and a channel of their own
     is_open = False
 
     def __init__(self, arguments: Sequence[str] | None = None) -> None:

@@ -56,17 +56,14 @@ class Setup:
 
     @property
     def sinc(self) -> int:
-        """The SINC length that gives the rate."""
         return OVERSAMPLING_HZ // self.rate_hz
 
 
 class Child:
-    """A program that runs beside this process and never outlives it."""
+    """A program that never outlives this process; it may end by itself once `result` exists."""
 
-    def __init__(self, name: str, command: list[str], directory: Path, result: Path | None = None) -> None:
-        """`result`: it may end by itself once this file exists."""
-        self.name, self.result = name, result or directory / name
-        self._may_end = result is not None
+    def __init__(self, name: str, command: list[str], directory: Path) -> None:
+        self.name, self.result = name, directory / name
         self.log = directory / f"{name}.log"
         with self.log.open("wb") as log:
             # A session of its own: Ctrl-C reaches this process only, which then ends its children in order.
@@ -79,15 +76,14 @@ class Child:
     def check(self) -> None:
         """ScriptError, with its last lines of output, if it has failed."""
         code = self._process.poll()
-        if code is not None and not (self._may_end and self.result.exists()):
+        if code is not None and not self.result.exists():
             lines = self.log.read_text(errors="replace").strip().splitlines()[-8:]
             text = f"{self.name} ended by itself with exit code {code}; its last output:"
             raise ScriptError("\n    ".join([text, *lines]))
 
     def stop(self) -> str | None:
         """End it; what was wrong about how it ended, or None."""
-        if self._process.poll() is None:
-            self._process.terminate()
+        self._process.terminate()
         try:
             code = self._process.wait(_STOP_TIMEOUT_S)
         except subprocess.TimeoutExpired:
@@ -103,11 +99,6 @@ def used_s(pid: int) -> float:
     return sum(int(task.read_text().split()[0]) for task in tasks) / 1e9
 
 
-def rss(pid: int) -> float:
-    """Resident memory of a process, bytes."""
-    return float(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
 class Chain(contextlib.ExitStack):
     """A context in which programs run, and with which all of them end. `title` is printed."""
 
@@ -115,7 +106,6 @@ class Chain(contextlib.ExitStack):
         super().__init__()
         self.setup = setup
         self.children: list[Child] = []
-        self._watched: dict[str, int] = {}  # process ids
         self._link: Client | None = None
         self.directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
         self.callback(shutil.rmtree, self.directory, ignore_errors=True)
@@ -132,20 +122,16 @@ class Chain(contextlib.ExitStack):
         bus = self.enter_context(VirtualBus(arguments, setup.priority))
         self.callback(self.stop)  # before the bus
         os.sched_setaffinity(bus.pid, own_cpus()[:1])
-        self._watched["sensor"] = bus.pid
         return bus.ifname
 
-    def start(self, name: str, *command: object, result: Path | None = None, watch: bool = True) -> Child:
-        """Start any program; `watch`: `measure` has its CPU and memory."""
-        child = Child(name, list(map(str, command)), self.directory, result)
+    def start(self, name: str, *command: object) -> Child:
+        """Start any program; of the one named `server` `measure` has the CPU time."""
+        child = Child(name, list(map(str, command)), self.directory)
         self.children.append(child)
-        if watch:
-            self._watched[name] = child.pid
         return child
 
-    def python(self, name: str, module: str, *arguments: object, **how: Any) -> Child:
-        """Start a module of this project."""
-        return self.start(name, sys.executable, "-m", module, *arguments, **how)
+    def python(self, name: str, module: str, *arguments: object) -> Child:
+        return self.start(name, sys.executable, "-m", module, *arguments)
 
     def server(self) -> Client:
         """Start ethercat-server on a bus; a connection to it once its sensors stream."""
@@ -177,22 +163,19 @@ class Chain(contextlib.ExitStack):
         assert self._link is not None
         return self._link
 
-    def node(self, *parameters: str, position: int = 0) -> None:
-        """Start the ROS 2 node of a sensor, with these parameters; its `wrench` is /benchmark_POSITION."""
-        name = "node" if self.setup.sensors == 1 else f"node {position}"
-        given = [word for each in (f"server_port:={PORT}", f"sensor:={position}", *parameters)
-                 for word in ("-p", each)]  # fmt: skip
-        renamed = "-r", f"__node:=bridge_{position}", "-r", f"wrench:=/benchmark_{position}"
-        self.python(name, "bridge.client", "--ros-args", *renamed, *given)
+    def node(self, priority: int, position: int = 0) -> None:
+        """Start the ROS 2 node of a sensor, with this priority; its `wrench` is /benchmark_POSITION."""
+        given = f"server_port:={PORT}", f"sensor:={position}", f"rt_priority:={priority}"
+        renamed = f"__node:=bridge_{position}", f"wrench:=/benchmark_{position}"
+        words = [*(word for each in renamed for word in ("-r", each)), *(w for p in given for w in ("-p", p))]
+        self.python(f"node {position}", "bridge.client", "--ros-args", *words)
 
     def recorder(self, kind: str, *arguments: object, priority: int = 0) -> Child:
         """Start a recorder (processes/recorder.py, or of kind `c` the program given) that ends by itself."""
-        path = self.directory / f"{kind}-{len(self.children)}"
-        times = (path, WARM_UP_S, self.setup.seconds)
+        times = (self.directory / kind, WARM_UP_S, self.setup.seconds)
         if kind == "c":
-            return self.start(path.name, *arguments, PORT, *times, result=path, watch=False)
-        how = (kind, *times, priority, *arguments)
-        return self.python(path.name, f"{PROCESSES}.recorder", *how, result=path, watch=False)
+            return self.start(kind, *arguments, PORT, *times)
+        return self.python(kind, f"{PROCESSES}.recorder", kind, *times, priority, *arguments)
 
     def wait(self, done: Callable[[], bool], what: str = "a program did not get ready",
              seconds: float = _START_TIMEOUT_S) -> None:  # fmt: skip
@@ -206,7 +189,6 @@ class Chain(contextlib.ExitStack):
             time.sleep(0.02)
 
     def sleep(self, seconds: float) -> None:
-        """Let it run."""
         end = time.monotonic() + seconds
         self.wait(lambda: time.monotonic() > end, seconds=seconds + 5)
 
@@ -214,30 +196,22 @@ class Chain(contextlib.ExitStack):
         """Wait for a recording to be complete and end everything; what was recorded, and what it took."""
         path, seconds = recorder.result, self.setup.seconds
         self.wait(began(path).exists, "nothing was received")
-        watched, start = self._watched.copy(), time.monotonic()
-        before_s = {name: used_s(pid) for name, pid in watched.items()}
-
+        pid = next(child.pid for child in self.children if child.name == "server")
+        start, before_s = time.monotonic(), used_s(pid)
         self.wait(lambda: time.monotonic() > start + seconds - 0.1 or path.exists(), seconds=seconds + 5)
-        percent = 100 / (time.monotonic() - start)
-        usage: Figures = {
-            "cpu_percent": {n: round((used_s(pid) - before_s[n]) * percent, 1) for n, pid in watched.items()},
-            "rss_mb": {name: round(rss(pid) / 1e6, 1) for name, pid in watched.items()},
-        }
+        percent = 100 * (used_s(pid) - before_s) / (time.monotonic() - start)
+        usage: Figures = {"cpu_percent": {"server": round(percent, 1)}}
         self.wait(path.exists, "the recording did not end")
         if self._link:
-            status = self._link.ask("status")
-            usage |= {name: status[name] for name in ("missed_deadlines", "lost_frames")}
-            usage["hand_out_us"] = status["sensors"][0]["age_us"]
+            usage["hand_out_us"] = self._link.ask("status")["sensors"][0]["age_us"]
         self.stop()
         result, ages = statistics.summary(statistics.read_arrivals(path))
         return {**result, **usage}, ages
 
     def stop(self) -> list[str]:
         """End everything, the last first; what was wrong about how they ended."""
-        troubles = []
-        while self.children:
-            troubles.append(self.children.pop().stop())
-        self._watched.clear()
+        troubles = [child.stop() for child in reversed(self.children)]
+        self.children.clear()
         return [trouble for trouble in troubles if trouble]
 
 
@@ -282,6 +256,5 @@ def _on_signal(_number: int, _frame: FrameType | None) -> None:
 
 
 def ignore_signals() -> None:
-    """Only the clean-up follows."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)

@@ -21,9 +21,8 @@ from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import PROCESSES, WARM_UP_S, Chain, Child, Figures, ScriptError, Setup, Turn
 from scripts.benchmarks.processes.masters import build
 from scripts.benchmarks.records import REAL_TIME
-from scripts.benchmarks.statistics import Arrivals, Floats
 
-_MOST_TURNS: Final = 3
+_MAX_TURNS: Final = 3
 _NONE: Final = "-"
 VENDOR: Final = Path(__file__).parents[2] / ".venv-vendor"
 # What the ROS packages set is not for another environment's Python, which has no package of this project.
@@ -45,10 +44,10 @@ def _start(name: str, chain: Chain) -> Child:
     """Start what is compared; the recorder of what arrives."""
     setup, yardstick = chain.setup, Path(os.environ["DEMO_DIRECTORY"]) / "yardstick"
     if name == DRIVER:  # with the server's priority, for which it does not ask
-        file = chain.directory / "driver"
         return chain.start(
-            "server", *_OTHER, VENDOR / "bin" / "python", "-m", f"{PROCESSES}.vendor_driver", file,
-            WARM_UP_S, setup.seconds, chain.bus(), setup.sinc, setup.rate_hz, setup.priority, result=file,
+            "server", *_OTHER, VENDOR / "bin" / "python", "-m", f"{PROCESSES}.vendor_driver",
+            chain.directory / "server", WARM_UP_S, setup.seconds, chain.bus(), setup.sinc, setup.rate_hz,
+            setup.priority,
         )  # fmt: skip
     if name == BARE_C:
         chain.master(yardstick)
@@ -56,7 +55,7 @@ def _start(name: str, chain: Chain) -> Child:
         chain.server()
     if name == ROS:
         for position in range(setup.sensors):
-            chain.node(f"rt_priority:={REAL_TIME}", position=position)
+            chain.node(REAL_TIME, position)
         return chain.recorder("ros", setup.sensors)
     return chain.recorder("tcp") if name == THIS else chain.recorder("c", yardstick, "client")
 
@@ -64,17 +63,7 @@ def _start(name: str, chain: Chain) -> Child:
 def turn(setup: Setup, name: str) -> Turn:
     """One run of what is compared."""
     with Chain(setup, name) as chain:
-        recorder = _start(name, chain)
-        figures, ages = chain.measure(recorder)
-        if name == DRIVER:
-            ages = first_ages(statistics.read_arrivals(recorder.result)[0])
-            figures["age_us"] = statistics.spread_us(ages)
-    return figures, ages
-
-
-def first_ages(arrivals: Arrivals) -> Floats:
-    """How old each sample was when it arrived first, ns."""
-    return arrivals.ages[np.unique(arrivals.number, return_index=True)[1]]
+        return chain.measure(_start(name, chain))
 
 
 def find_missing(with_driver: bool) -> dict[str, str]:
@@ -94,7 +83,7 @@ def compare(setup: Setup, with_driver: bool) -> list[Figures]:
     with_driver = with_driver and setup.sensors == 1  # it knows one sensor only
     missing = find_missing(with_driver)
     alternating = [THIS] if BARE_C in missing else [THIS, C_CLIENT, BARE_C]
-    count = max(1, min(_MOST_TURNS, int(setup.seconds)))
+    count = max(1, min(_MAX_TURNS, int(setup.seconds)))
     short = replace(setup, seconds=setup.seconds / count)
     rounds = [{name: turn(short, name) for name in alternating} for _ in range(count)]
     taken = {name: together([each[name] for each in rounds]) for name in alternating}
@@ -116,7 +105,7 @@ def together(turns: Sequence[Turn]) -> Turn:
     for name, first in figures[0].items():
         if isinstance(first, int):
             found[name] = sum(each[name] for each in figures)
-        elif first is not None:
+        else:
             found[name] = {
                 key: round(float(np.median([each[name][key] for each in figures])), 1) for key in first
             }
@@ -152,11 +141,11 @@ def load(setup: Setup, loops: int) -> list[Figures]:
             with Chain(setup, f"{client}, {how}, beside {loops} loops") as chain:
                 chain.server()
                 if client == "wrench":
-                    chain.node(f"rt_priority:={priority}")
+                    chain.node(priority)
                 kind = ("ros", 1) if client == "wrench" else ("tcp",)
                 recorder = chain.recorder(*kind, priority=priority)
                 for number in range(loops):
-                    chain.start(f"loop-{number}", sys.executable, "-c", "while True: pass", watch=False)
+                    chain.start(f"loop-{number}", sys.executable, "-c", "while True: pass")
                 figures, _ = chain.measure(recorder)
             about = {"rate_hz": setup.rate_hz, "loops": loops, "chain": f"{client}, {how}"}
             rows.append({**about, **figures})
@@ -165,7 +154,7 @@ def load(setup: Setup, loops: int) -> list[Figures]:
 
 def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
     def show(row: Figures) -> str:
-        value = (row.get(table) or {}).get(key)
+        value = row.get(table, {}).get(key)
         text = _NONE if value is None else f"{value:.{1 if value < 100 else 0}f}"
         return f"{text} ({row['ratio'][ratio]:.2f})" if ratio and "ratio" in row else text
 
@@ -173,8 +162,7 @@ def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
 
 
 def _points(row: Figures, name: str) -> str:
-    """Median and tails."""
-    return " / ".join(f"{row[name][point]:.0f}" for point in ("p50", "p99", "p999")) if row[name] else _NONE
+    return " / ".join(f"{row[name][point]:.0f}" for point in ("p50", "p99", "p999"))
 
 
 # Of the table of each, by heading: how a row is shown.
@@ -185,7 +173,7 @@ TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
         "age p50, µs": _shown("age_us", "p50", "age_p50"),
         "p99": _shown("age_us", "p99", "age_p99"),
         "p99.9": _shown("age_us", "p999", "age_p999"),
-        "stamp error p99, µs": _shown("stamp_error_us", "p99_absolute"),
+        "stamp error p99, µs": _shown("stamp_error_us", "p99"),
         "CPU, %": _shown("cpu_percent", "server", "cpu"),
     },
     "load": {
@@ -199,7 +187,6 @@ TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
         "clients": lambda row: str(row["clients"]),
         "source lines": lambda row: f"{row['lines']:.0f} / {row['mean_lines']:.0f}",
         "calls": lambda row: f"{row['calls']:.0f} / {row['mean_calls']:.0f}",
-        "files": lambda row: f"{row['files']:.0f}",
         "system calls": lambda row: f"{row['system_calls']:.0f} / {row['mean_system_calls']:.1f}",
     },
 }

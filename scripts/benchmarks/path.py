@@ -1,4 +1,4 @@
-"""The way of a sample from the wire to its subscribers: source lines, Python calls, files, system calls.
+"""The way of a sample from the wire to its subscribers: source lines, Python calls, system calls.
 
 The server runs in memory and in simulated time, so the figures are the same on every machine and in every
 run. Everything between two hand-outs counts: the loop, learning, what is done once a second. What stands for
@@ -49,8 +49,7 @@ class _Tracer:
 
     def __init__(self) -> None:
         self.lines = self.calls = self.system_calls = 0
-        self.files: set[str] = set()
-        self.samples: list[tuple[int, int, int, int]] = []
+        self.samples: list[tuple[int, int, int]] = []
         self.begun = False
         self._system = {getattr(owner, name).__code__: n for (owner, name), n in _SYSTEM_CALLS.items()}
         self._outside: FrameType | None = None
@@ -72,12 +71,10 @@ class _Tracer:
             return self._leaving(self._system.get(code, 0))
         if code is Hub.publish.__code__:
             if self.begun:
-                self.samples.append((self.lines, self.calls, len(self.files), self.system_calls))
+                self.samples.append((self.lines, self.calls, self.system_calls))
             self.begun = True
             self.lines = self.calls = self.system_calls = 0
-            self.files = set()
         self.calls += 1
-        self.files.add(code.co_filename)
         return self._line
 
     def _line(self, _frame: FrameType, event: str, _argument: object) -> Callable[..., Any]:
@@ -120,9 +117,7 @@ def count(dc: str, clients: int, seconds: float = SECONDS) -> dict[str, float]:
         run(seconds)
     finally:
         sys.settrace(before)
-    found = dict(
-        zip(("lines", "calls", "files", "system_calls"), zip(*tracer.samples, strict=True), strict=True)
-    )
+    found = dict(zip(("lines", "calls", "system_calls"), zip(*tracer.samples, strict=True), strict=True))
     medians = {name: median(values) for name, values in found.items()}
     return medians | {f"mean_{name}": mean(values) for name, values in found.items()}
 

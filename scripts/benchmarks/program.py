@@ -17,10 +17,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
-
 from bota_ethercat.program.arguments import number
 from scripts.benchmarks import path
 from scripts.benchmarks.chain import (
@@ -34,7 +30,6 @@ from scripts.benchmarks.chain import (
 from scripts.benchmarks.modes import TABLES, answer, compare, load
 from scripts.benchmarks.records import may_be_real_time
 
-_WIDTH: Final = 108  # minimum width of the tables
 _RATES_HZ: Final = [OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512)]
 _PRIORITY: Final = 80  # SCHED_FIFO of the server, or what is in its place
 _LATENCY: Final = Path("/dev/cpu_dma_latency")
@@ -43,25 +38,23 @@ _ON_PAGE: Final = ("comparison", "load")
 _LOOPS_ON_PAGE: Final = 4
 
 
-def run(options: argparse.Namespace, console: Console, *, idle_states: bool) -> None:
+def run(options: argparse.Namespace, *, idle_states: bool) -> None:
     """Measure, show, write. ScriptError or Stopped end it early. `idle_states`: idle CPUs may halt."""
     loopback_up()
     if options.page:
         check(options.page)
     if idle_states:
-        console.print(
-            "idle CPUs may halt (no access to /dev/cpu_dma_latency): samples are older than as root"
-        )
+        print("idle CPUs may halt (no access to /dev/cpu_dma_latency): samples are older than as root")
     priority, ros = _PRIORITY if may_be_real_time() else 0, find_spec("rclpy") is not None
     if not priority:
-        console.print("no real-time scheduling here (CAP_SYS_NICE): everything runs with ordinary scheduling")
+        print("no real-time scheduling here (CAP_SYS_NICE): everything runs with ordinary scheduling")
     if not ros:
-        console.print("no ROS 2 here (rclpy): only up to a TCP client")
+        print("no ROS 2 here (rclpy): only up to a TCP client")
     wanted = dict.fromkeys((*_ON_PAGE, options.mode) if options.page else (options.mode,))
     began = time.monotonic()
     results = {name: measure(name, options, priority, ros=ros) for name in wanted}
     for name, rows in results.items():
-        console.print(table(name, rows))
+        print(f"\n{markdown(name, rows)}")
     content = {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "kernel": platform.release(),
@@ -97,24 +90,9 @@ def measure(name: str, options: argparse.Namespace, priority: int, *, ros: bool)
     return rows
 
 
-def cells(name: str, rows: Sequence[Figures]) -> list[list[str]]:
-    """The rows of a table."""
-    return [[shown(row) for shown in TABLES[name].values()] for row in rows]
-
-
-def table(name: str, rows: Sequence[Figures]) -> Table:
-    """For a terminal."""
-    made = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
-    for at, heading in enumerate(TABLES[name]):
-        made.add_column(heading, justify="right" if at else "left")
-    for line in cells(name, rows):
-        made.add_row(*line)
-    return made
-
-
 def markdown(name: str, rows: Sequence[Figures]) -> str:
-    """For the page."""
-    lines = [list(TABLES[name]), ["---"] * len(TABLES[name]), *cells(name, rows)]
+    shown = TABLES[name].values()
+    lines = [list(TABLES[name]), ["---"] * len(shown), *([show(row) for show in shown] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -180,19 +158,17 @@ def _benchmark() -> int:
 
     A halted CPU takes tens of µs to wake, and in a virtual machine as long as the host is busy with others.
     """
-    options, console = parse(), Console(width=max(Console().width, _WIDTH))
-    device = None
+    options, device = parse(), None
     with suppress(OSError):
         device = _LATENCY.open("wb", buffering=0)
     with device or nullcontext():
         if device:
             device.write(struct.pack("=i", 0))  # µs that a wake-up may take, until the file is closed
-        run(options, console, idle_states=not device)
+        run(options, idle_states=not device)
     return 0
 
 
 def main() -> int:
-    """Run; returns the exit code."""
     return stoppable(_benchmark, "benchmark", "stopped; nothing is written", 130)
 
 

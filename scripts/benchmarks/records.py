@@ -34,7 +34,7 @@ def decode_clock(force_torque: Sequence[float]) -> ClockReading:
     return ClockReading(number, seconds * 10**9 + micros * 1000 + nanos)
 
 
-class Recording:
+class ArrivalRecorder:
     """Keeps what arrives once the warm-up is over, for a time; then writes it to `path`."""
 
     def __init__(self, path: Path, warm_up_s: float, seconds: float) -> None:
@@ -43,7 +43,7 @@ class Recording:
         self._from_ns = self._until_ns = 0
         self._values = array("q")
 
-    def take(self, position: int, number: int, instant_ns: int, stamp_ns: int, received_ns: int) -> bool:
+    def add(self, position: int, number: int, instant_ns: int, stamp_ns: int, received_ns: int) -> bool:
         """Note one arrival; False when the time is over."""
         if received_ns < self._from_ns:
             return True

@@ -63,7 +63,7 @@ class Measurement:
 
     def take_frame(self, frame: DataMessage) -> None:
         """A frame came from the server."""
-        if self._stream.take(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
+        if self._stream.count(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
             return
         self.latest = _decoder(len(frame.process_data)).decode(frame.process_data)
         values = tuple(self.latest.array)

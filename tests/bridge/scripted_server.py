@@ -7,11 +7,12 @@
 from __future__ import annotations
 
 import contextlib
+import selectors
 import socket
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 from bota_ethercat.control import PROTOCOL_VERSION
 from bota_ethercat.errors import ProtocolError
@@ -95,19 +96,21 @@ class Script:
 
 
 class ScriptedServer(Script):
-    """Listens on a free port of the loopback; one connection after the other, one at a time."""
+    """Listens on a port of the loopback, by default a free one; samples go to the newest subscriber."""
 
     def __init__(self, port: int = 0) -> None:
         super().__init__()
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
         self.disconnected = threading.Event()
-        self._peer: socket.socket | None = None
-        self._closing = False
-        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self.streams: list[socket.socket] = []  # subscribers, the newest last
+        self._peers: dict[int, socket.socket] = {}  # by descriptor
+        self._selector = selectors.DefaultSelector()
+        self._asking: socket.socket | None = None
+        self._thread = threading.Thread(target=self._serve, name="scripted server", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> ScriptedServer:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -117,30 +120,59 @@ class ScriptedServer(Script):
         self._closing = True
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
         self.drop()
         self._thread.join(5)
+        self._listener.close()
 
     def drop(self) -> None:
         self.subscribed.clear()
-        if self._peer is not None:
+        for peer in list(self._peers.values()):
             with contextlib.suppress(OSError):
-                self._peer.shutdown(socket.SHUT_RDWR)
+                peer.shutdown(socket.SHUT_RDWR)
 
     def send_raw(self, data: bytes) -> None:
-        assert self._peer is not None
-        self._peer.sendall(data)
+        answers = threading.current_thread() is self._thread or not self.streams
+        peer = self._asking if answers else self.streams[-1]
+        assert peer is not None
+        peer.sendall(data)
+
+    def _answer(self, message: JsonObject) -> None:
+        if message["action"] == "subscribe" and self._asking is not None:
+            self.streams.append(self._asking)
+        super()._answer(message)
 
     def _serve(self) -> None:
-        while not self._closing:
-            try:
-                self._peer, _ = self._listener.accept()
-            except OSError:
-                return
-            self.connections += 1
-            with self._peer, contextlib.suppress(OSError, ProtocolError):
-                decoder = FrameDecoder()
-                while data := self._peer.recv(65536):
-                    self.receive(decoder, data)
-            self.subscribed.clear()
-            self.disconnected.set()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        while True:
+            for ready, _ in self._selector.select():
+                if isinstance(ready.data, FrameDecoder):
+                    self._read(self._peers[ready.fd], ready.data)
+                    continue
+                try:
+                    self._asking, _ = self._listener.accept()
+                except OSError:  # it is closed
+                    for peer in list(self._peers.values()):
+                        self._end(peer)
+                    self._selector.close()
+                    return
+                self.connections += 1
+                self._peers[self._asking.fileno()] = self._asking
+                self._selector.register(self._asking, selectors.EVENT_READ, FrameDecoder())
+
+    def _read(self, peer: socket.socket, decoder: FrameDecoder) -> None:
+        self._asking = peer
+        try:
+            if not (data := peer.recv(65536)):
+                raise ConnectionResetError
+            self.receive(decoder, data)
+        except (OSError, ProtocolError):
+            self._end(peer)
+
+    def _end(self, peer: socket.socket) -> None:
+        self._selector.unregister(peer)
+        del self._peers[peer.fileno()]
+        if peer in self.streams:
+            self.streams.remove(peer)
+        peer.close()
+        self.subscribed.clear()
+        self.disconnected.set()

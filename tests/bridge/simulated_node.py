@@ -27,6 +27,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.serialization import deserialize_message
 
+from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.control import Event, event
 from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 from bota_ethercat.framing import FrameDecoder
@@ -69,15 +70,17 @@ def status(lost_samples: int = 0, mode: str = "locked") -> JsonObject:
     }  # fmt: skip
 
 
-class Wire:
-    """A `Channel` in memory; `feed` and `end` are for its other end."""
-
-    is_near = True
-    own = ("memory", 0)
+class Wire(TcpChannel):
+    """A channel in memory; `feed` and `end` are for its other end."""
 
     def __init__(self, world: Any, clock: SimulatedClock) -> None:
-        self.monotonic_ns, self.wait = clock.monotonic_ns, clock.wait
-        self._world = world
+        super().__init__("memory", 0)
+        self.monotonic_ns, self.same_address, self._clock, self._world = (
+            clock.monotonic_ns,
+            True,
+            clock,
+            world,
+        )
         self.arrived, self._ended = bytearray(), True
         self._send: Callable[[bytes], object] = lambda _: None
 
@@ -92,7 +95,11 @@ class Wire:
     def end(self) -> None:
         self._ended = True
 
-    shutdown = end
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        return self._clock.wait(event, seconds)
+
+    def shutdown(self) -> None:
+        self.end()
 
     def close(self) -> None:
         self.end()

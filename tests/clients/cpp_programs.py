@@ -11,14 +11,14 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import pytest
 
-from tests.server.running import PATIENCE_S, wait_until
+from tests.server.running import PATIENCE_S
 
 ROOT: Final = Path(__file__).parents[2]
 CLIENT: Final = ROOT / "clients" / "cpp"
@@ -34,14 +34,12 @@ patient: Final = pytest.mark.timeout(300)
 STRICT: Final = ("-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 SANITIZED: Final = ("-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 FAST: Final = (*SANITIZED, "-O2", "-ffast-math")
-"""As many controllers are built: what the compiler assumes then must not hide a NaN."""
 # System calls that the driver counts, and the clock, which it can set.
 WRAPPED: Final = (
     "socket", "connect", "close", "poll", "ppoll", "setsockopt", "getsockopt", "send", "recv",
     "clock_gettime",
 )  # fmt: skip
 
-BUILD_TIMEOUT_S: Final = 280.0
 KEPT_S: Final = 7 * 86400.0
 """Age from which a program that was built for other contents is deleted."""
 Reading = dict[str, Any]
@@ -79,9 +77,7 @@ def build(source: Path, flags: Sequence[str], others: Sequence[Path] = (), compi
             unfinished = program.with_suffix(".new")
             sources = [str(path) for path in (source, *others)]
             command = [compiler, *STRICT, *flags, f"-I{INCLUDE}", *sources, "-o", str(unfinished)]
-            made = subprocess.run(
-                command, check=False, capture_output=True, text=True, timeout=BUILD_TIMEOUT_S
-            )
+            made = subprocess.run(command, check=False, capture_output=True, text=True, timeout=280.0)
             assert made.returncode == 0, f"{' '.join(command)}\n{made.stderr}"
             unfinished.rename(program)
     return program
@@ -102,7 +98,6 @@ class Commanded:
     process: subprocess.Popen[str]
 
     def begin(self, *words: object) -> None:
-        """Give a command; `answer` has what comes of it."""
         assert self.process.stdin is not None
         self.process.stdin.write(" ".join(map(str, words)) + "\n")
         self.process.stdin.flush()
@@ -132,33 +127,18 @@ class Driver(Commanded):
 
     def latest(self, position: int = 0) -> Reading:
         reading: Reading = self.do("latest", position)
+        assert reading["fresh"] == (reading["condition"] == "fresh")
+        assert reading["has_sample"] or not (reading["fresh"] or reading["is_new"])
         return reading
 
-    def info(self, position: int = 0) -> dict[str, Any]:
-        told: dict[str, Any] = self.do("info", position)
+    def info(self) -> dict[str, Any]:
+        told: dict[str, Any] = self.do("info")
         return told
-
-    def until(self, condition: Callable[[Reading], bool], what: str) -> Reading:
-        """Ask for the latest until it is so; every reading until then must hold what all must hold."""
-        last: Reading = {}
-
-        def so() -> bool:
-            last.update(self.latest())
-            check(last)
-            return condition(last)
-
-        wait_until(so, what)
-        return last
 
 
 def start_driver(*inside: str, flags: Sequence[str] = SANITIZED) -> subprocess.Popen[str]:
-    """A driver, started by the command `inside`."""
-    return subprocess.Popen(
-        [*inside, driver_program(flags)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    command = [*inside, str(driver_program(flags))]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def end_driver(process: subprocess.Popen[str]) -> int:
@@ -189,15 +169,5 @@ def driver(port: int, /, **options: object) -> Iterator[Driver]:
 
 
 def assert_no_faults() -> None:
-    """End the drivers; none had a fault that a sanitizer found."""
     while _idle:
         assert end_driver(_idle.pop()) == 0
-
-
-def check(reading: Reading) -> None:
-    """What holds of every reading."""
-    if reading["fresh"]:
-        assert reading["has_sample"]
-    if reading["is_new"]:
-        assert reading["has_sample"]
-    assert reading["fresh"] == (reading["condition"] == "fresh")

@@ -86,7 +86,7 @@ def simulate(
             wire.append(made[0])
     decoder, frames = FrameDecoder(), list[DataMessage]()
     decoder.feed(b"".join(wire))
-    decoder.take_data(frames)
+    decoder.next_data(frames)
     return tuple(frames)
 
 

@@ -83,6 +83,14 @@ bool another_file() { return bota_ethercat::Client().latest().fresh(); }
 """
 
 
+def run(*command: str | Path, limit: Callable[[], None] | None = None, **environment: str) -> str:
+    done = subprocess.run(
+        command, check=False, capture_output=True, text=True, env=os.environ | environment, preexec_fn=limit
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
 def snippets() -> Iterator[tuple[str, str]]:
     """Every piece of C++ in the documentation and in comments of headers, with where it is from."""
     for path in PAGES:
@@ -120,8 +128,7 @@ def test_examples_and_snippets_need_no_exceptions_and_give_no_warning(tmp_path: 
 
 
 def test_the_conditions_are_those_of_python_and_documented_with_their_numbers() -> None:
-    told = subprocess.run([driver_program(), "conditions"], check=True, capture_output=True, text=True).stdout
-    found = [line.split(" ", 2) for line in told.splitlines()]
+    found = [line.split(" ", 2) for line in run(driver_program(), "conditions").splitlines()]
     assert [(number, name) for number, name, _ in found] == [
         (str(c.value), c.name.lower()) for c in Condition
     ]
@@ -155,9 +162,9 @@ def test_a_world_sends_what_the_python_one_does(tmp_path: Path) -> None:
 
 
 def scheduled(priority: int, cpu: int, limit: Callable[[], None] | None = None) -> tuple[list[int], str]:
-    command = [str(driver_program()), "real_time", str(priority), str(cpu)]
-    said = subprocess.run(command, capture_output=True, text=True, check=True, preexec_fn=limit).stdout
-    numbers, refused = said.splitlines()
+    numbers, refused = run(driver_program(), "real_time", str(priority), str(cpu), limit=limit).split("\n")[
+        :2
+    ]
     skip_if_forbidden(refused)
     return [int(number) for number in numbers.split()], refused
 
@@ -197,14 +204,6 @@ int main() { return bota_ethercat::Client().latest().fresh(); }
 """,
 }
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-
-
-def run(*command: str | Path, **environment: str) -> str:
-    done = subprocess.run(
-        command, check=False, capture_output=True, text=True, env={**os.environ, **environment}
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout + done.stderr
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S, description, frame, now, status
 

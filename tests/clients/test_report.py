@@ -17,7 +17,7 @@ from bota_clients.report.checks import Check, Examination
 from bota_clients.report.series import CHANNELS, Subject, channel_limit, limit_origin, subject
 from bota_clients.report.subjects import past
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from bota_ethercat.sensor.meaning import meaning
 from ethercat_server.virtual_sensor.signals import poses

@@ -17,7 +17,6 @@ PAGE = (ROOT / "docs" / "ros2-control.md").read_text()
 
 
 def names(table: str, file: str) -> list[str]:
-    """The strings that begin the rows of a table in C++."""
     text = (INCLUDE / file).read_text()
     rows = text[text.index(table) :].split("\n};", 1)[0]
     return re.findall(r'^    \{"([\w.]+)"' if "Row" in table else r'"([\w.]+)"', rows, re.MULTILINE)

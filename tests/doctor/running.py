@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from ethercat_server.doctor.bus_checks import examine_bus
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.report import NAMES, CheckResult, worst

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import pytest
 
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from bota_ethercat.replies import DistributionStatus
 from ethercat_server.doctor import bus_checks
 from ethercat_server.doctor.bus_checks import ErrorCounters, ExaminedSlave

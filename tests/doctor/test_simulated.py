@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 from bota_ethercat.address import Address
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from bota_ethercat.replies import Description, Status
 from ethercat_server.access.adapters import Holder
 from ethercat_server.access.sensors import Sensors

@@ -1,4 +1,4 @@
-"""A scripted server in memory and in simulated time, and the `Channel` to it: no sockets, no threads."""
+"""A scripted server in memory and in simulated time, and the channel to it: no sockets, no threads."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable
 
+from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 from bota_ethercat.framing import FrameDecoder
 from tests.bridge.scripted_server import Script
@@ -23,11 +24,9 @@ class MemoryServer(Script):
         self._agenda: list[tuple[int, Callable[[], object]]] = []
 
     def at(self, now_ns: int, action: Callable[[], object]) -> None:
-        """Do something at this time; one thing after the other."""
         self._agenda.append((now_ns, action))
 
     def go_on(self, seconds: float) -> None:
-        """Time passes, until something arrives."""
         until_ns = self.now_ns + math.ceil(seconds * 1e9)
         while not self.arrived and self._agenda and self._agenda[0][0] <= until_ns:
             self.now_ns, action = self._agenda.pop(0)
@@ -47,18 +46,16 @@ class MemoryServer(Script):
         self.is_connected = False
 
 
-class ScriptedChannel:
-    """See `Channel`. Time passes while the client waits."""
-
-    is_near = True
-    own = ("memory", 0)
+class ScriptedChannel(TcpChannel):
+    """The channel to it. Time passes while the client waits."""
 
     def __init__(self, server: MemoryServer) -> None:
+        super().__init__("memory", 0)
+        self.same_address, self.monotonic_ns = True, server.monotonic_ns
         self._server = server
         self._requests = FrameDecoder()
-        self.monotonic_ns = server.monotonic_ns
 
-    def wait(self, event: threading.Event, seconds: float, /) -> bool:
+    def wait(self, event: threading.Event, seconds: float) -> bool:
         self._server.now_ns += math.ceil(max(seconds, 0.0) * 1e9)
         return event.is_set()
 

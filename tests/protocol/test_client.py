@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import fcntl
 import functools
 import math
 import os
@@ -29,23 +28,14 @@ import pytest
 from bota_ethercat import address
 from bota_ethercat.address import boot_id
 from bota_ethercat.client import Client, Condition, Connected, Disconnected, NoSampleError, connect
-from bota_ethercat.client.channel import Channel, TcpChannel
+from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.bridge.scripted_server import ScriptedServer, description, process_data
 from tests.golden_vectors import odd_messages
 from tests.protocol.scripted_channel import MemoryServer, ScriptedChannel
-from tests.server.running import (
-    HERE,
-    PATIENCE_S,
-    THERE,
-    Veth,
-    free_port,
-    full_listener,
-    on_a_bus,
-    steady_addresses,
-)
+from tests.server.running import PATIENCE_S, free_port, full_listener
 from tests.simulation import MemoryChannel, Simulation
 
 ROOT = Path(__file__).parents[2]
@@ -56,7 +46,10 @@ def server() -> MemoryServer:
     return MemoryServer()
 
 
-def client_of(server: MemoryServer, **options: Any) -> Client:
+def client_of(server: MemoryServer, sensors: int = 1, **options: Any) -> Client:
+    if sensors > 1:
+        rows = [{"sensor": number, "rate_hz": 800} for number in range(sensors)]
+        server.description = description() | {"sensors": rows}
     return Client(1, channel=ScriptedChannel(server), **options).connect()
 
 
@@ -73,9 +66,6 @@ def test_samples_come_decoded_in_order_and_nothing_old(server: MemoryServer) -> 
     assert sensor.frame is not None
     assert sensor.frame.sequence == 4
     assert sensor.frame.flags & DataFlag.GAP
-
-
-def test_units_and_sizes(server: MemoryServer) -> None:
     sensor = client_of(server, imu_units=ImuUnits.SI)
     server.send_sample(3.0, process_data=process_data(3.0, 77))
     assert next(iter(sensor)).acceleration[0] == 3.0 + 6 / 16
@@ -94,9 +84,9 @@ def test_a_frame_was_measured_before_its_stamp_by_the_delay_of_the_filters(serve
 
 
 def test_raw_gives_every_frame_and_event_in_order(server: MemoryServer) -> None:
-    sensor = client_of(server, fresh_only=False, every=2, sensors=[0], raw=True)
+    sensor = client_of(server, fresh_only=False, every=2, raw=True)
     assert server.requests[-1] | {"id": 0} == {
-        "action": "subscribe", "id": 0, "fresh_only": False, "every": 2, "sensors": [0]
+        "action": "subscribe", "id": 0, "fresh_only": False, "every": 2
     }  # fmt: skip
     server.send_sample(1.0)
     server.send_json({"event": "reconfigured", "sensor": 0})
@@ -165,9 +155,7 @@ def test_nothing_new_is_an_error_that_says_why(server: MemoryServer) -> None:
 
 
 def test_each_sensor_must_have_a_sample_in_time(server: MemoryServer) -> None:
-    rows = [{"sensor": number, "rate_hz": 800} for number in (0, 1)]
-    server.description = description() | {"sensors": rows}
-    sensor = client_of(server)
+    sensor = client_of(server, 2)
     begun_ns = server.now_ns
     server.send_sample(1.0, sensor=1)
     for ms in range(25):
@@ -176,6 +164,16 @@ def test_each_sensor_must_have_a_sample_in_time(server: MemoryServer) -> None:
         deque(sensor, maxlen=0)
     assert server.now_ns == begun_ns + 20_000_000
     assert sensor.receive(), "the samples of sensor 0 are kept"
+    server.send_sample(1.0, sensor=1)
+    sensor.receive()
+    server.now_ns += 25_000_000
+    for number in range(3):
+        server.send_sample(float(number))
+    with pytest.raises(NoSampleError, match="sensor 1"):
+        sensor.receive()
+    sequences = [frame.sequence for frame in sensor.receive()]
+    assert sequences == sorted(sequences), "those that are put back stay in order"
+    assert sequences[-1] - sequences[-3] == 2
 
 
 def test_what_comes_before_a_reply_is_kept(server: MemoryServer) -> None:
@@ -188,23 +186,8 @@ def test_what_comes_before_a_reply_is_kept(server: MemoryServer) -> None:
     assert sensor.poll() == []
 
 
-def test_frames_that_are_put_back_stay_in_order(server: MemoryServer) -> None:
-    rows = [{"sensor": number, "rate_hz": 800} for number in (0, 1)]
-    server.description = description() | {"sensors": rows}
-    sensor = client_of(server)
-    server.send_sample(1.0, sensor=1)
-    sensor.receive()
-    server.now_ns += 25_000_000
-    for number in range(3):
-        server.send_sample(float(number))
-    with pytest.raises(NoSampleError, match="sensor 1"):
-        sensor.receive()
-    assert [frame.sequence for frame in sensor.receive()] == [2, 3, 4]
-
-
 @pytest.mark.parametrize("rate_hz", [800, None])
 def test_reading_connects_by_itself(server: MemoryServer, rate_hz: float | None) -> None:
-    """Whether or not a rate is known."""
     server.description["sensors"][0]["rate_hz"] = rate_hz
     server.on_subscribe = lambda: server.send_sample(1.0)
     assert [frame.sequence for frame in Client(1, channel=ScriptedChannel(server)).receive()] == [1]
@@ -215,9 +198,7 @@ def test_reading_connects_by_itself(server: MemoryServer, rate_hz: float | None)
 
 @pytest.mark.parametrize("timeout_s", [0, -1.0])
 def test_a_timeout_of_0_takes_what_has_arrived(server: MemoryServer, timeout_s: float) -> None:
-    rows = [{"sensor": number, "rate_hz": 800} for number in (0, 1)]
-    server.description = description() | {"sensors": rows}
-    sensor, begun_ns = client_of(server), server.now_ns
+    sensor, begun_ns = client_of(server, 2), server.now_ns
     for number in range(3):
         server.send_sample(1.0, sensor=number % 2)
     assert [frame.sequence for frame in sensor.receive(timeout_s)] == [1, 2, 3]
@@ -267,9 +248,7 @@ def test_the_newest_sample_is_asked_for_and_nothing_is_raised(server: MemoryServ
 
 def test_what_nobody_takes_is_dropped_with_a_gap(server: MemoryServer) -> None:
     """While the only thread waits for a reply; of each sensor, and events as well."""
-    rows = [{"sensor": number, "rate_hz": 800} for number in (0, 1, 2)]
-    server.description = description() | {"sensors": rows}
-    client = client_of(server)
+    client = client_of(server, 3)
     count, most = 70_000, 65_536
     for number in range(2):
         server.send_sample(1.0, sensor=number)
@@ -320,8 +299,6 @@ def test_odd_messages_cost_nothing(server: MemoryServer) -> None:
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str | None]]:
-    """`boot_id` of a machine whose kernel says these things; None: there is no such file."""
-
     def named(boot: str | None, offsets: str | None) -> str | None:
         for name, text in (("_BOOT_ID", boot), ("_CLOCK_OFFSETS", offsets)):
             path = tmp_path / name
@@ -405,7 +382,7 @@ def test_what_is_not_granted_does_not_end_it(scripted: ScriptedServer) -> None:
         assert next(iter(sensor)).force[0] == 1.0
 
 
-def test_nobody_there() -> None:
+def test_nobody_there_and_a_host_that_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
     with pytest.raises(
         UnreachableError, match=rf"^no server at localhost:{port} \(Connection refused\): start"
@@ -416,8 +393,6 @@ def test_nobody_there() -> None:
     with pytest.raises(ConnectionFailedError, match=f"not connected to localhost:{port}"):
         Client(port).ask("status")
 
-
-def test_a_host_that_is_not_known_is_said_so(monkeypatch: pytest.MonkeyPatch) -> None:
     def unknown(*_: object, **__: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
@@ -505,23 +480,14 @@ def waits_everywhere(client: Client) -> None:
 
 @pytest.fixture
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A connection has to be made within a moment."""
     monkeypatch.setattr("bota_ethercat.client.channel.CONNECT_TIMEOUT_S", 0.2)
 
 
 @pytest.mark.usefixtures("hasty")
 def test_a_full_backlog_takes_no_longer_than_the_timeout() -> None:
-    """`connect` is pending: the computer or its program hangs."""
+    """`connect` is pending: the computer is off, or its program hangs."""
     with full_listener() as port:
         waits_everywhere(Client(port))
-
-
-@on_a_bus
-@pytest.mark.usefixtures("hasty")
-def test_a_computer_that_is_off_takes_no_longer_than_the_timeout() -> None:
-    with steady_addresses(fcntl.LOCK_EX), Veth() as veth:
-        veth.ip("address", "add", f"{HERE}/30", "dev", veth.near)
-        waits_everywhere(Client(12001, THERE))
 
 
 @pytest.mark.usefixtures("hasty")
@@ -603,7 +569,6 @@ def test_another_thread_may_ask_while_one_receives(scripted: ScriptedServer) -> 
 
 
 def test_it_receives_beyond_1024_descriptors(scripted: ScriptedServer) -> None:
-    """Which `select` does not take."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, limits[1]), limits[1]))
     with contextlib.ExitStack() as taken:
@@ -637,7 +602,6 @@ def test_what_waits_for_a_slow_reader_is_bounded() -> None:
 
 
 def examples() -> list[str]:
-    """Of the section of the docs."""
     text = (ROOT / "docs" / "protocol.md").read_text().split("## A client in ten lines")[1].split("\n## ")[0]
     return [part.split("```")[0] for part in text.split("```python\n")[1:]]
 
@@ -671,13 +635,12 @@ PULLS: dict[str, tuple[Pull, str]] = {
 }
 
 
-def guard(channel: Channel | None = None, port: int = 1) -> Callable[[Callable[[str], object]], object]:
-    """The guard of the docs."""
+def guard(channel: TcpChannel) -> Callable[[Callable[[str], object]], object]:
     source = examples()[1]
     assert len(source.splitlines()) <= 15
     names: dict[str, Any] = {}
     exec(source, names)
-    names["Client"] = lambda _, **options: Client(port, channel=channel, **options)
+    names["Client"] = lambda _, **options: Client(1, channel=channel, **options)
     found: Callable[[Callable[[str], object]], object] = names["guard"]
     return found
 
@@ -733,13 +696,16 @@ def test_the_guard_of_the_docs_stops_in_every_state_that_it_begins_in(
     assert server.now_ns <= begun_ns + 1_010_000_000
 
 
-def test_the_guard_of_the_docs_waits_for_a_server_that_starts(
+def test_the_guard_of_the_docs_waits_for_a_server_and_stops_when_it_is_ended(
     server: MemoryServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def interrupt(*_: object) -> int:
+        raise KeyboardInterrupt
+
     server.listens = False
     server.on_subscribe = lambda: server.send_sample(-60.0)
-    channel = ScriptedChannel(server)
-    wait, said = channel.wait, list[str]()
+    channel, said = ScriptedChannel(server), list[str]()
+    wait = channel.wait
 
     def waited(event: threading.Event, seconds: float) -> bool:
         server.listens = True
@@ -747,25 +713,7 @@ def test_the_guard_of_the_docs_waits_for_a_server_that_starts(
 
     monkeypatch.setattr(channel, "wait", waited)
     guard(channel)(said.append)
-    assert said == ["60.0 N"]
-
-
-def test_the_guard_of_the_docs_stops_when_it_is_ended(
-    server: MemoryServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_: object) -> int:
-        raise KeyboardInterrupt
-
-    channel, said = ScriptedChannel(server), list[str]()
     monkeypatch.setattr(channel, "receive", interrupt)
     with pytest.raises(KeyboardInterrupt):
         guard(channel)(said.append)
-    assert said == ["the guard has ended"]
-
-
-def test_the_guard_of_the_docs_stops_without_a_server_over_tcp() -> None:
-    said = list[str]()
-    guard(port=free_port())(said.append)
-    with full_listener() as port:
-        guard(port=port)(said.append)
-    assert said == ["no force: disconnected"] * 2
+    assert said == ["60.0 N", "the guard has ended"]

@@ -22,7 +22,6 @@ from tests.golden_vectors import (
     JSON,
     READ,
     STREAMS,
-    AccountedStream,
     ReadStream,
     Vector,
     expected,
@@ -30,11 +29,6 @@ from tests.golden_vectors import (
     same_sample,
 )
 from tests.protocol.scripted_channel import MemoryServer, ScriptedChannel
-
-
-def test_each_alone() -> None:
-    for vector in (*DATA, *JSON, *BROKEN):
-        assert outcomes([vector.wire]) == [vector.outcome], vector.name
 
 
 def test_samples() -> None:
@@ -48,10 +42,10 @@ def test_samples() -> None:
             assert same_sample(decoded, sample), (vector.name, decoded)
 
 
-def test_what_follows_is_read_or_not() -> None:
-    for vector in BROKEN:
-        after = expected([vector, JSON[0]])
-        assert len(after) == (2 if vector.outcome == "refused" else 1), vector.name
+def test_each_alone_and_whether_what_follows_is_read() -> None:
+    for vector in (*DATA, *JSON, *BROKEN):
+        assert outcomes([vector.wire]) == [vector.outcome], vector.name
+        after = [vector.outcome] if vector.outcome == "broken" else [vector.outcome, JSON[0].outcome]
         assert outcomes([vector.wire + JSON[0].wire]) == after, vector.name
 
 
@@ -63,28 +57,21 @@ def test_streams_cut_at_every_byte(vectors: list[Vector]) -> None:
     assert outcomes([bytes((byte,)) for byte in wire]) == expected(vectors)
 
 
-def accounting_of(stream: AccountedStream) -> StreamAccounting:
-    accounting = StreamAccounting(every=stream.every, fresh_only=stream.fresh_only)
-    accounting.rate_hz = stream.rate_hz
-    return accounting
-
-
 def test_accounting() -> None:
     for stream in ACCOUNTED:
-        accounting = accounting_of(stream)
-        for step in stream.steps:
-            if step is None:
+        accounting = StreamAccounting(every=stream.every, fresh_only=stream.fresh_only)
+        accounting.rate_hz = stream.rate_hz
+        for step in stream.frames:
+            if step == "begin":
                 accounting.begin()
             else:
                 sequence, monotonic_ns, flags, kind = step
-                if flags or not accounting.take_next(sequence, monotonic_ns):
-                    assert accounting.take(*step[:3]).name == kind.upper(), (stream.name, step)
+                if flags or not accounting.count_next(sequence, monotonic_ns):
+                    assert accounting.count(*step[:3]).name == kind.upper(), (stream.name, step)
         assert accounting.counts == StreamCounts(**stream.counts), stream.name
 
 
 class PythonPlayer:
-    """See `Player`: the Python client."""
-
     def __init__(self, stream: ReadStream) -> None:
         self.server = MemoryServer()
         self.server.now_ns = BEGIN_NS - 10**10

@@ -11,8 +11,8 @@ import pytest
 
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.judge import Observation, judge, who_was_late
+from bota_ethercat.health.limits import LIMITS, Level, Verdict
 from bota_ethercat.health.observer import StreamObserver
-from bota_ethercat.health.verdict import LIMITS, Level, Verdict
 from bota_ethercat.pdo import encode
 from tests.clients.simulated import simulate
 
@@ -35,7 +35,7 @@ class Stream(NamedTuple):
         observer = StreamObserver(1e9 / PERIOD_NS, start_ns, window_ns=5 * SECOND_NS)
         for begin_ns in range(start_ns, start_ns + SECOND_NS, BATCH_NS):
             came = [f for f in self.frames if begin_ns <= f.monotonic_ns + self.age_ns < begin_ns + BATCH_NS]
-            observer.take(came, came[-1].monotonic_ns + self.age_ns if came else begin_ns + BATCH_NS)
+            observer.add_frames(came, came[-1].monotonic_ns + self.age_ns if came else begin_ns + BATCH_NS)
             for newest in came[-1:]:
                 observer.note_age(newest, newest.monotonic_ns + self.age_ns)
         return judge(observer.observation(start_ns + SECOND_NS, SECOND_NS)._replace(locked=True))
@@ -174,7 +174,7 @@ def arriving(*batches: tuple[float, Sequence[tuple[int, float, int]]]) -> Observ
     observer = StreamObserver(800.0, 0)
     for at_s, rows in batches:
         frames = [frame(k, flags=flags)._replace(monotonic_ns=round(at * 1e9)) for k, at, flags in rows]
-        observer.take(frames, round(at_s * 1e9))
+        observer.add_frames(frames, round(at_s * 1e9))
     return observer.observation(round(batches[-1][0] * 1e9))
 
 

@@ -25,7 +25,6 @@ JSON = st.recursive(
 
 
 def rows_of(row: Any) -> st.SearchStrategy[Any]:
-    """Objects with this row's keys and any values."""
     return JSON | st.fixed_dictionaries({}, optional=dict.fromkeys((*get_type_hints(row), "delay_ms"), JSON))
 
 
@@ -58,11 +57,8 @@ def test_a_real_servers_replies_are_decoded_whole() -> None:
     simulation.run(3.0)
     status, said = Status.parse(simulation.status()), simulation.status()
     row = status.find(0)
-    assert (status.cycles, row.fresh, row.clock.mode) == (
-        said["cycles"],
-        said["sensors"][0]["fresh"],
-        "locked",
-    )
+    expected = said["cycles"], said["sensors"][0]["fresh"], "locked"
+    assert (status.cycles, row.fresh, row.clock.mode) == expected
     assert None not in (*status.last_10s.wake_us, *status.recent_age_us(0), *row.age_us, status.uptime_s)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
 from bota_ethercat.sensor.response import (
-    Source,
+    DelaySource,
     acceleration_response,
     angular_rate_response,
     delays_ms,
@@ -50,15 +50,11 @@ def test_the_noise_that_passes() -> None:
 @pytest.mark.parametrize("fir", [False, True])
 def test_the_delay_is_the_filters_own(fir: bool) -> None:
     """A third-order sinc filter is three moving averages over a period each."""
-    steps = 64
-    average = [1 / steps] * steps
-    impulse = [1.0]
-    for taps in (
-        average,
-        average,
-        average,
-        *([[tap for each in fir_taps() for tap in [each, *[0.0] * (steps - 1)]]] if fir else []),
-    ):
+    steps, impulse = 64, [1.0]
+    stages = [[1 / steps] * steps] * 3
+    if fir:
+        stages.append([tap for each in fir_taps() for tap in [each, *[0.0] * (steps - 1)]])
+    for taps in stages:
         impulse = [
             sum(taps[at - k] * value for k, value in enumerate(impulse) if 0 <= at - k < len(taps))
             for at in range(len(impulse) + len(taps) - 1)
@@ -76,10 +72,10 @@ def test_of_what_is_not_known_no_delay_is_made_up() -> None:
     assert delays_ms(known)["force_torque"] == 15
     assert delays_ms(known, 400)["force_torque"] == 30
     for settings, source in (
-        ({**known, "fast": True}, Source.FAST),
-        ({**known, "chop": True}, Source.CHOP),
-        ({"sinc_length": 64}, Source.UNKNOWN),
-        ({}, Source.UNKNOWN),
+        ({**known, "fast": True}, DelaySource.FAST),
+        ({**known, "chop": True}, DelaySource.CHOP),
+        ({"sinc_length": 64}, DelaySource.UNKNOWN),
+        ({}, DelaySource.UNKNOWN),
     ):
         found = force_torque_response(settings)
         assert (found.delay_s, found.delay_ms, found.phase_deg(1), found.source) == (None, None, None, source)

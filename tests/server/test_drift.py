@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from bota_ethercat.health import history as words
+from bota_ethercat.health import sentences as words
 from bota_ethercat.health.judge import Observation, judge
-from bota_ethercat.health.verdict import LIMITS
+from bota_ethercat.health.limits import LIMITS
 from bota_ethercat.pdo import PDO_FIELDS
 from bota_ethercat.replies import SensorStatus, decode
 from ethercat_server.acquisition.drift import Drift

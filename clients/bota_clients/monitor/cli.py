@@ -22,8 +22,8 @@ from bota_clients.monitor.web.hub import is_loopback
 from bota_clients.monitor.words import json_line, verdict
 from bota_clients.program import interrupt_on_signals, not_installed
 from bota_ethercat.address import DEFAULT_HOST, Address
+from bota_ethercat.health.limits import Level
 from bota_ethercat.health.sentences import no_server
-from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.arguments import Parser, seconds
 from bota_ethercat.program.output import discard_output, ends_with_its_reader

@@ -16,11 +16,10 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health import history
 from bota_ethercat.health.judge import judge, saturated_axes
+from bota_ethercat.health.limits import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
-from bota_ethercat.health.sentences import event_sentence
-from bota_ethercat.health.verdict import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
+from bota_ethercat.health.sentences import drift, event_sentence
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.replies import (
     Description,
@@ -178,17 +177,13 @@ class _Sensor:
         """Reset peaks and past warnings."""
         self.peaks, self._seen = None, {}
         self.observer.forget()
-        self.observer.said.forget()
 
     def describe(self, info: SensorInfo, now_s: float, *, anew: bool) -> None:
         """Take its row of `describe`; `anew`: after connecting; nothing before counts as lost."""
-        said, now_ns = self.observer.said, _ns(now_s)
-        before = said.info
+        before, now_ns = self.observer.info, _ns(now_s)
         if anew:
-            self.observer = StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
-            self.observer.said = said
-            said.connected(now_ns)
-        said.info = info
+            self.observer.connected(now_ns)
+        self.observer.info = info
         if info.serial != before.serial and before != SensorInfo():
             self.reset()
             self._newest = None
@@ -197,12 +192,12 @@ class _Sensor:
 
     def take_status(self, status: Status, now_s: float) -> None:
         """Take a reply to `status`."""
-        self.observer.said.take_status(status, self.position, _ns(now_s))
+        self.observer.add_status(status, self.position, _ns(now_s))
         self._hand_out = status.recent_age_us(self.position)
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
         """Frames of this sensor as they came, oldest first."""
-        samples = self.observer.take(frames, _ns(now_s))
+        samples = self.observer.add_frames(frames, _ns(now_s))
         self._judge(now_s)
         if not samples:
             return
@@ -212,7 +207,7 @@ class _Sensor:
         self.peaks = tuple(_range([*was, *columns[i]]) for was, i in zip(before, _WRENCH, strict=True))
 
     def _judge(self, now_s: float) -> None:
-        seen, lost = self.observer.observation(_ns(now_s), _JUDGED_NS), self.observer.said.lost
+        seen, lost = self.observer.observation(_ns(now_s), _JUDGED_NS), self.observer.lost
         self._verdict = judge(seen)
         self._saturated = frozenset(axis for axes in saturated_axes(seen).values() for axis in axes)
         self._now = []
@@ -239,21 +234,20 @@ class _Sensor:
             for key, (finding, at_s) in latest
             if key not in keys
         ]
-        said = self.observer.said
-        info, status = said.info, said.status
+        info, status, lost = self.observer.info, self.observer.status, self.observer.lost
         sample = self._newest and SampleDecoder(len(self._newest), self._imu_units).decode(self._newest)
         return SensorState(
             position=self.position,
             info=info,
             status=status,
-            al_state="LOST" if said.lost is not None else info.state,
+            al_state="LOST" if lost is not None else info.state,
             sample=sample or None,
             peaks=self.peaks,
             saturated=self._saturated,
             verdict=self._verdict,
             alerts=tuple(alerts),
             hand_out_us=_spread(self._hand_out),
-            zero=history.drift(status),
+            zero=drift(status),
             **self._stream(_ns(now_s)),
         )
 
@@ -332,7 +326,7 @@ class Model:
             self._read_s = now_s
             if seconds >= SILENT_S:
                 for sensor in self._sensors.values():
-                    sensor.observer.said.note_unread((seconds, busy), _ns(now_s))
+                    sensor.observer.note_unread((seconds, busy), _ns(now_s))
 
     def note_age(self, frame: DataMessage, now_ns: int) -> None:
         """This frame arrived exactly at this CLOCK_MONOTONIC."""
@@ -362,7 +356,7 @@ class Model:
             self._heard_s = now_s
             position = position_of(event)
             if position is not None and (sensor := self._sensors.get(position)) is not None:
-                sensor.observer.said.take_event(event)
+                sensor.observer.add_event(event)
                 if event.get("event") == Event.OFFSET_CHANGED:  # the zero has moved
                     sensor.peaks = None
             self._events.append(f"{clock_text()} {event_sentence(event)}")

@@ -7,7 +7,7 @@ from typing import Any
 
 from bota_clients.monitor.model import Alert, Client, SensorState, ServerState, Spread, State
 from bota_clients.numbers import duration, milliseconds
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from bota_ethercat.text.json_text import finite
 
 DIGITS = {"N": 2, "Nm": 3, "counts": 0, "m/s²": 2, "rad/s": 3}  # decimals by unit

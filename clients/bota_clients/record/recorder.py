@@ -252,7 +252,7 @@ class Recorder:
         if isinstance(item, DataMessage):
             self._unflushed += 1
             self.saved += 1
-            self._stream(item.sensor).take(item.sequence, item.monotonic_ns, item.flags)
+            self._stream(item.sensor).count(item.sequence, item.monotonic_ns, item.flags)
             writer.frame(item)
         elif isinstance(item, Description):
             writer.describe(item.stamp_ns, item.reply)

@@ -24,7 +24,7 @@ from bota_clients.report.measure import (
 )
 from bota_clients.report.series import CHANNELS, Series, Subject, bits
 from bota_ethercat.health.judge import SATURATIONS, Observation, judge
-from bota_ethercat.health.verdict import LIMITS, Finding, Level
+from bota_ethercat.health.limits import LIMITS, Finding, Level
 from bota_ethercat.pdo import STANDARD_GRAVITY
 
 

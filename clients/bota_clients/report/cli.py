@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from bota_clients.arguments import add_force, add_imu_units, add_server, server_of
 from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.address import Address
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.arguments import Parser, number, typed
 from bota_ethercat.program.new_file import NewFile

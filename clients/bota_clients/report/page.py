@@ -15,7 +15,7 @@ from bota_clients.numbers import figure, share
 from bota_clients.report import plots
 from bota_clients.report.checks import Examination
 from bota_clients.report.series import CHANNELS, GROUPS, limit_origin
-from bota_ethercat.health.verdict import Level
+from bota_ethercat.health.limits import Level
 from bota_ethercat.sensor.meaning import meaning, value_meaning
 from bota_ethercat.settings import SETTINGS
 from bota_ethercat.text.untrusted import printable, visible

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from bota_clients.numbers import listing
 from bota_clients.recording.columns import Columns, Floats, Ints
 from bota_ethercat.accounting import StreamAccounting
-from bota_ethercat.health.verdict import LIMITS
+from bota_ethercat.health.limits import LIMITS
 from bota_ethercat.sensor.filters import LONG_SINC, SHORT_SINC, noise_limit
 from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, known_settings, rate_divisor
@@ -239,7 +239,7 @@ class Series:
         frames, summed = self.frames, list[int]()
         heads = (array.tolist() for array in (frames.sequence, frames.monotonic_ns, frames.flags))
         for head in zip(*heads, strict=True):
-            accounting.take(*head)
+            accounting.count(*head)
             summed.append(self.counts.missing)
         lost = np.diff(np.array(summed, np.int64)[frames.fresh]) // self.step
         fresh, intervals = frames.fresh, np.diff(self.frame_time)

@@ -30,7 +30,7 @@ from bota_clients.report.series import Subject, subject
 from bota_ethercat.address import Address
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health import history
+from bota_ethercat.health import sentences
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import Status
 from bota_ethercat.sensor_choice import SensorChoice
@@ -199,7 +199,7 @@ def of_server(
 def past(status: Mapping[str, Any], position: int) -> list[str]:
     """What the server knows of a sensor's past, from its reply to `status`: sentences."""
     row = Status.parse(status).find(position)
-    overload, overloaded = history.overload(row)
-    texts = [history.drift(row), overload]
+    overload, overloaded = sentences.overload(row)
+    texts = [sentences.drift(row), overload]
     texts += ["have it checked for damage by overload"] if overloaded else []
     return [f"{text[0].upper()}{text[1:]}." for text in texts if text]

@@ -23,7 +23,7 @@ public:
     CallbackReturn on_init(const hardware_interface::HardwareComponentInterfaceParams& params) override {
         if (SensorInterface::on_init(params) != CallbackReturn::SUCCESS) return CallbackReturn::ERROR;
         parameters_ = Parameters();
-        std::string wrong = take_sensor();
+        std::string wrong = read_sensors();
         for (const auto& [name, value] : info_.hardware_parameters)
             if (wrong.empty()) wrong = set_parameter(parameters_, name, value);
         if (wrong.empty() && parameters_.wants_compensated && !parameters_.has_payload)
@@ -35,10 +35,13 @@ public:
         handles_.clear();
         for (const auto& sensor : info_.sensors)
             for (const auto& interface : sensor.state_interfaces)
-                handles_.emplace_back(get_state_interface_handle(sensor.name + "/" + interface.name), place(sensor, interface.name));
+                handles_.emplace_back(get_state_interface_handle(sensor.name + "/" + interface.name), index_of(sensor, interface.name));
         loop_ = std::make_unique<SensorLoop>(parameters_, [this](Level level, const std::string& text) { log(level, text); });
         std::string why;
-        if (!loop_->open(why)) return loop_.reset(), refuse(why, CallbackReturn::FAILURE);
+        if (!loop_->open(why)) {
+            loop_.reset();
+            return refuse(why, CallbackReturn::FAILURE);
+        }
         introduce();
         return CallbackReturn::SUCCESS;
     }
@@ -82,19 +85,19 @@ public:
     }
 
 private:
-    /// The place in `Values` of a state interface; the second <sensor> has those of the compensated wrench.
-    std::size_t place(const hardware_interface::ComponentInfo& sensor, const std::string& name) const {
+    /// The index in `Values` of a state interface; the second <sensor> has those of the compensated wrench.
+    std::size_t index_of(const hardware_interface::ComponentInfo& sensor, const std::string& name) const {
         return signal(&sensor == &info_.sensors[0] ? name : "compensated." + name);
     }
 
     /// Each <sensor> of the URDF; what is wrong with it, or nothing.
-    std::string take_sensor() {
+    std::string read_sensors() {
         if (info_.sensors.empty() || info_.sensors.size() > 2 || !info_.joints.empty() || !info_.gpios.empty())
             return "its <ros2_control> tag must have one <sensor>, perhaps a second one for the compensated wrench, and nothing else";
         for (const auto& sensor : info_.sensors) {
             if (sensor.state_interfaces.empty()) return "the <sensor> " + sensor.name + " has no <state_interface>";
             for (const auto& interface : sensor.state_interfaces) {
-                const std::size_t which = place(sensor, interface.name);
+                const std::size_t which = index_of(sensor, interface.name);
                 if (which == kSignals.size()) return detail::unknown("state interface", interface.name, kSignals);
                 if (interface.data_type != "double")
                     return "the state interface " + interface.name + " has the data type " + interface.data_type + "; it must be double";
@@ -148,7 +151,7 @@ private:
 
     Parameters parameters_;
     std::unique_ptr<SensorLoop> loop_;
-    std::vector<std::pair<hardware_interface::StateInterface::SharedPtr, std::size_t>> handles_;  // place in `Values`
+    std::vector<std::pair<hardware_interface::StateInterface::SharedPtr, std::size_t>> handles_;  // index in `Values`
     bool is_active_ = false;
 };
 

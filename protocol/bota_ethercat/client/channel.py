@@ -11,7 +11,8 @@ import socket
 import struct
 import threading
 import time
-from typing import Final, Protocol
+from collections.abc import Callable
+from typing import Final
 
 from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 
@@ -28,48 +29,6 @@ _KEEPALIVE: Final = tuple(
 _DONT_WAIT: Final = getattr(socket, "MSG_DONTWAIT", 0)
 
 
-class Channel(Protocol):
-    """A stream of bytes to one server, which can be made again and again, and the time it is in."""
-
-    def monotonic_ns(self) -> int:
-        """CLOCK_MONOTONIC."""
-
-    def wait(self, event: threading.Event, seconds: float, /) -> bool:
-        """Wait until `event` is set, `seconds` at most; whether it is."""
-
-    def connect(self, timeout_s: float) -> bool:
-        """Begin or go on connecting, waiting at most `timeout_s`; whether it is done. UnreachableError.
-
-        Without an answer for ever it may never be; here and in `receive` 0 or less does not wait.
-        """
-
-    def receive(self, buffer: memoryview, timeout_s: float) -> int:
-        """Receive what fits, waiting at most `timeout_s` for the first byte; 0: nothing came.
-
-        ConnectionFailedError at its end.
-        """
-
-    def send(self, data: bytes) -> None:
-        """Send all of it; ConnectionFailedError."""
-
-    def shutdown(self) -> None:
-        """End the connection; from any thread, which ends a `receive` in another."""
-
-    def close(self) -> None:
-        """Give the connection up, finished or not."""
-
-    @property
-    def is_near(self) -> bool:
-        """Whether both ends have one address, and so probably one machine."""
-
-    @property
-    def own(self) -> tuple[str, int]:
-        """The address of this end."""
-
-    def fileno(self) -> int:
-        """For `poll`: readable when something has arrived; -1 without a connection."""
-
-
 _Found = tuple[socket.AddressFamily, tuple[object, ...]]
 
 
@@ -84,7 +43,6 @@ class _Lookup(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        """The thread."""
         try:
             found = socket.getaddrinfo(*self._where, type=socket.SOCK_STREAM)
             self.found = [(family, address) for family, _, _, _, address in found]
@@ -93,10 +51,13 @@ class _Lookup(threading.Thread):
 
 
 class TcpChannel:
-    """A `Channel` to `host`:`port`."""
+    """A stream of bytes to one server, which can be connected again and again, and the time that it is in.
 
-    monotonic_ns = staticmethod(time.monotonic_ns)
-    wait = staticmethod(threading.Event.wait)
+    Attributes:
+        own: the address of this end.
+        same_address: whether both ends have one address, and so probably one machine.
+        monotonic_ns: CLOCK_MONOTONIC.
+    """
 
     def __init__(self, host: str, port: int, receive_buffer: int = RECEIVE_BUFFER) -> None:
         """Nothing is sent yet. Each attempt looks the host's name up."""
@@ -106,11 +67,19 @@ class TcpChannel:
         self._sock: socket.socket | None = None
         self._give_up_ns = 0
         self._timeout_s = -1.0
+        self.monotonic_ns: Callable[[], int] = time.monotonic_ns
         self.own: tuple[str, int] = ("", 0)
-        self.is_near = False
+        self.same_address = False
+
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        """Wait until `event` is set, `seconds` at most; whether it is."""
+        return event.wait(seconds)
 
     def connect(self, timeout_s: float) -> bool:
-        """See `Channel`. Each address has `CONNECT_TIMEOUT_S`, and so have the name servers."""
+        """Begin or go on connecting, waiting at most `timeout_s`; whether it is done. UnreachableError.
+
+        Each address has `CONNECT_TIMEOUT_S`, and so have the name servers. 0 or less does not wait.
+        """
         deadline_ns, why = self.monotonic_ns() + round(timeout_s * 1e9), ""
         while True:
             left_s = max(0.0, (deadline_ns - self.monotonic_ns()) * 1e-9)
@@ -174,7 +143,7 @@ class TcpChannel:
         own, peer = sock.getsockname(), sock.getpeername()
         if own == peer:  # a free ephemeral port can connect to itself
             raise OSError("nothing listens there")
-        self.own, self.is_near = own[:2], own[0] == peer[0]
+        self.own, self.same_address = own[:2], own[0] == peer[0]
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # for a peer that was switched off
         for option, value in _KEEPALIVE:
@@ -185,7 +154,10 @@ class TcpChannel:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _timeval(_SEND_TIMEOUT_S))
 
     def receive(self, buffer: memoryview, timeout_s: float) -> int:
-        """See `Channel`. The kernel's own timeout costs no system call, as long as it is the same."""
+        """Receive what fits, waiting at most `timeout_s` for the first byte; 0: nothing came.
+
+        ConnectionFailedError at its end. The kernel's own timeout costs no system call while it is the same.
+        """
         sock = self._sock
         try:
             if sock is None:
@@ -208,7 +180,7 @@ class TcpChannel:
         return count
 
     def send(self, data: bytes) -> None:
-        """See `Channel`."""
+        """Send all of it; ConnectionFailedError."""
         try:
             if self._sock is None:
                 raise OSError(errno.EPIPE, os.strerror(errno.EPIPE))
@@ -217,13 +189,13 @@ class TcpChannel:
             raise ConnectionFailedError(f"cannot send: {error.strerror or error}") from None
 
     def shutdown(self) -> None:
-        """See `Channel`."""
+        """End the connection; from any thread, which ends a `receive` in another."""
         if (sock := self._sock) is not None:
             with contextlib.suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """See `Channel`."""
+        """Give the connection up, finished or not."""
         self.shutdown()
         self._give_up_ns = 0
         if self._sock is not None:
@@ -231,7 +203,7 @@ class TcpChannel:
             self._sock = None
 
     def fileno(self) -> int:
-        """See `Channel`."""
+        """For `poll`: readable when something has arrived; -1 without a connection."""
         return -1 if self._sock is None else self._sock.fileno()
 
 

@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import Final
 
 from bota_ethercat.address import Address
-from bota_ethercat.client.channel import RECEIVE_BUFFER, Channel, TcpChannel
+from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
 from bota_ethercat.client.reading import Condition, Reading
 from bota_ethercat.client.session import ClientEvent, Session, check_granted
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, ProtocolError, UnreachableError
@@ -37,8 +37,8 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import rows
 
 ANSWER_TIMEOUT_S: Final = 5.0
-_MOST_EVENTS: Final = 1000
-_MOST_READS: Final = 64  # reads in one call, so that it returns whatever arrives
+_MAX_EVENTS: Final = 1000
+_MAX_READS: Final = 64  # reads in one call, so that it returns whatever arrives
 _BACKLOG: Final = 2048  # bytes received at once that are more than any steady stream: more may be waiting
 _AGAIN_S: Final = 0.5
 _CLOSED: Final = "this client has been closed"
@@ -109,7 +109,7 @@ class Client:
         imu_units: ImuUnits = ImuUnits.G_DPS,
         terminals: Sequence[int] = (),
         receive_buffer: int = RECEIVE_BUFFER,
-        channel: Channel | None = None,
+        channel: TcpChannel | None = None,
     ) -> None:
         """Nothing is sent yet.
 
@@ -121,7 +121,7 @@ class Client:
         periods, at least 20 ms. `channel`: another one than TCP.
         """
         self.address = Address(host, port)
-        self.events: deque[ClientEvent] = deque(maxlen=_MOST_EVENTS)
+        self.events: deque[ClientEvent] = deque(maxlen=_MAX_EVENTS)
         self.frame: DataMessage | None = None
         self.scheduling = Scheduling()
         self.session = Session(
@@ -129,7 +129,7 @@ class Client:
             terminals=terminals,
         )  # fmt: skip
         self.terminal_frames = self.session.terminal_frames
-        self.channel: Channel = TcpChannel(host, port, receive_buffer) if channel is None else channel
+        self.channel = TcpChannel(host, port, receive_buffer) if channel is None else channel
         self._reconnect, self._timeout_s = reconnect, timeout_s
         self._open = False
         self._failed: ProtocolError | None = None
@@ -144,7 +144,6 @@ class Client:
         self._closing = threading.Event()
 
     def __enter__(self) -> Client:
-        """The client; `with` closes it."""
         return self
 
     def __exit__(
@@ -196,7 +195,7 @@ class Client:
                 self._gather(left_s)
             except ConnectionFailedError:  # the only connection has ended
                 self.channel.wait(self._closing, max(left_s, 0.0))
-            self._take_items()
+            self._pop_frames()
             left_s = (deadline_ns - self.channel.monotonic_ns()) * 1e-9
             if state.unread or left_s <= 0:
                 break
@@ -217,7 +216,7 @@ class Client:
         self._looked_ns, self._unread_ns = self.channel.monotonic_ns(), 0  # what was before is its caller's
         while True:
             self._gather(left_s)
-            frames = self._take_items()
+            frames = self._pop_frames()
             left_s = (deadline_ns - self.channel.monotonic_ns()) * 1e-9
             if frames or left_s <= 0:
                 break
@@ -251,12 +250,12 @@ class Client:
     def poll(self, timeout_s: float = 0.0) -> list[DataMessage]:
         """The frames that have arrived, if any, waiting at most `timeout_s` for the first, or an event."""
         self._gather(timeout_s)
-        return self._take_items()
+        return self._pop_frames()
 
     def poll_all(self, timeout_s: float = 0.0) -> list[DataMessage | ClientEvent]:
         """As `poll`, with the events in their places between the frames."""
         self._gather(timeout_s)
-        return self.session.take_items()
+        return self.session.pop_items()
 
     def frames(self) -> Iterator[DataMessage]:
         """The frames as they come; without end, or with `reconnect` False until the connection ends."""
@@ -345,16 +344,16 @@ class Client:
         items, monotonic_ns = self.session.items, self.channel.monotonic_ns
         of_terminals = len(self.terminal_frames)
         left_s, begun_ns = 0.0 if items else timeout_s, monotonic_ns()
-        for _ in range(_MOST_READS):
+        for _ in range(_MAX_READS):
             count = self._step(left_s)
             if count < _BACKLOG and (items or left_s <= 0 or len(self.terminal_frames) != of_terminals):
                 return
             left_s = 0.0 if items else timeout_s - (monotonic_ns() - begun_ns) * 1e-9
 
-    def _take_items(self) -> list[DataMessage]:
+    def _pop_frames(self) -> list[DataMessage]:
         """The frames among the items; `events` gets the others."""
         frames = list[DataMessage]()
-        for item in self.session.take_items():
+        for item in self.session.pop_items():
             if isinstance(item, DataMessage):
                 frames.append(item)
             else:
@@ -390,7 +389,7 @@ class Client:
             elif channel.connect(min(timeout_s, _AGAIN_S)):  # which `close` does not end
                 self._open = True
                 self._looked_ns = self._watched_ns = channel.monotonic_ns()
-                self._send(session.opened(channel.monotonic_ns(), is_near=channel.is_near))
+                self._send(session.opened(channel.monotonic_ns(), same_address=channel.same_address))
         except ProtocolError as error:
             if self._failed is error:
                 raise

@@ -18,7 +18,7 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
-_LEAST_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
+_MIN_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
 _WARNINGS_AT: Final = LAYOUTS[min(LAYOUTS)].offsets["warnings"]
 _WARNINGS: Final = slice(_WARNINGS_AT, _WARNINGS_AT + 4)
@@ -82,7 +82,7 @@ class Reading(NamedTuple):
         return self.condition is Condition.FRESH
 
 
-class SensorState:
+class ReceivedSensor:
     """One sensor of a `Session`."""
 
     def __init__(self, sensor: int, *, every: int, fresh_only: bool, imu_units: ImuUnits) -> None:
@@ -101,7 +101,7 @@ class SensorState:
         self.info = SensorInfo(sensor)
         self._sampled_delay_ns = Delays()
 
-    def take_info(self, info: SensorInfo) -> None:
+    def update(self, info: SensorInfo) -> None:
         """What the server says of it now."""
         self.info = info
         self.accounting.rate_hz = info.rate_hz or self.accounting.rate_hz
@@ -112,7 +112,7 @@ class SensorState:
         self.accounting.begin()
         self.lost = False
 
-    def take(self, frame: DataMessage, received_ns: int, same_clock: bool) -> DataMessage | None:
+    def add(self, frame: DataMessage, received_ns: int, same_clock: bool) -> DataMessage | None:
         """A frame that arrived at `received_ns`; itself if it brings a new, valid sample.
 
         GAP of a frame that brings none is carried to the next that does.
@@ -120,9 +120,9 @@ class SensorState:
         sequence, _, monotonic_ns, _, flags, _, process_data = frame
         accounting = self.accounting
         unusual = flags or self._reconnected or self._carried or self.lost
-        if unusual or not accounting.take_next(sequence, monotonic_ns):
+        if unusual or not accounting.count_next(sequence, monotonic_ns):
             restarts = accounting.counts.restarts
-            kind = accounting.take(sequence, monotonic_ns, flags)
+            kind = accounting.count(sequence, monotonic_ns, flags)
             if kind is FrameKind.OLD:
                 return None
             if self._reconnected or accounting.counts.restarts > restarts:
@@ -156,9 +156,9 @@ class SensorState:
             ahead = since_ns < -_CLOCK_TOLERANCE_NS
             age_ns = math.inf if ahead else max(0, since_ns)
         if sample is not None and age_ns <= max_age_ns:
-            condition = _worth(sample)
+            condition = _condition_of(sample)
         else:
-            silence_ns = max(2 * max_age_ns, _LEAST_SILENCE_NS)
+            silence_ns = max(2 * max_age_ns, _MIN_SILENCE_NS)
             condition = self.why_old(silence_ns, now_ns, connected=connected, ahead=ahead)
         reading = Reading(
             condition, self.sensor, sample, frame, self.unread > 0, age_ns * 1e-9,
@@ -183,8 +183,8 @@ class SensorState:
         return Condition.BAD_CLOCK if ahead else Condition.LATE
 
 
-def _worth(sample: Sample) -> Condition:
-    """What a recent sample is worth: by force and torque."""
+def _condition_of(sample: Sample) -> Condition:
+    """The condition of a recent sample, by force and torque."""
     if not math.isfinite(sum(sample.force) + sum(sample.torque)):
         return Condition.NOT_FINITE
     saturated = sample.force_torque_saturated or sample.warnings & _SATURATED

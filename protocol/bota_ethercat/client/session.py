@@ -21,7 +21,7 @@ from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import boot_id
-from bota_ethercat.client.reading import SensorState
+from bota_ethercat.client.reading import ReceivedSensor
 from bota_ethercat.control import Event, check_version, request
 from bota_ethercat.errors import (
     BadMessageError,
@@ -36,13 +36,13 @@ from bota_ethercat.replies import Description, position_of
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
-_FIRST_RETRY_NS: Final = 100_000_000
-_LONGEST_RETRY_NS: Final = 1_000_000_000
+_MIN_RETRY_NS: Final = 100_000_000
+_MAX_RETRY_NS: Final = 1_000_000_000
 # After a connection that lasted this long the next attempt follows as soon as after the first.
 _LASTED_NS: Final = 1_000_000_000
-_MOST_ITEMS: Final = 65536  # kept until they are taken; a tare of 20,000 samples needs fewer
+_MAX_ITEMS: Final = 65536  # kept until they are taken; a tare of 20,000 samples needs fewer
 _HANDSHAKE_NS: Final = 5_000_000_000
-_LEAST_TIMEOUT_S: Final = 0.02
+_MIN_TIMEOUT_S: Final = 0.02
 _TIMEOUT_PERIODS: Final = 5
 # Events that say what is in force from then on.
 _IN_FORCE: Final = frozenset({Event.SENSOR_BACK, Event.RECONFIGURED, Event.OFFSET_CHANGED})
@@ -98,12 +98,12 @@ class Session:
         """What to subscribe to, `sensors` None for all; nothing unless `stream`."""
         self.wanted = None if sensors is None else tuple(sensors)
         self._terminals = list(terminals)
-        self.terminal_frames: deque[TerminalMessage] = deque(maxlen=_MOST_ITEMS // 64)
+        self.terminal_frames: deque[TerminalMessage] = deque(maxlen=_MAX_ITEMS // 64)
         self.connected = self.same_machine = False
         self.description: JsonObject = {}
         self.items: deque[DataMessage | ClientEvent] = deque()
         self._dropped: set[int] = set()  # sensors whose frames were dropped from `items`
-        self.sensors: dict[int, SensorState] = {}
+        self.sensors: dict[int, ReceivedSensor] = {}
         self.connections = 0
         self.retry_at_ns = 0
         self.problem = "no connection yet"
@@ -119,16 +119,16 @@ class Session:
         # The request that is to be granted next, and what its reply goes to.
         self._handshake: tuple[Future[JsonObject], Callable[[JsonObject], bytes]] | None = None
         self._missing: tuple[int, ...] = ()
-        self._retry_ns = _FIRST_RETRY_NS
+        self._retry_ns = _MIN_RETRY_NS
         self._opened_ns = 0
         self._open = False
 
     # -- the connection
 
-    def opened(self, now_ns: int, *, is_near: bool) -> bytes:
-        """There is a connection; what to send. `is_near`: to this machine, unless its server denies it."""
+    def opened(self, now_ns: int, *, same_address: bool) -> bytes:
+        """There is a connection; what to send. `same_address`: of both ends, as on one machine."""
         self._open, self._opened_ns = True, now_ns
-        self.same_machine = is_near
+        self.same_machine = same_address
         self._decoder = FrameDecoder()
         return self._ask_first(self._described, "describe")
 
@@ -136,11 +136,11 @@ class Session:
         """The connection has ended, or none could be made."""
         was_connected = self.connected
         if self._open and now_ns - self._opened_ns >= _LASTED_NS:
-            self._retry_ns = _FIRST_RETRY_NS
+            self._retry_ns = _MIN_RETRY_NS
         self.connected = self._open = False
         self._handshake = None
         self.retry_at_ns = now_ns + self._retry_ns
-        self._retry_ns = min(self._retry_ns * 3 // 2, _LONGEST_RETRY_NS)
+        self._retry_ns = min(self._retry_ns * 3 // 2, _MAX_RETRY_NS)
         self.problem = reason
         error = ConnectionFailedError(f"the connection ended before the reply: {reason}")
         for identifier in list(self._replies):
@@ -149,7 +149,7 @@ class Session:
         self.items.append(Disconnected(reason, reachable, was_connected))
         self._drop_oldest()
 
-    def take_items(self) -> list[DataMessage | ClientEvent]:
+    def pop_items(self) -> list[DataMessage | ClientEvent]:
         """`items`, which are taken; GAP in the first frame of a sensor whose frames were dropped."""
         items = list(self.items)
         self.items.clear()
@@ -162,7 +162,7 @@ class Session:
 
     def _drop_oldest(self) -> None:
         """Nobody takes the items: their owner waits for a reply, say."""
-        while len(self.items) > _MOST_ITEMS:
+        while len(self.items) > _MAX_ITEMS:
             item = self.items.popleft()
             if isinstance(item, DataMessage):
                 self._dropped.add(item.sensor)
@@ -185,24 +185,24 @@ class Session:
         decoder.received(count)
         try:
             while True:
-                message = decoder.take_data(batch)
+                message = decoder.next_data(batch)
                 if batch:
-                    self._take(now_ns)
+                    self._add_frames(now_ns)
                 if message is None:
                     self._drop_oldest()
                     return answer
                 if not isinstance(message, TerminalMessage):
-                    answer += self._take_json(message)
+                    answer += self._handle_json(message)
                 elif self._raw or not message.flags & DataFlag.INVALID:
                     self.terminal_frames.append(message)
         except (RemoteProtocolError, BadMessageError) as error:
             raise ConnectionFailedError(f"what came is not this protocol: {printable(error)}") from None
 
-    def _take(self, now_ns: int) -> None:
+    def _add_frames(self, now_ns: int) -> None:
         sensors, items, batch, same = self.sensors, self.items, self._batch, self.same_machine
         for frame in batch:
             state = sensors.get(frame.sensor)
-            new = state.take(frame, now_ns, same) if state is not None else None
+            new = state.add(frame, now_ns, same) if state is not None else None
             if self._raw:
                 items.append(frame)
             elif new is not None:
@@ -224,11 +224,11 @@ class Session:
             if waiting is future:
                 self._replies.pop(identifier, None)
 
-    def _take_json(self, message: JsonObject) -> bytes:
+    def _handle_json(self, message: JsonObject) -> bytes:
         """Take a JSON message; what to send."""
         if "event" in message:
             if isinstance(message["event"], str):
-                self._take_event(message)
+                self._handle_event(message)
             return b""
         identifier = message.get("id")
         future = self._replies.pop(identifier, None) if type(identifier) is int else None
@@ -282,15 +282,15 @@ class Session:
         """Take a description of the server, which may be newer than that of the connection."""
         self.description = description
         for info in Description.parse(description).sensors:
-            self.state(info.sensor).take_info(info)
+            self.state(info.sensor).update(info)
 
-    def _take_event(self, message: JsonObject) -> None:
+    def _handle_event(self, message: JsonObject) -> None:
         kind, position = message["event"], position_of(message)
         state = None if position is None else self.sensors.get(position)
         if state is not None and kind in _IN_FORCE:
             state.lost = state.lost and kind == Event.OFFSET_CHANGED
             said = message if kind != Event.OFFSET_CHANGED else {"offset": message.get("offset")}
-            state.take_info(state.info.changed_by(said))
+            state.update(state.info.changed_by(said))
         elif state is not None and kind == Event.SENSOR_LOST:
             state.lost = True
         self.items.append(message)
@@ -301,12 +301,12 @@ class Session:
     def timeout_s(self) -> float:
         """After this time without a sample something is wrong: a few periods of the slowest sensor."""
         rates = [state.accounting.rate_hz for state in self.sensors.values() if state.accounting.rate_hz]
-        return max([_LEAST_TIMEOUT_S, *(_TIMEOUT_PERIODS * self._every / rate for rate in rates)])
+        return max([_MIN_TIMEOUT_S, *(_TIMEOUT_PERIODS * self._every / rate for rate in rates)])
 
-    def state(self, sensor: int) -> SensorState:
+    def state(self, sensor: int) -> ReceivedSensor:
         """What is known of a sensor, so far nothing of one that no description had."""
         if sensor not in self.sensors:
-            self.sensors[sensor] = SensorState(
+            self.sensors[sensor] = ReceivedSensor(
                 sensor, every=self._every, fresh_only=self._fresh_only, imu_units=self._imu_units
             )
         return self.sensors[sensor]

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
+from bota_ethercat.health.limits import LIMITS, About, Finding, Level, StreamLimits, Verdict, verdict
 from bota_ethercat.health.sentences import IT_TELLS, STOOD_STILL, did_not_read
-from bota_ethercat.health.verdict import LIMITS, About, Finding, Level, Limits, Verdict, verdict
 from bota_ethercat.pdo import AXES
-from bota_ethercat.replies import Emergency
+from bota_ethercat.replies import EmergencyStatus
 from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain
 
 
@@ -77,12 +77,12 @@ _STALL_S: Final = 0.02  # a shorter one makes no sample old
 _BUFFERED_S: Final = 0.25
 
 
-def judge(seen: Observation, limits: Limits = LIMITS) -> Verdict:
+def judge(seen: Observation, limits: StreamLimits = LIMITS) -> Verdict:
     """The verdict on a stream."""
     return verdict(_findings(seen, limits))
 
 
-def _findings(seen: Observation, limits: Limits) -> Iterator[Finding]:
+def _findings(seen: Observation, limits: StreamLimits) -> Iterator[Finding]:
     silent = seen.silent_s > limits.stale_after
     if silent:
         yield _silence(seen, limits)
@@ -115,12 +115,12 @@ def _stood_still(seen: Observation) -> bool:
     return seen.missed_deadlines > _STANDSTILL_S * seen.nominal_hz > 0
 
 
-def _silence(seen: Observation, limits: Limits) -> Finding:
+def _silence(seen: Observation, limits: StreamLimits) -> Finding:
     why, remedy = who_was_late(seen, limits)
     return _trouble("silence", f"No new sample for {seen.silent_s:.1f} s, {why}", remedy, size=seen.silent_s)
 
 
-def who_was_late(seen: Observation, limits: Limits = LIMITS) -> tuple[str, str]:
+def who_was_late(seen: Observation, limits: StreamLimits = LIMITS) -> tuple[str, str]:
     """Why there was no new sample for `silent_s`, and what to do: a clause each.
 
     From what each knows of itself: this program, whether it looked for samples, or did other things; the
@@ -148,7 +148,7 @@ def _who_held_up(seen: Observation, least_s: float) -> tuple[str, str]:
     return "they came late", "The network, or the server's computer, is too slow"
 
 
-def _values(seen: Observation, limits: Limits) -> Iterator[Finding]:
+def _values(seen: Observation, limits: StreamLimits) -> Iterator[Finding]:
     """What is wrong with the samples themselves."""
     if seen.not_finite:
         remedy = "Power-cycle the sensor; if it persists, contact support"
@@ -168,7 +168,7 @@ def _values(seen: Observation, limits: Limits) -> Iterator[Finding]:
         yield from _temperature(seen.temperature, limits)
 
 
-def _temperature(celsius: float, limits: Limits) -> Iterator[Finding]:
+def _temperature(celsius: float, limits: StreamLimits) -> Iterator[Finding]:
     if celsius >= limits.temperature_warn:
         make, found = (
             _trouble if celsius >= limits.temperature_error else _look,
@@ -190,7 +190,7 @@ def saturated_axes(seen: Observation) -> dict[int, list[str]]:
     return found
 
 
-def _losses(seen: Observation, limits: Limits) -> Iterator[Finding]:
+def _losses(seen: Observation, limits: StreamLimits) -> Iterator[Finding]:
     if seen.lost >= limits.lost_warn:
         total = seen.samples + seen.lost
         found = f"{seen.lost} of {total} samples ({_percent(seen.lost, total)}) were lost"
@@ -208,7 +208,7 @@ def _losses(seen: Observation, limits: Limits) -> Iterator[Finding]:
         yield _look("recoveries", f"The server lost the sensor {times} and has it back", _advice(seen))
 
 
-def _many(count: int, total: int, seen: Observation, limits: Limits) -> Level:
+def _many(count: int, total: int, seen: Observation, limits: StreamLimits) -> Level:
     period_s = 1 / seen.nominal_hz if seen.nominal_hz else seen.seconds / max(total, 1)
     many = count > limits.lost_error * total and count * period_s >= limits.lost_error_s
     return Level.TROUBLE if many else Level.LOOK
@@ -223,7 +223,7 @@ def _percent(part: int, total: int) -> str:
     return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
-def _arrival(seen: Observation, limits: Limits) -> Iterator[Finding]:
+def _arrival(seen: Observation, limits: StreamLimits) -> Iterator[Finding]:
     """How the samples arrive, of a stream that is not silent."""
     yield from _rate(seen, limits)
     if seen.invalid >= limits.lost_warn:
@@ -240,7 +240,7 @@ def _arrival(seen: Observation, limits: Limits) -> Iterator[Finding]:
         yield make("age", found, remedy, size=seen.age_p99_us)
 
 
-def _rate(seen: Observation, limits: Limits) -> Iterator[Finding]:
+def _rate(seen: Observation, limits: StreamLimits) -> Iterator[Finding]:
     rate, nominal = seen.rate_hz, seen.nominal_hz
     if rate is None or not nominal or seen.unread_s > _BUFFERED_S:
         return
@@ -271,7 +271,7 @@ def _circumstances(seen: Observation) -> Iterator[Finding]:
         yield _look("reconnects", found, "If it happens again, see the server's log", About.LINK)
 
 
-def emergency(last: Emergency) -> str:
+def emergency(last: EmergencyStatus) -> str:
     """An emergency of a sensor in words; empty if there is none, or one that says that an error is over."""
     if last.code is None or not last.code & _ERROR_CLASS:
         return ""

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observes one sensor over a time that ends now: its frames, of which every one is used, and what the server
-says of it in `describe`, `status` and events.
+"""Observes one sensor over a time that ends now: what the server says of it in `describe`, `status` and
+events (`SensorObserver`), and its frames, of which every one is used (`StreamObserver`).
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.accounting import NOT_NEW, FrameKind, StreamAccounting, StreamCounts
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health.history import drift
 from bota_ethercat.health.judge import Observation, emergency
-from bota_ethercat.health.sentences import event_sentence
-from bota_ethercat.health.verdict import LIMITS, Limits
+from bota_ethercat.health.limits import LIMITS, StreamLimits
+from bota_ethercat.health.sentences import drift, event_sentence
 from bota_ethercat.pdo import LAYOUTS, PdoLayout, is_finite
 from bota_ethercat.replies import SensorInfo, SensorStatus, Status
 
@@ -28,9 +27,9 @@ _FLAGS: Final = tuple(
     for name in ("warnings", "force_torque_saturated", "acceleration_saturated", "angular_rate_saturated")
 )
 _TEMPERATURE: Final = COMMON.index("temperature")
-_MOST_KEPT: Final = 1 << 16
+_MAX_KEPT: Final = 1 << 16
 _COUNTED: Final = ("lost_samples", "not_finite", "recoveries")  # what has grown matters
-_HIGHEST_HZ: Final = 1e6  # a rate beyond it is no sensor's, and not known
+_MAX_HZ: Final = 1e6  # a rate beyond it is no sensor's, and not known
 
 
 def by_sensor(frames: Iterable[DataMessage]) -> dict[int, list[DataMessage]]:
@@ -53,7 +52,6 @@ class _Batch(NamedTuple):
     last_ns: int = 0
 
     def then(self, later: _Batch) -> _Batch:
-        """Both, as one."""
         return _Batch(
             later.at_ns,
             tuple(map(operator.add, self.counts, later.counts)),
@@ -79,7 +77,7 @@ class SensorObserver:
         self._missed_deadlines: int | None = None
         self._grown: deque[tuple[int, str, int]] = deque()  # when, what, and by how much
         self._unread: deque[tuple[int, tuple[float, bool]]] = deque()  # when, and of `Client.take_unread`
-        self.dated = self._grown, self._unread
+        self._dated: tuple[deque[Any], ...] = self._grown, self._unread
         self._emergency = "", 0  # and when it came
         self._emergencies: int | None = 0  # how many there were when `_emergency` was the last
 
@@ -93,7 +91,7 @@ class SensorObserver:
         """Counts are not compared with those of another connection."""
         self.lost, self.status, self._missed_deadlines = None, SensorStatus(), None
 
-    def take_event(self, event: Mapping[str, Any]) -> None:
+    def add_event(self, event: Mapping[str, Any]) -> None:
         """An event of this sensor."""
         kind = event.get("event")
         if kind == Event.SENSOR_LOST:
@@ -101,7 +99,7 @@ class SensorObserver:
         elif kind in (Event.SENSOR_BACK, Event.RECONFIGURED):
             self.lost = None
 
-    def take_status(self, status: Status, position: int, now_ns: int) -> None:
+    def add_status(self, status: Status, position: int, now_ns: int) -> None:
         """A reply to `status`, in which it is the sensor at `position`."""
         before, row = self.status, status.find(position)
         counts = [(name, getattr(before, name), getattr(row, name)) for name in _COUNTED]
@@ -119,14 +117,14 @@ class SensorObserver:
         """What `Client.take_unread` has returned just now."""
         self._unread.append((now_ns, unread))
 
-    def begin(self) -> None:
+    def restart(self) -> None:
         """What comes from here on counts."""
-        for dated in self.dated:
+        for dated in self._dated:
             dated.clear()
 
     def forget(self) -> None:
         """Forget all that has been."""
-        self.begin()
+        self.restart()
         self._emergency = "", 0
 
     def grown(self, name: str, since_ns: int = 0) -> int:
@@ -134,7 +132,7 @@ class SensorObserver:
         return sum(by for at_ns, what, by in self._grown if what == name and at_ns >= since_ns)
 
     def complete(
-        self, seen: Observation, now_ns: int, window_ns: int | None = None, limits: Limits = LIMITS
+        self, seen: Observation, now_ns: int, window_ns: int | None = None, limits: StreamLimits = LIMITS
     ) -> Observation:
         """`seen` of its frames, with what the server said, at most in the last `window_ns`."""
         since_ns = now_ns - window_ns if window_ns else 0
@@ -157,27 +155,31 @@ class SensorObserver:
         )
 
 
-class StreamObserver:
+class StreamObserver(SensorObserver):
     """One sensor's frames from `start_ns` (CLOCK_MONOTONIC) on, subscribed to with `fresh_only` false.
 
     Attributes:
-        newest: process data of the newest sample.
-        said: what the server says of the sensor.
+        newest: process data of the newest sample of this connection.
     """
 
     def __init__(self, nominal_hz: float, start_ns: int, *, window_ns: int | None = None) -> None:
         """`window_ns`: look back no further than this."""
-        self.newest: bytes | None = None
-        self.said = SensorObserver()
-        self._accounting = StreamAccounting(fresh_only=False)
+        super().__init__()
         self._window_ns = window_ns
-        self._previous_ns: int | None = None  # the newest sample's stamp, unless other frames have come since
-        self._temperature: float | None = None
         self._batches: deque[_Batch] = deque()
         # When each came, and: the age of samples, ns; the interval between samples that follow one another.
-        self._ages: deque[tuple[int, int]] = deque(maxlen=_MOST_KEPT)
-        self._intervals: deque[tuple[int, int]] = deque(maxlen=_MOST_KEPT)
+        self._ages: deque[tuple[int, int]] = deque(maxlen=_MAX_KEPT)
+        self._intervals: deque[tuple[int, int]] = deque(maxlen=_MAX_KEPT)
+        self.connected(start_ns)
         self.begin(nominal_hz, start_ns)
+
+    def connected(self, now_ns: int) -> None:
+        """A connection was made: nothing before its first frame counts as missing."""
+        super().connected(now_ns)
+        self.newest: bytes | None = None
+        self._accounting = StreamAccounting(fresh_only=False)
+        self._previous_ns: int | None = None  # the newest sample's stamp, unless other frames have come since
+        self._temperature: float | None = None
 
     @property
     def counts(self) -> StreamCounts:
@@ -186,26 +188,30 @@ class StreamObserver:
 
     def begin(self, nominal_hz: float, start_ns: int) -> None:
         """Observe from here on, at this rate; the counts go on."""
-        self._nominal_hz = nominal_hz if 0 < nominal_hz <= _HIGHEST_HZ else 0.0
+        self._nominal_hz = nominal_hz if 0 < nominal_hz <= _MAX_HZ else 0.0
         self._accounting.rate_hz = self._nominal_hz
         self._start_ns = self._fresh_at_ns = start_ns
-        self.forget()
+        self._forget_frames()
 
     def forget(self) -> None:
         """Forget all that has been."""
+        super().forget()
+        self._forget_frames()
+
+    def _forget_frames(self) -> None:
         for kept in (self._batches, self._ages, self._intervals):
             kept.clear()
 
-    def take(self, frames: Sequence[DataMessage], now_ns: int) -> list[tuple[Any, ...]]:
+    def add_frames(self, frames: Sequence[DataMessage], now_ns: int) -> list[tuple[Any, ...]]:
         """Frames that came just now, oldest first; the values of the new samples, as in COMMON."""
         if not frames:
             return []
-        counts, take, before = self._accounting.counts, self._accounting.take, self._counted()
+        counts, count, before = self._accounting.counts, self._accounting.count, self._counted()
         fresh: list[DataMessage] = []
         previous, missing = self._previous_ns, counts.missing
         apart_ns = -1 if previous is None else 0  # the longest time in which no sample was made; -1: unknown
         for frame in frames:
-            if take(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
+            if count(frame.sequence, frame.monotonic_ns, frame.flags) is not FrameKind.NEW:
                 previous, apart_ns = None, -1
                 continue
             if previous is not None and counts.missing == missing:
@@ -273,7 +279,7 @@ class StreamObserver:
             acceleration_saturated=acceleration,
             angular_rate_saturated=angular_rate,
         )
-        return self.said.complete(found, now_ns, window_ns)
+        return self.complete(found, now_ns, window_ns)
 
     def ages_us(self, now_ns: int, window_ns: int | None = None) -> list[float]:
         """The ages noted, at most those of the last `window_ns`."""
@@ -299,7 +305,8 @@ class StreamObserver:
         if self._window_ns is None:
             return
         oldest_ns = now_ns - self._window_ns
-        for kept in (self._batches, self._ages, self._intervals, *self.said.dated):
+        all_kept: tuple[deque[Any], ...] = self._batches, self._ages, self._intervals, *self._dated
+        for kept in all_kept:
             while kept and kept[0][0] < oldest_ns:
                 kept.popleft()
 

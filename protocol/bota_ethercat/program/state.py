@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Any, Final
 
-_LONGEST: Final = 1 << 20  # bytes that a file may have
+_MAX_SIZE: Final = 1 << 20  # bytes that a file may have
 
 
 def folder() -> Path:
@@ -26,7 +26,7 @@ def folder() -> Path:
 def read(path: Path) -> dict[str, Any]:
     """The object, which may be another program's; empty if there is none."""
     try:
-        if not path.is_file() or path.stat().st_size > _LONGEST:
+        if not path.is_file() or path.stat().st_size > _MAX_SIZE:
             return {}
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

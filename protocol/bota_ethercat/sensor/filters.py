@@ -36,7 +36,6 @@ class ImuFilter(NamedTuple):
     """None for the gyroscope."""
 
     def __str__(self) -> str:
-        """For display."""
         text = f"bandwidth {self.bandwidth_hz} Hz, delay {self.delay_ms:g} ms, rate {self.rate_khz} kHz"
         if self.noise_density_ug_rthz is not None:
             text += f", noise density {self.noise_density_ug_rthz} µg/√Hz"

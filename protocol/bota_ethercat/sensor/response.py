@@ -29,7 +29,7 @@ FIR_TAPS: Final = 22  # symmetrical
 _KAISER_BETA: Final = 8.8
 
 
-class Source(Enum):
+class DelaySource(Enum):
     """How a delay is known."""
 
     PUBLISHED = "published by Bota"
@@ -44,7 +44,7 @@ class Response(NamedTuple):
     """Of one channel."""
 
     delay_s: float | None  # group delay, the same at all frequencies that pass; None: unknown
-    source: Source
+    source: DelaySource
 
     @property
     def delay_ms(self) -> float | None:
@@ -56,7 +56,6 @@ class Response(NamedTuple):
         return None if self.delay_s is None else 360.0 * hz * self.delay_s
 
     def __str__(self) -> str:
-        """The delay, for display."""
         return self.source.value if self.delay_s is None else f"{self.delay_ms:g} ms ({self.source.value})"
 
 
@@ -65,14 +64,14 @@ def force_torque_response(settings: Mapping[str, SettingValue], rate_hz: float |
     length = settings.get("sinc_length") or 0
     rate = rate_hz or (BASE_SAMPLING_RATE_HZ / length if length else 0.0)
     if not rate:
-        return Response(None, Source.UNKNOWN)
+        return Response(None, DelaySource.UNKNOWN)
     chop, fir, fast = settings.get("chop"), settings.get("fir"), settings.get("fast")
     if chop or fir is None:
-        return Response(None, Source.CHOP if chop else Source.UNKNOWN)
+        return Response(None, DelaySource.CHOP if chop else DelaySource.UNKNOWN)
     if fir and fast:
-        return Response(None, Source.FAST)
+        return Response(None, DelaySource.FAST)
     periods = SINC_ORDER / 2 + ((FIR_TAPS - 1) / 2 if fir else 0.0)
-    return Response(periods / rate, Source.FIR if fir else Source.DERIVED)
+    return Response(periods / rate, DelaySource.FIR if fir else DelaySource.DERIVED)
 
 
 def acceleration_response(settings: Mapping[str, SettingValue]) -> Response:
@@ -104,8 +103,8 @@ def delays_ms(settings: Mapping[str, SettingValue], rate_hz: float | None = None
 
 def _imu(row: ImuFilter | None) -> Response:
     if row is None:
-        return Response(None, Source.UNKNOWN)
-    return Response(row.delay_ms * 1e-3, Source.PUBLISHED)
+        return Response(None, DelaySource.UNKNOWN)
+    return Response(row.delay_ms * 1e-3, DelaySource.PUBLISHED)
 
 
 def sinc_gain(share: float) -> float:

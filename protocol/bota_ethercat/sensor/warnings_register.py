@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sensor's warnings register ("Warnings Errors Fatal"): what each bit means and what to do about it.
 
-Source: Table III.3 of the design note.
+From the table of warnings and errors in Bota's manual.
 """
 
 from __future__ import annotations

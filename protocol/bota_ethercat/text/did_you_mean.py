@@ -8,21 +8,21 @@ import re
 from collections.abc import Iterable
 from typing import Final
 
-_LONGEST: Final = 80
-_SHORTEST_PART: Final = 3
-_MOST: Final = 3
+_MAX_LENGTH: Final = 80
+_MIN_PART: Final = 3
+_MAX_NAMES: Final = 3
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """The question to go on with after "no such name", such as "; did you mean 'fir'?"; may be empty."""
-    names, word = list(known), word.lower()[:_LONGEST]
+    names, word = list(known), word.lower()[:_MAX_LENGTH]
     close = names_with(word, names) or difflib.get_close_matches(word, names, n=1)
     return f"; did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
 def names_with(word: str, known: Iterable[str]) -> list[str]:
     """The first few names of which `word` is a part, as `sinc` is of `sinc_length` and `SINC length`."""
-    if len(word) < _SHORTEST_PART:
+    if len(word) < _MIN_PART:
         return []
     part = re.compile(rf"(?<![^\W_]){re.escape(word)}(?![^\W_])", re.IGNORECASE)
-    return list(filter(part.search, known))[:_MOST]
+    return list(filter(part.search, known))[:_MAX_NAMES]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
-from bota_ethercat.health.verdict import LIMITS, Limits
+from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.program.real_time import HIGHEST_PRIORITY
 from ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
@@ -233,7 +233,7 @@ class Parameters:
         return parse_frames(self.wrench_frames)
 
     @cached_property
-    def limits(self) -> Limits:
+    def limits(self) -> StreamLimits:
         return LIMITS._replace(**self._group("diagnostics_"))
 
     @cached_property

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
-from bota_ethercat.client.channel import Channel
+from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.client.client import Client
 from bota_ethercat.client.session import ClientEvent, Connected, Disconnected
 from bota_ethercat.control import Event
@@ -21,7 +21,7 @@ from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import no_server
 from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
-from bota_ethercat.replies import LONGEST_MS
+from bota_ethercat.replies import MAX_DELAY_MS
 from bota_ethercat.text.untrusted import rows
 from bridge.parameters.table import Parameters
 from bridge.process import Worker
@@ -30,7 +30,7 @@ from bridge.stream.link import SYSTEM_CLOCK, Clock, Link, sentence
 
 _WAIT_S: Final = 0.1  # so that silence is known to be the server's
 # Times that a ROS message can carry, less the longest delay of a filter.
-_FIRST_STAMP_NS: Final = LONGEST_MS * 10**6
+_FIRST_STAMP_NS: Final = MAX_DELAY_MS * 10**6
 _LAST_STAMP_NS: Final = (2**31 - 1) * 10**9
 _SOMETIMES: Final = {"throttle_duration_sec": 10.0}
 _MOST_NOTED: Final = 8192
@@ -105,7 +105,7 @@ class Reader:
 
     def __init__(
         self, parameters: Parameters, outputs: Outputs, log: Any, on_failure: Callable[[str], object], *,
-        channel: Channel | None = None, clock: Clock = SYSTEM_CLOCK,
+        channel: TcpChannel | None = None, clock: Clock = SYSTEM_CLOCK,
     ) -> None:  # fmt: skip
         self._sensor, self._outputs, self._log = parameters.sensor, outputs, log
         units = ImuUnits(parameters.imu_raw_units)

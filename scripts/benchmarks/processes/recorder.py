@@ -19,14 +19,13 @@ from bota_ethercat.client import make_real_time
 from bota_ethercat.control import request
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from bota_ethercat.pdo import SampleDecoder
-from scripts.benchmarks.records import PORT, Recording, decode_clock
+from scripts.benchmarks.records import PORT, ArrivalRecorder, decode_clock
 
 SIZE: Final = 61
 _DEPTH: Final = 50
 
 
-def tcp(recording: Recording, port: int = PORT) -> None:
-    """A client of ethercat-server."""
+def tcp(recording: ArrivalRecorder, port: int = PORT) -> None:
     frames, decode = FrameDecoder(), SampleDecoder(SIZE).decode
     old = DataFlag.REPEATED | DataFlag.INVALID
     with socket.create_connection(("127.0.0.1", port)) as connection:
@@ -38,11 +37,11 @@ def tcp(recording: Recording, port: int = PORT) -> None:
                 if not isinstance(frame, DataMessage) or frame.flags & old:
                     continue
                 clock = decode_clock(decode(frame.process_data).array)
-                if not recording.take(frame.sensor, *clock, frame.monotonic_ns, now):
+                if not recording.add(frame.sensor, *clock, frame.monotonic_ns, now):
                     return
 
 
-def ros(recording: Recording, sensors: str) -> None:
+def ros(recording: ArrivalRecorder, sensors: str) -> None:
     """A subscriber of the `wrench` of each sensor.
 
     It waits for and takes messages itself, because rclpy's executor takes longer for that than everything
@@ -60,18 +59,18 @@ def ros(recording: Recording, sensors: str) -> None:
     ]
     with node.context.handle:
         wait_set = rclpy_implementation.WaitSet(len(handles), 0, 0, 0, 0, 0, node.context.handle)
-    goes_on = True
-    while goes_on:
+    is_recording = True
+    while is_recording:
         wait_set.clear_entities()
         for handle in handles:
             wait_set.add_subscription(handle)
         wait_set.wait(1_000_000_000)
         for position, handle in enumerate(handles):
-            while goes_on and (taken := handle.take_message(WrenchStamped, False)) is not None:
+            while is_recording and (taken := handle.take_message(WrenchStamped, False)) is not None:
                 now = time.monotonic_ns()
                 force, torque = taken[0].wrench.force, taken[0].wrench.torque
                 clock = decode_clock((force.x, force.y, force.z, torque.x))
-                goes_on = recording.take(position, *clock, 0, now)
+                is_recording = recording.add(position, *clock, 0, now)
     node.destroy_node()
     rclpy.try_shutdown()
 
@@ -80,8 +79,7 @@ KINDS: Final[dict[str, Callable[..., None]]] = {"tcp": tcp, "ros": ros}
 
 
 def main(kind: str, path: str, warm_up_s: str, seconds: str, priority: str, *arguments: str) -> None:
-    """Record, then end."""
-    recording = Recording(Path(path), float(warm_up_s), float(seconds))
+    recording = ArrivalRecorder(Path(path), float(warm_up_s), float(seconds))
     gc.disable()
     make_real_time(int(priority))  # of all threads: the middleware's inherit it
     KINDS[kind](recording, *arguments)

@@ -20,15 +20,14 @@ from typing import Final
 import bota_driver  # type: ignore[import-not-found]
 
 from bota_ethercat.program.real_time import make_real_time
-from scripts.benchmarks.records import Recording, decode_clock
+from scripts.benchmarks.records import ArrivalRecorder, decode_clock
 
 _ATTEMPTS: Final = 5
 
 
 def main() -> None:
-    """Record, then end."""
     path, warm_up_s, seconds, ifname, sinc, rate_hz, priority = sys.argv[1:]
-    recording = Recording(Path(path), float(warm_up_s), float(seconds))
+    recording = ArrivalRecorder(Path(path), float(warm_up_s), float(seconds))
     gc.disable()
     Path("/proc/self/timerslack_ns").write_text("1000", encoding="ascii")  # as the server's
     make_real_time(int(priority))  # before the driver starts its threads, which inherit it
@@ -71,7 +70,7 @@ def configuration(ifname: str, sinc: int) -> bota_driver.BotaDriverConfig:
     return config
 
 
-def record(driver: bota_driver.BotaDriver, recording: Recording, period_ns: int) -> None:
+def record(driver: bota_driver.BotaDriver, recording: ArrivalRecorder, period_ns: int) -> None:
     """Note everything that is returned until the time is over; when, before anything is decoded."""
     due = time.monotonic_ns()
     while True:
@@ -80,7 +79,7 @@ def record(driver: bota_driver.BotaDriver, recording: Recording, period_ns: int)
         now = time.monotonic_ns()
         if not frame.status.invalid:
             clock = decode_clock((*frame.force, *frame.torque))
-            if not recording.take(0, *clock, 0, now):
+            if not recording.add(0, *clock, 0, now):
                 return
         due += period_ns * (1 + max(0, now - due) // period_ns)
 

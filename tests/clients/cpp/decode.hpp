@@ -122,7 +122,7 @@ void account(const std::string& line) {
         unsigned flags = 0;
         char comma = 0;
         numbers >> sequence >> comma >> monotonic_ns >> comma >> flags;
-        std::printf("%s ", kKinds[static_cast<int>(accounting.take(sequence, monotonic_ns, static_cast<std::uint8_t>(flags)))]);
+        std::printf("%s ", kKinds[static_cast<int>(accounting.count(sequence, monotonic_ns, static_cast<std::uint8_t>(flags)))]);
     }
     const StreamCounts& c = accounting.counts;
     for (const std::uint64_t count : {c.samples, c.repeated, c.invalid, c.old, c.restarts, c.gaps, c.withheld, c.lost, c.skipped})

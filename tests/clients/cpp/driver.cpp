@@ -90,44 +90,16 @@ void conditions() {
             std::printf("%d %s %s\n", number, name(condition), to_string(condition));
 }
 
-/// As Python's JSON has it.
-void print(double number) {
-    if (is_finite(number))
-        std::printf("%.17g", number);
-    else
-        std::printf("%s", is_nan(number) ? "NaN" : number > 0.0 ? "Infinity" : "-Infinity");
-}
-
-template <std::size_t Size>
-void print(const char* key, const std::array<double, Size>& numbers) {
-    std::printf(",\"%s\":", key);
-    for (std::size_t i = 0; i < Size; ++i) {
-        std::printf("%c", i == 0 ? '[' : ',');
-        print(numbers[i]);
-    }
-    std::printf("]");
-}
-
-void print(const Reading& r) {
-    std::printf("{\"has_sample\":%s,\"is_new\":%s,\"fresh\":%s,\"condition\":\"%s\",\"sensor\":%u,\"flags\":%u,\"wkc\":%u",
-                yes(r.has_sample), yes(r.is_new), yes(r.fresh()), name(r.condition), unsigned{r.sensor}, unsigned{r.flags},
-                unsigned{r.wkc});
-    std::printf(",\"sequence\":%" PRIu64 ",\"stamp_ns\":%" PRIu64 ",\"monotonic_ns\":%" PRIu64 ",\"received_ns\":%" PRId64
-                ",\"age_ns\":%" PRId64 ",\"age_is_lower_bound\":%s",
-                r.sequence, r.stamp_ns, r.monotonic_ns, r.received_ns, r.age_ns, yes(r.age_is_lower_bound));
-    std::printf(",\"gap\":%s,\"withheld\":%" PRIu64 ",\"lost\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"warnings_seen\":%" PRIu32
-                ",\"connection\":%" PRIu32 ",\"more_waits\":%s",
-                yes(r.gap), r.withheld, r.lost, r.passed_over, r.warnings_seen, r.connection, yes(r.more_waits));
-    std::printf(",\"measured_ns\":[");
-    for (const Channel channel : {Channel::force_torque, Channel::acceleration, Channel::angular_rate}) {
-        const auto measured_ns = r.measured_ns(channel);
-        std::printf("%s%s", channel == Channel::force_torque ? "" : ",", measured_ns ? std::to_string(*measured_ns).c_str() : "null");
-    }
-    std::printf("]");
-    print("array", r.sample.array());
-    std::printf(",\"temperature\":");
-    print(r.sample.temperature);
-    std::printf("}");
+std::string text_of(const Reading& r) {
+    const auto measured_ns = [&r](Channel channel) { return json_text(r.measured_ns(channel)); };
+    constexpr std::array channels{Channel::force_torque, Channel::acceleration, Channel::angular_rate};
+    return Object()("has_sample", r.has_sample)("is_new", r.is_new)("fresh", r.fresh())("condition", name(r.condition))(
+        "sensor", r.sensor)("flags", r.flags)("wkc", r.wkc)("sequence", r.sequence)("stamp_ns", r.stamp_ns)(
+        "monotonic_ns", r.monotonic_ns)("received_ns", r.received_ns)("age_ns", r.age_ns)(
+        "age_is_lower_bound", r.age_is_lower_bound)("gap", r.gap)("withheld", r.withheld)("lost", r.lost)(
+        "passed_over", r.passed_over)("warnings_seen", r.warnings_seen)("connection", r.connection)("more_waits", r.more_waits)
+        .raw("measured_ns", json_list(channels, measured_ns))("array", r.sample.array())("temperature", r.sample.temperature)
+        .text();
 }
 
 Options options_from(std::istringstream& words) {
@@ -151,24 +123,23 @@ Options options_from(std::istringstream& words) {
     return options;
 }
 
-void info(const Client& client, std::uint8_t place) {
+std::string info(const Client& client, std::uint8_t place) {
     const Counters c = client.counters(place);
     constexpr const char* kLinks[] = {"down", "connecting", "subscribing", "up"};
-    std::printf("{\"link\":\"%s\",\"error\":%s,\"connections\":%u,\"reconfigurations\":%u,\"refused\":%s,\"bad_messages\":%" PRIu64
-                ",\"allocated\":%zu,\"allocates\":%s,\"receives\":%zu,\"other_calls\":%zu,\"fd\":%d",
-                kLinks[static_cast<int>(client.link())], quoted(client.error()).c_str(), client.connections(),
-                client.reconfigurations(), yes(client.refused()), client.bad_messages(), allocated, yes(allocations > 0), received, called, client.fd());
-    std::printf(",\"frames\":%" PRIu64 ",\"samples\":%" PRIu64 ",\"repeated\":%" PRIu64 ",\"invalid\":%" PRIu64 ",\"gaps\":%" PRIu64
-                ",\"withheld\":%" PRIu64 ",\"skipped\":%" PRIu64 ",\"passed_over\":%" PRIu64 ",\"names\":[",
-                c.frames(), c.samples, c.repeated, c.invalid, c.gaps, c.withheld, c.skipped, c.passed_over);
-    for (std::size_t i = 0; i < client.description().sensor_count; ++i)
-        std::printf("%s%s", i ? "," : "", quoted(client.description().sensors[i].name.view()).c_str());
-    std::printf("]}");
+    return Object()("link", kLinks[static_cast<int>(client.link())])("error", client.error())("connections", client.connections())(
+        "reconfigurations", client.reconfigurations())("refused", client.refused())("bad_messages", client.bad_messages())(
+        "allocated", allocated)("allocates", allocations > 0)("receives", received)("other_calls", called)("fd", client.fd())(
+        "samples", c.samples)("sensor_count", client.description().sensor_count)
+        .text();
 }
 
-void print(const Control& control, bool ok) {
-    std::printf("\"ok\":%s,\"error\":%s,\"code\":%s,\"abort_code\":%u}", yes(ok), quoted(control.error()).c_str(),
-                quoted(control.error_code()).c_str(), control.abort_code());
+std::string text_of(const SensorInfo& s) {
+    return Object()("sensor", s.sensor)("serial", s.serial)("pdo_size", s.pdo_size)("rate_hz", s.rate_hz)("name", s.name)(
+        "hardware", s.hardware)("firmware", s.firmware)("state", s.state).text();
+}
+
+std::string ended(Object told, const Control& control, bool ok) {
+    return told("ok", ok)("error", control.error())("code", control.error_code())("abort_code", control.abort_code()).text();
 }
 
 }  // namespace
@@ -196,77 +167,60 @@ int main(int argc, char** argv) {
             words >> set_ns;
             continue;
         }
+        if (command != "server" && !maybe_client) return 2;
+        Client& client = *maybe_client;
+        Control& control = *maybe_control;
+        long number = 0;
+        if (command != "ask" && command != "server") words >> number;
+        const auto place = static_cast<std::uint8_t>(number);
+        std::string told = "{}";
         if (command == "server") {
             std::string given;
             words >> given;
             Options options;
             const bool ok = choose_server(given.empty() ? nullptr : given.c_str(), options);
-            std::printf("[%s,%s,%u]\n", yes(ok), quoted(options.host.c_str()).c_str(), unsigned{options.port});
-            std::fflush(stdout);
-            continue;
-        }
-        if (!maybe_client) return 2;
-        Client& client = *maybe_client;
-        Control& control = *maybe_control;
-        long number = 0;
-        if (command != "ask") words >> number;
-        const auto place = static_cast<std::uint8_t>(number);
-        if (command == "connect") {
+            told = "[" + json_text(ok) + "," + json_text(options.host) + "," + json_text(options.port) + "]";
+        } else if (command == "connect") {
             const bool ok = client.connect(std::chrono::milliseconds(number));
-            std::printf("{\"ok\":%s,\"error\":%s}", yes(ok), quoted(client.error()).c_str());
+            told = Object()("ok", ok)("error", client.error()).text();
         } else if (command == "reconnect") {
-            std::printf("%s", yes(client.reconnect()));
+            told = json_text(client.reconnect());
         } else if (command == "moved") {
             Client other("nowhere", 1);
             other = std::move(client);
             maybe_client.emplace(std::move(other));
-            std::printf("{}");
         } else if (command == "close") {
             client.close();
-            std::printf("{}");
         } else if (command == "latest") {
-            print(watched([&] { return client.latest(place); }));
+            told = text_of(watched([&] { return client.latest(place); }));
         } else if (command == "peek") {
-            print(watched([&] { return client.peek(place); }));
+            told = text_of(watched([&] { return client.peek(place); }));
         } else if (command == "next") {
-            print(watched([&] { return client.next(std::chrono::milliseconds(number)); }));
+            told = text_of(watched([&] { return client.next(std::chrono::milliseconds(number)); }));
         } else if (command == "info") {
-            info(client, place);
+            told = info(client, place);
         } else if (command == "ask") {
             const bool ok = control.ask(line.substr(4), std::chrono::seconds(5));
             const std::string_view reply = control.reply().text();
-            std::printf("{\"reply\":%s,", reply.empty() ? "null" : std::string(reply).c_str());
-            print(control, ok);
+            told = ended(Object().raw("reply", reply.empty() ? "null" : reply), control, ok);
         } else if (command == "describe") {
             Description d;
             const bool ok = control.describe(d);
-            std::printf("{\"sensors\":[");
-            for (std::size_t i = 0; i < d.sensor_count; ++i) {
-                const SensorInfo& s = d.sensors[i];
-                std::printf("%s{\"sensor\":%u,\"serial\":%" PRIu64 ",\"pdo_size\":%u,\"rate_hz\":%g,\"name\":%s,\"hardware\":%s,"
-                            "\"firmware\":%s,\"state\":%s}",
-                            i ? "," : "", unsigned{s.sensor}, s.serial, s.pdo_size, s.rate_hz, quoted(s.name.view()).c_str(),
-                            quoted(s.hardware.view()).c_str(), quoted(s.firmware.view()).c_str(), quoted(s.state.view()).c_str());
-            }
-            std::printf("],\"version\":%s,", quoted(d.version.view()).c_str());
-            print(control, ok);
+            const std::vector<SensorInfo> sensors(d.sensors.begin(), d.sensors.begin() + static_cast<long>(d.sensor_count));
+            const std::string rows = json_list(sensors, [](const SensorInfo& each) { return text_of(each); });
+            told = ended(Object().raw("sensors", rows)("version", d.version), control, ok);
         } else if (command == "tare") {
             std::array<double, 6> target{};
             for (double& value : target)  // also nan and inf
                 if (std::string word; words >> word) value = std::strtod(word.c_str(), nullptr);
             TareResult t;
             const bool ok = control.tare(t, 0, static_cast<unsigned>(number), target);
-            std::printf("{\"done\":%s", yes(ok));
-            print("old_offset", t.old_offset);
-            print("new_offset", t.new_offset);
-            print("residual", t.residual);
-            print("deviation", t.deviation);
-            std::printf(",");
-            print(control, ok);
+            told = ended(Object()("old_offset", t.old_offset)("new_offset", t.new_offset)("residual", t.residual)(
+                             "deviation", t.deviation), control, ok);
         } else {
             return 2;
         }
-        std::printf("\n");
+        std::printf("%s\n", told.c_str());
         std::fflush(stdout);
     }
     return 0;

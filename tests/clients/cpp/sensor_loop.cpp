@@ -47,18 +47,11 @@ void keep(Level level, const std::string& text) {
     lines.push_back(kLevels[static_cast<int>(level)] + text);
 }
 
-void number(const char* key, double value) {
-    std::printf(",\"%s\":", key);
-    if (bota_ethercat::is_nan(value)) std::printf("null");
-    else if (!bota_ethercat::is_finite(value)) std::printf("1e999");
-    else std::printf("%.17g", value);
-}
-
-void print(bool good, const Values& values) {
-    const std::size_t allocated = allocations;
-    std::printf("{\"good\":%s", yes(good));
-    for (std::size_t i = 0; i < values.size(); ++i) number(std::string(kSignals[i]).c_str(), values[i]);
-    std::printf(",\"allocated\":%zu}", allocated);
+std::string text_of(bool good, const Values& values) {
+    Object told;
+    told("allocated", allocations)("good", good);
+    for (std::size_t i = 0; i < values.size(); ++i) told(kSignals[i], values[i]);
+    return told.text();
 }
 
 bool watched_read(SensorLoop& loop) {
@@ -71,7 +64,7 @@ void sleep_until(std::int64_t due) {
     clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &at, nullptr);
 }
 
-void run(SensorLoop& loop, double seconds, double hz) {
+std::string run(SensorLoop& loop, double seconds, double hz) {
     std::map<int, long> conditions;
     std::size_t allocated = 0, bad = 0;
     std::int64_t due = bota_ethercat::monotonic_now_ns();
@@ -81,10 +74,9 @@ void run(SensorLoop& loop, double seconds, double hz) {
         allocated += allocations;
         ++conditions[loop.condition()];
     }
-    std::printf("{\"bad\":%zu,\"allocated\":%zu,\"conditions\":{", bad, allocated);
-    const char* separator = "";
-    for (const auto& [condition, count] : conditions) std::printf("%s\"%d\":%ld", separator, condition, count), separator = ",";
-    std::printf("}}");
+    Object counts;
+    for (const auto& [condition, count] : conditions) counts(std::to_string(condition), count);
+    return Object()("bad", bad)("allocated", allocated).raw("conditions", counts.text()).text();
 }
 
 /// From here on this thread is killed, and the process with it, for any other system call.
@@ -118,11 +110,11 @@ void* cycles_of(void* given) {
     return nullptr;
 }
 
-void run_sealed(SensorLoop& loop, long count) {
+std::string run_sealed(SensorLoop& loop, long count) {
     Sealed sealed{loop, count, 0, false};
     pthread_t thread{};  // not std::thread: to check its virtual calls UBSan makes system calls
     if (pthread_create(&thread, nullptr, cycles_of, &sealed) == 0) pthread_join(thread, nullptr);
-    std::printf("{\"sealed\":%s,\"good\":%ld}", yes(sealed.is_sealed), sealed.good);
+    return Object()("sealed", sealed.is_sealed)("good", sealed.good).text();
 }
 
 }  // namespace
@@ -135,8 +127,7 @@ int main() {
     for (std::string line, command; std::getline(std::cin, line);) {
         std::istringstream words(line);
         words >> command;
-        std::string why;
-        bool ok = true;
+        std::string why, told = "{}";
         if (command == "new") {
             maybe.reset();
             lines.clear();
@@ -150,14 +141,14 @@ int main() {
             }
             maybe.emplace(parameters, keep);
             gate.emplace(parameters);
-            std::printf("{\"why\":%s}", quoted(why).c_str());
+            told = Object()("why", why).text();
         } else if (command == "check") {
             const std::string text = line.substr(6);
             bota_ethercat::Description description;
             const bool is_read = bota_ethercat::detail::read_description(bota_ethercat::json::Value(text), description);
             const SensorInfo* const found = description.find(0);
             if (!is_read || found == nullptr) return 2;
-            std::printf("{\"why\":%s,\"max_age\":%g}", quoted(objection(parameters, *found, *found)).c_str(), max_age(parameters, *found));
+            told = Object()("why", objection(parameters, *found, *found))("max_age", max_age(parameters, *found)).text();
         } else if (command == "take") {
             double now = 0, age = 0, force = 0;
             int condition = 0, checked = 0;
@@ -177,58 +168,56 @@ int main() {
             reading.sample.force[0] = force;
             received.tool[0] = 0.25;
             allocations = 0;
-            const bool good = gate->take(received, std::llround(now * 1e6));
-            print(good, gate->values());
+            const bool good = gate->update(received, std::llround(now * 1e6));
+            told = text_of(good, gate->values());
         } else if (command == "tool") {
             std::string model;
             double lag_s = 0, rate_hz = 0;
             int fir = 0, count = 0;
             words >> model >> lag_s >> fir >> rate_hz >> count;
             Tool tool(parameters.payload, model, Alignment(lag_s, 0.00096, fir != 0, rate_hz));
-            const char* separator = "[";
+            std::vector<double> loads;
             for (; count > 0 && std::getline(std::cin, line); --count) {
                 std::vector<double> numbers;
                 for (std::istringstream text(line); text >> line;) numbers.push_back(std::strtod(line.c_str(), nullptr));
                 bota_ethercat::Sample sample;
                 std::copy_n(numbers.begin() + 1, 3, sample.acceleration.begin());
                 std::copy_n(numbers.begin() + 4, 3, sample.angular_rate.begin());
-                for (const double value : tool.follow(sample, numbers[0]))
-                    bota_ethercat::is_nan(value) ? std::printf("%snull", separator) : std::printf("%s%.17g", separator, value), separator = ",";
+                const Wrench load = tool.follow(sample, numbers[0]);
+                loads.insert(loads.end(), load.begin(), load.end());
             }
-            std::printf("]");
+            told = json_list(loads, [](double value) { return json_text(value); });
         } else if (command == "log") {
             const std::lock_guard<std::mutex> guard(lines_lock);
-            std::printf("[");
-            for (std::size_t i = 0; i < lines.size(); ++i) std::printf("%s%s", i ? "," : "", quoted(lines[i]).c_str());
-            std::printf("]");
+            told = json_list(lines, [](const std::string& each) { return json_text(each); });
         } else if (!maybe) {
             return 2;
         } else if (command == "open" || command == "tare" || command == "wait") {
             long ms = 0;
             words >> ms;
+            bool ok = true;
             if (command == "open") ok = maybe->open(why);
             else ok = command == "tare" ? maybe->tare(why) : maybe->wait_until_usable(why, static_cast<double>(ms) / 1e3);
-            std::printf("{\"ok\":%s,\"why\":%s}", yes(ok), quoted(ok ? "" : why).c_str());
+            told = Object()("ok", ok)("why", ok ? "" : why).text();
         } else if (command == "read") {
-            ok = watched_read(*maybe);
-            print(ok, maybe->values());
+            const bool good = watched_read(*maybe);
+            told = text_of(good, maybe->values());
         } else if (command == "max_age") {
-            std::printf("%g", maybe->max_age());
+            told = json_text(maybe->max_age());
         } else if (command == "run") {
             double seconds = 0, hz = 1000;
             words >> seconds >> hz;
-            run(*maybe, seconds, hz);
+            told = run(*maybe, seconds, hz);
         } else if (command == "sealed") {
             long count = 0;
             words >> count;
-            run_sealed(*maybe, count);
+            told = run_sealed(*maybe, count);
         } else if (command == "stop") {
             maybe.reset();
-            std::printf("{}");
         } else {
             return 2;
         }
-        std::printf("\n");
+        std::printf("%s\n", told.c_str());
         std::fflush(stdout);
     }
     return 0;

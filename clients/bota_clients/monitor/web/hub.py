@@ -28,11 +28,11 @@ from bota_clients.numbers import duration
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health.limits import Level
 from bota_ethercat.health.observer import COMMON
-from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import AXES, STANDARD_GRAVITY, ImuUnits, PdoType
 from bota_ethercat.sensor.meaning import value_meaning
-from bota_ethercat.sensor_choice import MOST_PLACES
+from bota_ethercat.sensor_choice import MAX_SENSORS
 from bota_ethercat.text.json_text import JsonObject, finite, parse_json_object
 from bota_ethercat.text.untrusted import whole
 
@@ -241,7 +241,7 @@ class Hub:
         seen, position, action = whole(message.get("seen")), whole(message.get("sensor")), message.get("do")
         while seen is not None and page.unseen and page.unseen[0] <= seen:
             page.unseen.popleft()
-        if position is not None and 0 <= position < MOST_PLACES and position != page.sensor:
+        if position is not None and 0 <= position < MAX_SENSORS and position != page.sensor:
             page.sensor = position
             self._send_kept(page)
         if "token" in message and not self._check_token(page, message["token"]):

@@ -101,8 +101,8 @@ inline std::int64_t after(std::int64_t now_ns, nanoseconds duration) noexcept {
     return more > never - now_ns ? never : now_ns + more;
 }
 
-/// Begin a complaint: of which server.
-inline Message& begin_error(Message& error, const Options& options) noexcept {
+/// Start an error message with the server's address.
+inline Message& start_error(Message& error, const Options& options) noexcept {
     error.clear();
     return error.add(options.host).add(" port ").add(std::int64_t{options.port}).add(": ");
 }
@@ -134,13 +134,13 @@ private:
     int fd_;
 };
 
-/// To one of a host's addresses, and a request sent over it.
+/// A connection to one of a host's addresses, and the request that is sent over it.
 class Connection {
 public:
     Options options;
-    Message error;  ///< why there is none, or what the server last complained of: a sentence, for a person
+    Message error;  ///< why there is no connection, or the server's last error message: a sentence, for a person
     Link link = Link::down;
-    bool is_shutting_down = false;                  ///< says the server
+    bool is_shutting_down = false;                  ///< the server has announced it
     std::int64_t now_ns = 0, received_ns = 0;       ///< CLOCK_MONOTONIC of the current step, and of the newest bytes
 
     /// `request` is sent on every new connection, and answered within `patience`.
@@ -153,10 +153,10 @@ public:
 
     // -- connecting
 
-    /// Look up the host and try its addresses until one accepts. `take` gets each JSON message until it makes the link
-    /// `up`. Waits, for name servers as long as it takes.
-    template <typename Take>
-    bool connect(nanoseconds timeout, const Take& take) noexcept {
+    /// Look up the host and try its addresses until one accepts. `handle` gets each JSON message until it sets the link
+    /// `up`. Blocks; there is no timeout for name servers.
+    template <typename Handle>
+    bool connect(nanoseconds timeout, const Handle& handle) noexcept {
         const std::int64_t deadline_ns = after(monotonic_now_ns(), timeout);
         drop();
         socket_.close();
@@ -166,7 +166,7 @@ public:
         for (const addrinfo* each = addresses_.get(); each != nullptr && !was_accepted_; each = each->ai_next) {
             begin();
             while (link != Link::down) {
-                advance(take);
+                advance(handle);
                 if (link == Link::up) return true;
                 if (link == Link::down) break;
                 if (now_ns >= deadline_ns) lose("the server did not answer in time");
@@ -182,9 +182,9 @@ public:
         if (link == Link::connecting) finish_connecting();
     }
 
-    /// A step, and read as far as the reply, and nothing behind it.
-    template <typename Take>
-    void advance(const Take& take) noexcept {
+    /// A step towards a connection, and read until the reply to the request; not the messages after it.
+    template <typename Handle>
+    void advance(const Handle& handle) noexcept {
         if (link < Link::subscribing) step();
         Frame frame;
         std::string_view text;
@@ -192,7 +192,7 @@ public:
         do {
             auto found = FrameDecoder::Found::data;
             while (link == Link::subscribing && found != FrameDecoder::Found::nothing)
-                if ((found = next(frame, text)) == FrameDecoder::Found::json) take(text);
+                if ((found = next(frame, text)) == FrameDecoder::Found::json) handle(text);
         } while (link == Link::subscribing && receive(budget) > 0 && budget > 0);
     }
 
@@ -223,7 +223,7 @@ public:
 
     // -- what arrives
 
-    /// Receive once, at most `budget` bytes, which become less; 0 if there is nothing now, or the connection is over.
+    /// Receive once, at most `budget` bytes, and subtract what came from it; 0 if nothing has arrived or the connection is over.
     std::size_t receive(std::size_t& budget) noexcept {
         std::size_t room = 0;
         std::uint8_t* const into = decoder_.space(room);
@@ -242,11 +242,11 @@ public:
         return 0;
     }
 
-    /// The next message received; a server that breaks the framing is left.
+    /// The next message received; a server that breaks the framing is disconnected.
     FrameDecoder::Found next(Frame& frame, std::string_view& text) noexcept {
         const FrameDecoder::Found found = decoder_.next(frame, text);
         if (found == FrameDecoder::Found::broken) {
-            complain("the server sent ").add(decoder_.reason()).add(": is that ethercat-server?");
+            set_error("the server sent ").add(decoder_.reason()).add(": is that ethercat-server?");
             drop();
         }
         return found;
@@ -254,9 +254,9 @@ public:
 
     // -- the end
 
-    /// The connection is over; `why` is a part of a sentence.
+    /// The connection is over; `why` completes the error message.
     void lose(std::string_view why) noexcept {
-        complain(why);
+        set_error(why);
         drop();
     }
 
@@ -275,7 +275,7 @@ public:
         is_shutting_down = false;
     }
 
-    Message& complain(std::string_view what) noexcept { return begin_error(error, options).add(what); }
+    Message& set_error(std::string_view what) noexcept { return start_error(error, options).add(what); }
 
 private:
     bool resolve() noexcept {
@@ -332,7 +332,7 @@ private:
 
     /// As `lose`. Not strerror: that may allocate.
     void fail(int error_number) noexcept {
-        switch (complain(""); error_number) {
+        switch (set_error(""); error_number) {
             case ECONNREFUSED: error.add("nobody listens there: start ethercat-server, or give its address"); break;
             case ECONNRESET: case EPIPE: error.add("the server reset the connection"); break;
             case ETIMEDOUT: error.add("no answer"); break;

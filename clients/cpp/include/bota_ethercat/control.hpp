@@ -59,9 +59,9 @@ public:
 
     /// Set the sensor's own offset so that the mean of `samples` samples becomes `target` (N, Nm). The sensor must be
     /// stationary; it takes `samples` sample periods and some more.
-    bool tare(TareResult& into, std::uint8_t place = 0, unsigned samples = 400, const std::array<double, 6>& target = {},
+    bool tare(TareResult& into, std::uint8_t position = 0, unsigned samples = 400, const std::array<double, 6>& target = {},
               nanoseconds timeout = std::chrono::seconds(60)) {
-        std::string request = "{\"action\":\"tare\",\"sensor\":" + std::to_string(place) +
+        std::string request = "{\"action\":\"tare\",\"sensor\":" + std::to_string(position) +
                               ",\"samples\":" + std::to_string(samples) + ",\"target\":";
         char separator = '[';
         for (const double value : target) {
@@ -90,7 +90,7 @@ public:
 
 private:
     bool fail(std::string_view why) noexcept {
-        detail::begin_error(error_, options_).add(why);
+        detail::start_error(error_, options_).add(why);
         return false;
     }
 

@@ -208,12 +208,12 @@ public:
     };
 
     explicit FrameDecoder(std::size_t max_json_length = kMaxJsonLength)
-        : max_json_length_(max_json_length), buffer_(max_json_length + kPrefix + kLeastRoom) {}
+        : max_json_length_(max_json_length), buffer_(max_json_length + kPrefix + kMinRoom) {}
 
     /// Free space to receive into, and how much. Take all messages first.
     std::uint8_t* space(std::size_t& size) noexcept {
         if (start_ == end_) start_ = end_ = 0;
-        if (buffer_.size() - end_ < kLeastRoom && start_ > 0) {
+        if (buffer_.size() - end_ < kMinRoom && start_ > 0) {
             std::memmove(buffer_.data(), buffer_.data() + start_, end_ - start_);
             end_ -= start_;
             start_ = 0;
@@ -275,7 +275,7 @@ public:
 private:
     static constexpr std::size_t kPrefix = 5, kLengthSize = 4;  // the length; the type is behind it
     static constexpr std::size_t kHeader = 28;
-    static constexpr std::size_t kLeastRoom = 65536;
+    static constexpr std::size_t kMinRoom = 65536;
     static constexpr unsigned kTypeData = 1, kTypeJson = 2;
 
     Found broken(const char* reason) noexcept {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a controller is told: `Condition`, `Reading`, `Counters`; and what they are made of, `StreamAccounting`, `SensorState`.
+// What a controller is told: `Condition`, `Reading`, `Counters`; and what they are made of, `StreamAccounting`, `ReceivedSensor`.
 #pragma once
 
 #include <array>
@@ -76,10 +76,14 @@ public:
     /// Whether a frame has come since.
     bool begun() const noexcept { return begun_; }
 
-    FrameKind take(std::uint64_t sequence, std::uint64_t monotonic_ns, std::uint8_t flags) noexcept {
+    /// Count the next frame; what it is.
+    FrameKind count(std::uint64_t sequence, std::uint64_t monotonic_ns, std::uint8_t flags) noexcept {
         std::uint64_t jump = 0;
         if (begun_ && sequence <= sequence_) {
-            if (monotonic_ns <= monotonic_ns_) return ++counts.old, FrameKind::old;
+            if (monotonic_ns <= monotonic_ns_) {
+                ++counts.old;
+                return FrameKind::old;
+            }
             ++counts.restarts;
         } else if (begun_) {
             jump = sequence - sequence_ - 1;
@@ -88,12 +92,19 @@ public:
         sequence_ = sequence;
         monotonic_ns_ = monotonic_ns;
         begun_ = true;
-        if ((flags & kInvalid) != 0) return ++counts.invalid, FrameKind::invalid;
-        if ((flags & kRepeated) != 0) return ++counts.repeated, FrameKind::repeated;
+        if ((flags & kInvalid) != 0) {
+            ++counts.invalid;
+            return FrameKind::invalid;
+        }
+        if ((flags & kRepeated) != 0) {
+            ++counts.repeated;
+            return FrameKind::repeated;
+        }
+        ++counts.samples;
         new_ns_ = monotonic_ns;
         has_new_ = true;
         missed_ = 0;
-        return ++counts.samples, FrameKind::sample;
+        return FrameKind::sample;
     }
 
 private:
@@ -169,7 +180,7 @@ namespace detail {
 
 /// What a client knows of one sensor: its newest frame, its newest sample, and what a reading makes of them. As in
 /// protocol/bota_ethercat/client/reading.py.
-class SensorState {
+class ReceivedSensor {
 public:
     StreamAccounting accounting;
     Delays delay_ns{};
@@ -185,11 +196,11 @@ public:
         lost = false;
     }
 
-    /// A frame that was received at `received_ns`; `same_clock`: its stamps are of our CLOCK_MONOTONIC. GAP of a frame that
+    /// Add a frame that was received at `received_ns`; `same_clock`: its stamps are of our CLOCK_MONOTONIC. GAP of a frame that
     /// brings no sample is carried to the next that does.
-    void take(const Frame& frame, std::int64_t received_ns, bool same_clock) noexcept {
+    void add(const Frame& frame, std::int64_t received_ns, bool same_clock) noexcept {
         const std::uint64_t restarts = accounting.counts.restarts;
-        const FrameKind kind = accounting.take(frame.sequence, frame.monotonic_ns, frame.flags);
+        const FrameKind kind = accounting.count(frame.sequence, frame.monotonic_ns, frame.flags);
         if (kind == FrameKind::old) return;
         if (reconnected_ || accounting.counts.restarts > restarts || (frame.flags & kGap) != 0) carried_gap_ = true;
         reconnected_ = false;
@@ -212,7 +223,7 @@ public:
         carried_gap_ = lost = false;
     }
 
-    /// What this sensor knows, as of `now_ns`; the next reading begins.
+    /// What is known of the sensor as of `now_ns`; the next reading begins.
     Reading read(const Options& options, bool connected, std::int64_t now_ns) noexcept {
         Reading reading = next_;
         reading.gap = next_.gap || carried_gap_;
@@ -233,16 +244,16 @@ public:
         }
         const std::int64_t max_age_ns = options.max_age.count();
         const bool recent = reading.has_sample && !ahead && reading.age_ns <= max_age_ns;
-        reading.condition = recent ? worth(reading.sample, options.judge_imu) : why_old(max_age_ns, connected, now_ns, ahead);
+        reading.condition = recent ? condition_of(reading.sample, options.judge_imu) : why_old(max_age_ns, connected, now_ns, ahead);
         return reading;
     }
 
 private:
     static constexpr std::uint64_t kClockToleranceNs = 1'000'000;
-    static constexpr std::int64_t kLeastSilenceNs = 30'000'000;  // three times the pace of REPEATED frames
+    static constexpr std::int64_t kMinSilenceNs = 30'000'000;  // three times the pace of REPEATED frames
 
-    /// What a recent sample is worth.
-    static Condition worth(const Sample& sample, bool judge_imu) noexcept {
+    /// The condition of a recent sample.
+    static Condition condition_of(const Sample& sample, bool judge_imu) noexcept {
         if (!sample.wrench_is_finite() || (judge_imu && !sample.imu_is_finite())) return Condition::not_finite;
         if (sample.wrench_is_saturated() || (judge_imu && sample.imu_is_saturated())) return Condition::saturated;
         return Condition::fresh;
@@ -253,7 +264,7 @@ private:
         if (!connected) return Condition::disconnected;
         if (lost) return Condition::sensor_lost;
         const std::int64_t silence_ns = now_ns - received_ns_;
-        if (!accounting.begun() || (silence_ns >= kLeastSilenceNs && silence_ns / 2 >= max_age_ns)) return Condition::silent;
+        if (!accounting.begun() || (silence_ns >= kMinSilenceNs && silence_ns / 2 >= max_age_ns)) return Condition::silent;
         if ((next_.flags & kInvalid) != 0) return Condition::invalid;
         if ((next_.flags & kRepeated) != 0) return Condition::repeated;
         return ahead ? Condition::bad_clock : Condition::late;

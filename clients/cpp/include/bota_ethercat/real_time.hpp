@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Real-time scheduling for the calling thread: SCHED_FIFO, a CPU, memory that is never paged out; bota_ethercat/client/real_time.py
+// Real-time scheduling for the calling thread: SCHED_FIFO, a CPU, memory that is never paged out; bota_ethercat/program/real_time.py
 // in C++. Each right is used if the system allows it; what is not allowed is said, with what would allow it.
 #pragma once
 

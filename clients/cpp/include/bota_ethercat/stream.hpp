@@ -16,7 +16,7 @@ namespace bota_ethercat {
 
 /// A subscription to the samples of one server. After the loss of the connection readings keep the last sample, whose age grows;
 /// the first sample of a new connection has `gap`, and `connection` is one more. Host names are looked up in `connect` only.
-/// What is left of one that was moved from can only be destroyed or assigned to.
+/// A moved-from client can only be destroyed or assigned to.
 class Client {
 public:
     /// Allocates everything that is ever needed.
@@ -27,14 +27,14 @@ public:
     /// and `latest` and `next`, or `reconnect`, may go on trying.
     bool connect(nanoseconds timeout = std::chrono::seconds(2)) noexcept {
         refused_ = false;
-        return connection_.connect(timeout, [this](std::string_view text) { take(text); });
+        return connection_.connect(timeout, [this](std::string_view text) { handle(text); });
     }
 
     /// A step of reconnecting, without waiting, one attempt per `reconnect_every`; true once connected.
     /// With `Reconnect::when_told` only this and `connect` do so: call it every few milliseconds.
     bool reconnect() noexcept {
         connection_.now_ns = monotonic_now_ns();
-        connection_.advance([this](std::string_view text) { take(text); });
+        connection_.advance([this](std::string_view text) { handle(text); });
         return connected();
     }
 
@@ -50,9 +50,9 @@ public:
         bool may_be_more = true;
         for (int reads = 0;; ++reads) {
             Frame frame;
-            while (link() != Link::down && take_message(frame)) frames += frame.process_data != nullptr;
+            while (link() != Link::down && read_message(frame)) frames += frame.process_data != nullptr;
             if (link() == Link::down || !may_be_more) break;
-            if (budget == 0 || reads == kMostReads) {
+            if (budget == 0 || reads == kMaxReads) {
                 more_waits_ = true;
                 break;
             }
@@ -64,16 +64,16 @@ public:
         return frames;
     }
 
-    /// The newest sample of the sensor at position `place`, after reading everything that has arrived.
-    Reading latest(std::uint8_t place = 0) noexcept {
+    /// The newest sample of the sensor at this position, after reading everything that has arrived.
+    Reading latest(std::uint8_t position = 0) noexcept {
         update();
-        return read(place);
+        return read(position);
     }
 
     /// The same without reading the socket: for the second sensor of a chain, after `latest` of the first.
-    Reading peek(std::uint8_t place = 0) noexcept {
+    Reading peek(std::uint8_t position = 0) noexcept {
         connection_.now_ns = monotonic_now_ns();
-        return read(place);
+        return read(position);
     }
 
     /// The next sample of any sensor, in order, none left out; waits at most `timeout`.
@@ -89,7 +89,7 @@ public:
         for (bool has_read = false; may_read() || connection_.options.reconnect == Reconnect::by_itself;) {
             const Link before = link();
             Frame frame;
-            while (before >= Link::subscribing && take_message(frame)) {
+            while (before >= Link::subscribing && read_message(frame)) {
                 if (frame.process_data && (frame.flags & (kRepeated | kInvalid)) == 0) return read(frame.sensor);
             }
             // A server that sends without end what is no sample does not hold this up.
@@ -108,7 +108,7 @@ public:
     /// `Options::max_age` from now on, for a sensor whose rate is another now.
     void set_max_age(nanoseconds max_age) noexcept { connection_.options.max_age = max_age; }
 
-    /// Why there is no connection, or what the server last complained of. A sentence, for a person.
+    /// Why there is no connection, or the server's last error message. A sentence, for a person.
     const char* error() const noexcept { return connection_.error.c_str(); }
     Link link() const noexcept { return connection_.link; }
     bool connected() const noexcept { return link() == Link::up; }
@@ -117,8 +117,8 @@ public:
     /// The server's sensors, as it described them last: when the subscription was made, and a sensor's rate, settings and
     /// offset when it came back, was reconfigured or tared.
     const Description& description() const noexcept { return description_; }
-    Counters counters(std::uint8_t place = 0) const noexcept {
-        return {sensors_[place].accounting.counts, sensors_[place].all_passed_over};
+    Counters counters(std::uint8_t position = 0) const noexcept {
+        return {sensors_[position].accounting.counts, sensors_[position].all_passed_over};
     }
     /// Connections made so far.
     std::uint32_t connections() const noexcept { return connections_; }
@@ -131,7 +131,7 @@ public:
 
 private:
     static constexpr std::size_t kPlaces = 256;    // every value of the `sensor` byte
-    static constexpr int kMostReads = 16;          // in one call of `update`
+    static constexpr int kMaxReads = 16;          // in one call of `update`
     static constexpr std::size_t kBacklog = 2048;  // received at once: more than any steady stream
 
     static std::string request(const Options& options) {
@@ -142,69 +142,69 @@ private:
         return text + (options.sensors.empty() ? "}" : "]}");
     }
 
-    /// Whether there may be something to read, after a step towards a connection where that is this call's business.
+    /// Whether there may be something to read; makes a step towards a connection if the client reconnects by itself.
     bool may_read() noexcept {
         if (connection_.options.reconnect == Reconnect::when_told) return connected();
         if (link() < Link::subscribing) connection_.step();
         return link() >= Link::subscribing;
     }
 
-    /// Take one message; false if there is no whole one. `frame.process_data` is null if it was no DATA.
-    bool take_message(Frame& frame) noexcept {
+    /// Read and handle one message; false if there is no complete one. `frame.process_data` is null if it is not DATA.
+    bool read_message(Frame& frame) noexcept {
         std::string_view text;
         frame.process_data = nullptr;
         const FrameDecoder::Found found = connection_.next(frame, text);
-        if (found == FrameDecoder::Found::data) sensors_[frame.sensor].take(frame, connection_.received_ns, same_clock_);
-        if (found == FrameDecoder::Found::json) take(text);
+        if (found == FrameDecoder::Found::data) sensors_[frame.sensor].add(frame, connection_.received_ns, same_clock_);
+        if (found == FrameDecoder::Found::json) handle(text);
         return found == FrameDecoder::Found::data || found == FrameDecoder::Found::json;
     }
 
-    void take(std::string_view text) noexcept {
+    void handle(std::string_view text) noexcept {
         const json::Value message = json::is_object(text) ? json::Value(text) : json::Value();
         bool ok = false;
         if (const json::Value event = message["event"])
-            take_event(event, message);
+            handle_event(event, message);
         else if (!message["reply"] || !message["ok"].get(ok))
             ++bad_messages_;
         else if (!ok)
-            take_refusal(message);
+            handle_refusal(message);
         else if (link() == Link::subscribing && message["reply"].is("subscribe"))
-            take_description(message);
+            handle_description(message);
     }
 
-    void take_event(json::Value event, json::Value message) noexcept {
-        std::uint8_t place = 0;
-        const bool of_a_sensor = message["sensor"].get(place);
+    void handle_event(json::Value event, json::Value message) noexcept {
+        std::uint8_t position = 0;
+        const bool of_a_sensor = message["sensor"].get(position);
         if (event.is("shutting_down")) connection_.is_shutting_down = true;
         if (event.is("reconfigured")) {
             const auto& wanted = connection_.options.sensors;
-            if (!of_a_sensor || wanted.empty() || std::count(wanted.begin(), wanted.end(), place) > 0) ++reconfigurations_;
+            if (!of_a_sensor || wanted.empty() || std::count(wanted.begin(), wanted.end(), position) > 0) ++reconfigurations_;
         }
         if (!of_a_sensor) return;
         if (event.is("sensor_lost")) {
-            sensors_[place].lost = true;
+            sensors_[position].lost = true;
             message["message"].get(connection_.error);
         } else if (event.is("sensor_back") || event.is("reconfigured")) {
-            sensors_[place].lost = false;
-            for (std::size_t i = 0; i < description_.sensor_count; ++i)
-                if (description_.sensors[i].sensor == place) detail::read_in_force(message, description_.sensors[i]);
-            take_in_force();
+            sensors_[position].lost = false;
+            if (SensorInfo* const info = described(position)) detail::read_in_force(message, *info);
+            update_sensors();
         } else if (event.is("offset_changed")) {
-            for (std::size_t i = 0; i < description_.sensor_count; ++i)
-                if (description_.sensors[i].sensor == place) detail::read_offset(message, description_.sensors[i]);
+            if (SensorInfo* const info = described(position)) detail::read_offset(message, *info);
         }
     }
 
-    void take_refusal(json::Value message) noexcept {
+    SensorInfo* described(std::uint8_t position) noexcept { return const_cast<SensorInfo*>(description_.find(position)); }
+
+    void handle_refusal(json::Value message) noexcept {
         detail::Message reason;
         message["error"]["message"].get(reason);
-        connection_.complain("the server refused: ").add(reason.view());
+        connection_.set_error("the server refused: ").add(reason.view());
         if (link() != Link::subscribing) return;
         refused_ = true;
         connection_.drop();
     }
 
-    void take_description(json::Value message) noexcept {
+    void handle_description(json::Value message) noexcept {
         if (!detail::read_description(message, description_)) {
             refused_ = true;
             return connection_.lose("the server speaks another version of the protocol");
@@ -216,12 +216,12 @@ private:
         connection_.link = Link::up;
         connection_.error.clear();
         ++connections_;
-        for (detail::SensorState& each : sensors_) each.begin(connection_.options.every, connection_.options.fresh_only);
-        take_in_force();
+        for (detail::ReceivedSensor& each : sensors_) each.begin(connection_.options.every, connection_.options.fresh_only);
+        update_sensors();
     }
 
-    /// A rate that is not known is what it was.
-    void take_in_force() noexcept {
+    /// By the description; a rate that is not known stays as it was.
+    void update_sensors() noexcept {
         for (std::size_t i = 0; i < description_.sensor_count; ++i) {
             const SensorInfo& info = description_.sensors[i];
             if (info.rate_hz > 0.0) sensors_[info.sensor].accounting.rate_hz = info.rate_hz;
@@ -229,16 +229,16 @@ private:
         }
     }
 
-    Reading read(std::uint8_t place) noexcept {
-        Reading reading = sensors_[place].read(connection_.options, connected(), connection_.now_ns);
-        reading.sensor = place;
+    Reading read(std::uint8_t position) noexcept {
+        Reading reading = sensors_[position].read(connection_.options, connected(), connection_.now_ns);
+        reading.sensor = position;
         reading.connection = connections_;
         reading.more_waits = more_waits_;
         return reading;
     }
 
     detail::Connection connection_;
-    std::vector<detail::SensorState> sensors_ = std::vector<detail::SensorState>(kPlaces);
+    std::vector<detail::ReceivedSensor> sensors_ = std::vector<detail::ReceivedSensor>(kPlaces);
     std::string clock_name_ = detail::clock_name();  // ours
     Description description_;
     std::uint32_t connections_ = 0, reconfigurations_ = 0;

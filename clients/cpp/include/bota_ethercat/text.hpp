@@ -83,7 +83,11 @@ public:
     }
 
     /// Blanks and this character.
-    bool take(char c) noexcept { return !at_end() && *p_ == c && (++p_, true); }
+    bool skip(char c) noexcept {
+        const bool found = !at_end() && *p_ == c;
+        p_ += found;
+        return found;
+    }
 
     bool value() noexcept {
         std::array<char, kMaxJsonDepth> closing{};
@@ -96,10 +100,10 @@ public:
             } else if (!scalar()) {
                 return false;
             }
-            while (depth > 0 && take(closing[depth - 1])) --depth, opened = false;
+            while (depth > 0 && skip(closing[depth - 1])) --depth, opened = false;
             if (depth == 0) return true;
-            if (!opened && !take(',')) return false;
-            if (closing[depth - 1] == '}' && (at_end() || !string() || !take(':'))) return false;
+            if (!opened && !skip(',')) return false;
+            if (closing[depth - 1] == '}' && (at_end() || !string() || !skip(':'))) return false;
         }
     }
 
@@ -120,7 +124,9 @@ public:
             if (!(*p_ == '\\' ? escape(c) : utf8(c) && c >= 0x20)) return false;
             give(c);
         }
-        return p_ != end_ && (++p_, true);
+        const bool closed = p_ != end_;
+        p_ += closed;
+        return closed;
     }
 
 private:
@@ -270,9 +276,9 @@ public:
     template <typename Give>
     void for_each(Give&& give) const noexcept {
         if (!is_object() && !is_array()) return;
-        for (detail::Scanner scanner(text_.substr(1, text_.size() - 2)); !scanner.at_end(); (void)scanner.take(',')) {
+        for (detail::Scanner scanner(text_.substr(1, text_.size() - 2)); !scanner.at_end(); (void)scanner.skip(',')) {
             const Value name(is_object() ? scanner.piece() : std::string_view());
-            if (is_object()) (void)scanner.take(':');
+            if (is_object()) (void)scanner.skip(':');
             give(name, Value(scanner.piece()));
         }
     }

@@ -90,7 +90,7 @@ struct Alignment {
     }
 
     double period_s, gap_s = 0.1;  ///< samples further apart than `gap_s` do not belong together
-    int lead;                      ///< so many samples after a gap tell nothing of the instant that force and torque are of
+    int lead;                      ///< this many samples after a gap do not yet show the instant of force and torque
     std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
 
 private:
@@ -156,7 +156,7 @@ public:
         constexpr double kTurning = 0.05;  // rad/s: less is a gyroscope's offset
         if (!sample.imu_is_finite()) time_s_ = kNever;
         if (!sample.imu_is_finite() || sample.acceleration == Vector3{}) return none();
-        take(row(sample), time_s - time_s_);
+        append(row(sample), time_s - time_s_);
         time_s_ = time_s;
         const Vector3& rate = sample.angular_rate;
         const bool turns = rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2] > kTurning * kTurning;
@@ -190,8 +190,8 @@ private:
         return {a[0] - xy * a[1] - xz * a[2], a[1] - yx * a[0] - yz * a[2], a[2] - zx * a[0] - zy * a[1], w[0], w[1], w[2]};
     }
 
-    /// Append a sample that comes so long after the one before, and what was between them.
-    void take(const Row& row, double passed_s) {
+    /// Append a sample that comes `passed_s` after the one before, and interpolate those that are missing between them.
+    void append(const Row& row, double passed_s) {
         if (!(passed_s > 0.0 && passed_s <= alignment_.gap_s)) {
             history_.assign(count_, row);
             known_ = 1;

@@ -58,7 +58,7 @@ using Values = std::array<double, kSignals.size()>;
 inline constexpr double kNaN = NAN, kInfinity = INFINITY;
 inline double seconds(std::int64_t ns) noexcept { return static_cast<double>(ns) / 1e9; }
 
-/// The place of a state interface in `Values`; their number if there is none of that name.
+/// The index of a state interface in `Values`; their number if there is none of that name.
 inline std::size_t signal(std::string_view name) noexcept {
     return static_cast<std::size_t>(std::find(kSignals.begin(), kSignals.end(), name) - kSignals.begin());
 }
@@ -79,13 +79,13 @@ struct Received {
 /// Three places: one is written, one is read, and the third holds the newest that was written; an atomic exchange swaps it.
 class Latest {
 public:
-    /// For the writing thread: the place to write the next one to.
+    /// For the writing thread: where to write the next one.
     Received& next() noexcept { return places_[written_]; }
     /// It is written.
     void publish() noexcept { written_ = newest_.exchange(written_ | kUnread, std::memory_order_acq_rel) & ~kUnread; }
 
     /// For the reading thread: the newest that was published; valid until the next call.
-    const Received& take() noexcept {
+    const Received& newest() noexcept {
         if ((newest_.load(std::memory_order_relaxed) & kUnread) != 0)
             read_ = newest_.exchange(read_, std::memory_order_acq_rel) & ~kUnread;
         return places_[read_];
@@ -127,7 +127,7 @@ public:
     }
 
     /// True: the values may be used, or are what the policy has for a moment. False: it is an error.
-    bool take(const Received& received, std::int64_t now_ns) noexcept {
+    bool update(const Received& received, std::int64_t now_ns) noexcept {
         const bota_ethercat::Reading& reading = received.reading;
         if (reading.has_sample) sampled_ns_ = reading.age_ns == kNever ? kNever : received.at_ns - reading.age_ns;
         condition_ = static_cast<int>(reading.condition);
@@ -245,11 +245,14 @@ public:
     bool open(std::string& why) {
         const std::int64_t begin = monotonic_now_ns();
         while (!client_.connect(std::chrono::seconds(1))) {
-            if (client_.refused() || seconds_since(begin) >= parameters_.connect_timeout) return why = client_.error(), false;
+            if (client_.refused() || seconds_since(begin) >= parameters_.connect_timeout) return fail(why, client_.error());
             std::this_thread::sleep_for(std::chrono::milliseconds(100));
         }
         receive();
-        if (!objection_.empty()) return client_.close(), why = objection_, false;
+        if (!objection_.empty()) {
+            client_.close();
+            return fail(why, objection_);
+        }
         sigset_t all, before;
         sigfillset(&all);
         pthread_sigmask(SIG_SETMASK, &all, &before);  // signals are for the threads of the program
@@ -261,9 +264,9 @@ public:
     /// The sensor of `open`.
     const SensorInfo& sensor() const { return *sensor_; }
     /// s up to which a sample is fresh now: another rate may make it another.
-    double max_age() noexcept { return seconds(latest_.take().max_age_ns); }
+    double max_age() noexcept { return seconds(latest_.newest().max_age_ns); }
     /// Whether the age counts from the arrival: the server is on another machine.
-    bool age_is_lower_bound() noexcept { return latest_.take().reading.age_is_lower_bound; }
+    bool age_is_lower_bound() noexcept { return latest_.newest().reading.age_is_lower_bound; }
 
     /// Set the sensor's offset so that it reads the load of the tool now, or zero where that is not known. Waits for samples.
     bool tare(std::string& why) {
@@ -272,7 +275,7 @@ public:
         bota_ethercat::Control control(parameters_.client.host, parameters_.client.port);
         bota_ethercat::TareResult result;
         if (!control.tare(result, parameters_.sensor(), 400, load))
-            return why = std::string("the sensor could not be tared: ") + control.error(), false;
+            return fail(why, std::string("the sensor could not be tared: ") + control.error());
         tared_offset_ = result.new_offset;
         is_tared_.store(true, std::memory_order_release);
         while (is_tared_ && !stopping_) std::this_thread::sleep_for(std::chrono::milliseconds(1));  // the other thread knows
@@ -287,15 +290,18 @@ public:
     bool wait_until_usable(std::string& why, double timeout_s = 2.0) {
         for (const std::int64_t begin = monotonic_now_ns(); seconds_since(begin) < timeout_s;) {
             (void)read();
-            if (gate_.usable() && values()[kAge] <= seconds_since(begin)) return gate_.restart(), true;
+            if (gate_.usable() && values()[kAge] <= seconds_since(begin)) {
+                gate_.restart();
+                return true;
+            }
             std::this_thread::sleep_for(std::chrono::milliseconds(1));
         }
-        return why = "no usable sample within " + detail::text(timeout_s) + " s; " + condition_text(gate_.condition()), false;
+        return fail(why, "no usable sample within " + detail::text(timeout_s) + " s; " + condition_text(gate_.condition()));
     }
 
     /// Once a cycle. False: it is an error by the parameters.
     bool read() noexcept {
-        const bool good = gate_.take(latest_.take(), monotonic_now_ns());
+        const bool good = gate_.update(latest_.newest(), monotonic_now_ns());
         condition_.store(gate_.condition(), std::memory_order_relaxed);
         return good;
     }
@@ -308,17 +314,22 @@ public:
 private:
     static constexpr int kPaceMs = 5;  // without anything from the server: how soon it is seen that nothing comes
     static constexpr std::int64_t kQuietNs = 1'000'000'000;
-    static constexpr int kMostSamples = 1000;  // until they are handed over
+    static constexpr int kMaxSamples = 1000;  // until they are handed over
     static constexpr int kLoads = 100;         // samples of the load before a tare
 
     /// The load of the tool, N and Nm: the mean of some samples.
     bool mean_load(Wrench& mean, std::string& why) {
         for (int count = 1; count <= kLoads; ++count) {
             if (!wait_until_usable(why)) return false;
-            const Wrench& load = latest_.take().tool;
+            const Wrench& load = latest_.newest().tool;
             for (std::size_t i = 0; i < mean.size(); ++i) mean[i] += (load[i] - mean[i]) / count;
         }
         return true;
+    }
+
+    static bool fail(std::string& why, std::string text) {
+        why = std::move(text);
+        return false;
     }
 
     static double seconds_since(std::int64_t begin_ns) noexcept { return seconds(monotonic_now_ns() - begin_ns); }
@@ -352,7 +363,7 @@ private:
             own_offset_.begin(tared_offset_);
             is_tared_ = false;
         }
-        for (int left = kMostSamples; left > 0; --left) {  // the load of the tool needs every sample
+        for (int left = kMaxSamples; left > 0; --left) {  // the load of the tool needs every sample
             received.reading = client_.next({});
             if (!received.reading.is_new) break;
             if (tool_) load_ = tool_->follow(received.reading.sample, seconds(static_cast<std::int64_t>(received.reading.monotonic_ns)));

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The thresholds of every verdict on a stream: one table. docs/programs.md has it for people."""
+"""The limits of every verdict on a stream, in one table (for people: docs/programs.md); levels, findings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from enum import Enum, IntEnum
 from typing import Final, NamedTuple
 
 
-class Limits(NamedTuple):
+class StreamLimits(NamedTuple):
     """Limits of a stream; the node's parameters `diagnostics.*` replace those that have one."""
 
     stale_after: float = 0.5  # seconds without a new sample that are trouble
@@ -30,7 +30,7 @@ class Limits(NamedTuple):
     irregular: float = 0.2
 
 
-LIMITS: Final = Limits()  # what holds unless somebody sets something else
+LIMITS: Final = StreamLimits()  # what holds unless somebody sets something else
 
 
 class Level(IntEnum):
