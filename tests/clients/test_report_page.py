@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +20,6 @@ from bota_clients.report.page import as_json, render
 from bota_clients.report.plots import envelope, stretches
 from bota_clients.report.series import GROUPS
 from bota_ethercat.framing import DataFlag
-from tests.clients import pictures
-from tests.clients.devtools import browser, needs_chromium
 from tests.clients.simulated import decoded, described, sensor, simulate, subject_of
 from tests.simulation import more_if_long
 
@@ -66,8 +63,9 @@ class Reader(HTMLParser):
 
 @pytest.fixture(scope="module")
 def page() -> str:
-    """A report on a sensor with a noisy axis."""
-    return pictures.report_page()
+    """A report on a sensor with a noisy axis, and some samples lost."""
+    noisy = sensor(12, "noise force.y 0.6", "skip 0.3", seed=12)
+    return render([Examination(noisy)], made=MADE, program="ethercat-report")
 
 
 def test_it_is_one_file_with_nothing_outside_it(page: str) -> None:
@@ -224,36 +222,3 @@ def test_figures_and_spans_of_time() -> None:
     assert list(map(figure, figures)) == list(figures.values())
     spans = {0: "0 s", 2e-6: "2.00 µs", 0.25: "250 ms", 12: "12.0 s", 1200: "20.0 min"}
     assert list(map(seconds, spans)) == list(spans.values())
-
-
-# In a browser.
-
-
-@pytest.mark.long
-@needs_chromium
-def test_chromium_draws_it_in_the_light_and_in_the_dark_and_prints_it(page: str, tmp_path: Path) -> None:
-    source = tmp_path / "report.html"
-    source.write_text(page, encoding="utf-8")
-    with browser(tmp_path) as shown:
-        shown.open(source.as_uri())
-        colors = []
-        for dark in (False, True):
-            shown.size(700, 1000, dark=dark)
-            colors.append(
-                shown.value(
-                    "[getComputedStyle(document.body).backgroundColor, ...new Set("
-                    "[...document.querySelectorAll('svg path')].map(e => getComputedStyle(e).stroke))]"
-                )
-            )
-            assert shown.value("document.documentElement.scrollWidth") <= 700
-        assert [each[0] for each in colors] == ["rgb(255, 255, 255)", "rgb(20, 24, 29)"]
-        light, dark_ = (set(each[1:]) - {"none"} for each in colors)
-        assert len(light) == len(dark_) > 5
-        assert not light & dark_
-        assert 4 <= len(re.findall(rb"/Type\s*/Page\b", shown.printed())) <= 12
-        assert shown.complaints == []
-
-
-def test_the_picture_in_the_docs_is_of_this_page(page: str) -> None:
-    assert pictures.digest_in("report.png") == pictures.report_digest(page), pictures.AGAIN
-    assert (pictures.DOCS / "report.png").stat().st_size < 300_000

@@ -6,9 +6,6 @@ import json
 import math
 import re
 import threading
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -18,17 +15,14 @@ from websockets.http11 import Request, Response
 
 from bota_clients.monitor.cli import parse
 from bota_clients.monitor.tare import Say
-from bota_clients.monitor.web.hub import CHANNELS, MOST_BEHIND, STEP_NS, Page, WebModel, state_text
-from bota_clients.monitor.web.server import HEADERS, STREAM, answer, read_page
+from bota_clients.monitor.web.hub import CHANNELS, STEP_NS, Page, WebModel, state_text
+from bota_clients.monitor.web.server import HEADERS, STREAM, read_page, respond
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.clients import monitor_states as made
-from tests.clients import pictures
 from tests.clients.monitor_states import START_S, frame, moving
 from tests.clients.web_pages import Web
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "clients/bota_clients/monitor/web/page"
 PAGE_FILES = read_page()
 FX, FZ, AZ, WX = (CHANNELS.index(n) for n in ("force.x", "force.z", "acceleration.z", "angular_rate.x"))
 
@@ -127,12 +121,11 @@ def test_a_slow_sensor_has_a_point_for_each_sample_at_its_time_and_none_waits_en
 
 
 class Harness(Web):
-    """A hub with a model of two sensors, and what its pages were sent; a tare goes on until it is ended."""
+    """A hub with a model of two sensors; a tare goes on until it is ended."""
 
     def __init__(self) -> None:
         super().__init__("one", "two")
         self.taring_now = True
-        self.sent: dict[Page, list[str]] = {}
         self.page = self.join()
 
     def tare(self, position: int, say: Say, way: str) -> threading.Thread:
@@ -140,32 +133,17 @@ class Harness(Web):
         return cast("threading.Thread", SimpleNamespace(is_alive=lambda: self.taring_now))
 
     def join(self) -> Page:
-        sent: list[str] = []
-        page = self.hub.join(sent.append, START_S)
+        page = self.hub.join()
         assert page is not None
-        self.sent[page] = sent
         return page
 
-    def states(self) -> dict[Page, Any]:
-        """The state that each page was sent just now."""
-        return {page: json.loads(sent[-1]) for page, sent in self.now(self.hub.send_states, START_S).items()}
-
-    def points(self, now_s: float) -> dict[Page, list[dict[str, Any]]]:
-        """The points likewise."""
-        found = self.now(self.hub.send_points, now_s)
-        return {page: list(map(json.loads, sent)) for page, sent in found.items()}
-
-    def now(self, send: Callable[..., None], *arguments: Any) -> dict[Page, list[str]]:
-        for sent in self.sent.values():
-            sent.clear()
-        send(*arguments)
-        return {page: list(sent) for page, sent in self.sent.items() if sent}
+    def points(self, page: Page) -> list[dict[str, Any]]:
+        return list(map(json.loads, self.hub.points(page)))
 
     def take(self, page: Page, **message: Any) -> dict[str, Any] | None:
         """The answer to a message of a page."""
-        found = self.now(self.hub.take, page, json.dumps(message)).get(page, [])
-        replies = [dict(each) for each in map(json.loads, found) if "control" in each]
-        return replies[0] if replies else None
+        answer = self.hub.take(page, json.dumps(message))
+        return dict(json.loads(answer)) if answer else None
 
     def message(self) -> str:
         said = self.model.state(START_S).message
@@ -177,84 +155,47 @@ def web() -> Harness:
     return Harness()
 
 
-def test_each_page_gets_the_sensor_that_it_shows(web: Harness) -> None:
+def test_each_page_gets_the_points_of_the_sensor_that_it_shows(web: Harness) -> None:
     other = web.join()
     web.take(other, sensor=1)
-    states = web.states()
-    assert states[web.page]["sensor"]["identity"].startswith("Sensor 0  OP  one")
-    assert states[other]["sensor"]["identity"].startswith("Sensor 1  OP  two")
     web.model.take([frame(k, sensor=s) for k in range(40) for s in (0, 1)], START_S + 0.05)
-    sent = {page: [each["points"] for each in batches] for page, batches in web.points(START_S + 1).items()}
-    assert sent == {web.page: [0], other: [1]}
-    web.hub.leave(other)
-    web.model.take([frame(k, sensor=s) for k in range(40, 80) for s in (0, 1)], START_S + 0.1)
-    assert list(web.points(START_S + 2)) == [web.page]
+    web.hub.collect(START_S + 1)
+    for page, position in ((web.page, 0), (other, 1)):
+        assert [each["points"] for each in web.points(page)] == [position]
+        assert web.points(page) == [], "once"
 
 
-def test_a_page_that_comes_later_gets_the_last_minute(web: Harness) -> None:
+def test_a_page_that_comes_later_gets_the_last_minute_and_a_slow_one_begins_anew(web: Harness) -> None:
     def pass_by(first_s: int, last_s: int) -> None:
         for second in range(first_s, last_s):
             moment = 10**12 + second * 10**9
             frames = [frame(second, sensor=s)._replace(monotonic_ns=moment) for s in (0, 1)]
             web.model.take(frames, START_S)
-            web.hub.send_points(START_S + second)
-
-    def kept(sensor: int) -> list[dict[str, Any]]:
-        sent = web.now(web.hub.take, later, json.dumps({"sensor": sensor})).get(later, [])
-        return list(map(json.loads, sent))
+            web.hub.collect(START_S + second)
 
     pass_by(0, 100)
     later = web.join()
-    sent = [each for each in map(json.loads, web.sent[later]) if "points" in each]
-    assert times(*sent) == pytest.approx(range(1039, 1100))
-    assert {each["points"] for each in kept(1)} == {1}
-    assert kept(5) == []
+    assert times(*web.points(later)) == pytest.approx(range(1039, 1100))
+    pass_by(100, 102)
+    assert times(*web.points(later)) == pytest.approx(range(1100, 1102)), "it catches up"
+    pass_by(102, 106)
+    anew, newest = web.points(later)
+    assert anew == {"anew": True}
+    assert times(newest) == pytest.approx([1105])
+    web.take(later, sensor=5)
+    assert web.points(later) == []
     web.model.connected(made.description(("one", "two")), made.OWN_PEER, START_S)
     pass_by(-500, -490)  # a restarted machine
-    assert times(*kept(1)) == pytest.approx(range(500, 510))
-
-
-def test_a_page_that_lags_misses_what_came_and_goes_on_with_the_newest(web: Harness) -> None:
-    quick, slow = web.join(), web.page
-    first = len(slow.unseen)
-    for _ in range(30):
-        states = web.states()
-        web.take(quick, seen=states[quick]["state"])
-        first += slow in states
-    assert first == MOST_BEHIND
-    web.model.take([frame(k) for k in range(100)], START_S + 1)
-    assert list(web.points(START_S + 1)) == [quick]
-    newest = states[quick]["state"]
-    web.take(slow, seen=newest)
-    assert web.states()[slow]["state"] == newest + 1, "the newest"
-    for start, expected in ((100, {quick: False, slow: True}), (200, {quick: False, slow: False})):
-        web.model.take([frame(k) for k in range(start, start + 100)], START_S + 1)
-        skipped = {page: "skipped" in each for page, [each] in web.points(START_S + 2).items()}
-        assert skipped == expected, "it is told where it was that missed something, not the sensor"
-
-
-def test_an_acknowledgement_of_what_was_not_sent_buys_nothing(web: Harness) -> None:
-    web.take(web.page, seen=999_999_999)
-    for _ in range(MOST_BEHIND):
-        assert not web.page.behind
-        web.hub.send_states(START_S)
-        web.take(web.page, seen=-3)
-        web.take(web.page, seen=1)
-    assert web.page.behind
+    web.take(later, sensor=1)
+    assert times(*web.points(later)) == pytest.approx(range(500, 510))
 
 
 @pytest.mark.parametrize(
     "text", ["", "[]", "{", '{"do":"shutdown"}', '{"do":5}', '{"do":[]}', b"\xff", "\ud800", "[" * 900]
 )
 def test_a_message_that_no_page_sends_ends_the_connection(web: Harness, text: str | bytes) -> None:
-    assert not web.now(web.hub.take, web.page, text)
+    assert web.hub.take(web.page, text) is None
     assert web.page.end == "Not a message of this page"
-
-
-def test_a_flood_of_messages_ends_the_connection(web: Harness) -> None:
-    for _ in range(100):
-        web.take(web.page, sensor=1)
-    assert web.page.end == "Too many messages"
 
 
 # Who may.
@@ -285,7 +226,7 @@ def test_with_the_token_the_sensor_is_tared_once_at_a_time(web: Harness) -> None
     assert not refused["control"]
     web.take(web.page, do="tare", sensor=1)
     assert web.tared == [(1, "tare")]
-    assert web.states()[web.page]["message"]["text"].endswith("Sensor 1 was tared")
+    assert web.message().endswith("Sensor 1 was tared")
     web.take(web.page, do="tare")
     assert "A tare is running already" in web.message()
     web.taring_now = False
@@ -296,9 +237,9 @@ def test_with_the_token_the_sensor_is_tared_once_at_a_time(web: Harness) -> None
 def test_with_the_token_peaks_are_reset(web: Harness) -> None:
     web.model.take([frame(0, {"force.x": 77.0})], START_S)
     web.model.take([frame(1, {"force.x": 1.0})], START_S)
-    assert web.states()[web.page]["sensor"]["peaks"]["Fx"] == [1, 77]
+    assert web.model.state(START_S).sensors[0].peaks is not None
     web.take(web.page, token=web.hub.token, do="reset")
-    assert web.states()[web.page]["sensor"]["peaks"] is None
+    assert web.model.state(START_S).sensors[0].peaks is None
 
 
 def asked(path: str, *origins: str, host: str | None = "localhost:12080") -> Response | None:
@@ -306,7 +247,7 @@ def asked(path: str, *origins: str, host: str | None = "localhost:12080") -> Res
     headers = Headers([("Host", host)] if host is not None else [])
     for origin in origins:
         headers["Origin"] = origin
-    return answer(PAGE_FILES, Request(path, headers))
+    return respond(PAGE_FILES, Request(path, headers))
 
 
 def test_only_names_of_this_machine_are_answered() -> None:
@@ -364,40 +305,22 @@ def test_every_answer_has_the_headers_and_nothing_else_is_served() -> None:
         assert found.status_code == (200 if path in known else 404), path
 
 
-def test_the_picture_in_the_docs_is_of_this_page() -> None:
-    assert pictures.digest_in("web.png") == pictures.web_digest(), pictures.AGAIN
-    assert (pictures.DOCS / "web.png").stat().st_size < 60_000
-
-
 # What it says.
 
 
 def test_a_page_says_what_the_monitor_says() -> None:
-    found = json.loads(state_text(made.troubled(), 0, 7))
-    sensor = found["sensor"]
-    assert found["state"] == 7
-    assert [s["ok"] for s in found["sensors"]] == [False, True]
-    state = made.troubled().sensors[0]
-    assert [(a["severity"], a["text"], a["remedy"]) for a in sensor["alerts"]] == [
-        (a.level.key, a.text, a.remedy) for a in state.alerts
+    found = json.loads(state_text(made.troubled()))["state"]
+    sensor, state = found["sensors"][0], made.troubled().sensors[0]
+    assert [each["verdict"] for each in found["sensors"]] == ["trouble", "look"]
+    assert [(a["severity"], a["text"], a["remedy"], a["present"]) for a in sensor["alerts"]] == [
+        (a.level.key, a.text, a.remedy, a.ago_s is None) for a in state.alerts
     ]
-    assert sensor["saturated"] == ["Fz"]
-    assert sensor["losses"] == [["2 on the bus", True], ["5 on the way here", True], ["repeated 0", False],
-                                ["invalid 0", False]]  # fmt: skip
-    assert ["sinc_length", "64", "800 Hz; cut-off 209.5 Hz with FIR off, 31.5 Hz with FIR on"] in sensor[
-        "settings"
-    ]
-    assert dict(sensor["stream"])["Temperature"] == "34.6 °C"
+    assert (sensor["saturated"], sensor["units"]) == (["Fz"], ["N", "Nm"])
+    assert any("5 on the way here" in row for row in found["table"])
     assert found["message"] == {"text": "12:00:00 Sensor 0 is not tared: it is not at rest", "bad": True}
-    assert (sensor["units"], sensor["imu_off"]) == (["N", "Nm"], False)
-    info = state.info._replace(settings={"calibration_matrix": False, "imu_active": 0})
-    raw = replace(state, info=info)
-    counts = json.loads(state_text(replace(made.troubled(), sensors=(raw,)), 0, 8))["sensor"]
-    assert (counts["units"], counts["imu_off"]) == (["counts", "counts"], True)
-    gone = json.loads(state_text(made.gone(), 0, 8))
+    gone = json.loads(state_text(made.gone()))["state"]
     assert gone["trouble"] == "gone at 12:00:00: no server answers (Connection refused); reconnecting"
-    assert (gone["server"], gone["sensors"][0]["ok"], gone["sensor"]["old"]) == ([], None, "1m05s")
-    assert json.loads(state_text(made.gone(), 5, 9))["sensor"] is None
+    assert gone["sensors"][0]["old"] == "1m05s"
 
 
 @pytest.mark.parametrize(

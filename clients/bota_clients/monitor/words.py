@@ -150,9 +150,14 @@ def alert(one: Alert) -> dict[str, str]:
 
 
 def json_line(state: State, unix_s: float) -> str:
-    """The state as one JSON object, for programs: docs/schemas/monitor.json. What is not known is null."""
+    """The state in one line, for programs: docs/schemas/monitor.json."""
+    return json.dumps(finite(json_object(state, unix_s)), allow_nan=False)
+
+
+def json_object(state: State, unix_s: float) -> dict[str, Any]:
+    """The state for programs; what is not known is null."""
     server = state.server
-    found = {
+    return {
         "time": unix_s,
         **_plain(server, "address connected since_s heard_s"),
         "reason": server.reason or None,
@@ -168,7 +173,6 @@ def json_line(state: State, unix_s: float) -> str:
         "sensors": [_sensor(sensor) for sensor in state.sensors],
         "clients": [client._asdict() for client in state.clients],
     }
-    return json.dumps(finite(found), allow_nan=False)
 
 
 def _sensor(sensor: SensorState) -> dict[str, Any]:

@@ -2,9 +2,9 @@
 
 States are sent as `state_text` makes them; frames as points of the traces: the extremes of every 10 ms, so
 that no peak is lost. A message with points has `points`, position of the sensor; `start`, time of the first
-point, `times` after it; `columns`, values of each of the 13 channels; `newest`, those of the newest sample;
-`skipped`, if the page was not sent the points before because it was slow. Times are the server's
-CLOCK_MONOTONIC in s, values in SI units or counts, both to six decimals; null: not a finite number.
+point, `times` after it; `columns`, values of each of the 13 channels; `newest`, those of the newest sample.
+Times are the server's CLOCK_MONOTONIC in s, values in SI units or counts, both to six decimals; null: not a
+finite number. A page that was too slow for the points before them is told to begin its traces anew.
 
 `WebModel.take` and `connected` are called by the reader's thread, everything else by one other.
 """
@@ -17,21 +17,22 @@ import json
 import math
 import secrets
 import threading
+import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
+from itertools import takewhile
 from typing import Any, Final
 
 from bota_clients.monitor import words
-from bota_clients.monitor.model import Model, SensorState, State
+from bota_clients.monitor.model import Model, State
+from bota_clients.monitor.screen import table
 from bota_clients.monitor.tare import WAYS, Say
 from bota_clients.numbers import duration
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.observer import COMMON
-from bota_ethercat.health.verdict import Level
-from bota_ethercat.pdo import AXES, STANDARD_GRAVITY, ImuUnits, PdoType
-from bota_ethercat.sensor.meaning import value_meaning
+from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits, PdoType
 from bota_ethercat.sensor_choice import MOST_PLACES
 from bota_ethercat.text.json_text import JsonObject, finite, parse_json_object
 from bota_ethercat.text.untrusted import whole
@@ -40,8 +41,7 @@ MOST_PAGES: Final = 8
 TOO_MANY: Final = f"{MOST_PAGES} pages are connected already: close one of them"
 KEPT_S: Final = 60.0
 MOST_BYTES: Final = 1024  # of a message from a page
-MOST_BEHIND: Final = 10  # states without an acknowledgement
-_MOST_MESSAGES: Final = 40  # between two states
+BEHIND_S: Final = 2.0  # points that wait longer for a page are too many for it
 _SILENT_S: Final = 0.1
 STEP_NS: Final = 10_000_000  # of the traces
 MOST_POINTS: Final = 4096  # that wait to be taken: 20 s
@@ -49,7 +49,7 @@ MOST_POINTS: Final = 4096  # that wait to be taken: 20 s
 CHANNELS: Final = tuple(field.name for field in COMMON.fields if field.type is PdoType.REAL)
 
 Values = tuple[float, ...]
-Send = Callable[[str], None]
+_ANEW: Final = '{"anew":true}'
 
 
 class Points:
@@ -147,21 +147,13 @@ class WebModel(Model):
 
 
 class Page:
-    """A connected page. It acknowledges states by number; while it lags by two seconds it is sent nothing."""
+    """A connected page."""
 
-    def __init__(self, send: Send) -> None:
-        self.send = send
+    def __init__(self) -> None:
         self.sensor = 0  # position of the one that it shows
         self.control = False  # whether it has shown the token
-        self.missed = False  # whether it was not sent the last points, because it was behind
+        self.sent = 0  # number of the newest points that it was sent; 0: none
         self.end = ""  # why its connection must be closed; empty if not
-        self.unseen: deque[int] = deque()  # states that it has not acknowledged
-        self.messages = 0  # since the last state
-
-    @property
-    def behind(self) -> bool:
-        """Whether it has too much on the way already."""
-        return len(self.unseen) >= MOST_BEHIND
 
 
 class Hub:
@@ -170,80 +162,65 @@ class Hub:
     def __init__(self, model: WebModel, tare: Callable[[int, Say, str], threading.Thread]) -> None:
         """`tare` starts one of WAYS with the sensor at a position."""
         self.token: Final = secrets.token_urlsafe(24)
+        self.pages: set[Page] = set()
         self._model = model
         self._tare = tare
         self._taring: threading.Thread | None = None
-        self._pages: set[Page] = set()
-        self._number = 0
         self._points_s = 0.0
-        # Points of the last minute by position: the time of the first, and the message.
-        self._kept: dict[int, deque[tuple[float, str]]] = defaultdict(deque)
+        self._number = 0
+        # Points of the last minute by position: their number, the time of the first, and the message.
+        self._kept: dict[int, deque[tuple[int, float, str]]] = defaultdict(deque)
 
-    def join(self, send: Send, now_s: float) -> Page | None:
-        """A page has connected: it gets the state and the last minute; None if there are enough."""
-        if len(self._pages) >= MOST_PAGES:
+    def join(self) -> Page | None:
+        """A page has connected; None if there are enough."""
+        if len(self.pages) >= MOST_PAGES:
             return None
-        page = Page(send)
-        self._pages.add(page)
-        self.send_states(now_s)
-        self._send_kept(page)
+        page = Page()
+        self.pages.add(page)
         return page
 
-    def leave(self, page: Page) -> None:
-        """Its connection has ended."""
-        self._pages.discard(page)
+    def state(self, now_s: float) -> str:
+        """The message with the state."""
+        return state_text(self._model.state(now_s))
 
-    def send_states(self, now_s: float) -> None:
-        """Send the state to the pages that keep up."""
-        self._number += 1
-        state, texts = self._model.state(now_s), dict[int, str]()
-        for page in self._pages:
-            if not page.behind:
-                page.unseen.append(self._number)
-                page.messages = 0
-                if page.sensor not in texts:
-                    texts[page.sensor] = state_text(state, page.sensor, self._number)
-                page.send(texts[page.sensor])
-
-    def send_points(self, now_s: float) -> None:
-        """Send new points to the pages that keep up; to others, the next ones are marked `skipped`."""
+    def collect(self, now_s: float) -> None:
+        """Keep the points that have come since the last call."""
         silent = now_s - self._points_s > _SILENT_S
         for batch in self._model.batches(silent=silent):
-            self._points_s, start_s, text = now_s, batch["start"], _json(batch)
-            kept = self._kept[batch["points"]]
-            kept.append((start_s, text))
-            while not start_s - KEPT_S <= kept[0][0] <= start_s:  # or of another server
+            self._number += 1
+            self._points_s, start_s, kept = now_s, batch["start"], self._kept[batch["points"]]
+            kept.append((self._number, start_s, _json(batch)))
+            while not start_s - KEPT_S <= kept[0][1] <= start_s:  # or of another server
                 kept.popleft()
-            for page in self._pages:
-                if page.sensor == batch["points"]:
-                    if not page.behind:
-                        page.send(_json(batch | {"skipped": True}) if page.missed else text)
-                    page.missed = page.behind
 
-    def take(self, page: Page, text: str | bytes) -> None:
-        """A message of a page; afterwards `page.end` may be set."""
-        page.messages += 1
-        if page.messages > _MOST_MESSAGES:
-            page.end = "Too many messages"
-            return
+    def points(self, page: Page) -> list[str]:
+        """What the page has not been sent of its sensor, oldest first: at first the last minute."""
+        kept = self._kept.get(page.sensor, ())
+        new = [*takewhile(lambda each: each[0] > page.sent, reversed(kept))]
+        if not new:
+            return []
+        anew = page.sent > 0 and new[0][1] - new[-1][1] > BEHIND_S
+        page.sent = new[0][0]
+        return [_ANEW, new[0][2]] if anew else [text for *_, text in reversed(new)]
+
+    def take(self, page: Page, text: str | bytes) -> str | None:
+        """A message of a page, whose `end` may be set afterwards; the answer, if there is one."""
         try:
             message = parse_json_object(text.encode() if isinstance(text, str) else text)
         except (BadMessageError, UnicodeEncodeError):
             page.end = "Not a message of this page"
-            return
+            return None
         before = page.control
         refused = self._do(page, message)
         if refused or page.control != before:
-            page.send(_json({"control": page.control, "refused": refused}))
+            return _json({"control": page.control, "refused": refused})
+        return None
 
     def _do(self, page: Page, message: JsonObject) -> str | None:
         """Do what it asks for; why not."""
-        seen, position, action = whole(message.get("seen")), whole(message.get("sensor")), message.get("do")
-        while seen is not None and page.unseen and page.unseen[0] <= seen:
-            page.unseen.popleft()
+        position, action = whole(message.get("sensor")), message.get("do")
         if position is not None and 0 <= position < MOST_PLACES and position != page.sensor:
-            page.sensor = position
-            self._send_kept(page)
+            page.sensor, page.sent = position, 0
         if "token" in message and not self._check_token(page, message["token"]):
             return "The token in this link is not that of this run: open the link that it printed"
         if action is None:
@@ -268,10 +245,6 @@ class Hub:
         page.control = hmac.compare_digest(text.encode(errors="replace"), self.token.encode())
         return page.control
 
-    def _send_kept(self, page: Page) -> None:
-        for _, text in self._kept.get(page.sensor, ()):
-            page.send(text)
-
 
 def is_loopback(host: str) -> bool:
     """Whether a host, without port, is this machine."""
@@ -283,73 +256,20 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def state_text(state: State, position: int, number: int) -> str:
-    """State `number` for a page that shows the sensor at `position`, as JSON; unknown values are null."""
-    trouble = words.trouble(state.server)
-    message = {
-        "state": number,
-        "address": state.server.address,
-        "link": words.link(state.server),
-        "trouble": trouble,
-        "server": words.server_facts(state.server),
-        "clients": [words.client(client) for client in state.clients],
-        "message": state.message and state.message._asdict(),
-        "events": state.events,
-        "sensors": [
-            {
-                "position": s.position,
-                "name": s.info.name,
-                "ok": None if trouble else s.verdict.level < Level.TROUBLE,
-            }
-            for s in state.sensors
-        ],
-        "sensor": next((_sensor(sensor) for sensor in state.sensors if sensor.position == position), None),
-    }
-    return _json(finite(message))
+def state_text(state: State) -> str:
+    """The state as JSON: what `--json` prints, and words for the page."""
+    found = words.json_object(state, time.time())
+    for row, sensor in zip(found["sensors"], state.sensors, strict=True):
+        row["identity"], row["alerts"] = words.identity(sensor), [
+            words.alert(each) | {"level": each.level.words, "when": words.seen(each.ago_s),
+                                 "present": each.ago_s is None}
+            for each in sensor.alerts
+        ]  # fmt: skip
+        row["old"] = None if sensor.old_s is None else duration(sensor.old_s)
+    found["link"], found["trouble"] = words.link(state.server), words.trouble(state.server)
+    found["message"], found["table"] = state.message and state.message._asdict(), table(state)
+    return _json({"state": finite(found)})
 
 
 def _json(message: object) -> str:
     return json.dumps(message, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
-
-
-def _sensor(sensor: SensorState) -> dict[str, Any]:
-    sample, rate_hz = sensor.sample, sensor.info.rate_hz or None
-    stream = {
-        "Rate": words.rate(sensor),
-        "Filter delay": words.delays(sensor),
-        "Age": words.times(sensor.age_us),
-        "Age at hand-out": words.times(sensor.hand_out_us),
-        "Jitter": words.jitter(sensor),
-        "Clock": words.clock(sensor),
-    }
-    if sample is not None:
-        stream["Temperature"] = f"{sample.temperature:.1f} °C"
-        if sample.orientation is not None:
-            stream["Orientation xyzw"] = " ".join(f"{part:+.2f}" for part in sample.orientation)
-    return {
-        "position": sensor.position,
-        "identity": words.identity(sensor),
-        "old": None if sensor.old_s is None else duration(sensor.old_s),
-        "has_sample": sample is not None,
-        "nominal_hz": rate_hz,
-        "units": sensor.units,
-        "imu_off": sensor.imu_off,
-        "peaks": sensor.peaks and dict(zip(AXES, sensor.peaks, strict=True)),
-        "saturated": sorted(sensor.saturated),
-        "alerts": [
-            words.alert(a) | {"level": a.level.words, "when": words.seen(a.ago_s), "present": a.ago_s is None}
-            for a in sensor.alerts
-        ],
-        "stream": list(stream.items()),
-        "losses": words.losses(sensor),
-        "settings": [
-            (
-                name,
-                str(value).lower(),
-                value_meaning(
-                    name, value, round(rate_hz) if rate_hz else None, sensor.info.settings.get("chop")
-                ),
-            )
-            for name, value in sensor.info.settings.items()
-        ],
-    }

@@ -21,14 +21,14 @@ from importlib.resources import files
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from websockets.asyncio.server import ServerConnection, broadcast, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.tare import start_tare
-from bota_clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, WebModel, is_loopback
+from bota_clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, Page, WebModel, is_loopback
 from bota_clients.program import call_on, say
 from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
@@ -107,31 +107,42 @@ async def serving(
     """
     page_files = read_page()
     options: dict[str, Any] = {
-        "process_request": lambda _, request: answer(page_files, request),
+        "process_request": lambda _, request: respond(page_files, request),
         "compression": None, "max_size": MOST_BYTES, "max_queue": 4, "open_timeout": 5.0,
         "close_timeout": 0.5, "server_header": None, "logger": _QUIET,
     }  # fmt: skip
 
     async def converse(connection: ServerConnection) -> None:
-        page = hub.join(partial(broadcast, [connection]), clock())
+        page = hub.join()
         if page is None:
             await connection.close(_TRY_AGAIN_LATER, TOO_MANY)
             return
+        sending = asyncio.create_task(send(connection, page))
         try:
             async for text in connection:
-                hub.take(page, text)
+                if answer := hub.take(page, text):
+                    await connection.send(answer)
                 if page.end:
                     await connection.close(_POLICY_VIOLATION, page.end)
         except ConnectionClosed:
             pass
         finally:
-            hub.leave(page)
+            sending.cancel()
+            hub.pages.discard(page)
 
-    async def send() -> None:
-        for count in itertools.count():
-            if count % POINTS_A_STATE == 0:
-                hub.send_states(clock())
-            hub.send_points(clock())
+    async def send(connection: ServerConnection, page: Page) -> None:
+        """As fast as the page reads: what it has no time for waits in the hub."""
+        with contextlib.suppress(ConnectionClosed):
+            for count in itertools.count():
+                if count % POINTS_A_STATE == 0:
+                    await connection.send(hub.state(clock()))
+                for text in hub.points(page):
+                    await connection.send(text)
+                await asyncio.sleep(POINTS_S)
+
+    async def collect() -> None:
+        while True:
+            hub.collect(clock())
             await asyncio.sleep(POINTS_S)
 
     async with contextlib.AsyncExitStack() as stack:
@@ -142,11 +153,11 @@ async def serving(
                 if (host, address) != ("localhost", "::1") or error.errno not in _NO_ADDRESS:
                     raise
             port = next(iter(server.sockets)).getsockname()[1]
-        sending = asyncio.create_task(send())
+        collecting = asyncio.create_task(collect())
         try:
             yield port
         finally:
-            sending.cancel()
+            collecting.cancel()
 
 
 def read_page() -> dict[str, tuple[bytes, str]]:
@@ -162,7 +173,7 @@ def read_page() -> dict[str, tuple[bytes, str]]:
     return found
 
 
-def answer(page_files: dict[str, tuple[bytes, str]], request: Request) -> Response | None:
+def respond(page_files: dict[str, tuple[bytes, str]], request: Request) -> Response | None:
     """The answer to a GET; None for a stream that may be opened."""
     path = request.path.partition("?")[0]
     host, origin = (_only(request.headers.get_all(name)) for name in ("Host", "Origin"))

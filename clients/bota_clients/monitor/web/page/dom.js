@@ -30,7 +30,7 @@ export const dark = matchMedia("(prefers-color-scheme: dark)");
 
 function renew() {
   const style = getComputedStyle(document.documentElement);
-  for (const name of ["raised", "ink", "muted", "grid", "missed", "x", "y", "z", "torque"])
+  for (const name of ["raised", "ink", "muted", "grid", "x", "y", "z"])
     colors[name] = style.getPropertyValue(`--${name}`).trim();
 }
 

@@ -17,19 +17,17 @@ export class History {
 
   clear() {
     this.times = [];
-    this.skipped = []; // where this page was too slow: [from, to]
     this.columns = Array.from({ length: CHANNELS }, () => []);
     this.offset = null;
   }
 
   /** `period`: of the samples, in seconds. */
-  add({ skipped, start, times, columns }, period) {
+  add({ start, times, columns }, period) {
     let last = this.times.at(-1);
     if (start <= last) this.clear(); // another server, or a restarted machine
     times.forEach((after, i) => {
       if (start + after - last > 2.5 * Math.max(STEP_S, period)) {
         this.#push(last + 1e-4);
-        if (skipped && !i) this.skipped.push([last, start]);
       }
       last = start + after;
       this.#push(last, columns, i);
@@ -60,7 +58,6 @@ export class History {
   #trim(before) {
     const count = this.times.findIndex((time) => time >= before);
     this.times.splice(0, count);
-    this.skipped = this.skipped.filter(([, to]) => to >= before);
     for (const column of this.columns) column.splice(0, count);
   }
 }
@@ -117,16 +114,20 @@ export class Trace {
       ],
       series: [{}, ...["x", "y", "z"].map((name) => (
         { stroke: () => colors[name], width: 1, points: { show: false }, spanGaps: false }))],
-      hooks: { setCursor: [(u) => this.#point(u)], drawClear: [(u) => this.#missed(u)] },
+      hooks: { setCursor: [(u) => this.#point(u)] },
     }, [[], [], [], []], this.box);
-    this.plot.skipped = [];
-    this.card.plot = this.plot;
     new ResizeObserver(() => this.plot.setSize(this.#size())).observe(this.box);
+  }
+
+  /** Of force and torque: those of the sensor. */
+  units(unit) {
+    this.unit = unit ?? this.group.unit;
+    this.digits = this.unit === "counts" ? 0 : this.group.digits;
+    this.unitText.textContent = this.unit;
   }
 
   draw(history, edge) {
     const { first } = this.group;
-    this.plot.skipped = history.skipped;
     this.plot.batch(() => {
       this.plot.setData([history.times, ...history.columns.slice(first, first + 3)], false);
       this.plot.setScale("x", { min: edge - this.span, max: edge });
@@ -165,29 +166,8 @@ export class Trace {
     return this.unit === "counts" ? 1000 : this.group.least;
   }
 
-  /** What this page missed is shaded: nothing was lost there. */
-  #missed({ ctx, axes, bbox, skipped, valToPos }) {
-    ctx.save();
-    ctx.font = axes[0].font[0];
-    ctx.textAlign = "center";
-    ctx.textBaseline = "top";
-    for (const [from, to] of skipped ?? []) {
-      const [left, right] = [from, to].map((time) => Math.min(Math.max(valToPos(time, "x", true), bbox.left), bbox.left + bbox.width));
-      ctx.fillStyle = colors.missed;
-      ctx.fillRect(left, bbox.top, right - left, bbox.height);
-      ctx.fillStyle = colors.muted;
-      if (ctx.measureText("page was slow").width < right - left) ctx.fillText("page was slow", (left + right) / 2, bbox.top);
-    }
-    ctx.restore();
-  }
-
   #point(u) {
     const at = u.cursor.idx;
-    const time = u.posToVal(u.cursor.left, "x");
-    if (u.cursor.left >= 0 && u.skipped.some(([from, to]) => from < time && time < to)) {
-      this.at.textContent = "this page was too slow to show what came here";
-      return;
-    }
     if (at === null || at === undefined || u.data[1][at] === null || !(u.cursor.left >= 0)) {
       this.at.textContent = "";
       return;
