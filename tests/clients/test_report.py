@@ -15,7 +15,6 @@ import pytest
 
 from bota_clients.report.checks import Check, Examination
 from bota_clients.report.series import CHANNELS, Subject, channel_limit, limit_origin, subject
-from bota_clients.report.subjects import past
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
@@ -115,10 +114,10 @@ def test_the_noise_is_that_of_the_sensor_whatever_it_does(healthy: Subject) -> N
         ("noise force.y 0.6", FORCE_TORQUE, TROUBLE, "^Force y has a noise of 0.58"),
         ("noise acceleration.x 0.02", IMU, TROUBLE, "^Acceleration x has a noise of 0.19"),
         ("noise angular_rate.z 10", IMU, TROUBLE, "^Angular rate z has a noise of 0.17"),
-        ("limit force.z 9", "Saturation", TROUBLE, "Force z was saturated in"),
-        ("limit angular_rate.x 5", "Saturation", TROUBLE, "Angular rate x was saturated in"),
+        ("limit force.z 9", "Saturation", TROUBLE, "saturated: Fz"),
+        ("limit angular_rate.x 5", "Saturation", TROUBLE, "saturated: ωx"),
         ("freeze angular_rate.y", "Stuck values", TROUBLE, "^Angular rate y was constant at"),
-        ("skip 2", "Lost samples", TROUBLE, r"were lost\. In "),
+        ("skip 2", "Lost samples", TROUBLE, "were lost"),
     ],
 )
 def test_an_injected_fault_is_found_and_nothing_else(
@@ -144,7 +143,7 @@ SHAKES = {"acceleration.x": 0.05, "acceleration.y": 0.05, "force.x": 1.5, "torqu
          {FORCE_TORQUE: (LOOK, "^Torque y is noisy in")}),
         (SLOW, 5, {4.0: "freeze force.x", 4.5: "thaw force.x"},
          {"Stuck values": (TROUBLE, r"^Force x .* for (49|50)\d ms \((49|50|51) samples\) from (3.9|4.0)")}),
-        (SLOW, 8, {5.0: "stick"}, {SILENT: (TROUBLE, "the longest 3.00 s")}),
+        (SLOW, 8, {5.0: "stick"}, {SILENT: (TROUBLE, "No new sample for 3.0 s")}),
     ],
 )  # fmt: skip
 def test_a_fault_that_comes_and_goes_is_found(
@@ -158,10 +157,8 @@ def test_a_fault_that_comes_and_goes_is_found(
 
 def test_warnings_are_told_with_their_remedy() -> None:
     script = Script(((2.0, "warn 0x20 80"), (4.0, "warn 0x40 8")))
-    fatal = {"Warnings": (TROUBLE, r"Wrong supply voltage \(fatal\) in 8 samples")}
+    fatal = {"Warnings": (TROUBLE, r"Wrong supply voltage\. Overtemperature\.")}
     check = check_of(expect(sensor(5, script=script, sinc_length=SINC), fatal), "Warnings")
-    words = r"Overtemperature \(warning\) in (79|80|81) samples, first (1.99|2.00) s after the start"
-    assert re.search(words, check.found)
     assert "let it cool down" in check.remedy
     assert "Remove sensor from power supply" in check.remedy
 
@@ -186,7 +183,6 @@ def test_the_share_of_lost_samples_is_told() -> None:
     lost = examination.series.lost
     assert lost / (lost + examination.series.count) == pytest.approx(0.02, abs=0.006)
     assert lost + examination.series.count == pytest.approx(20 * 100, abs=10), "none is counted twice"
-    assert "All of them never reached the server" in check_of(examination, "Lost samples").found
 
 
 def test_a_sensor_that_never_gave_anything_new_is_no_healthy_one() -> None:
@@ -212,7 +208,7 @@ def test_frames_that_the_client_did_not_take_are_told_apart_from_those_the_serve
     frames: tuple[DataMessage, ...],
 ) -> None:
     kept = flagged([*frames[:1000], *frames[1080:]], DataFlag.GAP, range(1000, 1001))
-    series = expect(subject_of(kept, ROW), {"Lost samples": (TROUBLE, "not read in time")}).series
+    series = expect(subject_of(kept, ROW), {"Lost samples": (TROUBLE, "^80 of")}).series
     assert (series.lost, series.withheld) == (80, 80)
 
 
@@ -222,7 +218,7 @@ def test_one_frame_in_some_is_no_loss(frames: tuple[DataMessage, ...]) -> None:
 
 def test_invalid_frames_are_a_silence(frames: tuple[DataMessage, ...]) -> None:
     kept = flagged(frames, DataFlag.INVALID, range(2000, 2025))  # 62 ms, and 0.9 %
-    assert expect(subject_of(kept, ROW), {SILENT: (TROUBLE, "25 invalid ones")}).series.lost == 0
+    assert expect(subject_of(kept, ROW), {SILENT: (TROUBLE, "25 frames were invalid")}).series.lost == 0
 
 
 @pytest.mark.parametrize("flag", [DataFlag.INVALID, DataFlag.REPEATED])
@@ -304,7 +300,7 @@ def test_imu_units_are_taken_as_told(frames: tuple[DataMessage, ...]) -> None:
 def test_values_that_are_no_numbers_are_found_and_spoil_nothing_else(healthy: Subject, value: float) -> None:
     force = healthy.columns.force.copy()
     force[100:110, 1] = value
-    expect(changed(healthy, force=force), {"Numbers": (TROUBLE, "^Samples .*10 samples .*: Force y")})
+    expect(changed(healthy, force=force), {"Numbers": (TROUBLE, "^Samples have values that")})
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 50, 400])
@@ -357,8 +353,3 @@ def test_limits_are_botas_at_the_published_lengths_and_between_them_in_between()
     assert "own test limits for SINC 51" in limit_origin(51)
     assert "interpolated between" in limit_origin(64)
     assert "extrapolated from" in limit_origin(32)
-
-
-def test_what_the_server_says_of_the_past_is_not_trusted() -> None:
-    row = {"sensor": 0, "drift": {"wrench": [2, 0, 0, 0, 0, 0], "ago_s": 60, "kelvin": 0}, "history": 7}
-    assert past({"sensors": [{"sensor": []}, row]}, 0) == ["Fx has drifted 2.0 N since the start 1 min ago."]

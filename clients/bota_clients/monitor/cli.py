@@ -15,10 +15,9 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from bota_clients.arguments import add_imu_units, add_server, address, server_of
+from bota_clients.arguments import add_imu_units, add_server, address, is_loopback, server_of
 from bota_clients.monitor.model import Model
 from bota_clients.monitor.reader import Reader
-from bota_clients.monitor.web.hub import is_loopback
 from bota_clients.monitor.words import json_line, verdict
 from bota_clients.program import interrupt_on_signals, not_installed
 from bota_ethercat.address import DEFAULT_HOST, Address

@@ -1,8 +1,4 @@
-"""The plots of the page, as inline SVG: colors as CSS variables, text as text, reproducible.
-
-Figures are drawn in placeholder colors, which become CSS variables: the style sheet defines `--ink` or
-`--x` for light, dark and print. No text from a device is drawn.
-"""
+"""The plots of the page, as inline SVG, text as text, reproducible. No text from a device is drawn."""
 
 from __future__ import annotations
 
@@ -24,12 +20,9 @@ from bota_clients.numbers import figure as number
 from bota_clients.recording.columns import Floats, Ints
 from bota_clients.report.series import GROUPS, Group, Series
 
-_VARIABLES: Final = {
-    f"#0101{number}": f"--{name}"
-    for number, name in enumerate(["ink", "muted", "grid", "x", "y", "z", "bad", "limit", "plain"], start=10)
-}
-INK, MUTED, GRID, X, Y, Z, BAD, LIMIT, PLAIN = _VARIABLES
-AXES: Final = (X, Y, Z)
+# Those of the axes differ in lightness as well as in hue (after Okabe and Ito).
+AXES: Final = ("#c44601", "#00795c", "#1763c6")
+INK, MUTED, GRID, BAD, LIMIT, PLAIN = "#1b1f24", "#5b6570", "#e3e7eb", "#b3201b", "#7a3e9d", "#5d7896"
 
 STYLE: Final[dict[str, Any]] = {
     "svg.fonttype": "none",
@@ -64,11 +57,7 @@ _DROPPED: Final = re.compile(
     re.DOTALL,
 )
 _OPENING: Final = re.compile(r"<svg\b[^>]*?(viewBox=\"[^\"]*\")[^>]*>", re.DOTALL)
-_COLOR: Final = re.compile("|".join(_VARIABLES))
-_PATH: Final = re.compile(r'\bd="([^"]*)"')
-_NUMBER: Final = re.compile(r"-?\d+\.\d+")
 _IDENTIFIER: Final = re.compile(r'(\bid="|url\(#|href="#)')
-_FONT_FAMILY: Final = re.compile(r"'?DejaVu Sans'?(, sans-serif)*")
 
 
 def draw(name: str, title: str, paint: Callable[..., str], *arguments: Any) -> str | None:
@@ -86,10 +75,7 @@ def draw(name: str, title: str, paint: Callable[..., str], *arguments: Any) -> s
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     svg = _DROPPED.sub("", buffer.getvalue())
-    svg = _PATH.sub(lambda m: f'd="{_NUMBER.sub(_rounded, " ".join(m[1].split()))}"', svg)
     svg = _IDENTIFIER.sub(rf"\1{name}-", svg)
-    svg = _COLOR.sub(lambda m: f"var({_VARIABLES[m[0]]})", svg)
-    svg = _FONT_FAMILY.sub("var(--font)", svg)
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" {{box}} '
         f'role="img" aria-labelledby="{name}-title {name}-desc">'
@@ -98,10 +84,6 @@ def draw(name: str, title: str, paint: Callable[..., str], *arguments: Any) -> s
     )
     svg = _OPENING.sub(lambda m: head.format(box=m[1]), svg, count=1)
     return "\n".join(line.strip() for line in svg.splitlines() if line.strip())
-
-
-def _rounded(match: re.Match[str]) -> str:
-    return f"{float(match[0]):.2f}".rstrip("0").rstrip(".")
 
 
 def _margins(figure: Figure, **space: float) -> None:

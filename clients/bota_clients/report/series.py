@@ -19,7 +19,6 @@ from bota_clients.recording.columns import Columns, Floats, Ints
 from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.health.verdict import LIMITS
 from bota_ethercat.sensor.filters import LONG_SINC, SHORT_SINC, noise_limit
-from bota_ethercat.sensor.warnings_register import explain
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, known_settings, rate_divisor
 from bota_ethercat.text.untrusted import printable, whole
 
@@ -219,16 +218,6 @@ class Series:
         self.lost = int(self.missing.sum())  # samples, except those of a silent sensor
         # Those of the lost samples that the server had numbered: the client or recorder was too slow.
         self.withheld = min(self.counts.withheld // self.step, self.lost)
-        # What the sensor warned of, and which channels were saturated: when, s.
-        self.warnings = [
-            (meaning, self.time[samples.warnings & meaning.flag != 0])
-            for meaning in explain(bits(samples.warnings))
-        ]
-        self.saturations = [
-            (channel, self.time[column])
-            for channel, column in zip(CHANNELS, self.saturated.T, strict=True)
-            if column.any()
-        ]
 
     def _missing(self, accounting: StreamAccounting) -> Ints:
         """(n - 1,) how many samples are missing between one and the next, beside those of a silent sensor.

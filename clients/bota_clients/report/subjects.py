@@ -1,22 +1,17 @@
-"""The sensors to report on, from a recording that `ethercat-record` made or from some seconds of a server's
-stream."""
+"""The sensors to report on, from a recording that `ethercat-record` made."""
 
 from __future__ import annotations
 
-import contextlib
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from bota_clients.errors import ClientError
 from bota_clients.numbers import count, listing, moment
-from bota_clients.record.recorder import Recorder, Source
 from bota_clients.recording.columns import Columns, columns
 from bota_clients.recording.reader import (
     Histories,
@@ -27,12 +22,8 @@ from bota_clients.recording.reader import (
     open_recording,
 )
 from bota_clients.report.series import Subject, subject
-from bota_ethercat.address import Address
-from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.health import history
 from bota_ethercat.pdo import ImuUnits
-from bota_ethercat.replies import Status
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.text.untrusted import printable
 
@@ -41,10 +32,8 @@ _MOST_SENSORS_NAMED: Final = 4
 _LONGEST_CHANGE_NS: Final = 2_000_000_000  # a change of settings takes the sensor out of operation for less
 
 
-def of_recording(
-    path: Path, choice: SensorChoice | None, imu_units: ImuUnits, source: str = ""
-) -> list[Subject]:
-    """The sensors of the recording at `path`, or those chosen, by position; it is named as `source`.
+def of_recording(path: Path, choice: SensorChoice | None, imu_units: ImuUnits) -> list[Subject]:
+    """The sensors of the recording at `path`, or those chosen, by position.
 
     RecordingError if it cannot be read, ClientError if it has no such sensor.
     """
@@ -58,13 +47,12 @@ def of_recording(
                 for row in s.history
                 for who in [row.identity]
             ]
-            raise _no_sensor(source or str(path), choice, dict.fromkeys(there))
+            raise _no_sensor(str(path), choice, dict.fromkeys(there))
         remarks = [f"The recording was cut off: {recording.cut_off}."] if recording.cut_off else []
         if others := [str(sensor.sensor) for sensor in recording.sensors if sensor not in recorded]:
             remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
         remarks += _event_remarks(event.name for event in recording.events)
-        source = source or path.name
-        subjects = [_subject(recording, sensor, choice, imu_units, source) for sensor in found]
+        subjects = [_subject(recording, sensor, choice, imu_units) for sensor in found]
         return [subject.with_remarks(remarks) for subject in subjects]
 
 
@@ -112,11 +100,7 @@ def _frames(recording: Recording, sensor: int, before: list[int]) -> Iterator[Da
 
 
 def _subject(
-    recording: Recording,
-    sensor: RecordedSensor,
-    choice: SensorChoice | None,
-    imu_units: ImuUnits,
-    source: str,
+    recording: Recording, sensor: RecordedSensor, choice: SensorChoice | None, imu_units: ImuUnits
 ) -> Subject:
     """Its longest stretch without a change of settings or sensor."""
     before, history = list[int](), sensor.history
@@ -141,7 +125,7 @@ def _subject(
             f"The sensor's own offset was changed {count(tared, 'time')} (by a tare, say): forces before and "
             "after differ by that."
         )
-    made = subject(row, values, frames, source, sensor.sensor)
+    made = subject(row, values, frames, recording.path.name, sensor.sensor)
     return made.with_remarks(remarks)
 
 
@@ -163,43 +147,3 @@ def _remarks(history: Sequence[Settings], kept: Settings, frames: Columns) -> li
         first, last = (moment(int(frames.stamp_ns[row])) for row in (0, -1))
         remarks.append(f"This report is of the longest stretch without a change, from {first} to {last}.")
     return remarks
-
-
-_BATCH_S: Final = 0.05
-
-
-def of_server(
-    address: Address,
-    seconds: float,
-    choice: SensorChoice | None,
-    imu_units: ImuUnits,
-    show: Callable[..., None],
-) -> list[Subject]:
-    """The server's sensors, or those chosen, from a recording of `seconds`, which is not kept.
-
-    `show` gets the time so far, s, as `completed`. ConnectionFailedError or RefusedError if there is no
-    stream; ClientError if there is no such sensor.
-    """
-    with TemporaryDirectory() as folder, contextlib.closing(Source(address, None)) as source:
-        source.connect()
-        path = Path(folder, "live.mcap")
-        recorder = Recorder(path, "", {}, overwrite=False)
-        begin = time.monotonic()
-        while (passed := time.monotonic() - begin) < seconds:
-            show(completed=passed)
-            recorder.put(source.batch(min(_BATCH_S, seconds - passed)))
-        recorder.stop("")
-        status: Mapping[str, Any] = {}
-        with contextlib.suppress(ProtocolError):  # the stream is enough
-            status = source.ask("status")
-        subjects = of_recording(path, choice, imu_units, str(address))
-        return [each.with_remarks(past(status, each.position)) for each in subjects]
-
-
-def past(status: Mapping[str, Any], position: int) -> list[str]:
-    """What the server knows of a sensor's past, from its reply to `status`: sentences."""
-    row = Status.parse(status).find(position)
-    overload, overloaded = history.overload(row)
-    texts = [history.drift(row), overload]
-    texts += ["have it checked for damage by overload"] if overloaded else []
-    return [f"{text[0].upper()}{text[1:]}." for text in texts if text]

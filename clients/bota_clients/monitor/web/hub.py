@@ -12,7 +12,6 @@ finite number. A page that was too slow for the points before them is told to be
 from __future__ import annotations
 
 import hmac
-import ipaddress
 import json
 import math
 import secrets
@@ -244,16 +243,6 @@ class Hub:
         text = given if isinstance(given, str) else ""
         page.control = hmac.compare_digest(text.encode(errors="replace"), self.token.encode())
         return page.control
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a host, without port, is this machine."""
-    if host.lower() == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def state_text(state: State) -> str:

@@ -26,9 +26,10 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from bota_clients.arguments import is_loopback
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.tare import start_tare
-from bota_clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, Page, WebModel, is_loopback
+from bota_clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, Page, WebModel
 from bota_clients.program import call_on, say
 from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
