@@ -15,9 +15,10 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from bota_clients.recording.columns import Columns, columns
-from bota_clients.report.series import Subject, subject
+from bota_clients.report.series import Subject
 from bota_ethercat.framing import DataMessage, FrameDecoder
 from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import sampling_rate_hz, start_up_defaults
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.ethercat.clock import Clock
@@ -113,8 +114,9 @@ def subject_of(
     source: str = "simulated.mcap",
     **kind: Any,
 ) -> Subject:
-    row = described() if row is None else row
-    return subject(row, row.get("settings"), decoded(frames, **kind), source, 0)
+    info = SensorInfo.parse(described() if row is None else row)
+    assert info is not None
+    return Subject(info, decoded(frames, **kind), source)
 
 
 def sensor(seconds: float, *commands: str, **options: Any) -> Subject:

@@ -121,7 +121,7 @@ def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> N
     with open_recording(path) as recording:
         recorded = joined(windows_of(recording, Periodic(30.0), Windows(32, tool=TOOL)))
     live = Windows(32, tool=TOOL)
-    live.configure(recording.sensors[0].settings, RATE_HZ, row["name"])
+    live.configure(recording.sensors[0].info.settings, RATE_HZ, row["name"])
     sent, asked, blocks = [each for each in frames if not each.flags & DataFlag.REPEATED], 0, []
     while sent:
         size = chance.randrange(1, 40)
@@ -221,7 +221,7 @@ def test_every_format_has_the_same(tmp_path: Path) -> None:
     texts = table.schema.metadata[b"bota_ethercat"], str(npz["attributes"])
     for found in (group.attrs["bota_ethercat"], *map(json.loads, texts)):
         first = found["settings"][0]
-        assert (first["identity"]["serial"], found["options"]["window"]) == (100, 8)
+        assert (first["serial"], found["options"]["window"]) == (100, 8)
         assert first["delay_ms"]["acceleration"] == 1.94
     assert {*table.column_names, "attributes"} == {*group, "attributes"} == {*npz}
     assert len(npz["stamp_ns"]) == 113

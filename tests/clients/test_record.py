@@ -106,7 +106,7 @@ def test_it_ends_by_itself_and_says_what_it_has(endless: Replay, out: Path) -> N
     assert code == 0
     assert end(out)["reason"] == "time is up"
     with open_recording(out) as opened:
-        assert [sensor.serial for sensor in opened.sensors] == [100, 101]
+        assert [sensor.info.serial for sensor in opened.sensors] == [100, 101]
         assert opened.metadata["server"] == f"localhost:{endless.port}"
         assert f"{opened.frame_count} frames of 2 sensors" in said
         assert is_whole(list(opened.frames()))
@@ -447,7 +447,7 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
     def last_setting() -> tuple[object, float]:
         with open_recording(out) as opened:
             (sensor,) = opened.sensors
-            return sensor.history[-1].values["sinc_length"], sensor.history[-1].rate_hz
+            return sensor.history[-1].info.settings["sinc_length"], sensor.history[-1].info.rate_hz
 
     with served(sinc_length=512) as server, server.client() as client, Recorder(out, server.port) as recorder:
         recorder.wait_for_frames(1)
@@ -456,7 +456,7 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
         recorder.wait_for_frames(20)
         assert recorder.stop() == 0
     with open_recording(out) as opened:
-        assert opened.sensors[0].settings["sinc_length"] == 512
+        assert opened.sensors[0].info.settings["sinc_length"] == 512
         assert is_whole(list(opened.frames()))
 
 

@@ -191,7 +191,7 @@ def test_a_position_that_no_sensor_can_have_costs_nothing(path: Path) -> None:
     made.finish({})
     with open_recording(path) as recording:
         assert [sensor.sensor for sensor in recording.sensors] == [0]
-        assert len(ReplayedSensors(recording.sensors).sensors) == 1
+        assert len(ReplayedSensors(recording).sensors) == 1
 
 
 @needs_another_user
@@ -214,7 +214,7 @@ def test_requests_are_answered_as_by_a_server_whose_sensors_are_lost(path: Path,
     server.run(1.0)
     expected = server.connect()
     with open_recording(path) as recording, contextlib.closing(Simulation()) as other:
-        replayed = ReplayedSensors(recording.sensors)
+        replayed = ReplayedSensors(recording)
         other.hub.start(Actions(other.hub, other.cycle, replayed).handle)
         client, codes = other.connect(), set[str]()
         for _ in range(300):
@@ -283,16 +283,16 @@ def test_the_offset_of_a_replay_is_that_of_the_recording(path: Path) -> None:
     made.frame(frame(0))
     made.finish({})
     with open_recording(path) as recording:
-        sensors = ReplayedSensors(recording.sensors)
+        sensors = ReplayedSensors(recording)
     (sensor,) = sensors.sensors
-    assert sensor.describe()["offset"] == (1.0,) * 6
+    assert sensor.describe()["offset"] == [1.0] * 6
     sensors.take(Event(0, {"event": "offset_changed", "sensor": 0, "offset": [2.0] * 6}))
     assert sensor.describe()["offset"] == [2.0] * 6
 
 
 def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
     with open_recording(path) as recording:
-        sensors = ReplayedSensors(recording.sensors)
+        sensors = ReplayedSensors(recording)
     for event, state in (("sensor_lost", "LOST"), ("sensor_back", "OP")):
         row = {"event": event, "sensor": 1, "settings": {"sinc_length": 32}, "rate_hz": 1600}
         row |= {"offset": [1.0] * 6, "delay_ms": {"force_torque": 1.0}}

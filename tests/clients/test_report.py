@@ -6,7 +6,7 @@ The samples are the virtual sensor's own, taken through the server's own stream 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 
 from bota_clients.report.checks import Check, Examination
-from bota_clients.report.series import CHANNELS, Subject, channel_limit, limit_origin, subject
+from bota_clients.report.series import CHANNELS, Subject, channel_limit, limit_origin
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
-from bota_ethercat.sensor.meaning import meaning
 from ethercat_server.virtual_sensor.signals import poses
-from tests.clients.simulated import Script, decoded, described, sensor, simulate, subject_of
+from tests.clients.simulated import Script, described, sensor, simulate, subject_of
 from tests.virtual_sensor.motions import measured, turning
 
 SLOW = 512  # SINC length for what does not depend on the rate: 100 Hz
@@ -50,6 +49,11 @@ def expect(given: Subject, found: dict[str, tuple[Level, str]] | None = None) ->
 
 def check_of(examination: Examination, name: str) -> Check:
     return next(check for check in examination.checks if check.name == name)
+
+
+def with_settings(given: Subject, settings: Mapping[str, Any] | None = None, **info: Any) -> Subject:
+    """With these settings in force."""
+    return replace(given, info=given.info._replace(settings=settings or {}, **info))
 
 
 def changed(given: Subject, **columns: Any) -> Subject:
@@ -260,22 +264,22 @@ def test_late_stamps_are_uneven_and_no_losses(healthy: Subject) -> None:
 
 def test_settings_that_are_not_those_in_force_are_found(healthy: Subject) -> None:
     check = check_of(
-        Examination(replace(healthy, settings={**healthy.settings, "sinc_length": 64})), "Sampling rate"
+        Examination(with_settings(healthy, {**healthy.settings, "sinc_length": 64})), "Sampling rate"
     )
     assert (check.level, "the settings say 800.000 Hz" in check.found) == (TROUBLE, True)
 
 
 def test_without_settings_nothing_is_called_healthy(healthy: Subject) -> None:
     unknown = dict.fromkeys((FORCE_TORQUE, "Sampling rate"), (NOT_POSSIBLE, "not known|Neither"))
-    assert expect(replace(healthy, settings={}, rate_hz=0.0), unknown).headline == "Not conclusive"
-    raw = Examination(replace(healthy, settings={**healthy.settings, "calibration_matrix": False}))
+    assert expect(with_settings(healthy, rate_hz=0.0), unknown).headline == "Not conclusive"
+    raw = Examination(with_settings(healthy, {**healthy.settings, "calibration_matrix": False}))
     assert "raw counts" in check_of(raw, FORCE_TORQUE).found
 
 
 def test_an_imu_that_is_off_is_no_reason_not_to_be_healthy(healthy: Subject) -> None:
     nothing = np.zeros((len(healthy.columns), 3))
     constant = changed(healthy, acceleration=nothing, angular_rate=nothing)
-    off = replace(constant, settings={**healthy.settings, "imu_active": 0})
+    off = with_settings(constant, {**healthy.settings, "imu_active": 0})
     assert "Not applicable: noise of the IMU, gravity" in expect(off).sentence
     assert check_of(Examination(constant), "Stuck values").level is TROUBLE
 
@@ -311,33 +315,10 @@ def test_too_little_is_not_conclusive(healthy: Subject, count: int) -> None:
     assert TROUBLE not in {check.level for check in examination.checks}
 
 
-def test_descriptions_are_taken_for_what_they_are() -> None:
-    row = {
-        "name": ["a"],
-        "serial": -1,
-        "rate_hz": "fast",
-        "firmware": "x" * 5000,
-        "hardware": "\x1b[31m\u202e",
-    }
-    settings: dict[Any, Any] = {"sinc_length": "64", "fir": 1, "no such": 1, 7: 7, "fast": True}
-    settings |= {f"s{number}": number for number in range(99)}
-    made = subject(row, settings, decoded([]), "s", 0)
-    assert made.settings == {"fast": True}
-    assert (made.rate_hz, made.nominal_period_s) == (0.0, None)
-    assert len(made.firmware) <= 80
-    assert made.hardware.isprintable()
-    (remark,) = made.remarks
-    assert "ignored: sinc_length, fir, no such, 7" in remark
-
-
 def test_a_rate_that_chop_divides_is_that_of_the_report() -> None:
     settings = {"sinc_length": 64, "fir": False, "chop": True}
-    made = [subject({"rate_hz": rate_hz}, settings, decoded([]), "s", 0) for rate_hz in (400, 800)]
+    made = [subject_of([], {"sensor": 0, "rate_hz": rate_hz, "settings": settings}) for rate_hz in (400, 800)]
     assert [each.nominal_period_s for each in made] == [0.0025, 0.00125]
-    assert meaning(settings, 400).lines()[:2] == [
-        "sampling rate 400 Hz",
-        "force and torque: cut-off not in the table, delay unknown: CHOP",
-    ]
 
 
 def test_limits_are_botas_at_the_published_lengths_and_between_them_in_between() -> None:

@@ -128,7 +128,10 @@ def two() -> tuple[str, str]:
         "settings": {**described()["settings"], EVIL: 1, "sinc_length": EVIL},
     }  # fmt: skip
     first = subject_of(simulate(1), row, source=EVIL)
-    examined = [Examination(first), Examination(replace(first, position=1, serial=9, columns=decoded([])))]
+    examined = [
+        Examination(first),
+        Examination(replace(first, info=first.info._replace(sensor=1, serial=9), columns=decoded([]))),
+    ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike
         return render(examined, made=MADE, program="p", note=EVIL), as_json(examined)

@@ -32,7 +32,6 @@ from bota_clients.program import interrupt_on_signals, say
 from bota_clients.recording.columns import Ints, columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import angular_rate_response
-from bota_ethercat.settings import known_settings
 from ft_compensation.identification.delay import at_times, hann_window, lowest, smoothed
 
 Array = npt.NDArray[np.float64]
@@ -272,10 +271,10 @@ def run(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     with open_recording(options.recording) as recording:
         rows = []
-        for settings, frames in recording.batches(choose(recording, options.sensor).sensor):
+        for info, frames in recording.batches(choose(recording, options.sensor).sensor):
             table = columns(frames, options.imu_units)
             table = table.where(table.fresh & np.isfinite(table.angular_rate).all(axis=1))
-            delay_s = angular_rate_response(known_settings(settings.values)).delay_s or 0.0
+            delay_s = angular_rate_response(info.settings).delay_s or 0.0
             rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
     instants, rates = map(np.concatenate, zip(*rows, strict=True))
     if (np.diff(instants) <= 0).any():

@@ -37,7 +37,6 @@ from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor.response import delays_ms
-from bota_ethercat.settings import known_settings
 from bota_ethercat.text.json_text import parse_json_object
 
 _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
@@ -282,10 +281,10 @@ def windows_of(
     RecordingError for the first frame without a window.
     """
     done, clocks, waiting = 0, np.zeros((2, 0), np.int64), np.zeros((2, 0), np.int64)
-    for settings, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
+    for info, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
         until_ns = windows.until_ns
-        if settings is not None:
-            windows.configure(settings.values, settings.rate_hz, settings.identity.name, settings.offset)
+        if info is not None:
+            windows.configure(info.settings, info.rate_hz, info.name, info.offset)
             samples = windows.take(batch)
             clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
             if clocks.size:
@@ -330,8 +329,8 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         # In force from `stamp_ns` on, with delays of the filters; null: unknown, and taken to be 0.
         "settings": [
             {
-                **row._asdict(), "offset": None, "identity": row.identity._asdict(),
-                "delay_ms": delays_ms(known_settings(row.values), row.rate_hz),
+                "stamp_ns": row.stamp_ns, **row.info._asdict(), "offset": None,
+                "delay_ms": delays_ms(row.info.settings, row.info.rate_hz),
             }
             for row in sensor.history
         ],

@@ -19,7 +19,6 @@ from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
-from bota_ethercat.settings import known_settings
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
@@ -133,7 +132,7 @@ def run(options: IdentifyOptions) -> int:
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
         for row in sensor.history:
-            known = known_settings(row.values)
+            known = row.info.settings
             if why := not_newtons(known, has_tool=True) or hides_gravity(known):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")
         data, offset = at_last_offset(recording, sensor, options.imu_units)
@@ -157,7 +156,7 @@ def run(options: IdentifyOptions) -> int:
         _say(error or "no result")
         return 1
     if options.yaml is not None:
-        who = f"{sensor.name}, serial number {sensor.serial}, from {options.path.name}"
+        who = f"{sensor.info.name}, serial number {sensor.info.serial}, from {options.path.name}"
         gravity = None if options.gravity is None else (0.0, 0.0, -options.gravity)
         write_yaml(
             options.yaml,
@@ -186,7 +185,7 @@ def choose(recording: Recording, position: int | None) -> RecordedSensor:
     sensor = there.get(next(iter(there)) if position is None else position)
     if sensor is None:
         raise RecordingError(f"{recording.path} has no samples of sensor {position}")
-    serials = list(dict.fromkeys(row.identity.serial for row in sensor.history))
+    serials = list(dict.fromkeys(row.info.serial for row in sensor.history))
     if len(serials) > 1:
         raise RecordingError(
             f"{recording.path}: sensor {sensor.sensor} was replaced during it (serial numbers "

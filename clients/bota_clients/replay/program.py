@@ -8,7 +8,6 @@ import math
 import sys
 import time
 from functools import partial
-from itertools import takewhile
 from typing import Any, Final, NoReturn
 
 from bota_clients.errors import RecordingError
@@ -56,13 +55,9 @@ class Player:
 
     def __init__(self, recording: Recording, options: ReplayOptions, signals: Signals) -> None:
         """RecordingError if there is nothing to play, ServerError if it cannot be served."""
-        self.sensors = ReplayedSensors(recording.sensors)
+        self.sensors = ReplayedSensors(recording)
         if not self.sensors.sensors:
             raise RecordingError(f"{recording.path} has neither frames nor sensors: there is nothing to play")
-        # As the first subscriber finds it: its description comes before its first frame.
-        for item in takewhile(lambda item: not isinstance(item, DataMessage), recording.everything()):
-            if isinstance(item, Description):
-                self.sensors.describe(item)
         self.hub = Hub(SocketTransport(options.hosts, options.port))
         self._recording = recording
         self._options = options

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable
+from itertools import takewhile
 from typing import Any, Final, NoReturn
 
-from bota_clients.recording.reader import Description, Event, Identity, RecordedSensor
+from bota_clients.recording.reader import Description, Event, Recording
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.control import ErrorCode, Request
 from bota_ethercat.control import Event as ServerEvent
@@ -25,14 +25,11 @@ _IN_FORCE: Final = ("settings", "rate_hz", "delay_ms", "offset")
 class ReplayedSensor:
     """One sensor as the recording last described it, and what was sent of it."""
 
-    def __init__(self, recorded: RecordedSensor) -> None:
-        self.row: dict[str, Any] = {**recorded._asdict(), "state": "OP"}
-        for name in ("history", "frames", "offsets"):
-            del self.row[name]
-        if recorded.offsets and recorded.offsets[0].offset is not None:
-            self.row["offset"] = recorded.offsets[0].offset
-        if recorded.rate_hz.is_integer():
-            self.row["rate_hz"] = int(recorded.rate_hz)
+    def __init__(self, position: int) -> None:
+        self.row: dict[str, Any] = {
+            "sensor": position, "name": "?", "serial": 0, "hardware": "?", "firmware": "?", "pdo_size": 0,
+            "rate_hz": 0.0, "settings": {}, "state": "OP",
+        }  # fmt: skip
         self._frames = Counter[int]()  # by the flags that say that they are not new
         self._not_finite = 0
         self._emergencies = 0
@@ -105,12 +102,13 @@ class ReplayedSensors:
         sent: number of frames.
     """
 
-    def __init__(self, recorded: Iterable[RecordedSensor]) -> None:
-        found = {sensor.sensor: sensor for sensor in recorded}
-        self.sensors = [
-            ReplayedSensor(found.get(at) or RecordedSensor(at, *Identity(), 0.0, {}, (), 0))
-            for at in range(max(found, default=-1) + 1)
-        ]
+    def __init__(self, recording: Recording) -> None:
+        count = max((sensor.sensor + 1 for sensor in recording.sensors), default=0)
+        self.sensors = [ReplayedSensor(position) for position in range(count)]
+        # As the first subscriber finds them: their description comes before their first frame.
+        for item in takewhile(lambda item: not isinstance(item, DataMessage), recording.everything()):
+            if isinstance(item, Description):
+                self.describe(item)
         self.sent = 0
         self._started = time.monotonic()
 

@@ -101,7 +101,7 @@ def make(options: ReportOptions) -> tuple[str, int]:
 
 def _summary(examination: Examination) -> str:
     subject = examination.subject
-    who = f"Sensor {subject.position} ({subject.who})"
+    who = f"Sensor {subject.info.sensor} ({subject.who})"
     lines = [f"{who}: {examination.headline}. {examination.sentence}"]
     lines += [f"  {remark}" for remark in subject.remarks]
     for check in examination.checks:

@@ -55,11 +55,11 @@ def render(examinations: Sequence[Examination], *, made: str, program: str, note
 def _view(examination: Examination) -> dict[str, Any]:
     """What the template shows of one sensor, beside the examination's own."""
     subject, series = examination.subject, examination.series
-    rate_hz, chop = round(subject.rate_hz), subject.settings.get("chop")
+    rate_hz, chop = round(subject.info.rate_hz), subject.settings.get("chop")
     groups = [group for group in GROUPS if not (group.is_imu and series.imu_off)]
     return {
         "headline": examination.headline,
-        "name": f"Sensor {subject.position}: {subject.who}",
+        "name": f"Sensor {subject.info.sensor}: {subject.who}",
         "settings": [
             (setting, str(value).lower(), value_meaning(setting, value, rate_hz, chop))
             for setting in SETTINGS
@@ -99,7 +99,8 @@ def as_json(examinations: Sequence[Examination]) -> str:
     return json.dumps(
         [
             {
-                "sensor": each.subject.position, "name": each.subject.name, "serial": each.subject.serial,
+                "sensor": each.subject.info.sensor, "name": each.subject.info.name,
+                "serial": each.subject.info.serial,
                 "source": each.subject.source, "verdict": each.level.key,
                 "sentence": each.sentence, "remarks": list(each.subject.remarks),
                 "stream": {"verdict": each.stream.level.key, "sentence": each.stream.sentence},

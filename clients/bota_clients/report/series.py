@@ -1,7 +1,6 @@
 """What a report is about: one sensor's settings and frames, and its new, valid samples on a time axis.
 
-Everything comes from a file or the network: texts are cut to one printable line; settings that are unknown
-or invalid are omitted, with a remark. A sample is a frame that is neither REPEATED nor INVALID. Times are
+A sample is a frame that is neither REPEATED nor INVALID. Times are
 seconds of CLOCK_MONOTONIC since the first frame.
 """
 
@@ -9,22 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from bota_clients.numbers import listing
 from bota_clients.recording.columns import Columns, Floats, Ints
 from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.health.verdict import LIMITS
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.filters import LONG_SINC, SHORT_SINC, noise_limit
-from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, known_settings, rate_divisor
-from bota_ethercat.text.untrusted import printable, whole
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
+from bota_ethercat.text.untrusted import printable
 
 Bools = npt.NDArray[np.bool_]
 
-_LONGEST_TEXT: Final = 80
 _HIGHEST_RATE_HZ: Final = 100_000.0
 
 
@@ -32,21 +30,20 @@ _HIGHEST_RATE_HZ: Final = 100_000.0
 class Subject:
     """One sensor and its frames."""
 
-    position: int
-    name: str
-    serial: int | None
-    hardware: str
-    firmware: str
-    rate_hz: float  # nominal, as described; 0 if unknown
-    settings: Mapping[str, SettingValue]  # those that exist and have a valid value
+    info: SensorInfo
     columns: Columns
-    source: str  # a file name or a server's address
+    source: str  # a file name
     remarks: tuple[str, ...] = ()  # sentences about the recording for the reader of the report
 
     @property
     def who(self) -> str:
         """Name and serial number."""
-        return f"{self.name}, serial {_text(self.serial)}"
+        return f"{self.info.name or '?'}, serial {'?' if self.info.serial is None else self.info.serial}"
+
+    @property
+    def settings(self) -> Mapping[str, SettingValue]:
+        """Those that are known."""
+        return self.info.settings
 
     @property
     def sinc_length(self) -> int | None:
@@ -56,43 +53,15 @@ class Subject:
     @property
     def nominal_period_s(self) -> float | None:
         """From the settings; None if unknown."""
+        rate_hz = self.info.rate_hz
         if self.sinc_length is not None:
-            divisor = rate_divisor(self.sinc_length, round(self.rate_hz), self.settings.get("chop"))
+            divisor = rate_divisor(self.sinc_length, round(rate_hz), self.settings.get("chop"))
             return self.sinc_length * (divisor or 1) / BASE_SAMPLING_RATE_HZ
-        return 1 / self.rate_hz if 0 < self.rate_hz <= _HIGHEST_RATE_HZ else None
+        return 1 / rate_hz if 0 < rate_hz <= _HIGHEST_RATE_HZ else None
 
     def with_remarks(self, remarks: Iterable[str]) -> Subject:
         """The same with more remarks."""
         return replace(self, remarks=(*self.remarks, *(printable(remark, 300) for remark in remarks)))
-
-
-def subject(
-    description: Mapping[str, Any], settings: object, columns: Columns, source: str, position: int
-) -> Subject:
-    """The sensor that one row of a reply to `describe` describes."""
-    known, remarks = known_settings(settings), list[str]()
-    if not isinstance(settings, dict):
-        remarks.append("The settings are not known.")
-    elif ignored := [printable(name, 40) for name in settings if name not in known]:
-        remarks.append(
-            f"Settings that do not exist, or not with this value, were ignored: {listing(ignored)}."
-        )
-    rate = description.get("rate_hz")
-    return Subject(
-        position=position,
-        name=_text(description.get("name")),
-        serial=whole(description.get("serial")),
-        hardware=_text(description.get("hardware")),
-        firmware=_text(description.get("firmware")),
-        rate_hz=float(rate) if isinstance(rate, int | float) and 0 < rate <= _HIGHEST_RATE_HZ else 0.0,
-        settings=known,
-        columns=columns,
-        source=printable(source),
-    ).with_remarks(remarks)
-
-
-def _text(value: object) -> str:
-    return "not known" if value is None or value == "" else printable(value, _LONGEST_TEXT)
 
 
 class Group(NamedTuple):
