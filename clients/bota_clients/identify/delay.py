@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Mapping
@@ -10,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from bota_clients.errors import RecordingError
-from bota_clients.identify.cli import IdentifyOptions
 from bota_clients.identify.program import choose
 from bota_clients.program import say
 from bota_clients.recording.columns import Columns
@@ -22,7 +22,7 @@ from ft_compensation.identification.delay import Lag, find_lag
 from ft_compensation.quantities import CompensationError
 
 
-def run(options: IdentifyOptions) -> int:
+def run(options: argparse.Namespace) -> int:
     """Find it; returns the exit code."""
     with open_recording(options.path) as recording:
         sensor = choose(recording, options.sensor)

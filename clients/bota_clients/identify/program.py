@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -12,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 
 from bota_clients.errors import RecordingError
-from bota_clients.identify.cli import IdentifyOptions
 from bota_clients.identify.stationary_periods import LEAST_S, StationaryPeriod, find_stationary_periods
 from bota_clients.program import say
 from bota_clients.recording.own_offset import at_last_offset
@@ -123,7 +123,7 @@ def as_json(
     }
 
 
-def run(options: IdentifyOptions) -> int:
+def run(options: argparse.Namespace) -> int:
     """Identify; returns the exit code."""
     if options.yaml is not None:
         refuse_existing(options.yaml, force=options.force)
@@ -195,7 +195,7 @@ def choose(recording: Recording, position: int | None) -> RecordedSensor:
 
 
 def _solve(
-    periods: Sequence[StationaryPeriod], options: IdentifyOptions
+    periods: Sequence[StationaryPeriod], options: argparse.Namespace
 ) -> tuple[Poses, Identified | None, str | None]:
     """The periods that are poses, and the result or why there is none."""
     poses: list[tuple[StationaryPeriod, Pose]] = []

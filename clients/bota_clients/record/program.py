@@ -5,6 +5,7 @@ Progress is a line on standard error, if that is a terminal.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import time
 from collections.abc import Callable
@@ -16,7 +17,6 @@ from rich.text import Text
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import duration
 from bota_clients.program import Signals, say
-from bota_clients.record.cli import RecordOptions
 from bota_clients.record.recorder import BATCH_S, NAME, Batch, Recorder, Source, notes
 from bota_clients.recording.reader import Event
 from bota_ethercat.errors import RefusedError
@@ -27,7 +27,7 @@ from bota_ethercat.text.untrusted import printable
 _say = partial(say, "ethercat-record")
 
 
-def run(options: RecordOptions, signals: Signals) -> int:
+def run(options: argparse.Namespace, signals: Signals) -> int:
     """Record; returns the exit code."""
     with contextlib.closing(Source(options.address, options.sensors)) as source:
         try:
@@ -38,7 +38,7 @@ def run(options: RecordOptions, signals: Signals) -> int:
         return _record(source, options, signals)
 
 
-def _record(source: Source, options: RecordOptions, signals: Signals) -> int:
+def _record(source: Source, options: argparse.Namespace, signals: Signals) -> int:
     console = Console(stderr=True, highlight=False)
     show = partial(console.print, markup=False, soft_wrap=True)
     began, reason = time.monotonic(), "asked to stop"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import logging
 import math
@@ -13,7 +14,6 @@ from typing import Any, Final, NoReturn
 from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
 from bota_clients.recording.reader import Description, Event, Recording, open_recording
-from bota_clients.replay.cli import ReplayOptions
 from bota_clients.replay.sensors import ReplayedSensors, needs_sensor
 from bota_clients.replay.timeline import Timeline
 from bota_ethercat.control import Event as ServerEvent
@@ -34,7 +34,7 @@ _DRAIN_NS: Final = 10_000_000_000  # timeout for clients that do not read the la
 _say = partial(say, "ethercat-replay")
 
 
-def run(options: ReplayOptions, signals: Signals) -> int:
+def run(options: argparse.Namespace, signals: Signals) -> int:
     """Replay; returns the exit code."""
     logging.basicConfig(level=logging.INFO, format="ethercat-replay: %(message)s", stream=sys.stderr)
     try:
@@ -53,7 +53,7 @@ def run(options: ReplayOptions, signals: Signals) -> int:
 class Player:
     """What produces the frames, in place of the server's `Cycle`."""
 
-    def __init__(self, recording: Recording, options: ReplayOptions, signals: Signals) -> None:
+    def __init__(self, recording: Recording, options: argparse.Namespace, signals: Signals) -> None:
         """RecordingError if there is nothing to play, ServerError if it cannot be served."""
         self.sensors = ReplayedSensors(recording)
         if not self.sensors.sensors:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final
 from bota_clients.arguments import add_force, add_imu_units
 from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.health.verdict import Level
-from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.arguments import Parser, typed
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.output import discard_output, ends_with_its_reader
@@ -25,19 +24,7 @@ if TYPE_CHECKING:
 _PROGRAM: Final = "ethercat-report"
 
 
-class ReportOptions(argparse.Namespace):
-    """What to report on, and where to."""
-
-    recording: Path
-    output: Path
-    force: bool
-    sensor: SensorChoice | None
-    imu_units: ImuUnits
-    note: str
-    json: bool
-
-
-def parse_options(argv: Sequence[str] | None) -> ReportOptions:
+def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; argparse exits with 2 if it is wrong."""
     made = Parser(
         _PROGRAM,
@@ -53,7 +40,7 @@ def parse_options(argv: Sequence[str] | None) -> ReportOptions:
     add_imu_units(made)
     add("--note", default="", metavar="TEXT", help="a remark for the head of the page")
     add("--json", action="store_true", help="print the checks as JSON")
-    options = made.parse_args(argv, ReportOptions())
+    options = made.parse_args(argv)
     recording = options.recording
     if is_address(str(recording)) and not recording.exists():
         made.error(f"{recording} is a server's address: record its stream first, with ethercat-record")
@@ -69,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return start(_PROGRAM, "report.cli", parse_options(argv))
 
 
-def run(options: ReportOptions) -> int:
+def run(options: argparse.Namespace) -> int:
     """Make a report; returns the exit code."""
     try:
         words, exit_code = make(options)
@@ -84,7 +71,7 @@ def run(options: ReportOptions) -> int:
     return exit_code
 
 
-def make(options: ReportOptions) -> tuple[str, int]:
+def make(options: argparse.Namespace) -> tuple[str, int]:
     """Write the report; the words for the standard output, and the exit code."""
     from bota_clients.report import checks, page, subjects  # noqa: PLC0415 - needs the extra
 

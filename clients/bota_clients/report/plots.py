@@ -1,10 +1,9 @@
-"""The plots of the page, as inline SVG, text as text, reproducible. No text from a device is drawn."""
+"""The plots of the page, as pictures in it. No text from a device is drawn."""
 
 from __future__ import annotations
 
-import html
+import base64
 import io
-import re
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -12,7 +11,7 @@ import matplotlib as mpl
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from bota_clients.numbers import count, seconds
@@ -25,8 +24,6 @@ AXES: Final = ("#c44601", "#00795c", "#1763c6")
 INK, MUTED, GRID, BAD, LIMIT, PLAIN = "#1b1f24", "#5b6570", "#e3e7eb", "#b3201b", "#7a3e9d", "#5d7896"
 
 STYLE: Final[dict[str, Any]] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "ethercat-report",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 8.5,
     "text.color": INK,
@@ -49,41 +46,24 @@ STYLE: Final[dict[str, Any]] = {
     "xtick.labelcolor": INK,
     "ytick.labelcolor": INK,
     "lines.linewidth": 1.0,
-    "path.simplify_threshold": 0.2,
 }
 
-_DROPPED: Final = re.compile(
-    r"<\?xml.*?\?>|<!DOCTYPE.*?>|<!--.*?-->|<metadata>.*?</metadata>|<style type=\"text/css\">.*?</style>",
-    re.DOTALL,
-)
-_OPENING: Final = re.compile(r"<svg\b[^>]*?(viewBox=\"[^\"]*\")[^>]*>", re.DOTALL)
-_IDENTIFIER: Final = re.compile(r'(\bid="|url\(#|href="#)')
+_DPI: Final = 120
 
 
-def draw(name: str, title: str, paint: Callable[..., str], *arguments: Any) -> str | None:
-    """The SVG of the figure that one of the functions below paints from `arguments`.
+def draw(paint: Callable[..., str], *arguments: Any) -> tuple[str, str] | None:
+    """The figure that one of the functions below paints from `arguments`, as a data URL, and what it shows.
 
-    `paint` returns what is in the plot, for screen readers, as `title` is; None if it has nothing to show.
-    `name` must be unique in the page.
+    None if it has nothing to show.
     """
     with mpl.style.context(STYLE, after_reset=True):
         figure = Figure()
-        FigureCanvasSVG(figure)
-        description = paint(figure, *arguments)
-        if not description:
+        FigureCanvasAgg(figure)
+        if not (description := paint(figure, *arguments)):
             return None
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    svg = _DROPPED.sub("", buffer.getvalue())
-    svg = _IDENTIFIER.sub(rf"\1{name}-", svg)
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" {{box}} '
-        f'role="img" aria-labelledby="{name}-title {name}-desc">'
-        f'<title id="{name}-title">{html.escape(title)}</title>'
-        f'<desc id="{name}-desc">{html.escape(description)}</desc>'
-    )
-    svg = _OPENING.sub(lambda m: head.format(box=m[1]), svg, count=1)
-    return "\n".join(line.strip() for line in svg.splitlines() if line.strip())
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=_DPI)
+    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}", description
 
 
 def _margins(figure: Figure, **space: float) -> None:
