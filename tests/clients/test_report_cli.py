@@ -161,9 +161,6 @@ def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(report: Report) 
         number(frames()[SPLIT:]),
     )
     assert report.lacks(*words, "The settings were changed") == ["The settings were changed"]
-    assert "serial 4711): Not conclusive" in report.again("--sensor", "serial:4711")[1]
-    assert report.lacks(number(frames()[:SPLIT])) == []
-    assert "serial 4711), 0 (BFT-SENS-ECAT-M8, serial 99)" in report.again("--sensor", "serial:7")[2]
 
 
 def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(report: Report) -> None:
@@ -171,8 +168,6 @@ def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(report: Report) -> N
     code, out = report.of(describe(*rows), frames(), sensors="0 4")
     assert (code, out.count("serial")) == (0, 1)
     assert report.lacks("Not recorded, because others were chosen: sensor 1 and 2.") == []
-    code, _, err = report.again("--sensor", "1")
-    assert (code, "has no sensor 1: it has 0 (BFT-SENS-ECAT-M8, serial 100)\n" in err) == (1, True)
 
 
 def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(report: Report) -> None:
@@ -182,22 +177,12 @@ def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(report: R
         assert "The recording was cut off: it has no footer" in said
 
 
-def test_sensors_are_chosen_by_place_serial_or_name(report: Report) -> None:
-    record(report.path, SENSOR, frames())
-    code, _, err = report.run(report.path, "--sensor", "serial:9")
-    assert (code, report.out.exists()) == (1, False)
-    assert "has no sensor serial:9: it has 0 (BFT-SENS-ECAT-M8, serial 4711)" in err
-    for choice in ("serial:4711", "0", "BFT-SENS-ECAT-M8"):
-        assert report.again("--sensor", choice)[0] == 0
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ("", "required"),
         ("localhost:1", "record its stream first"),
         ("a.mcap -o a.mcap", "would overwrite the recording"),
-        ("a.mcap --sensor=", "must be"),
     ],
 )
 def test_wrong_usage(report: Report, arguments: str, words: str) -> None:

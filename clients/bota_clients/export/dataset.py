@@ -18,7 +18,6 @@ import json
 import math
 import shutil
 import tempfile
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -27,8 +26,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.cli import DATASETS, PROGRAM, Advance
-from bota_clients.export.windows import Array, Arrays, Windows, offset_of, read_tool
+from bota_clients.export.cli import DATASETS, PROGRAM
+from bota_clients.export.windows import Arrays, Windows, offset_of, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
@@ -274,7 +273,6 @@ def windows_of(
     frames: Periodic | Stamped,
     windows: Windows,
     sensor: int = 0,
-    advance: Advance = lambda _: None,
 ) -> Iterator[Arrays]:
     """Blocks of f frames: `stamp_ns` as given, `monotonic_ns` of the exposure, and their `Windows.at`.
 
@@ -298,7 +296,6 @@ def windows_of(
             yield {"stamp_ns": ready[0], "monotonic_ns": ready[1], **windows.at(ready[1])}
         done, waiting = done + len(ready[0]), waiting[:, len(ready[0]) :]
         windows.forget(min([until_ns, *waiting[1, :1].tolist()]))
-        advance(len(batch))
     if not clocks.size:
         raise RecordingError(f"{recording.path} has no new and valid samples")
     if isinstance(frames, Stamped) and done < frames.count:
@@ -309,7 +306,7 @@ def windows_of(
         raise RecordingError("the recording is too short for a frame")
 
 
-def write(options: argparse.Namespace, recording: Recording, advance: Advance) -> str:
+def write(options: argparse.Namespace, recording: Recording) -> str:
     """Windows for the frames that are asked for, into a file; says of how many samples."""
     clock = options.clock and Clock.read(options.clock)
     tool = options.tool and read_tool(options.tool)
@@ -321,7 +318,7 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         frames = Stamped(read_stamps(options.at, options.column), str(options.at), options.latency, clock)
     if tool and any(tool.get("bias", ())):
         _check_offsets(options.tool, tool, recording, sensor.offsets)
-    windows = Windows(length, hold=options.hold, tool=tool, imu_units=options.imu_units)
+    windows = Windows(length, tool=tool, imu_units=options.imu_units)
     about = {
         "program": f"{PROGRAM} {VERSION}",
         "options": vars(options),
@@ -343,7 +340,7 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
     if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
         raise FileError(f"{path} {EXISTS}")
     with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
-        made, blocks = Path(folder, path.name), windows_of(recording, frames, windows, sensor.sensor, advance)
+        made, blocks = Path(folder, path.name), windows_of(recording, frames, windows, sensor.sensor)
         _WRITERS[path.suffix](made, json.dumps(about, default=str), _in_chunks(blocks))
         if path.is_dir():
             shutil.rmtree(path)
@@ -397,19 +394,10 @@ def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
 
 
 def _npz(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
-    """An array for each name, and `attributes`, text; on disk until their length is known."""
-    like = Arrays()
-    for like in blocks:
-        for name, array in like.items():
-            with (path.parent / name).open("ab") as file:
-                array.tofile(file)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, array in (like | {"attributes": np.array(about)}).items():
-            whole: Array = array
-            if name in like:
-                whole = np.memmap(path.parent / name, array.dtype, "r").reshape(-1, *array.shape[1:])
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, whole, allow_pickle=False)
+    """An array for each name, and `attributes`, text."""
+    made = list(blocks)
+    arrays: dict[str, Any] = {name: np.concatenate([block[name] for block in made]) for name in made[0]}
+    np.savez(path, attributes=np.array(about), **arrays)
 
 
 def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from bota_clients.errors import RecordingError
-from bota_clients.record import recorder as files
+from bota_clients.record.recorder import Source, record
 from bota_ethercat.address import Address
 from bota_ethercat.errors import ProtocolError
 
@@ -63,13 +63,9 @@ class Recorder:
             self._said = f"The recording failed: {error}", True
 
     def _record(self, path: Path) -> str:
-        with contextlib.closing(files.Source(self._address, None)) as source:
+        with contextlib.closing(Source(self._address, None)) as source:
             source.connect()
-            with files.Recorder(path, files.NAME, files.notes(source), overwrite=False) as recorder:
-                while not (self._asked.wait(files.BATCH_S) or recorder.failed):
-                    recorder.put(source.batch())
-                source.close()
-                recorder.stop("asked to stop")
+            recorder = record(source, path, lambda *_: "asked to stop" if self._asked.is_set() else None)
         if recorder.error is not None:
             raise recorder.error
         return recorder.so_far

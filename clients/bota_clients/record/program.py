@@ -17,7 +17,7 @@ from rich.text import Text
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import duration
 from bota_clients.program import Signals, say
-from bota_clients.record.recorder import BATCH_S, NAME, Batch, Recorder, Source, notes
+from bota_clients.record.recorder import Batch, Recorder, Source, record
 from bota_clients.recording.reader import Event
 from bota_ethercat.errors import RefusedError
 from bota_ethercat.health.sentences import event_sentence
@@ -41,33 +41,26 @@ def run(options: argparse.Namespace, signals: Signals) -> int:
 def _record(source: Source, options: argparse.Namespace, signals: Signals) -> int:
     console = Console(stderr=True, highlight=False)
     show = partial(console.print, markup=False, soft_wrap=True)
-    began, reason = time.monotonic(), "asked to stop"
-    made = Recorder(options.path, NAME, notes(source), overwrite=options.force)
-    with made as recorder, console.status("") as status:
+    began = time.monotonic()
+
+    def until(recorder: Recorder, batch: Batch) -> str | None:
+        _report(batch, show)
+        connected, passed_s = source.session.connected, time.monotonic() - began
+        of = "" if options.seconds is None else f" of {duration(options.seconds)}"
+        state = "" if connected else "no server, reconnecting; "
+        status.update(Text(f"{state}{duration(passed_s)}{of}, {recorder.so_far}"))
+        if signals.asked:
+            return "asked to stop"
+        if options.seconds is not None and passed_s >= options.seconds:
+            return "time is up"
+        return None if connected or options.reconnect else "the server ended"
+
+    with console.status("") as status:
         show(f"recording {options.address} to {options.path}; Ctrl-C ends it")
-        while True:
-            batch = source.batch()
-            recorder.put(batch)
-            _report(batch, show)
-            connected, passed_s = source.session.connected, time.monotonic() - began
-            if recorder.failed or signals.asked:
-                break
-            if options.seconds is not None and passed_s >= options.seconds:
-                reason = "time is up"
-                break
-            if not (connected or options.reconnect):
-                reason = "the server ended"
-                break
-            of = "" if options.seconds is None else f" of {duration(options.seconds)}"
-            state = "" if connected else "no server, reconnecting; "
-            status.update(Text(f"{state}{duration(passed_s)}{of}, {recorder.so_far}"))
-            time.sleep(BATCH_S)
-        passed_s = time.monotonic() - began
-        source.close()
-        recorder.stop(reason)
+        recorder = record(source, options.path, until, overwrite=options.force)
     if recorder.error is not None:
         _say(str(recorder.error))
-    _say(f"{options.path}: {duration(passed_s)}, {recorder.so_far}")
+    _say(f"{options.path}: {duration(time.monotonic() - began)}, {recorder.so_far}")
     return int(recorder.error is not None)
 
 

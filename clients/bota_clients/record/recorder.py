@@ -14,7 +14,7 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -283,6 +283,25 @@ class Recorder:
         counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self._counts().items()}
         dropped = str(self.dropped)
         self._writer.finish({"reason": self._reason, "dropped": dropped, "sensors": json.dumps(counts)})
+
+
+def record(
+    source: Source, path: Path, until: Callable[[Recorder, Batch], str | None], *, overwrite: bool = False
+) -> Recorder:
+    """Record what a connected source gives, and close it; the recorder, which has ended.
+
+    Until `until`, which is told each batch, has a reason to end, or nothing more can be written.
+    """
+    with Recorder(path, NAME, notes(source), overwrite=overwrite) as recorder:
+        reason = None
+        while not (reason or recorder.failed):
+            recorder.put(batch := source.batch())
+            reason = until(recorder, batch)
+            if not reason:
+                time.sleep(BATCH_S)
+        source.close()
+        recorder.stop(reason or "")
+    return recorder
 
 
 def _frames_in(batch: Iterable[object]) -> int:

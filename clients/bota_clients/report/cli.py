@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Final
 from bota_clients.arguments import add_force, add_imu_units
 from bota_clients.program import interrupt_on_signals, say, start
 from bota_ethercat.health.verdict import Level
-from bota_ethercat.program.arguments import Parser, typed
+from bota_ethercat.program.arguments import Parser
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.output import discard_output, ends_with_its_reader
 from bota_ethercat.program.server_choice import is_address
 from bota_ethercat.program.version import VERSION
-from bota_ethercat.sensor_choice import MEANING, SensorChoice
 
 if TYPE_CHECKING:
     from bota_clients.report.checks import Examination
@@ -36,7 +35,6 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     add("-o", "--output", type=Path, metavar="REPORT.html",
         help="where to write the page (default: beside the recording)")  # fmt: skip
     add_force(made)
-    add("--sensor", type=typed(SensorChoice.parse, MEANING), metavar="S", help=f"only this sensor: {MEANING}")
     add_imu_units(made)
     add("--note", default="", metavar="TEXT", help="a remark for the head of the page")
     add("--json", action="store_true", help="print the checks as JSON")
@@ -77,7 +75,7 @@ def make(options: argparse.Namespace) -> tuple[str, int]:
 
     interrupt_on_signals()
     with NewFile(options.output, force=options.force) as file:
-        found = subjects.of_recording(options.recording, options.sensor, options.imu_units)
+        found = subjects.of_recording(options.recording, options.imu_units)
         examinations = [checks.Examination(each) for each in found]
         now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         file.write(page.render(examinations, made=now, program=f"{_PROGRAM} {VERSION}", note=options.note))

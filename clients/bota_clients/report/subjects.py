@@ -10,14 +10,13 @@ from typing import Final
 
 import numpy as np
 
-from bota_clients.errors import ClientError
+from bota_clients.errors import RecordingError
 from bota_clients.numbers import count, listing, moment
 from bota_clients.recording.columns import Columns, columns, joined
 from bota_clients.recording.reader import InForce, RecordedSensor, Recording, open_recording
 from bota_clients.report.series import Subject
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import SensorInfo
-from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.text.untrusted import printable
 
 _MOST_EVENTS_NAMED: Final = 10
@@ -25,31 +24,17 @@ _MOST_SENSORS_NAMED: Final = 4
 _LONGEST_CHANGE_NS: Final = 2_000_000_000  # a change of settings takes the sensor out of operation for less
 
 
-def of_recording(path: Path, choice: SensorChoice | None, imu_units: ImuUnits) -> list[Subject]:
-    """The sensors of the recording at `path`, or those chosen, by position.
-
-    RecordingError if it cannot be read, ClientError if it has no such sensor.
-    """
+def of_recording(path: Path, imu_units: ImuUnits) -> list[Subject]:
+    """The sensors of the recording at `path`, by position; RecordingError if there is none to be read."""
     with open_recording(path) as recording:
         recorded = [s for s in recording.sensors if not recording.chosen or s.sensor in recording.chosen]
-        found = [sensor for sensor in recorded if _meant(sensor, choice)]
-        if not found:
-            raise _no_sensor(path, choice, recorded)
+        if not recorded:
+            raise RecordingError(f"{path} has no sensor")
         remarks = [f"The recording was cut off: {recording.cut_off}."] if recording.cut_off else []
         if others := [str(sensor.sensor) for sensor in recording.sensors if sensor not in recorded]:
             remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
         remarks += _event_remarks(event.name for event in recording.events)
-        subjects = [_subject(recording, sensor, choice, imu_units) for sensor in found]
-        return [subject.with_remarks(remarks) for subject in subjects]
-
-
-def _no_sensor(path: Path, choice: SensorChoice | None, there: Sequence[RecordedSensor]) -> ClientError:
-    """The error that the chosen sensor does not exist, with those that do."""
-    rows = [row.info for sensor in there for row in sensor.history]
-    known = list(dict.fromkeys(f"{info.sensor} ({info.name}, serial {info.serial})" for info in rows))
-    if choice is None or not known:
-        return ClientError(f"{path} has no sensor")
-    return ClientError(f"{path} has no sensor {choice}: it has {', '.join(known[:16])}")
+        return [_subject(recording, sensor, imu_units).with_remarks(remarks) for sensor in recorded]
 
 
 def _event_remarks(names: Iterable[str]) -> list[str]:
@@ -60,18 +45,7 @@ def _event_remarks(names: Iterable[str]) -> list[str]:
     return [f"Events of the whole recording: {listing(told, _MOST_EVENTS_NAMED)}."] if told else []
 
 
-def _meant(sensor: RecordedSensor, choice: SensorChoice | None) -> bool:
-    """Whether it was a chosen sensor at any time."""
-    return any(_is(choice, row.info) for row in sensor.history) or _is(choice, sensor.info)
-
-
-def _is(choice: SensorChoice | None, info: SensorInfo) -> bool:
-    return choice is None or choice.matches(info.sensor, info.name, info.serial or 0)
-
-
-def _subject(
-    recording: Recording, sensor: RecordedSensor, choice: SensorChoice | None, imu_units: ImuUnits
-) -> Subject:
+def _subject(recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) -> Subject:
     """Its longest stretch without a change of settings or sensor."""
     # The order in the file decides what came first, because clocks differ.
     stretches: list[tuple[SensorInfo, list[Columns]]] = [(sensor.info, [columns([])])]
@@ -79,8 +53,7 @@ def _subject(
         if InForce(0, stretches[-1][0]).is_changed(info):
             stretches.append((info, []))
         stretches[-1][1].append(columns(frames, imu_units))
-    meant = [number for number, (info, _) in enumerate(stretches) if _is(choice, info)]
-    longest = max(meant, key=lambda number: sum(map(len, stretches[number][1])), default=0)
+    longest = max(range(len(stretches)), key=lambda number: sum(map(len, stretches[number][1])))
     kept, found = stretches[longest][0], joined(stretches[longest][1])
     if longest + 1 < len(stretches):
         # Without the end in which the change was made already: the sensor gives nothing then.
@@ -106,7 +79,7 @@ def _remarks(history: Sequence[SensorInfo], kept: SensorInfo, frames: Columns) -
     if len(there) > 1:
         remarks.append(
             f"The sensor was exchanged while it was recorded ({'; '.join([*there][:_MOST_SENSORS_NAMED])}): "
-            f"this report is of serial {kept.serial}; --sensor serial:N chooses."
+            f"this report is of serial {kept.serial}."
         )
     if changes := sum(new.serial == old.serial for old, new in pairwise(history)):
         remarks.append(f"The settings were changed {count(changes, 'time')} while it was recorded.")
