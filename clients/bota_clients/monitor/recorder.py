@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from bota_clients.errors import RecordingError
-from bota_clients.record.recorder import Source, record
+from bota_clients.record import recorder as files
 from bota_ethercat.address import Address
 from bota_ethercat.errors import ProtocolError
 
@@ -63,9 +63,10 @@ class Recorder:
             self._said = f"The recording failed: {error}", True
 
     def _record(self, path: Path) -> str:
-        with contextlib.closing(Source(self._address, None)) as source:
+        with contextlib.closing(files.Source(self._address, None)) as source:
             source.connect()
-            recorder = record(source, path, lambda *_: "asked to stop" if self._asked.is_set() else None)
+            recorder = files.Recorder(path, files.NAME, files.notes(source), overwrite=False)
+            files.record(source, recorder, lambda _: "asked to stop" if self._asked.is_set() else None)
         if recorder.error is not None:
             raise recorder.error
         return recorder.so_far

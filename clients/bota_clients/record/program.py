@@ -17,7 +17,7 @@ from rich.text import Text
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import duration
 from bota_clients.program import Signals, say
-from bota_clients.record.recorder import Batch, Recorder, Source, record
+from bota_clients.record.recorder import NAME, Batch, Recorder, Source, notes, record
 from bota_clients.recording.reader import Event
 from bota_ethercat.errors import RefusedError
 from bota_ethercat.health.sentences import event_sentence
@@ -43,7 +43,9 @@ def _record(source: Source, options: argparse.Namespace, signals: Signals) -> in
     show = partial(console.print, markup=False, soft_wrap=True)
     began = time.monotonic()
 
-    def until(recorder: Recorder, batch: Batch) -> str | None:
+    recorder = Recorder(options.path, NAME, notes(source), overwrite=options.force)
+
+    def until(batch: Batch) -> str | None:
         _report(batch, show)
         connected, passed_s = source.session.connected, time.monotonic() - began
         of = "" if options.seconds is None else f" of {duration(options.seconds)}"
@@ -55,9 +57,9 @@ def _record(source: Source, options: argparse.Namespace, signals: Signals) -> in
             return "time is up"
         return None if connected or options.reconnect else "the server ended"
 
-    with console.status("") as status:
+    with recorder, console.status("") as status:
         show(f"recording {options.address} to {options.path}; Ctrl-C ends it")
-        recorder = record(source, options.path, until, overwrite=options.force)
+        record(source, recorder, until)
     if recorder.error is not None:
         _say(str(recorder.error))
     _say(f"{options.path}: {duration(time.monotonic() - began)}, {recorder.so_far}")

@@ -285,23 +285,20 @@ class Recorder:
         self._writer.finish({"reason": self._reason, "dropped": dropped, "sensors": json.dumps(counts)})
 
 
-def record(
-    source: Source, path: Path, until: Callable[[Recorder, Batch], str | None], *, overwrite: bool = False
-) -> Recorder:
-    """Record what a connected source gives, and close it; the recorder, which has ended.
+def record(source: Source, recorder: Recorder, until: Callable[[Batch], str | None]) -> None:
+    """Record what a connected source gives, and close both.
 
     Until `until`, which is told each batch, has a reason to end, or nothing more can be written.
     """
-    with Recorder(path, NAME, notes(source), overwrite=overwrite) as recorder:
+    with recorder:
         reason = None
         while not (reason or recorder.failed):
             recorder.put(batch := source.batch())
-            reason = until(recorder, batch)
+            reason = until(batch)
             if not reason:
                 time.sleep(BATCH_S)
         source.close()
         recorder.stop(reason or "")
-    return recorder
 
 
 def _frames_in(batch: Iterable[object]) -> int:
