@@ -27,7 +27,6 @@ _OF_DATASETS: Final = ("pyarrow", "zarr", "rosbags", "yaml")
 
 
 def say(program: str, sentence: str) -> None:
-    """Print a sentence on standard error."""
     sys.stderr.write(f"{program}: {sentence}\n")
     sys.stderr.flush()
 

@@ -24,7 +24,7 @@ def plain(state: State, look: Look | None = None, width: int = 80) -> str:
 
 
 @pytest.mark.parametrize("name", STATES)
-@pytest.mark.parametrize("look", [Look(), Look(page="help"), Look(page="warnings"), Look(question="x" * 300)])
+@pytest.mark.parametrize("look", [Look(), Look(help=True), Look(question="x" * 300)])
 def test_no_row_is_wider_than_the_screen(name: str, look: Look) -> None:
     for width in (1, 10, 24, 40, 55, 56, 60, 80, 200):
         screen = render(STATES[name](), look, width)
@@ -88,13 +88,6 @@ def test_the_selected_sensor_comes_first() -> None:
     assert first.index("BFT-SENS-ECAT-M8") < first.index("BFT-ROKS-ECAT-M8")
     assert other.index("BFT-ROKS-ECAT-M8") < other.index("BFT-SENS-ECAT-M8")
     assert "0 trouble  1 worth a look" in first.splitlines()[0]
-
-
-def test_the_warnings_of_all_sensors_are_on_one_page() -> None:
-    text = plain(made.troubled(), Look(page="warnings"))
-    counts = [text.count(row) for row in ("Sensor 0  ", "Sensor 1  ", "saturated: Fz", "Force N")]
-    assert counts == [1, 1, 1, 0]
-    assert "Warnings none" in plain(made.healthy(), Look(page="warnings"))
 
 
 def test_no_fact_is_told_by_color_alone() -> None:

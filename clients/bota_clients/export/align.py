@@ -267,7 +267,6 @@ def _turned(vectors: Array) -> Array:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find it; returns the exit code. RecordingError."""
     interrupt_on_signals()
     with open_recording(options.recording) as recording:
         rows = []

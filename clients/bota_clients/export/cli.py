@@ -61,7 +61,6 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def parse_align(argv: Sequence[str]) -> argparse.Namespace:
-    """Read the command line after `align`."""
     made = Parser(
         f"{PROGRAM} align",
         "Finds the offset between the server's clock and a robot's, and its drift: from the angular rate of "
@@ -113,7 +112,6 @@ def run(options: argparse.Namespace) -> int:
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Export; returns the exit code."""
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["align"]:
         return start(PROGRAM, "export.align", parse_align(given[1:]))

@@ -35,7 +35,6 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def parse_delay(argv: Sequence[str]) -> argparse.Namespace:
-    """Read the command line after `delay`."""
     made = Parser(
         "ethercat-identify delay",
         "Tells from a recording how much later force and torque are than the accelerometer.",
@@ -56,7 +55,6 @@ def _add_recording(made: argparse.ArgumentParser) -> None:
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Identify; returns the exit code."""
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["delay"]:
         return start("ethercat-identify", "identify.delay", parse_delay(given[1:]))

@@ -23,7 +23,6 @@ from ft_compensation.quantities import CompensationError
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find it; returns the exit code."""
     with open_recording(options.path) as recording:
         sensor = choose(recording, options.sensor)
         data, _ = at_last_offset(recording, sensor, options.imu_units)

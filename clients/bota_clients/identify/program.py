@@ -33,7 +33,6 @@ _say = partial(say, "ethercat-identify")
 
 
 def show_poses(console: Console, poses: Poses, result: Identified | None) -> None:
-    """The poses with their residuals."""
     table = Table(title="poses", title_justify="left")
     for head in ("", "at s", "for s", "samples", "up x", "up y", "up z", "residual N", "residual Nm"):
         table.add_column(head, justify="right")
@@ -124,7 +123,6 @@ def as_json(
 
 
 def run(options: argparse.Namespace) -> int:
-    """Identify; returns the exit code."""
     if options.yaml is not None:
         refuse_existing(options.yaml, force=options.force)
     with open_recording(options.path) as recording:

@@ -37,8 +37,6 @@ Bools = npt.NDArray[np.bool_]
 
 
 class StationaryPeriod(NamedTuple):
-    """A stationary period."""
-
     begin_s: float  # from the beginning of the recording
     seconds: float
     means: StationaryMeans

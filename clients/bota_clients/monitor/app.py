@@ -39,7 +39,6 @@ class View(ScrollView, can_focus=True):
         self._rows: list[Text] = []
 
     def show(self, rows: list[Text]) -> None:
-        """Show these rows."""
         before, self._rows = self._rows, rows
         if len(rows) != len(before):
             self.virtual_size = Size(0, len(rows))
@@ -90,11 +89,9 @@ class Monitor(App[None]):
         self._to_tare = 0  # the position that the question is about
 
     def compose(self) -> ComposeResult:
-        """What stays, and between them what scrolls."""
         yield from self._views
 
     def on_mount(self) -> None:
-        """Start the timers and the signal handlers."""
         call_on(asyncio.get_running_loop(), self.exit, "SIGTERM", "SIGHUP")
         self.app_resume_signal.subscribe(self, lambda _: self.refresh(layout=True))
         self._views[1].focus()
@@ -103,7 +100,6 @@ class Monitor(App[None]):
             self.set_timer(self._seconds, self.exit)
 
     def on_resize(self) -> None:
-        """Draw for the new size."""
         self.call_after_refresh(self.draw)
 
     def draw(self) -> None:
@@ -137,7 +133,6 @@ class Monitor(App[None]):
         self.exit()
 
     def on_key(self, event: events.Key) -> None:
-        """Handle a key."""
         if event.key in {"ctrl+c", "ctrl+q", "ctrl+z"}:
             return
         event.stop()
@@ -146,8 +141,8 @@ class Monitor(App[None]):
             self.refresh(layout=True)
         elif look.question:
             self._answer(key)
-        elif look.page:
-            self._look = replace(look, page="")
+        elif look.help:
+            self._look = replace(look, help=False)
         elif key == "t":
             self._ask_tare()
         elif key == "r":
@@ -160,9 +155,7 @@ class Monitor(App[None]):
         elif key == "n":
             self._next()
         elif key in {"?", "h"}:
-            self._look = replace(look, page="help")
-        elif key == "w":
-            self._look = replace(look, page="warnings")
+            self._look = replace(look, help=True)
         elif key == "q":
             self.exit()
         self.draw()

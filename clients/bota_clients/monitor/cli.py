@@ -34,7 +34,6 @@ _ANSWER_S: Final = 6.0
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the monitor; returns its exit code."""
     options = parse(argv)
     try:
         return run(options)
@@ -86,7 +85,6 @@ def _loopback(text: str) -> Address:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the monitor; returns the exit code."""
     if options.web is not None:
         from bota_clients.monitor.web.server import run_web  # noqa: PLC0415
 

@@ -42,8 +42,6 @@ _MESSAGE_S: Final = 30.0
 
 
 class Range(NamedTuple):
-    """Minimum and maximum."""
-
     low: float
     high: float
 
@@ -76,8 +74,6 @@ class Client(NamedTuple):
 
 
 class Message(NamedTuple):
-    """The latest message for the user."""
-
     text: str
     bad: bool = False
 
@@ -116,7 +112,6 @@ class SensorState:
 
     @property
     def imu_off(self) -> bool:
-        """Whether the IMU is off."""
         return self.info.settings.get("imu_active") == 0
 
     @property
@@ -127,8 +122,6 @@ class SensorState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerState:
-    """The server."""
-
     address: str
     connected: bool = False
     since_s: float | None = None  # since it was connected or disconnected
@@ -175,7 +168,6 @@ class _Sensor:
         self._seen: dict[str, tuple[Finding, float]] = {}  # since the reset, each at its worst, and when last
 
     def reset(self) -> None:
-        """Reset peaks and past warnings."""
         self.peaks, self._seen = None, {}
         self.observer.forget()
         self.observer.said.forget()
@@ -196,12 +188,10 @@ class _Sensor:
             self.observer.begin(info.rate_hz, now_ns)
 
     def take_status(self, status: Status, now_s: float) -> None:
-        """Take a reply to `status`."""
         self.observer.said.take_status(status, self.position, _ns(now_s))
         self._hand_out = status.recent_age_us(self.position)
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
-        """Frames of this sensor as they came, oldest first."""
         samples = self.observer.take(frames, _ns(now_s))
         self._judge(now_s)
         if not samples:
@@ -305,7 +295,6 @@ class Model:
             self._describe(description, now_s, anew=True)
 
     def described(self, description: JsonObject, now_s: float) -> None:
-        """A later reply to `describe`."""
         with self._lock:
             self._describe(description, now_s, anew=False)
 
@@ -318,7 +307,6 @@ class Model:
             self._clients = ()
 
     def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
-        """Take frames in order of arrival."""
         with self._lock:
             if frames:
                 self._heard_s = now_s
@@ -341,7 +329,6 @@ class Model:
                 self._sensors[frame.sensor].observer.note_age(frame, now_ns)
 
     def take_status(self, reply: JsonObject, now_s: float) -> None:
-        """A reply to `status`."""
         status = Status.parse(reply)
         with self._lock:
             self._heard_s = now_s
@@ -357,7 +344,6 @@ class Model:
             self._status, self._status_s = status, now_s
 
     def take_event(self, event: JsonObject, now_s: float) -> None:
-        """An event of the server."""
         with self._lock:
             self._heard_s = now_s
             position = position_of(event)
@@ -368,7 +354,6 @@ class Model:
             self._events.append(f"{clock_text()} {event_sentence(event)}")
 
     def reset(self) -> None:
-        """Reset peaks and past warnings."""
         with self._lock:
             for sensor in self._sensors.values():
                 sensor.reset()
@@ -379,7 +364,6 @@ class Model:
             self._message, self._message_ends_s = Message(f"{clock_text()} {text(message)}", bad), 0.0
 
     def state(self, now_s: float) -> State:
-        """The current state."""
         with self._lock:
             self._message_ends_s = self._message_ends_s or now_s + _MESSAGE_S
             if now_s > self._message_ends_s:
@@ -420,7 +404,6 @@ class Model:
 
 
 def clock_text() -> str:
-    """The time of day."""
     return time.strftime("%H:%M:%S")
 
 

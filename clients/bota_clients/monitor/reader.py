@@ -28,8 +28,6 @@ _ANSWER_TIMEOUT_S: Final = 10.0  # timeout for a reply of the server
 
 
 class Reader(threading.Thread):
-    """Reads until closed."""
-
     def __init__(self, address: Address, model: Model, batch_s: float = BATCH_S) -> None:
         """`batch_s`: how long samples queue before they are taken."""
         super().__init__(name="reader", daemon=True)
@@ -41,13 +39,11 @@ class Reader(threading.Thread):
         self.tried = threading.Event()  # there was a reply to `status`, or a failed connection
 
     def close(self) -> None:
-        """End the connection and the thread."""
         self._closing.set()
         self._client.close()
         self.join(timeout=2.0)
 
     def run(self) -> None:
-        """The thread."""
         status_at_s = 0.0
         with self._client as client, contextlib.suppress(ConnectionFailedError):
             while not self._closing.wait(self._batch_s):

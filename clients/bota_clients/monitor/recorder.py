@@ -29,7 +29,6 @@ class Recorder:
         return self._thread is not None
 
     def start(self, now_s: float) -> str:
-        """Start a recording; a message."""
         path = Path(time.strftime("recording-%Y%m%d-%H%M%S.mcap"))
         self._asked.clear()
         self._thread = threading.Thread(target=self._run, args=(path,), name="recording")

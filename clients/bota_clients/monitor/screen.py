@@ -26,7 +26,6 @@ KEYS: Final = (
     ("r", "record", "start or stop a recording in this folder, as of ethercat-record"),
     ("p", "pause", "freeze the display; samples and peaks still count"),
     ("0", "reset", "reset peaks and past warnings"),
-    ("w", "warnings", "of all sensors, present and past"),
     ("n", "next", "the next sensor of the chain"),
     ("?", "help", "this page"),
     ("q", "quit", "also Ctrl-C; Ctrl-L redraws the screen"),
@@ -61,13 +60,11 @@ _WITH_PEAKS: Final = 56  # width from which the peaks are shown as numbers too
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """The user's choices."""
-
     selected: int = 0  # which sensor comes first, counted from 0 in the state's order
     paused: str = ""  # time of day of the pause; empty if not paused
     recording: str = ""  # the running recording, in words
     question: str = ""  # the pending question
-    page: str = ""  # "help" or "warnings" in place of the overview
+    help: bool = False  # in place of the overview
 
 
 class Screen(NamedTuple):
@@ -79,11 +76,7 @@ class Screen(NamedTuple):
 
 
 def render(state: State, look: Look, width: int) -> Screen:
-    """The screen."""
-    if look.page:
-        body = _help() if look.page == "help" else _warnings(state, width)
-    else:
-        body = _overview(state, look, width)
+    body = _help() if look.help else _overview(state, look, width)
     screen = Screen([_title(state, look, width)], body, [*_message(state, look, width), _keys(look, width)])
     for row in (row for part in screen for row in part):
         row.no_wrap = True
@@ -110,16 +103,6 @@ def table(state: State) -> list[str]:
 def _help() -> list[Text]:
     rows = [Text.assemble((f"  {key}  ", VALUE), (name.ljust(10), LABEL), what) for key, name, what in KEYS]
     return [*rows, *map(Text, _HELP.splitlines())]
-
-
-def _warnings(state: State, width: int) -> list[Text]:
-    """Of all sensors."""
-    rows = [
-        row
-        for sensor in state.sensors
-        for row in (Text(words.identity(sensor), VALUE), *_alerts(sensor, width), Text())
-    ]
-    return [*rows, Text("Press any key to return.")]
 
 
 def _overview(state: State, look: Look, width: int) -> list[Text]:
@@ -166,7 +149,6 @@ def _clients(state: State) -> Text:
 
 
 def _message(state: State, look: Look, width: int) -> list[Text]:
-    """The question or the latest message."""
     text, style = state.events[-1] if state.events else "", LABEL
     if look.question:
         text, style = look.question, NOTICE
@@ -186,7 +168,6 @@ def _keys(look: Look, width: int) -> Text:
 
 
 def _panel(sensor: SensorState, width: int, *, bars: bool = True) -> list[Text]:
-    """The rows of one sensor."""
     stream = f"{words.rate(sensor)}   age {words.times(sensor.age_us)}   jitter {words.jitter(sensor)}"
     lost = _field("Lost", "")
     for number, (text, bad) in enumerate(words.losses(sensor)):

@@ -86,13 +86,11 @@ def delays(sensor: SensorState) -> str:
 
 
 def rate(sensor: SensorState) -> str:
-    """Measured and nominal rate."""
     found = "no samples" if sensor.rate_hz is None else f"{sensor.rate_hz:.1f}"
     return f"{found} of {sensor.info.rate_hz:g} Hz" if sensor.info.rate_hz else f"{found} Hz"
 
 
 def jitter(sensor: SensorState) -> str:
-    """Standard deviation and worst interval."""
     if sensor.jitter_us is None or sensor.jitter_worst_us is None:
         return "not known"
     return f"{sensor.jitter_us:.0f} µs, worst {sensor.jitter_worst_us:.0f}"
@@ -120,7 +118,6 @@ def clock(sensor: SensorState) -> str:
 
 
 def client(one: Client) -> str:
-    """One client of the server."""
     text = "this one" if one.this else one.peer
     if one.rate_hz is not None:
         text += f" {one.rate_hz:.0f}/s"
@@ -135,17 +132,14 @@ def times(spread: Spread | None) -> str:
 
 
 def count(value: int | None) -> str:
-    """A count that may not be known."""
     return "?" if value is None else str(value)
 
 
 def seen(ago_s: float | None) -> str:
-    """When something was last seen."""
     return "now" if ago_s is None else f"{duration(ago_s)} ago"
 
 
 def alert(one: Alert) -> dict[str, str]:
-    """An alert for programs."""
     return {"severity": one.level.key, "text": one.text, "remedy": one.remedy}
 
 

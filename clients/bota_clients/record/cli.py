@@ -63,7 +63,6 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Record; returns the exit code."""
     signals = Signals()
     return start("ethercat-record", "record.program", parse_options(argv), signals)
 

@@ -28,7 +28,6 @@ _say = partial(say, "ethercat-record")
 
 
 def run(options: argparse.Namespace, signals: Signals) -> int:
-    """Record; returns the exit code."""
     with contextlib.closing(Source(options.address, options.sensors)) as source:
         try:
             refuse_existing(options.path, force=options.force)

@@ -99,7 +99,6 @@ class Source(Client):
 
 
 def _noted(name: str, **values: object) -> Event:
-    """An event of the recorder."""
     return Event(time.time_ns(), {"event": name, "source": RECORDER, **values})
 
 

@@ -100,5 +100,4 @@ def columns(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS)
 
 
 def joined(parts: Sequence[Columns]) -> Columns:
-    """All of them, one after the other."""
     return Columns(*(np.concatenate([getattr(part, name) for part in parts]) for name in Columns.__slots__))

@@ -85,7 +85,6 @@ class McapFile:
             raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from None
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def __enter__(self) -> Self:

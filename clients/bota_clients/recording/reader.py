@@ -44,7 +44,6 @@ class Event(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the event."""
         return str(self.event.get("event", "?"))
 
     @property

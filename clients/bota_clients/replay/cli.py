@@ -53,6 +53,5 @@ _host = typed(lambda text: str(ipaddress.ip_address(text)), "an IP address of th
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Replay; returns the exit code."""
     signals = Signals()
     return start("ethercat-replay", "replay.program", parse_options(argv), signals)

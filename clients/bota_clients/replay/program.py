@@ -35,7 +35,6 @@ _say = partial(say, "ethercat-replay")
 
 
 def run(options: argparse.Namespace, signals: Signals) -> int:
-    """Replay; returns the exit code."""
     logging.basicConfig(level=logging.INFO, format="ethercat-replay: %(message)s", stream=sys.stderr)
     try:
         with open_recording(options.path) as recording:
@@ -66,11 +65,9 @@ class Player:
         self._serve_by = 0
 
     def stop(self) -> None:
-        """End `run` soon."""
         self._signals.asked = True
 
     def status(self) -> dict[str, Any]:
-        """Its part of the `status` reply."""
         return self.sensors.status()
 
     def trace(self, offset: int) -> NoReturn:  # noqa: ARG002
@@ -78,7 +75,6 @@ class Player:
         raise needs_sensor("trace")
 
     def run(self) -> None:
-        """Play from the first subscriber on."""
         hub, options, recording = self.hub, self._options, self._recording
         hub.start(Actions(hub, self, self.sensors, lambda: {"replay": self._about()}).handle)
         name = f"{recording.path.name}, {recording.frame_count} frames,"

@@ -37,7 +37,6 @@ class ReplayedSensor:
         self._emergency_at = 0.0
 
     def take(self, event: Event) -> None:
-        """Apply an event of the recording."""
         said = event.event
         if event.name == ServerEvent.EMERGENCY:
             self._emergencies += 1
@@ -50,17 +49,14 @@ class ReplayedSensor:
             self.row["state"] = "OP"
 
     def count(self, frame: DataMessage) -> None:
-        """A frame was sent."""
         old = frame.flags & NOT_NEW
         self._frames[old] += 1
         self._not_finite += not old and not is_finite(frame.process_data)
 
     def describe(self) -> dict[str, Any]:
-        """Its part of the `describe` reply."""
         return self.row
 
     def status(self) -> dict[str, Any]:
-        """Its part of the `status` reply."""
         rate_hz = self.row.get("rate_hz")
         ago_s = round(time.monotonic() - self._emergency_at, 3)
         return {
@@ -113,18 +109,15 @@ class ReplayedSensors:
         self._started = time.monotonic()
 
     def describe(self, description: Description) -> None:
-        """Take a later description of the recording."""
         for row in rows(description.reply.get("sensors")):
             if (sensor := self._at(row.get("sensor"))) is not None:
                 sensor.row |= {**row, "settling": False}  # it was, when it was described
 
     def take(self, event: Event) -> None:
-        """Apply an event of the recording to the descriptions."""
         if (sensor := self._at(event.event.get("sensor"))) is not None:
             sensor.take(event)
 
     def count(self, frame: DataMessage) -> None:
-        """A frame was sent."""
         self.sent += 1
         self.sensors[frame.sensor].count(frame)
 

@@ -48,7 +48,6 @@ class Examination:
 
     @property
     def headline(self) -> str:
-        """The verdict in one or two words."""
         return "Not conclusive" if self.level is Level.NOT_POSSIBLE else self.level.words.capitalize()
 
 

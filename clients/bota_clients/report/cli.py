@@ -50,12 +50,10 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make a report; returns the exit code."""
     return start(_PROGRAM, "report.cli", parse_options(argv))
 
 
 def run(options: argparse.Namespace) -> int:
-    """Make a report; returns the exit code."""
     try:
         words, exit_code = make(options)
     except KeyboardInterrupt:

@@ -45,7 +45,6 @@ class Noise(NamedTuple):
 
 
 def measure_noise(series: Series) -> Noise:
-    """The noise of all channels."""
     length = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
     limit = _limits(series)
     usable = series.finite & ~series.saturated

@@ -95,7 +95,6 @@ def _noise_rows(examination: Examination) -> list[tuple[str, ...]]:
 
 
 def as_json(examinations: Sequence[Examination]) -> str:
-    """The verdicts and checks for programs."""
     return json.dumps(
         [
             {

@@ -28,8 +28,6 @@ _HIGHEST_RATE_HZ: Final = 100_000.0
 
 @dataclass(frozen=True)
 class Subject:
-    """One sensor and its frames."""
-
     info: SensorInfo
     columns: Columns
     source: str  # a file name
@@ -37,7 +35,6 @@ class Subject:
 
     @property
     def who(self) -> str:
-        """Name and serial number."""
         return f"{self.info.name or '?'}, serial {'?' if self.info.serial is None else self.info.serial}"
 
     @property
@@ -47,7 +44,6 @@ class Subject:
 
     @property
     def sinc_length(self) -> int | None:
-        """None if unknown."""
         return self.settings.get("sinc_length")
 
     @property
@@ -60,7 +56,6 @@ class Subject:
         return 1 / rate_hz if 0 < rate_hz <= _HIGHEST_RATE_HZ else None
 
     def with_remarks(self, remarks: Iterable[str]) -> Subject:
-        """The same with more remarks."""
         return replace(self, remarks=(*self.remarks, *(printable(remark, 300) for remark in remarks)))
 
 
@@ -88,8 +83,6 @@ GROUPS: Final = (
 
 
 class Channel(NamedTuple):
-    """One measured quantity."""
-
     group: Group
     axis: int  # 0, 1, 2 for x, y, z
     title: str  # for people: Force z

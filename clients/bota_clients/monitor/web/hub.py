@@ -125,7 +125,6 @@ class WebModel(Model):
         self._points_lock = threading.Lock()
 
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
-        """See `Model`."""
         with self._points_lock:
             for points in self._points.values():
                 points.last = (-1, -1)  # the server may count from the beginning again
@@ -146,8 +145,6 @@ class WebModel(Model):
 
 
 class Page:
-    """A connected page."""
-
     def __init__(self) -> None:
         self.sensor = 0  # position of the one that it shows
         self.control = False  # whether it has shown the token
@@ -179,7 +176,6 @@ class Hub:
         return page
 
     def state(self, now_s: float) -> str:
-        """The message with the state."""
         return state_text(self._model.state(now_s))
 
     def collect(self, now_s: float) -> None:

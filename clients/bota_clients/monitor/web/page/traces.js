@@ -89,10 +89,9 @@ export class Trace {
       return { axis, value, peaks, row: element("div", { class: `reading ${"xyz"[i]}` }, element("span", {}, axis), value, peaks) };
     });
     this.unitText = element("small", {}, group.unit);
-    this.at = element("span", { class: "at" });
     this.box = element("div", { class: "plot", role: "img", "aria-label": `${group.title} over time` });
     this.card = element("section", { id: group.id, class: "card trace" },
-      element("div", { class: "head" }, element("h2", {}, `${group.title} `, this.unitText), this.at),
+      element("div", { class: "head" }, element("h2", {}, `${group.title} `, this.unitText)),
       element("div", { class: "readings" }, ...this.readings.map(({ row }) => row)), this.box);
   }
 
@@ -104,7 +103,7 @@ export class Trace {
       grid: { stroke: () => colors.grid, width: 1 }, ticks: { show: false } };
     this.plot = new uPlot({
       ...this.#size(), padding: [6, 8, 0, 0], legend: { show: false }, pxAlign: 0,
-      cursor: { y: false, drag: { x: false, y: false }, points: { size: 6 }, sync: { key: "traces" } },
+      cursor: { show: false },
       scales: { x: { time: false }, y: { range: (_, low, high) => this.#range(low, high) } },
       axes: [
         { ...axis, size: 2 * em, gap: 4, splits: () => this.#splits(),
@@ -114,7 +113,6 @@ export class Trace {
       ],
       series: [{}, ...["x", "y", "z"].map((name) => (
         { stroke: () => colors[name], width: 1, points: { show: false }, spanGaps: false }))],
-      hooks: { setCursor: [(u) => this.#point(u)] },
     }, [[], [], [], []], this.box);
     new ResizeObserver(() => this.plot.setSize(this.#size())).observe(this.box);
   }
@@ -164,15 +162,5 @@ export class Trace {
 
   get least() {
     return this.unit === "counts" ? 1000 : this.group.least;
-  }
-
-  #point(u) {
-    const at = u.cursor.idx;
-    if (at === null || at === undefined || u.data[1][at] === null || !(u.cursor.left >= 0)) {
-      this.at.textContent = "";
-      return;
-    }
-    const values = this.group.axes.map((axis, i) => `${axis} ${signed(u.data[i + 1][at], this.digits)}`);
-    this.at.textContent = `${signed(u.data[0][at] - u.scales.x.max, 2)} s: ${values.join("  ")}`;
   }
 }
