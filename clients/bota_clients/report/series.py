@@ -115,11 +115,6 @@ def limit_origin(sinc_length: int) -> str:
 
 
 _LONG: Final = 2.5  # an interval of more than this many periods is none between two successive samples
-# Beside a silence, samples are lost if more periods and more time than this pass without any frame; ...
-_COVERED_PERIODS: Final = 4
-_COVERED_S: Final = 0.01
-# ... between two REPEATED or INVALID ones more time: the server polls a sensor that it has lost less often.
-_COVERED_BETWEEN_S: Final = 0.1
 # CLOCK_REALTIME that moves against CLOCK_MONOTONIC by more than this between two samples was adjusted.
 _STEP_NS: Final = 1_000_000
 
@@ -182,22 +177,13 @@ class Series:
         self.withheld = min(self.counts.withheld // self.step, self.lost)
 
     def _missing(self, accounting: StreamAccounting) -> Ints:
-        """(n - 1,) how many samples are missing between one and the next, beside those of a silent sensor.
-
-        As every client counts them. Where the sensor was silent, as many as have room between frames too far
-        apart to tell of a silence.
-        """
+        """(n - 1,) how many samples are missing between one and the next, as every client counts them."""
         frames, summed = self.frames, list[int]()
         heads = (array.tolist() for array in (frames.sequence, frames.monotonic_ns, frames.flags))
         for head in zip(*heads, strict=True):
             accounting.take(*head)
             summed.append(self.counts.missing)
-        lost = np.diff(np.array(summed, np.int64)[frames.fresh]) // self.step
-        fresh, intervals = frames.fresh, np.diff(self.frame_time)
-        near = np.where(fresh[:-1] | fresh[1:], _COVERED_S, _COVERED_BETWEEN_S)
-        untold = intervals > np.maximum(near, _COVERED_PERIODS * self.period)
-        told = np.cumsum(np.where(untold, _room(intervals / self.period), 0))
-        return np.where(self.silent, np.diff(np.append(0, told)[np.flatnonzero(fresh)]), lost)
+        return np.diff(np.array(summed, np.int64)[frames.fresh]) // self.step
 
     def _silences(self) -> Floats:
         """How long the sensor was silent each time, s, the time before the first and after the last too."""
@@ -208,11 +194,6 @@ class Series:
         ends = [] if fresh[0] else [self.time[0] - self.frame_time[0]]
         ends += [] if fresh[-1] else [self.frame_time[-1] - self.time[-1]]
         return np.asarray(np.maximum(np.concatenate([spans, ends]), 0.0), np.float64)
-
-
-def _room(periods: Floats) -> Ints:
-    """Samples missing in intervals of this many periods."""
-    return np.round(np.clip(periods, 0, 1e12)).astype(np.int64) - 1
 
 
 def bits(fields: Ints) -> int:

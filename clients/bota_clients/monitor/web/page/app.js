@@ -1,6 +1,6 @@
 // Puts the page together: what comes over the link goes into traces, readings and cards.
 
-import { byId, dark, element, fill, setText } from "./dom.js";
+import { byId, element, fill, setText } from "./dom.js";
 import { Link } from "./link.js";
 import { GROUPS, History, signed, Trace } from "./traces.js";
 
@@ -190,8 +190,4 @@ function frame(now) {
   }
 }
 
-dark.addEventListener("change", () => {
-  drawn = 0;
-  for (const trace of traces) trace.plot.redraw();
-});
 requestAnimationFrame(frame);

@@ -99,8 +99,8 @@ export class Trace {
   start() {
     // Whole pixels: uPlot takes the digits before "px" and multiplies them by the device pixel ratio.
     const em = Math.round(0.78 * parseFloat(getComputedStyle(document.documentElement).fontSize));
-    const axis = { stroke: () => colors.muted, font: `${em}px system-ui, sans-serif`,
-      grid: { stroke: () => colors.grid, width: 1 }, ticks: { show: false } };
+    const axis = { stroke: colors.muted, font: `${em}px system-ui, sans-serif`,
+      grid: { stroke: colors.grid, width: 1 }, ticks: { show: false } };
     this.plot = new uPlot({
       ...this.#size(), padding: [6, 8, 0, 0], legend: { show: false }, pxAlign: 0,
       cursor: { show: false },
@@ -112,7 +112,7 @@ export class Trace {
           values: (_, at) => at.map((value) => String(Number(value.toPrecision(6))).replace("-", "−")) },
       ],
       series: [{}, ...["x", "y", "z"].map((name) => (
-        { stroke: () => colors[name], width: 1, points: { show: false }, spanGaps: false }))],
+        { stroke: colors[name], width: 1, points: { show: false }, spanGaps: false }))],
     }, [[], [], [], []], this.box);
     new ResizeObserver(() => this.plot.setSize(this.#size())).observe(this.box);
   }
