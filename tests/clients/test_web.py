@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
+import subprocess
 import threading
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -23,6 +26,7 @@ from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S, frame, moving
 from tests.clients.web_pages import Web
 
+NODE = shutil.which("node")
 PAGE_FILES = read_page()
 FX, FZ, AZ, WX = (CHANNELS.index(n) for n in ("force.x", "force.z", "acceleration.z", "angular_rate.x"))
 
@@ -321,6 +325,33 @@ def test_a_page_says_what_the_monitor_says() -> None:
     gone = json.loads(state_text(made.gone()))["state"]
     assert gone["trouble"] == "gone at 12:00:00: no server answers (Connection refused); reconnecting"
     assert gone["sensors"][0]["old"] == "1m05s"
+
+
+@pytest.mark.skipif(NODE is None, reason="no Node here: apt install nodejs")
+def test_the_page_shows_what_it_is_sent_as_text_and_tares(web: Harness, tmp_path: Path) -> None:
+    evil = "<img src=x onerror=alert(1)>"
+    web.model.connected(made.description((evil, "two")), made.OWN_PEER, START_S)
+    web.model.take([frame(k, {**moving(k), "warnings": 16 * (k == 30)}) for k in range(400)], made.now(400))
+    web.hub.collect(made.now(401) + 1)
+    control = web.hub.take(web.page, json.dumps({"token": web.hub.token}))
+    messages = [control, web.hub.state(made.now(401)), *web.hub.points(web.page)]
+    for path, (body, _) in PAGE_FILES.items():
+        if path.endswith(".js") and "/uplot/" not in path:
+            (tmp_path / path[1:]).write_bytes(body)
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    command = [str(NODE), str(Path(__file__).with_name("page_in_node.mjs")), str(tmp_path / "app.js")]
+    ran = subprocess.run(
+        command, input="\n".join(map(str, messages)), capture_output=True, text=True, check=True
+    )
+    shown = json.loads(ran.stdout)
+    assert shown["identity"] == f"Sensor 0  OP  {evil}  serial 1234  firmware 1.3.8"
+    assert "Reduce sensor loading" in shown["warnings"]
+    assert f"{moving(399)['force.x']:+.2f}" in shown["traces"]
+    assert "Sensor 1  OP  two" in shown["table"]
+    assert (shown["trouble"], shown["message"]) == ("", "")
+    assert [shown[name] for name in shown if name.startswith("plot")] == ["101"] * 4, "two in ten milliseconds"
+    assert shown["sent"][0] == "address /", "the token does not stay in it"
+    assert shown["sent"][-1] == '{"do":"tare","sensor":0}'
 
 
 @pytest.mark.parametrize(
