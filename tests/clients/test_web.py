@@ -349,7 +349,9 @@ def test_the_page_shows_what_it_is_sent_as_text_and_tares(web: Harness, tmp_path
     assert f"{moving(399)['force.x']:+.2f}" in shown["traces"]
     assert "Sensor 1  OP  two" in shown["table"]
     assert (shown["trouble"], shown["message"]) == ("", "")
-    assert [shown[name] for name in shown if name.startswith("plot")] == ["101"] * 4, "two in ten milliseconds"
+    assert [shown[name] for name in shown if name.startswith("plot")] == ["101"] * 4, (
+        "two in ten milliseconds"
+    )
     assert shown["sent"][0] == "address /", "the token does not stay in it"
     assert shown["sent"][-1] == '{"do":"tare","sensor":0}'
 
