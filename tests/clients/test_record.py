@@ -30,7 +30,7 @@ from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer, description
 from tests.clients.recordings import frame, record
-from tests.clients.running import Recorder, RecorderProcess, Replay, frames_in, signalled
+from tests.clients.running import Recorder, Replay, frames_in, signalled
 from tests.ended import run_here
 from tests.golden_vectors import odd_messages
 from tests.served_simulation import served
@@ -99,17 +99,6 @@ def test_record_replay_record_gives_the_same_frames(source: Path, out: Path) -> 
     assert "nothing was lost" in said
     original, again = ([f._replace(stamp_ns=0, monotonic_ns=0) for f in read(path)] for path in (source, out))
     assert original == again
-
-
-def test_it_ends_by_itself_and_says_what_it_has(endless: Replay, out: Path) -> None:
-    code, said = run(out, "--server", endless.port, "--seconds", "0.5")
-    assert code == 0
-    assert end(out)["reason"] == "time is up"
-    with open_recording(out) as opened:
-        assert [sensor.info.serial for sensor in opened.sensors] == [100, 101]
-        assert opened.metadata["server"] == f"localhost:{endless.port}"
-        assert f"{opened.frame_count} frames of 2 sensors" in said
-        assert is_whole(list(opened.frames()))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -257,22 +246,6 @@ def test_of_a_file_that_is_removed_nothing_is_said_to_be_there(out: Path) -> Non
     removed.stop("asked to stop")
     assert str(removed.error) == f"{out} was removed while it was written: nothing of it is left"
     assert (removed.saved, removed.dropped) == (0, 11)
-
-
-def test_killed_it_leaves_what_was_there(endless: Replay, out: Path) -> None:
-    recorder = RecorderProcess(out, endless.port, "--force")
-    try:
-        recorder.wait_for("Ctrl-C ends it")
-        wait_until(lambda: frames_in(out) > 500, "frames")
-        before = frames_in(out)
-        recorder.signal(signal.SIGKILL)
-        recorder.wait()
-    finally:
-        recorder.close()
-    left = read(out)
-    assert len(left) >= before
-    assert is_whole(left)
-    assert {item.sensor for item in left} == {0, 1}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
