@@ -22,13 +22,13 @@ def frame(number: int, flags: int = 0) -> DataMessage:
 def message(measurement: Measurement, number: int, value: float = 1.0) -> None:
     """Of the sample with this number, 0.4 ms later."""
     stamp_ns = frame(number).stamp_ns
-    measurement.take_message(stamp_ns, [value] * 6, stamp_ns + 400_000)
+    measurement.add_message(stamp_ns, [value] * 6, stamp_ns + 400_000)
 
 
 def measured(first: int = 0, count: int = 801) -> Measurement:
     measurement = Measurement(800.0)
     for number in range(first, first + count):
-        measurement.take_frame(frame(number))
+        measurement.add_frame(frame(number))
         message(measurement, number)
     return measurement
 
@@ -57,9 +57,9 @@ def test_a_good_run_of_which_the_last_sample_has_not_come_yet() -> None:
 def test_each_fault_is_found(messages: list[tuple[int, float]], words: str | None) -> None:
     measurement = measured()
     for number in range(801, 830):
-        measurement.take_frame(frame(number))
+        measurement.add_frame(frame(number))
     for number, value in messages:
-        measurement.take_message(10**18 + round(number * PERIOD_NS), [value] * 6, 10**18 + 810 * PERIOD_NS)
+        measurement.add_message(10**18 + round(number * PERIOD_NS), [value] * 6, 10**18 + 810 * PERIOD_NS)
     message(measurement, 829)
     summary = measurement.summary()
     assert words in str(verdict(summary, 800)) if words else verdict(summary, 800) is None
@@ -69,7 +69,7 @@ def test_each_fault_is_found(messages: list[tuple[int, float]], words: str | Non
 def test_what_was_withheld_from_the_servers_client_may_be_a_message_and_is_lost_before() -> None:
     measurement = measured()
     message(measurement, 802)
-    measurement.take_frame(frame(805, DataFlag.GAP))
+    measurement.add_frame(frame(805, DataFlag.GAP))
     summary = measurement.summary()
     assert (summary.lost_before, summary.unknown, verdict(summary, 800)) == (4, 0, None)
     assert "800.0 messages/s" in str(verdict(measured().summary(), 1600))
@@ -81,7 +81,7 @@ def test_the_live_figure_of_what_is_lost_is_the_summarys(
     monkeypatch.setenv("COLUMNS", "80")
     measurement = measured()
     for each in (frame(805, DataFlag.GAP), frame(806)):
-        measurement.take_frame(each)
+        measurement.add_frame(each)
     message(measurement, 806)
     program.show(measurement, 802)
     assert re.match(r" *\d+\.\d Hz  age 0\.40 ms  lost 5  repeated 0  N \+0", capsys.readouterr().out)

@@ -54,13 +54,13 @@ class Measurement:
         """Of the topic."""
         return len(self._stamps)
 
-    def take_frame(self, frame: DataMessage) -> None:
+    def add_frame(self, frame: DataMessage) -> None:
         """A frame came from the server."""
         if self._stream.take(frame.sequence, frame.monotonic_ns, frame.flags) is FrameKind.NEW:
             self.latest = frame
             self._made.append(frame.stamp_ns)
 
-    def take_message(self, stamp_ns: int, values: Sequence[float], now_ns: int) -> None:
+    def add_message(self, stamp_ns: int, values: Sequence[float], now_ns: int) -> None:
         """A message came on the ROS topic."""
         self._not_finite += not all(map(math.isfinite, values))
         self._stamps.append(stamp_ns)

@@ -54,13 +54,13 @@ def listening(client: Client, measurement: Measurement, lock: threading.Lock) ->
     def receive() -> None:
         for frame in client.frames():
             with lock:
-                measurement.take_frame(frame)
+                measurement.add_frame(frame)
 
     def on_message(message: Any) -> None:
         now_ns, stamp, wrench = time.time_ns(), message.header.stamp, message.wrench
         values = [getattr(part, axis) for part in (wrench.force, wrench.torque) for axis in "xyz"]
         with lock:
-            measurement.take_message(stamp.sec * 10**9 + stamp.nanosec, values, now_ns)
+            measurement.add_message(stamp.sec * 10**9 + stamp.nanosec, values, now_ns)
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("demo")

@@ -101,7 +101,7 @@ def fed(model: Model, sensors: int, frames: Mapping[int, Values] | None = None) 
             for k in numbers
             for position in range(sensors)
         ]
-        model.take(batch, now(numbers[-1]))
+        model.add_frames(batch, now(numbers[-1]))
         for last in batch[-sensors:]:
             model.note_age(last, last.monotonic_ns + 190_000 + first * first % 61_000)
     return now(count - 1)
@@ -118,9 +118,9 @@ def healthy() -> State:
     """One sensor, all well."""
     model = Model(ADDRESS)
     model.connected(description(), OWN_PEER, START_S)
-    model.take_status(status(), START_S + 6.9)
+    model.add_status(status(), START_S + 6.9)
     end_s = fed(model, 1)
-    model.take_status(status(sent=800), START_S + 7.9)
+    model.add_status(status(sent=800), START_S + 7.9)
     return settled(model.state(end_s))
 
 
@@ -134,8 +134,8 @@ def troubled() -> State:
     frames |= {k: {**frames.get(k, {}), "warnings": 0b100000 | int(frames.get(k, {}).get("warnings", 0))}
                for k in range(6000, 6400)}  # fmt: skip
     end_s = fed(model, 2, frames)
-    model.take([frame(6405, sensor=0, flags=DataFlag.GAP)], end_s)
-    model.take_status(status(2, mode="oversampling"), START_S + 7.9)
+    model.add_frames([frame(6405, sensor=0, flags=DataFlag.GAP)], end_s)
+    model.add_status(status(2, mode="oversampling"), START_S + 7.9)
     model.say("Sensor 0 is not tared: it is not at rest", bad=True)
     return settled(model.state(end_s))
 
@@ -146,6 +146,6 @@ def gone() -> State:
     model = Model(ADDRESS)
     model.connected(description(), OWN_PEER, START_S)
     end_s = fed(model, 1)
-    model.take_event({"event": Event.SHUTTING_DOWN}, end_s)
+    model.add_event({"event": Event.SHUTTING_DOWN}, end_s)
     model.gone("no server answers (Connection refused)", end_s)
     return replace(settled(model.state(end_s + 65)), events=())

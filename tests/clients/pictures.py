@@ -11,14 +11,14 @@ from rich.console import Console
 from rich.text import Text
 
 from bota_clients.monitor.model import State
-from bota_clients.monitor.screen import Look, render
+from bota_clients.monitor.screen import ViewOptions, render
 from tests.clients import monitor_states as made
 
 DOCS: Final = Path(__file__).resolve().parents[2] / "docs"
 AGAIN: Final = "make it again: python -m tests.clients.pictures"
 
 
-def svg(state: State, look: Look, width: int, height: int) -> str:
+def svg(state: State, look: ViewOptions, width: int, height: int) -> str:
     console = Console(
         width=width, height=height, record=True, file=io.StringIO(), force_terminal=True,
         color_system="truecolor", legacy_windows=False, _environ={},
@@ -33,9 +33,9 @@ def svg(state: State, look: Look, width: int, height: int) -> str:
 def captures() -> Mapping[str, str]:
     """The terminal's view: name of the file to what it holds."""
     return {
-        "monitor.svg": svg(made.healthy(), Look(recording="REC 42 s"), 80, 24),
-        "monitor-warnings.svg": svg(made.troubled(), Look(), 80, 24),
-        "monitor-gone.svg": svg(made.gone(), Look(), 60, 15),
+        "monitor.svg": svg(made.healthy(), ViewOptions(recording="REC 42 s"), 80, 24),
+        "monitor-warnings.svg": svg(made.troubled(), ViewOptions(), 80, 24),
+        "monitor-gone.svg": svg(made.gone(), ViewOptions(), 60, 15),
     }
 
 

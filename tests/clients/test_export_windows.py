@@ -121,7 +121,7 @@ def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> N
     sent, asked, blocks = [each for each in frames if not each.flags & DataFlag.REPEATED], 0, []
     while sent:
         size = chance.randrange(1, 40)
-        live.take(sent[:size])
+        live.add(sent[:size])
         sent = sent[size:]
         instants = recorded["monotonic_ns"][asked:]
         ready = instants[: np.searchsorted(instants, live.until_ns, "right")]
@@ -145,7 +145,7 @@ def test_the_compensated_wrench_is_the_nodes() -> None:
     parts = "tool_mass", "tool_center_of_gravity", "bias"
     windows = Windows(1, tool={name: TOOL[name] for name in parts})
     windows.configure({**described()["settings"], **SETTINGS}, RATE_HZ, "BFT-SENS-ECAT-M8")
-    windows.take(frames)
+    windows.add(frames)
     made = windows.at(np.array([8, 130, 131]) * PERIOD_NS - 1_880_000)
     assert made["force_torque_compensated"][0, 0] == pytest.approx([5, 0, 0, 0, 0.6, 0], abs=1e-3)
     assert made["force_torque_compensated_valid"].ravel().tolist() == [True, False, True]

@@ -105,7 +105,7 @@ def test_what_does_not_fit_is_scrolled_to_and_another_size_is_drawn_anew() -> No
 def test_pause_reset_and_help() -> None:
     async def scene(stage: Stage) -> None:
         assert "PAUSED" in await stage.press("p")
-        stage.model.take([made.frame(6400, {"force.x": 77.0})], stage.now_s)
+        stage.model.add_frames([made.frame(6400, {"force.x": 77.0})], stage.now_s)
         assert "+77.00" not in stage.shown()
         text = await stage.press("p")
         assert "PAUSED" not in text

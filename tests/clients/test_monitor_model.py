@@ -11,7 +11,7 @@ import pytest
 
 from bota_clients.monitor.model import Model, SensorState
 from bota_clients.monitor.reader import Reader
-from bota_clients.monitor.screen import Look, render
+from bota_clients.monitor.screen import ViewOptions, render
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.control import Event
@@ -34,7 +34,7 @@ def model() -> Model:
 def take(model: Model, *frames: DataMessage) -> SensorState:
     """Its state when these have come together."""
     at_s = now(frames[-1].sequence)
-    model.take(frames, at_s)
+    model.add_frames(frames, at_s)
     return only(model, at_s)
 
 
@@ -117,7 +117,7 @@ def test_a_new_connection_is_no_loss_and_keeps_the_peaks_of_the_same_sensor(mode
 def test_a_tare_and_a_reset_forget_the_peaks_and_a_reset_past_warnings(model: Model, tared: bool) -> None:
     take(model, *run(0, 10, **{"force.x": 7.0, "warnings": 8}))
     if tared:
-        model.take_event({"event": Event.OFFSET_CHANGED, "sensor": 0}, now(10))
+        model.add_event({"event": Event.OFFSET_CHANGED, "sensor": 0}, now(10))
     else:
         model.reset()
     sensor = take(model, *run(10, 10))
@@ -130,7 +130,7 @@ def test_a_replay_is_told_from_a_server(model: Model) -> None:
     model.described({**description(), "replay": {"files": ["run.mcap"]}}, now(0))
     state = model.state(now(0))
     assert state.server.replay == "run.mcap"
-    assert "REPLAY run.mcap" in render(state, Look(), 80).head[0].plain
+    assert "REPLAY run.mcap" in render(state, ViewOptions(), 80).head[0].plain
 
 
 def test_a_warning_of_one_sample_is_present_for_a_while_and_then_follows_present_ones(
@@ -156,7 +156,7 @@ def test_the_last_emergency_is_told_until_it_is_over_or_reset(model: Model) -> N
         reply = status()
         last = {"code": code, "text": "temperature", "ago_s": 2.0}
         reply["sensors"][0].update(emergencies=count, emergency=last if count else None)
-        model.take_status(reply, at_s)
+        model.add_status(reply, at_s)
         return texts(only(model, at_s))
 
     assert after(0, 0, now(0)) == []
@@ -174,7 +174,7 @@ def test_drift_is_told(model: Model) -> None:
     reply, six = status(), [0.0, 0.0, 0.25, 0.0, 0.0, 0.0]
     drift = {"since": "tare", "ago_s": 2100, "kelvin": 6.0, "wrench": [5 * value for value in six]}
     reply["sensors"][0].update(drift=drift)
-    model.take_status(reply, now(0))
+    model.add_status(reply, now(0))
     sensor = only(model, now(0))
     assert texts(sensor) == ["Fz has drifted 1.2 N since the tare 35 min ago, 6 K warmer"]
     assert sensor.zero == texts(sensor)[0]
@@ -187,7 +187,7 @@ def test_a_monitor_that_was_not_run_blames_neither_server_nor_sensor(model: Mode
     starved = model.state(now(10) + 8.4)
     assert not starved.server.silent
     model.note_unread(8.35, False, now(10) + 8.4)
-    model.take(run(10, 1), now(10) + 8.4)
+    model.add_frames(run(10, 1), now(10) + 8.4)
     (alert,) = only(model, now(10) + 8.4).alerts
     assert alert.text == "No new sample for 8.4 s, this computer did not run this program for 8.3 s"
     assert alert.remedy == "Give it a priority, or the computer less to do"
@@ -196,22 +196,22 @@ def test_a_monitor_that_was_not_run_blames_neither_server_nor_sensor(model: Mode
 def test_a_lost_sensor_is_told_until_it_is_back_and_later_too(model: Model) -> None:
     """The computer is blamed where the server says so."""
     take(model, *run(0, 10))
-    model.take_status(status(), now(10))
+    model.add_status(status(), now(10))
     said = "sensor 0 is lost: this computer stood still for 300 ms, check it with ethercat-doctor"
     for message, remedy in (
         ("sensor 0 is lost: no carrier", "Check its cable and power (sensor 0 is lost: no carrier)"),
         (said, said),
     ):
-        model.take_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": message}, now(10))
+        model.add_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": message}, now(10))
         (alert,) = only(model, now(10)).alerts
         assert (alert.text, alert.remedy) == ("The server has lost the sensor", remedy)
     assert (only(model, now(10)).al_state, alert.level) == ("LOST", Level.TROUBLE)
-    model.take_event({"event": Event.SENSOR_BACK, "sensor": 0}, now(20))
+    model.add_event({"event": Event.SENSOR_BACK, "sensor": 0}, now(20))
     assert (only(model, now(20)).al_state, only(model, now(20)).verdict.level) == ("OP", Level.GOOD)
     after = status()
     after["missed_deadlines"] += 240
     after["sensors"][0]["recoveries"] += 1
-    model.take_status(after, now(20))
+    model.add_status(after, now(20))
     back, past = only(model, now(20)).alerts
     assert back.text == "The server lost the sensor once and has it back"
     assert "stood still" in back.remedy
@@ -223,7 +223,7 @@ def test_silence_is_the_sensors_only_if_the_server_speaks(model: Model) -> None:
     later_s = now(10) + 3
     assert model.state(later_s).server.silent
     assert not only(model, later_s).alerts
-    model.take([frame(10, REST, flags=DataFlag.INVALID)], later_s)
+    model.add_frames([frame(10, REST, flags=DataFlag.INVALID)], later_s)
     assert not model.state(later_s).server.silent
     assert texts(only(model, later_s)) == ["No new sample for 3.0 s, the sensor does not answer the bus"]
     assert only(model, later_s).old_s == pytest.approx(3, abs=0.1)
@@ -260,9 +260,9 @@ def test_an_age_is_noted_only_of_what_was_waited_for(
 
 
 def test_the_servers_clients_have_rates_and_one_of_them_is_this(model: Model) -> None:
-    model.take_status(status(sent=1000), START_S + 1)
+    model.add_status(status(sent=1000), START_S + 1)
     assert [client.rate_hz for client in model.state(START_S + 1).clients] == [None, None]
-    model.take_status(status(sent=2600), START_S + 3)
+    model.add_status(status(sent=2600), START_S + 3)
     state = model.state(START_S + 4)
     this, other = state.clients
     assert (this.this, this.rate_hz, this.withheld) == (True, 800, 0)

@@ -16,7 +16,7 @@ from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_clients.recording.columns import columns
 from bota_clients.recording.container import MAX_CHUNK, McapFile
-from bota_clients.recording.reader import Description, Event, open_recording
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import SampleDecoder
 from tests.clients.recordings import START_NS, describe, frame, record, writer
@@ -89,7 +89,7 @@ def test_settings_are_known_over_time(path: Path) -> None:
         history = [(at - START_NS, info.settings["sinc_length"], info.rate_hz) for at, info in sensor.history]
         assert history == [(0, 64, 800), (10, 32, 1600)]
         assert [type(item) for item in recording.everything()] == [
-            Description, DataMessage, Event, Description, DataMessage,
+            RecordedDescription, DataMessage, RecordedEvent, RecordedDescription, DataMessage,
         ]  # fmt: skip
         assert recording.events[0].name == "reconfigured"
         assert not recording.events[0].by_recorder

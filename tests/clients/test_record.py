@@ -25,7 +25,7 @@ from rosbags.rosbag2 import Reader
 from bota_clients.record import cli, program, recorder
 from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch
 from bota_clients.recording.file_format import frame_topic
-from bota_clients.recording.reader import Description, Event, open_recording
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer, description
@@ -137,7 +137,7 @@ def test_it_records_on_across_restarts_even_without_a_sensor_that_the_server_lac
         assert [event.by_recorder for event in opened.events] == [name != "shutting_down" for name in names]
         about = [event.event.get("message") for event in opened.events if event.name == "connected"]
         assert about == [None, "without sensor 1", None]
-        assert sum(isinstance(item, Description) for item in opened.everything()) == 3
+        assert sum(isinstance(item, RecordedDescription) for item in opened.everything()) == 3
 
 
 def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -171,10 +171,10 @@ def later(sent: DataMessage, ms: float) -> DataMessage:
         ),
         (  # 800 Hz, and 400 Hz later
             [
-                Description(0, description()),
+                RecordedDescription(0, description()),
                 frame(1),
                 later(frame(2, 0, DataFlag.GAP), 12.5),
-                Event(0, {"event": "reconfigured", "sensor": 0, "rate_hz": 400}),
+                RecordedEvent(0, {"event": "reconfigured", "sensor": 0, "rate_hz": 400}),
                 later(frame(3, 0, DataFlag.GAP), 32.5),
             ],
             "16 samples of sensor 0 lost on the bus (estimated)",
@@ -189,7 +189,7 @@ def test_what_was_lost_is_said(frames: Batch, sentence: str, out: Path) -> None:
     recorder = new_recorder(out)
     recorder.put([*frames])
     recorder.stop("")
-    assert recorder.so_far.endswith(f"; {sentence}")
+    assert recorder.summary.endswith(f"; {sentence}")
 
 
 def new_recorder(out: Path) -> recorder.Recorder:

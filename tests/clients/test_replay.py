@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from bota_clients.recording.reader import Description, Event, open_recording
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_clients.replay import cli
 from bota_clients.replay.sensors import ReplayedSensors
 from bota_clients.replay.timeline import Timeline
@@ -267,7 +267,7 @@ def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
     for event, state in (("sensor_lost", "LOST"), ("sensor_back", "OP")):
         row = {"event": event, "sensor": 1, "settings": {"sinc_length": 32}, "rate_hz": 1600}
         row |= {"offset": [1.0] * 6, "delay_ms": {"force_torque": 1.0}}
-        sensors.take(Event(0, row))
+        sensors.apply(RecordedEvent(0, row))
         described = [sensor.describe() for sensor in sensors.sensors]
         assert [sensor["rate_hz"] for sensor in described] == [800, 1600]
         assert described[1]["offset"] == row["offset"]
@@ -275,13 +275,13 @@ def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
             ("OP", 64),
             (state, 32),
         ]
-    sensors.take(Event(0, {"event": "sensor_lost", "sensor": 1, "reason": "different_sensor"}))
+    sensors.apply(RecordedEvent(0, {"event": "sensor_lost", "sensor": 1, "reason": "different_sensor"}))
     assert sensors.sensors[1].describe()["state"] == "REFUSED"
-    sensors.take(Event(0, {"event": "offset_changed", "sensor": 1, "offset": [2.0] * 6}))
+    sensors.apply(RecordedEvent(0, {"event": "offset_changed", "sensor": 1, "offset": [2.0] * 6}))
     assert sensors.sensors[1].describe()["offset"] == [2.0] * 6
     reply = describe(0)
     reply["sensors"][0]["settling"] = True  # it did when it was described; the node's tare waits for the end
-    sensors.describe(Description(0, reply))
+    sensors.describe(RecordedDescription(0, reply))
     assert not sensors.sensors[0].describe()["settling"]
     for flags in (0, 0, 0, DataFlag.REPEATED, DataFlag.INVALID, DataFlag.INVALID | DataFlag.REPEATED):
         sensors.count(frame(0, flags=flags))

@@ -18,7 +18,7 @@ from websockets.http11 import Request, Response
 
 from bota_clients.monitor.cli import parse
 from bota_clients.monitor.tare import Say
-from bota_clients.monitor.web.hub import CHANNELS, STEP_NS, Page, WebModel, state_text
+from bota_clients.monitor.web.pages import CHANNELS, STEP_NS, Page, WebModel, state_text
 from bota_clients.monitor.web.server import HEADERS, STREAM, read_page, respond
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
@@ -33,7 +33,7 @@ FX, FZ, AZ, WX = (CHANNELS.index(n) for n in ("force.x", "force.z", "acceleratio
 
 def batch(feed: WebModel, frames: list[DataMessage]) -> dict[str, Any]:
     """The message with the points of these."""
-    feed.take(frames, START_S)
+    feed.add_frames(frames, START_S)
     [found] = feed.batches(silent=True)
     assert {len(column) for column in found["columns"]} == {len(found["times"])}
     assert len(found["columns"]) == len(found["newest"]) == len(CHANNELS)
@@ -115,7 +115,7 @@ def test_a_slow_sensor_has_a_point_for_each_sample_at_its_time_and_none_waits_en
     found = batch(feed, frames[:20])
     assert times(found) == pytest.approx([f.monotonic_ns * 1e-9 for f in frames[:20]], abs=1e-6)
     assert found["columns"][FX] == near([moving(k)["force.x"] for k in range(20)])
-    feed.take(frames[20:], START_S)
+    feed.add_frames(frames[20:], START_S)
     assert [len(each["times"]) for each in feed.batches()] == [4096]
     assert [each["points"] for each in feed.batches(silent=True)] == [0]
     assert feed.batches(silent=True) == []
@@ -125,7 +125,7 @@ def test_a_slow_sensor_has_a_point_for_each_sample_at_its_time_and_none_waits_en
 
 
 class Harness(Web):
-    """A hub with a model of two sensors; a tare goes on until it is ended."""
+    """A pages with a model of two sensors; a tare goes on until it is ended."""
 
     def __init__(self) -> None:
         super().__init__("one", "two")
@@ -137,16 +137,16 @@ class Harness(Web):
         return cast("threading.Thread", SimpleNamespace(is_alive=lambda: self.taring_now))
 
     def join(self) -> Page:
-        page = self.hub.join()
+        page = self.pages.join()
         assert page is not None
         return page
 
     def points(self, page: Page) -> list[dict[str, Any]]:
-        return list(map(json.loads, self.hub.points(page)))
+        return list(map(json.loads, self.pages.points(page)))
 
-    def take(self, page: Page, **message: Any) -> dict[str, Any] | None:
+    def handle(self, page: Page, **message: Any) -> dict[str, Any] | None:
         """The answer to a message of a page."""
-        answer = self.hub.take(page, json.dumps(message))
+        answer = self.pages.handle(page, json.dumps(message))
         return dict(json.loads(answer)) if answer else None
 
     def message(self) -> str:
@@ -161,9 +161,9 @@ def web() -> Harness:
 
 def test_each_page_gets_the_points_of_the_sensor_that_it_shows(web: Harness) -> None:
     other = web.join()
-    web.take(other, sensor=1)
-    web.model.take([frame(k, sensor=s) for k in range(40) for s in (0, 1)], START_S + 0.05)
-    web.hub.collect(START_S + 1)
+    web.handle(other, sensor=1)
+    web.model.add_frames([frame(k, sensor=s) for k in range(40) for s in (0, 1)], START_S + 0.05)
+    web.pages.collect(START_S + 1)
     for page, position in ((web.page, 0), (other, 1)):
         assert [each["points"] for each in web.points(page)] == [position]
         assert web.points(page) == [], "once"
@@ -174,8 +174,8 @@ def test_a_page_that_comes_later_gets_the_last_minute_and_a_slow_one_begins_anew
         for second in range(first_s, last_s):
             moment = 10**12 + second * 10**9
             frames = [frame(second, sensor=s)._replace(monotonic_ns=moment) for s in (0, 1)]
-            web.model.take(frames, START_S)
-            web.hub.collect(START_S + second)
+            web.model.add_frames(frames, START_S)
+            web.pages.collect(START_S + second)
 
     pass_by(0, 100)
     later = web.join()
@@ -186,11 +186,11 @@ def test_a_page_that_comes_later_gets_the_last_minute_and_a_slow_one_begins_anew
     anew, newest = web.points(later)
     assert anew == {"anew": True}
     assert times(newest) == pytest.approx([1105])
-    web.take(later, sensor=5)
+    web.handle(later, sensor=5)
     assert web.points(later) == []
     web.model.connected(made.description(("one", "two")), made.OWN_PEER, START_S)
     pass_by(-500, -490)  # a restarted machine
-    web.take(later, sensor=1)
+    web.handle(later, sensor=1)
     assert times(*web.points(later)) == pytest.approx(range(500, 510))
 
 
@@ -198,7 +198,7 @@ def test_a_page_that_comes_later_gets_the_last_minute_and_a_slow_one_begins_anew
     "text", ["", "[]", "{", '{"do":"shutdown"}', '{"do":5}', '{"do":[]}', b"\xff", "\ud800", "[" * 900]
 )
 def test_a_message_that_no_page_sends_ends_the_connection(web: Harness, text: str | bytes) -> None:
-    assert web.hub.take(web.page, text) is None
+    assert web.pages.handle(web.page, text) is None
     assert web.page.end == "Not a message of this page"
 
 
@@ -207,15 +207,15 @@ def test_a_message_that_no_page_sends_ends_the_connection(web: Harness, text: st
 
 @pytest.mark.parametrize("action", ["tare", "clear", "reset"])
 def test_without_the_token_which_no_one_guesses_nothing_is_done(web: Harness, action: str) -> None:
-    token = web.hub.token
+    token = web.pages.token
     assert re.fullmatch(r"[\w-]{32,}", token)
-    assert Harness().hub.token != token, "each run has its own"
+    assert Harness().pages.token != token, "each run has its own"
     for wrong in ("", "wrong", token[:-1], token + "A", None, 5, ["x"], "\ud800é"):
-        reply = web.take(web.page, token=wrong, do=action)
+        reply = web.handle(web.page, token=wrong, do=action)
         assert reply is not None
         assert reply["control"] is False
         assert "token" in reply["refused"]
-    reply = web.take(web.page, do=action)
+    reply = web.handle(web.page, do=action)
     assert reply == {
         "control": False,
         "refused": "Only a page opened by the link that ethercat-monitor printed may do this",
@@ -224,25 +224,25 @@ def test_without_the_token_which_no_one_guesses_nothing_is_done(web: Harness, ac
 
 
 def test_with_the_token_the_sensor_is_tared_once_at_a_time(web: Harness) -> None:
-    assert web.take(web.page, token=web.hub.token) == {"control": True, "refused": None}
-    refused = web.take(web.join(), do="tare")
+    assert web.handle(web.page, token=web.pages.token) == {"control": True, "refused": None}
+    refused = web.handle(web.join(), do="tare")
     assert refused is not None, "the token of one page is no other's"
     assert not refused["control"]
-    web.take(web.page, do="tare", sensor=1)
+    web.handle(web.page, do="tare", sensor=1)
     assert web.tared == [(1, "tare")]
     assert web.message().endswith("Sensor 1 was tared")
-    web.take(web.page, do="tare")
+    web.handle(web.page, do="tare")
     assert "A tare is running already" in web.message()
     web.taring_now = False
-    web.take(web.page, do="undo")
+    web.handle(web.page, do="undo")
     assert web.tared[1:] == [(1, "undo")]
 
 
 def test_with_the_token_peaks_are_reset(web: Harness) -> None:
-    web.model.take([frame(0, {"force.x": 77.0})], START_S)
-    web.model.take([frame(1, {"force.x": 1.0})], START_S)
+    web.model.add_frames([frame(0, {"force.x": 77.0})], START_S)
+    web.model.add_frames([frame(1, {"force.x": 1.0})], START_S)
     assert web.model.state(START_S).sensors[0].peaks is not None
-    web.take(web.page, token=web.hub.token, do="reset")
+    web.handle(web.page, token=web.pages.token, do="reset")
     assert web.model.state(START_S).sensors[0].peaks is None
 
 
@@ -331,10 +331,12 @@ def test_a_page_says_what_the_monitor_says() -> None:
 def test_the_page_shows_what_it_is_sent_as_text_and_tares(web: Harness, tmp_path: Path) -> None:
     evil = "<img src=x onerror=alert(1)>"
     web.model.connected(made.description((evil, "two")), made.OWN_PEER, START_S)
-    web.model.take([frame(k, {**moving(k), "warnings": 16 * (k == 30)}) for k in range(400)], made.now(400))
-    web.hub.collect(made.now(401) + 1)
-    control = web.hub.take(web.page, json.dumps({"token": web.hub.token}))
-    messages = [control, web.hub.state(made.now(401)), *web.hub.points(web.page)]
+    web.model.add_frames(
+        [frame(k, {**moving(k), "warnings": 16 * (k == 30)}) for k in range(400)], made.now(400)
+    )
+    web.pages.collect(made.now(401) + 1)
+    control = web.pages.handle(web.page, json.dumps({"token": web.pages.token}))
+    messages = [control, web.pages.state(made.now(401)), *web.pages.points(web.page)]
     for path, (body, _) in PAGE_FILES.items():
         if path.endswith(".js") and "/uplot/" not in path:
             (tmp_path / path[1:]).write_bytes(body)

@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
 from bota_clients.monitor import cli
-from bota_clients.monitor.web.hub import MOST_PAGES, TOO_MANY
+from bota_clients.monitor.web.pages import MOST_PAGES, TOO_MANY
 from bota_clients.monitor.web.server import HEADERS
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.web_pages import Web
@@ -58,7 +58,7 @@ def test_the_page_is_served_on_both_loopback_addresses_and_nothing_is_kept(web: 
         assert answer.status == status
         assert dict(answer.getheaders()).items() >= HEADERS.items()
         assert answer.read().startswith(b"The page is for this machine only") is (status == 403)
-        assert web.hub.token not in str(answer.headers)
+        assert web.pages.token not in str(answer.headers)
         asking.close()
     with pytest.raises(InvalidStatus, match="403"), stream_of(web.port, "http://evil.example"):
         pass

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 
 from bota_clients.monitor.tare import Say
-from bota_clients.monitor.web.hub import Hub, WebModel
+from bota_clients.monitor.web.pages import Pages, WebModel
 from bota_clients.monitor.web.server import serving
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S
@@ -22,7 +22,7 @@ class Web:
     def __init__(self, *names: str) -> None:
         self.model = WebModel(made.ADDRESS)
         self.model.connected(made.description(*[names] * bool(names)), made.OWN_PEER, START_S)
-        self.hub = Hub(self.model, self.tare)
+        self.pages = Pages(self.model, self.tare)
         self.port = 0
         self.tared: list[tuple[int, str]] = []  # the positions that were to be tared, and the way
 
@@ -37,7 +37,7 @@ class Web:
         ready, loop, stop = Future[int](), asyncio.new_event_loop(), asyncio.Event()
 
         async def serve() -> None:
-            async with serving(self.hub, "localhost", self.port, lambda: START_S) as at:
+            async with serving(self.pages, "localhost", self.port, lambda: START_S) as at:
                 ready.set_result(at)
                 await stop.wait()
 

@@ -48,7 +48,7 @@ _COARSEST_S: Final = 0.001
 _NEAR_NS: Final = 366 * 86400 * _SECOND
 
 
-class Clock(NamedTuple):
+class ForeignClock(NamedTuple):
     """Another clock than the server's, as `ethercat-export align` finds it."""
 
     stamp_ns: int  # of that clock, ...
@@ -56,7 +56,7 @@ class Clock(NamedTuple):
     drift_ppm: float  # by which the server's is faster
 
     @classmethod
-    def read(cls, path: Path) -> Clock:
+    def read(cls, path: Path) -> ForeignClock:
         """What `ethercat-export align` printed; RecordingError."""
         try:
             found = parse_json_object(path.read_bytes())
@@ -91,7 +91,11 @@ class Stamped:
     """Frames in the order of their instants, stamped so long after the exposure."""
 
     def __init__(
-        self, stamps_ns: Ints, source: str = "the frames", latency_s: float = 0.0, clock: Clock | None = None
+        self,
+        stamps_ns: Ints,
+        source: str = "the frames",
+        latency_s: float = 0.0,
+        clock: ForeignClock | None = None,
     ) -> None:
         """`source` is for errors; `clock` made the stamps, if not the server's CLOCK_REALTIME."""
         self.count, self._stamps, self._source, self._clock = len(stamps_ns), stamps_ns, source, clock
@@ -283,7 +287,7 @@ def windows_of(
         until_ns = windows.until_ns
         if info is not None:
             windows.configure(info.settings, info.rate_hz, info.name, info.offset)
-            samples = windows.take(batch)
+            samples = windows.add(batch)
             clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
             if clocks.size:
                 waiting = np.hstack([waiting, frames.exposed(*clocks)])
@@ -308,7 +312,7 @@ def windows_of(
 
 def write(options: argparse.Namespace, recording: Recording) -> str:
     """Windows for the frames that are asked for, into a file; says of how many samples."""
-    clock = options.clock and Clock.read(options.clock)
+    clock = options.clock and ForeignClock.read(options.clock)
     tool = options.tool and read_tool(options.tool)
     length, sensor, path = int(options.window), choose(recording, options.sensor), options.output
     frames: Periodic | Stamped

@@ -2,7 +2,7 @@
 
     windows = Windows(32)
     windows.configure(row["settings"], row["rate_hz"], row["name"], row["offset"])  # whenever they change
-    windows.take(frames)  # DATA messages of one sensor, in order
+    windows.add(frames)  # DATA messages of one sensor, in order
     arrays = windows.at(np.array([windows.until_ns]))
 
 Samples are in slots, one for each period of the sensor; the slot of a lost sample stays empty. A sample was
@@ -159,7 +159,7 @@ class Windows:
         """The last instant of which nothing that comes later can be a part; -1 before the first sample."""
         return int(self._slots["measured_ns"].max(axis=0, initial=-1).min())
 
-    def take(self, frames: Sequence[DataMessage]) -> Columns:
+    def add(self, frames: Sequence[DataMessage]) -> Columns:
         """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
         samples = columns((each for each in frames if not each.flags & NOT_NEW), self._units)
         if not len(samples):

@@ -20,8 +20,8 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from bota_clients.monitor.model import Model, State, clock_text
-from bota_clients.monitor.recorder import Recorder
-from bota_clients.monitor.screen import Look, Screen, render
+from bota_clients.monitor.recording import MonitorRecording
+from bota_clients.monitor.screen import Screen, ViewOptions, render
 from bota_clients.monitor.tare import start_tare
 from bota_clients.numbers import duration
 from bota_clients.program import call_on
@@ -81,10 +81,10 @@ class Monitor(App[None]):
         self._model = model
         self._address = address
         self._clock = clock
-        self._look = Look()
+        self._view = ViewOptions()
         self._views = [View(id=name) for name in Screen._fields]
         self._seconds = seconds
-        self.recorder = Recorder(address)
+        self.recorder = MonitorRecording(address)
         self._state: State | None = None
         self._to_tare = 0  # the position that the question is about
 
@@ -111,12 +111,12 @@ class Monitor(App[None]):
         if ended := self.recorder.ended():
             self._model.say(*ended)
         state = self._model.state(now_s)
-        if self._look.paused and self._state is not None:
+        if self._view.paused and self._state is not None:
             state = replace(self._state, message=state.message)
         self._state = state
         recording = f"REC {duration(now_s - self.recorder.since_s)}" if self.recorder.running else ""
         width = self._views[1].scrollable_content_region.width
-        screen = render(state, replace(self._look, recording=recording), width)
+        screen = render(state, replace(self._view, recording=recording), width)
         self._views[2].styles.height = len(screen.foot)
         for view, rows in zip(self._views, screen, strict=True):
             view.show(rows)
@@ -136,26 +136,26 @@ class Monitor(App[None]):
         if event.key in {"ctrl+c", "ctrl+q", "ctrl+z"}:
             return
         event.stop()
-        look, key = self._look, (event.character or "").lower()
+        look, key = self._view, (event.character or "").lower()
         if event.key == "ctrl+l":
             self.refresh(layout=True)
         elif look.question:
             self._answer(key)
         elif look.help:
-            self._look = replace(look, help=False)
+            self._view = replace(look, help=False)
         elif key == "t":
             self._ask_tare()
         elif key == "r":
             self._record()
         elif key in {"p", " "}:
-            self._look = replace(look, paused="" if look.paused else clock_text())
+            self._view = replace(look, paused="" if look.paused else clock_text())
         elif key == "0":
             self._model.reset()
             self._model.say("Peaks and past warnings are reset")
         elif key == "n":
             self._next()
         elif key in {"?", "h"}:
-            self._look = replace(look, help=True)
+            self._view = replace(look, help=True)
         elif key == "q":
             self.exit()
         self.draw()
@@ -165,12 +165,12 @@ class Monitor(App[None]):
         if state is None or not state.sensors or not state.server.connected:
             self._model.say("No sensor to tare: not connected to the server", True)
             return
-        self._to_tare = state.sensors[self._look.selected % len(state.sensors)].position
+        self._to_tare = state.sensors[self._view.selected % len(state.sensors)].position
         answers = "y: yes, u: undo the last tare, c: clear it, any other key: no"
-        self._look = replace(self._look, question=f"Tare sensor {self._to_tare}? {answers}")
+        self._view = replace(self._view, question=f"Tare sensor {self._to_tare}? {answers}")
 
     def _answer(self, key: str) -> None:
-        self._look = replace(self._look, question="")
+        self._view = replace(self._view, question="")
         if key in _ANSWERS:
             start_tare(self._address, self._to_tare, self._model.say, _ANSWERS[key])
         else:
@@ -188,4 +188,4 @@ class Monitor(App[None]):
         if count < 2:
             self._model.say("There is only one sensor" if count else "There is no sensor")
         else:
-            self._look = replace(self._look, selected=(self._look.selected + 1) % count)
+            self._view = replace(self._view, selected=(self._view.selected + 1) % count)

@@ -59,7 +59,7 @@ _WITH_PEAKS: Final = 56  # width from which the peaks are shown as numbers too
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class ViewOptions:
     selected: int = 0  # which sensor comes first, counted from 0 in the state's order
     paused: str = ""  # time of day of the pause; empty if not paused
     recording: str = ""  # the running recording, in words
@@ -75,7 +75,7 @@ class Screen(NamedTuple):
     foot: list[Text]
 
 
-def render(state: State, look: Look, width: int) -> Screen:
+def render(state: State, look: ViewOptions, width: int) -> Screen:
     body = _help() if look.help else _overview(state, look, width)
     screen = Screen([_title(state, look, width)], body, [*_message(state, look, width), _keys(look, width)])
     for row in (row for part in screen for row in part):
@@ -105,7 +105,7 @@ def _help() -> list[Text]:
     return [*rows, *map(Text, _HELP.splitlines())]
 
 
-def _overview(state: State, look: Look, width: int) -> list[Text]:
+def _overview(state: State, look: ViewOptions, width: int) -> list[Text]:
     """Server, sensors from the selected one on, clients."""
     rows = _server(state, width)
     if not state.sensors:
@@ -117,7 +117,7 @@ def _overview(state: State, look: Look, width: int) -> list[Text]:
     return [*rows, _clients(state)]
 
 
-def _title(state: State, look: Look, width: int) -> Text:
+def _title(state: State, look: ViewOptions, width: int) -> Text:
     """Address, what is special, sensors that have findings, connection."""
     server = state.server
     left = Text(server.address, VALUE)
@@ -148,7 +148,7 @@ def _clients(state: State) -> Text:
     return _field("Clients", known if state.server.connected else "not known")
 
 
-def _message(state: State, look: Look, width: int) -> list[Text]:
+def _message(state: State, look: ViewOptions, width: int) -> list[Text]:
     text, style = state.events[-1] if state.events else "", LABEL
     if look.question:
         text, style = look.question, NOTICE
@@ -158,7 +158,7 @@ def _message(state: State, look: Look, width: int) -> list[Text]:
     return [Text(line, style) for line in lines or [""]]
 
 
-def _keys(look: Look, width: int) -> Text:
+def _keys(look: ViewOptions, width: int) -> Text:
     other = {"r": "stop"} if look.recording else {}
     other |= {"p": "resume"} if look.paused else {}
     row = Text()

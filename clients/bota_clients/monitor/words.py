@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from bota_clients.monitor.model import Alert, Client, SensorState, ServerState, Spread, State
+from bota_clients.monitor.model import Alert, Percentiles, SensorState, ServerClient, ServerState, State
 from bota_clients.numbers import duration, milliseconds
 from bota_ethercat.health.verdict import Level
 from bota_ethercat.text.json_text import finite
@@ -117,14 +117,14 @@ def clock(sensor: SensorState) -> str:
     return text or "not known"
 
 
-def client(one: Client) -> str:
+def client(one: ServerClient) -> str:
     text = "this one" if one.this else one.peer
     if one.rate_hz is not None:
         text += f" {one.rate_hz:.0f}/s"
     return f"{text}, {one.withheld} withheld" if one.withheld else text
 
 
-def times(spread: Spread | None) -> str:
+def times(spread: Percentiles | None) -> str:
     """Median and p99 or worst of a distribution."""
     if spread is None:
         return "not known"
@@ -159,8 +159,8 @@ def json_object(state: State, unix_s: float) -> dict[str, Any]:
         "server": {
             **_plain(server, "version uptime_s"),
             **_plain(server.status, "cycles missed_deadlines lost_frames"),
-            "wake_us": _spread(server.wake_us),
-            "exchange_us": _spread(server.exchange_us),
+            "wake_us": _percentiles(server.wake_us),
+            "exchange_us": _percentiles(server.exchange_us),
         }
         if server.connected
         else None,
@@ -192,9 +192,9 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         **_plain(sensor, "samples rate_hz jitter_us jitter_worst_us missed gaps repeated invalid silent_s"),
         "lost_on_bus": status.lost_samples,
         "recoveries": status.recoveries,
-        "age_us": _spread(sensor.age_us),
+        "age_us": _percentiles(sensor.age_us),
         "clock": _plain(status.clock, "mode offset_ppm uncertainty_us") if status.clock.mode else None,
-        "hand_out_us": _spread(sensor.hand_out_us),
+        "hand_out_us": _percentiles(sensor.hand_out_us),
     }
 
 
@@ -202,5 +202,5 @@ def _plain(thing: object, names: str) -> dict[str, Any]:
     return {name: getattr(thing, name) for name in names.split()}
 
 
-def _spread(spread: Spread | None) -> dict[str, float] | None:
+def _percentiles(spread: Percentiles | None) -> dict[str, float] | None:
     return None if spread is None else {"p50": spread.p50, spread.which: spread.high}

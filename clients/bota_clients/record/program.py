@@ -17,8 +17,8 @@ from rich.text import Text
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import duration
 from bota_clients.program import Signals, say
-from bota_clients.record.recorder import NAME, Batch, Recorder, Source, notes, record
-from bota_clients.recording.reader import Event
+from bota_clients.record.recorder import NAME, Batch, Recorder, RecordingClient, notes, record
+from bota_clients.recording.reader import RecordedEvent
 from bota_ethercat.errors import RefusedError
 from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.program.new_file import refuse_existing
@@ -28,7 +28,7 @@ _say = partial(say, "ethercat-record")
 
 
 def run(options: argparse.Namespace, signals: Signals) -> int:
-    with contextlib.closing(Source(options.address, options.sensors)) as source:
+    with contextlib.closing(RecordingClient(options.address, options.sensors)) as source:
         try:
             refuse_existing(options.path, force=options.force)
             source.connect()
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace, signals: Signals) -> int:
         return _record(source, options, signals)
 
 
-def _record(source: Source, options: argparse.Namespace, signals: Signals) -> int:
+def _record(source: RecordingClient, options: argparse.Namespace, signals: Signals) -> int:
     console = Console(stderr=True, highlight=False)
     show = partial(console.print, markup=False, soft_wrap=True)
     began = time.monotonic()
@@ -49,7 +49,7 @@ def _record(source: Source, options: argparse.Namespace, signals: Signals) -> in
         connected, passed_s = source.session.connected, time.monotonic() - began
         of = "" if options.seconds is None else f" of {duration(options.seconds)}"
         state = "" if connected else "no server, reconnecting; "
-        status.update(Text(f"{state}{duration(passed_s)}{of}, {recorder.so_far}"))
+        status.update(Text(f"{state}{duration(passed_s)}{of}, {recorder.summary}"))
         if signals.asked:
             return "asked to stop"
         if options.seconds is not None and passed_s >= options.seconds:
@@ -61,13 +61,13 @@ def _record(source: Source, options: argparse.Namespace, signals: Signals) -> in
         record(source, recorder, until)
     if recorder.error is not None:
         _say(str(recorder.error))
-    _say(f"{options.path}: {duration(time.monotonic() - began)}, {recorder.so_far}")
+    _say(f"{options.path}: {duration(time.monotonic() - began)}, {recorder.summary}")
     return int(recorder.error is not None)
 
 
 def _report(batch: Batch, show: Callable[[str], None]) -> None:
     for item in batch:
-        if isinstance(item, Event):
+        if isinstance(item, RecordedEvent):
             words = item.event.get("message") or item.event.get("reason") or ""
             if not item.by_recorder:
                 show(event_sentence(item.event))

@@ -29,14 +29,14 @@ _BATCH: Final = 4096  # frames
 _LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions
 
 
-class Description(NamedTuple):
+class RecordedDescription(NamedTuple):
     """A reply to `describe`."""
 
     stamp_ns: int  # when it was received, ns since 1970
     reply: JsonObject
 
 
-class Event(NamedTuple):
+class RecordedEvent(NamedTuple):
     """An event of the server, or of the recorder (`by_recorder`)."""
 
     stamp_ns: int  # when it was received, ns since 1970
@@ -89,9 +89,9 @@ class Histories:
         self._of: dict[int, list[InForce]] = {}
         self._offsets: dict[int, list[Offset]] = {}
 
-    def take(self, note: Description | Event) -> None:
+    def apply(self, note: RecordedDescription | RecordedEvent) -> None:
         """Take the next description or event of the file."""
-        if isinstance(note, Description):
+        if isinstance(note, RecordedDescription):
             for info in replies.Description.parse(note.reply).sensors:
                 self._learn(note.stamp_ns, info)
         elif (position := position_of(note.event)) is not None and {"settings", "offset"} & note.event.keys():
@@ -160,14 +160,14 @@ class Recording(McapFile):
             elif topic in (file_format.DESCRIPTION_TOPIC, file_format.EVENTS_TOPIC):
                 self._noted.add(number)
         self.frame_count = counts.total()
-        self.events: list[Event] = []
+        self.events: list[RecordedEvent] = []
         histories = Histories()
         for taken, note in enumerate(self._read(self._noted)):
             if taken == _MAX_NOTES:
                 raise RecordingError(f"{self.path} has more than {_MAX_NOTES} events")
             if not isinstance(note, DataMessage):
-                histories.take(note)
-            if isinstance(note, Event):
+                histories.apply(note)
+            if isinstance(note, RecordedEvent):
                 self.events.append(note)
         self.sensors: tuple[RecordedSensor, ...] = histories.sensors(counts)
 
@@ -179,7 +179,9 @@ class Recording(McapFile):
         frames = self._read(self._channels(sensor))
         return cast(Iterator[DataMessage], frames)
 
-    def everything(self, sensor: int | None = None) -> Iterator[DataMessage | Description | Event]:
+    def everything(
+        self, sensor: int | None = None
+    ) -> Iterator[DataMessage | RecordedDescription | RecordedEvent]:
         """Descriptions, events and the frames of the sensor at this position, or of all, as they came."""
         return self._read(self._channels(sensor) | self._noted)
 
@@ -195,22 +197,22 @@ class Recording(McapFile):
                     yield info, batch
                 else:
                     for note in batch:
-                        histories.take(note)
+                        histories.apply(note)
                     newest = histories.newest(sensor)
                     info = info if newest == SensorInfo(sensor) else newest
 
     def _channels(self, sensor: int | None) -> set[int]:
         return {number for number, position in self._sensor_of.items() if sensor in (None, position)}
 
-    def _read(self, channels: set[int]) -> Iterator[DataMessage | Description | Event]:
+    def _read(self, channels: set[int]) -> Iterator[DataMessage | RecordedDescription | RecordedEvent]:
         for channel, log_time_ns, body in self.messages(channels):
             position, topic = self._sensor_of.get(channel), self.topics[channel]
             if position is not None:
                 yield file_format.unpack_frame(body, position)
             elif topic == file_format.DESCRIPTION_TOPIC:
-                yield Description(log_time_ns, file_format.unpack_json(body, topic))
+                yield RecordedDescription(log_time_ns, file_format.unpack_json(body, topic))
             else:
-                yield Event(log_time_ns, file_format.unpack_json(body, topic))
+                yield RecordedEvent(log_time_ns, file_format.unpack_json(body, topic))
 
 
 def open_recording(path: Path) -> Recording:

@@ -13,11 +13,10 @@ from typing import Any, Final, NoReturn
 
 from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
-from bota_clients.recording.reader import Description, Event, Recording, open_recording
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording, open_recording
 from bota_clients.replay.sensors import ReplayedSensors, needs_sensor
 from bota_clients.replay.timeline import Timeline
-from bota_ethercat.control import Event as ServerEvent
-from bota_ethercat.control import event
+from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataMessage, encode_data
 from ethercat_server.errors import ServerError
 from ethercat_server.serving.actions import Actions
@@ -86,7 +85,7 @@ class Player:
                 self._timeline.begin_again()
             self._drain()
         finally:
-            hub.broadcast(event(ServerEvent.SHUTTING_DOWN))
+            hub.broadcast(event(Event.SHUTTING_DOWN))
         _say(f"{'stopped' if self._signals.asked else 'ended'} after {self.sensors.sent} frames")
 
     def _about(self) -> dict[str, object]:
@@ -108,7 +107,7 @@ class Player:
                 return False
             if isinstance(item, DataMessage):
                 self._send(item)
-            elif isinstance(item, Description):
+            elif isinstance(item, RecordedDescription):
                 self.sensors.describe(item)
             else:
                 self._happen(item)
@@ -117,14 +116,14 @@ class Player:
     def _has_subscriber(self) -> bool:
         return any(c.subscription is not None for c in self.hub.connections.values())
 
-    def _happen(self, event: Event) -> None:
+    def _happen(self, event: RecordedEvent) -> None:
         if event.by_recorder:
             if event.name == "connected":
                 self._timeline.reconnected()
             return
-        self.sensors.take(event)
+        self.sensors.apply(event)
         # It was the recorded server that shut down, not this one.
-        if event.name != ServerEvent.SHUTTING_DOWN:
+        if event.name != Event.SHUTTING_DOWN:
             self.hub.broadcast(event.event)
 
     def _send(self, frame: DataMessage) -> None:

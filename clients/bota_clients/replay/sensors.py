@@ -7,10 +7,9 @@ from collections import Counter
 from itertools import takewhile
 from typing import Any, Final, NoReturn
 
-from bota_clients.recording.reader import Description, Event, Recording
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording
 from bota_ethercat.accounting import NOT_NEW
-from bota_ethercat.control import ErrorCode, Request
-from bota_ethercat.control import Event as ServerEvent
+from bota_ethercat.control import ErrorCode, Event, Request
 from bota_ethercat.errors import RequestError
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import is_finite
@@ -36,16 +35,16 @@ class ReplayedSensor:
         self._emergency: dict[str, Any] | None = None
         self._emergency_at = 0.0
 
-    def take(self, event: Event) -> None:
+    def apply(self, event: RecordedEvent) -> None:
         said = event.event
-        if event.name == ServerEvent.EMERGENCY:
+        if event.name == Event.EMERGENCY:
             self._emergencies += 1
             self._emergency = {key: said.get(key) for key in ("code", "text", "register", "data")}
             self._emergency_at = time.monotonic()
         self.row |= {key: said[key] for key in _IN_FORCE if key in said}
-        if event.name == ServerEvent.SENSOR_LOST:
+        if event.name == Event.SENSOR_LOST:
             self.row["state"] = "REFUSED" if said.get("reason") == "different_sensor" else "LOST"
-        elif event.name == ServerEvent.SENSOR_BACK:
+        elif event.name == Event.SENSOR_BACK:
             self.row["state"] = "OP"
 
     def count(self, frame: DataMessage) -> None:
@@ -103,19 +102,19 @@ class ReplayedSensors:
         self.sensors = [ReplayedSensor(position) for position in range(count)]
         # As the first subscriber finds them: their description comes before their first frame.
         for item in takewhile(lambda item: not isinstance(item, DataMessage), recording.everything()):
-            if isinstance(item, Description):
+            if isinstance(item, RecordedDescription):
                 self.describe(item)
         self.sent = 0
         self._started = time.monotonic()
 
-    def describe(self, description: Description) -> None:
+    def describe(self, description: RecordedDescription) -> None:
         for row in rows(description.reply.get("sensors")):
             if (sensor := self._at(row.get("sensor"))) is not None:
                 sensor.row |= {**row, "settling": False}  # it was, when it was described
 
-    def take(self, event: Event) -> None:
+    def apply(self, event: RecordedEvent) -> None:
         if (sensor := self._at(event.event.get("sensor"))) is not None:
-            sensor.take(event)
+            sensor.apply(event)
 
     def count(self, frame: DataMessage) -> None:
         self.sent += 1

@@ -29,7 +29,7 @@ from websockets.http11 import Request, Response
 from bota_clients.arguments import is_loopback
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.tare import start_tare
-from bota_clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, Page, WebModel
+from bota_clients.monitor.web.pages import MOST_BYTES, TOO_MANY, Page, Pages, WebModel
 from bota_clients.program import call_on, say
 from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
@@ -82,11 +82,11 @@ async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: f
     stop = asyncio.Event()
     call_on(asyncio.get_running_loop(), stop.set, "SIGINT", "SIGTERM", "SIGHUP")
     model = WebModel(str(address), imu_units)
-    hub = Hub(model, partial(start_tare, address))
+    pages = Pages(model, partial(start_tare, address))
     reader = Reader(address, model, POINTS_S)
-    async with serving(hub, *where) as port:
+    async with serving(pages, *where) as port:
         sys.stdout.write(
-            f"Open http://{Address(where.host, port)}/#token={hub.token}\n"
+            f"Open http://{Address(where.host, port)}/#token={pages.token}\n"
             "With this link the page can tare the sensor; without #token=... it only shows. Ctrl-C ends it.\n"
         )
         sys.stdout.flush()
@@ -100,7 +100,7 @@ async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: f
 
 @contextlib.asynccontextmanager
 async def serving(
-    hub: Hub, host: str, port: int, clock: Callable[[], float] = time.monotonic
+    pages: Pages, host: str, port: int, clock: Callable[[], float] = time.monotonic
 ) -> AsyncIterator[int]:
     """Serve on a loopback address; yields the port. OSError if it cannot be bound.
 
@@ -114,14 +114,14 @@ async def serving(
     }  # fmt: skip
 
     async def converse(connection: ServerConnection) -> None:
-        page = hub.join()
+        page = pages.join()
         if page is None:
             await connection.close(_TRY_AGAIN_LATER, TOO_MANY)
             return
         sending = asyncio.create_task(send(connection, page))
         try:
             async for text in connection:
-                if answer := hub.take(page, text):
+                if answer := pages.handle(page, text):
                     await connection.send(answer)
                 if page.end:
                     await connection.close(_POLICY_VIOLATION, page.end)
@@ -129,21 +129,21 @@ async def serving(
             pass
         finally:
             sending.cancel()
-            hub.pages.discard(page)
+            pages.connected.discard(page)
 
     async def send(connection: ServerConnection, page: Page) -> None:
-        """As fast as the page reads: what it has no time for waits in the hub."""
+        """As fast as the page reads: what it has no time for waits in the pages."""
         with contextlib.suppress(ConnectionClosed):
             for count in itertools.count():
                 if count % POINTS_A_STATE == 0:
-                    await connection.send(hub.state(clock()))
-                for text in hub.points(page):
+                    await connection.send(pages.state(clock()))
+                for text in pages.points(page):
                     await connection.send(text)
                 await asyncio.sleep(POINTS_S)
 
     async def collect() -> None:
         while True:
-            hub.collect(clock())
+            pages.collect(clock())
             await asyncio.sleep(POINTS_S)
 
     async with contextlib.AsyncExitStack() as stack:

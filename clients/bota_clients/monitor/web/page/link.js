@@ -5,7 +5,7 @@ const SILENT_MS = 1500;
 const GIVEN_UP_MS = 5000;
 export const CHANNELS = 13;
 
-/** Calls `on.state`, `on.points`, `on.anew` (see monitor/web/hub.py), `on.reply` with messages and `on.trouble` with a text, or null. */
+/** Calls `on.state`, `on.points`, `on.anew` (see monitor/web/pages.py), `on.reply` with messages and `on.trouble` with a text, or null. */
 export class Link {
   constructor(on) {
     this.on = on;

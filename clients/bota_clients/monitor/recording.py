@@ -13,7 +13,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.errors import ProtocolError
 
 
-class Recorder:
+class MonitorRecording:
     """At most one recording at a time."""
 
     def __init__(self, address: Address) -> None:
@@ -62,10 +62,10 @@ class Recorder:
             self._said = f"The recording failed: {error}", True
 
     def _record(self, path: Path) -> str:
-        with contextlib.closing(files.Source(self._address, None)) as source:
+        with contextlib.closing(files.RecordingClient(self._address, None)) as source:
             source.connect()
             recorder = files.Recorder(path, files.NAME, files.notes(source), overwrite=False)
             files.record(source, recorder, lambda _: "asked to stop" if self._asked.is_set() else None)
         if recorder.error is not None:
             raise recorder.error
-        return recorder.so_far
+        return recorder.summary

@@ -6,7 +6,7 @@ point, `times` after it; `columns`, values of each of the 13 channels; `newest`,
 Times are the server's CLOCK_MONOTONIC in s, values in SI units or counts, both to six decimals; null: not a
 finite number. A page that was too slow for the points before them is told to begin its traces anew.
 
-`WebModel.take` and `connected` are called by the reader's thread, everything else by one other.
+`WebModel.add_frames` and `connected` are called by the reader's thread, everything else by one other.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Points:
         self._newest: Values = ()
         self.last = (-1, -1)  # number and time of the newest frame
 
-    def take(self, frames: Iterable[DataMessage]) -> None:
+    def add(self, frames: Iterable[DataMessage]) -> None:
         """Frames of any sensors as they came; REPEATED, INVALID and old ones bring nothing."""
         for sequence, _, time_ns, sensor, flags, _, process_data in frames:
             is_old = sequence <= self.last[0] and time_ns <= self.last[1]
@@ -130,12 +130,12 @@ class WebModel(Model):
                 points.last = (-1, -1)  # the server may count from the beginning again
         super().connected(description, own_peer, now_s)
 
-    def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
+    def add_frames(self, frames: Sequence[DataMessage], now_s: float) -> None:
         """See `Model`."""
-        super().take(frames, now_s)
+        super().add_frames(frames, now_s)
         with self._points_lock:
             for position in {frame.sensor for frame in frames}:
-                self._points.setdefault(position, Points(position, self._imu_units)).take(frames)
+                self._points.setdefault(position, Points(position, self._imu_units)).add(frames)
 
     def batches(self, *, silent: bool = False) -> list[dict[str, Any]]:
         """The messages with points that are due; `silent` as in `Points.batch`."""
@@ -152,13 +152,13 @@ class Page:
         self.end = ""  # why its connection must be closed; empty if not
 
 
-class Hub:
+class Pages:
     """The connected pages, the model that they show, and the token with which one may tare."""
 
     def __init__(self, model: WebModel, tare: Callable[[int, Say, str], threading.Thread]) -> None:
         """`tare` starts one of WAYS with the sensor at a position."""
         self.token: Final = secrets.token_urlsafe(24)
-        self.pages: set[Page] = set()
+        self.connected: set[Page] = set()
         self._model = model
         self._tare = tare
         self._taring: threading.Thread | None = None
@@ -169,10 +169,10 @@ class Hub:
 
     def join(self) -> Page | None:
         """A page has connected; None if there are enough."""
-        if len(self.pages) >= MOST_PAGES:
+        if len(self.connected) >= MOST_PAGES:
             return None
         page = Page()
-        self.pages.add(page)
+        self.connected.add(page)
         return page
 
     def state(self, now_s: float) -> str:
@@ -198,7 +198,7 @@ class Hub:
         page.sent = new[0][0]
         return [_ANEW, new[0][2]] if anew else [text for *_, text in reversed(new)]
 
-    def take(self, page: Page, text: str | bytes) -> str | None:
+    def handle(self, page: Page, text: str | bytes) -> str | None:
         """A message of a page, whose `end` may be set afterwards; the answer, if there is one."""
         try:
             message = parse_json_object(text.encode() if isinstance(text, str) else text)
