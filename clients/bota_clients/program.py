@@ -45,6 +45,9 @@ def start(program: str, module: str, *arguments: object) -> int:
     except (ClientError, ProtocolError) as error:
         say(program, str(error))
         code = 1
+    except KeyboardInterrupt:  # of those that write a file at the end
+        say(program, "stopped: nothing was written")
+        code = 1
     return code
 
 

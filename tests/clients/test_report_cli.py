@@ -215,5 +215,5 @@ def test_ctrl_c_leaves_nothing(report: Report, monkeypatch: pytest.MonkeyPatch) 
 
     record(report.path, SENSOR, frames())
     monkeypatch.setattr(page, "render", interrupted)
-    assert report.run(report.path) == (1, "", "ethercat-report: stopped: no report was written\n")
+    assert report.run(report.path) == (1, "", "ethercat-report: stopped: nothing was written\n")
     assert list(report.folder.iterdir()) == [report.path]

@@ -101,9 +101,6 @@ def run(options: argparse.Namespace) -> int:
                 how = f"was cut off ({recording.cut_off}): the intact part is exported"
                 say(PROGRAM, f"{recording.path} {how}")
             written = write(options, recording)
-    except KeyboardInterrupt:
-        say(PROGRAM, "stopped: nothing was written")
-        return 1
     except OSError as error:
         raise FileError(f"{options.output} cannot be written: {error.strerror or error}") from None
     say(PROGRAM, f"{options.output}: {written}")

@@ -54,21 +54,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    try:
-        words, exit_code = make(options)
-    except KeyboardInterrupt:
-        say(_PROGRAM, "stopped: no report was written")
-        return 1
-    try:
-        print(words, flush=True)
-    except BrokenPipeError:
-        discard_output()  # the report is in its file
-    say(_PROGRAM, f"the report is in {options.output}")
-    return exit_code
-
-
-def make(options: argparse.Namespace) -> tuple[str, int]:
-    """Write the report; the words for the standard output, and the exit code."""
     from bota_clients.report import checks, page, subjects  # noqa: PLC0415 - needs the extra
 
     interrupt_on_signals()
@@ -78,8 +63,14 @@ def make(options: argparse.Namespace) -> tuple[str, int]:
         now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         file.write(page.render(examinations, made=now, program=f"{_PROGRAM} {VERSION}", note=options.note))
         file.finish()
-    words = page.as_json(examinations) if options.json else "\n".join(map(_summary, examinations))
-    return words, int(any(each.level is Level.TROUBLE for each in examinations))
+    try:
+        print(
+            page.as_json(examinations) if options.json else "\n".join(map(_summary, examinations)), flush=True
+        )
+    except BrokenPipeError:
+        discard_output()  # the report is in its file
+    say(_PROGRAM, f"the report is in {options.output}")
+    return int(any(each.level is Level.TROUBLE for each in examinations))
 
 
 def _summary(examination: Examination) -> str:
