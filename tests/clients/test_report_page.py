@@ -88,7 +88,7 @@ def test_it_can_be_read_without_seeing_it(page: str) -> None:
     reader = Reader(page)
     assert "`" not in "".join(reader.words), "commands are set as code"
     descriptions = [str(plot["alt"]) for plot in reader.of("img")]
-    assert len(descriptions) == 6
+    assert len(descriptions) == 5
     assert all(re.search(r"\d", words) for words in descriptions), "they say what is in the plot"
     assert len(reader.of("th")) == len([tag for tag in reader.of("th") if tag.get("scope")])
     assert reader.of("html") == [{"lang": "en"}]

@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bota_clients.numbers import count, seconds
 from bota_clients.numbers import figure as number
+from bota_clients.numbers import seconds
 from bota_clients.recording.columns import Floats, Ints
 from bota_clients.report.series import GROUPS, Group, Series
 
@@ -159,30 +159,3 @@ def temperature(figure: Figure, series: Series) -> str:
     panel.plot(time[known], mean[known], color=PLAIN)
     panel.set(xlim=(0, series.width), xlabel="time, s", ylabel="°C")
     return f"Temperature from {number(np.nanmin(low))} to {number(np.nanmax(high))} °C."
-
-
-def intervals(figure: Figure, series: Series) -> str:
-    """Intervals over time, and how those without a loss are distributed."""
-    deviations = series.deviations * 1e6
-    if len(deviations) < 2:
-        return ""
-    off = np.abs(deviations)
-    reach = max(float(np.quantile(off, 0.999)), 1.0) * 1.2
-    figure.set_figheight(4.0)
-    _margins(figure, hspace=0.4)
-    upper, lower = figure.subplots(2, 1)
-    time, low, high, _ = envelope(series.time[1:], series.intervals * 1e3, series.width)
-    upper.fill_between(time, low, high, color=PLAIN, alpha=0.5, linewidth=0.4)
-    upper.plot(time, high, ".", color=PLAIN, markersize=1.5)
-    upper.set(xlim=(0, series.width), xlabel="time, s", ylabel="interval, ms")
-    lower.hist(np.clip(deviations, -reach, reach), 120, range=(-reach, reach), color=PLAIN, log=True)
-    lower.axvline(0, color=LIMIT, linestyle="--", linewidth=1)
-    typical = f"interval minus the typical one of {number(series.period * 1e3, 5)} ms, µs"
-    lower.set(xlim=(-reach, reach), xlabel=typical, ylabel="samples")
-    lower.yaxis.set_major_formatter("{x:g}")  # instead of exponents
-    lower.yaxis.set_minor_formatter("")
-    return (
-        f"{count(len(deviations), 'interval')} without a loss; the standard deviation is "
-        f"{number(deviations.std())} µs, the greatest deviation {number(off.max())} µs; "
-        f"{np.sum(off > reach)} beyond the ends are counted in the outermost bars."
-    )
