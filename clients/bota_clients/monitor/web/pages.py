@@ -22,11 +22,14 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import takewhile
 from typing import Any, Final
 
+import numpy as np
+
 from bota_clients.monitor import words
 from bota_clients.monitor.model import Model, State
 from bota_clients.monitor.screen import table
 from bota_clients.monitor.tare import WAYS, Say
 from bota_clients.numbers import duration
+from bota_clients.recording.columns import Floats
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError
 from bota_ethercat.framing import DataMessage
@@ -43,7 +46,6 @@ MOST_BYTES: Final = 1024  # of a message from a page
 BEHIND_S: Final = 2.0  # points that wait longer for a page are too many for it
 _SILENT_S: Final = 0.1
 STEP_NS: Final = 10_000_000  # of the traces
-MOST_POINTS: Final = 4096  # that wait to be taken: 20 s
 # Six axes of the wrench, acceleration, angular rate, temperature.
 CHANNELS: Final = tuple(field.name for field in COMMON.fields if field.type is PdoType.REAL)
 
@@ -59,61 +61,48 @@ class Points:
         factors = {"acceleration": STANDARD_GRAVITY, "angular_rate": math.pi / 180.0}
         to_si = {} if imu_units is ImuUnits.SI else factors  # from the process data's units
         self._scale = [to_si.get(name.split(".")[0], 1.0) for name in CHANNELS]
-        self._step: list[tuple[int, Values]] = []  # its samples so far
-        self._points: deque[tuple[int, Values]] = deque(maxlen=MOST_POINTS)
-        self._newest: Values = ()
+        self._samples: list[tuple[int, Values]] = []  # that are no points yet
         self.last = (-1, -1)  # number and time of the newest frame
 
     def add(self, frames: Iterable[DataMessage]) -> None:
         """Frames of any sensors as they came; REPEATED, INVALID and old ones bring nothing."""
         for sequence, _, time_ns, sensor, flags, _, process_data in frames:
             is_old = sequence <= self.last[0] and time_ns <= self.last[1]
-            if sensor != self._position or flags & NOT_NEW or is_old:
-                continue
-            if self._step and time_ns // STEP_NS != self._step[0][0] // STEP_NS:
-                self._end_step()
-            self.last = sequence, time_ns
-            self._newest = COMMON.reals.unpack_from(process_data)
-            self._step.append((time_ns, self._newest))
+            if sensor == self._position and not flags & NOT_NEW and not is_old:
+                self.last = sequence, time_ns
+                self._samples.append((time_ns, COMMON.reals.unpack_from(process_data)))
 
     def batch(self, *, silent: bool = False) -> dict[str, Any] | None:
-        """The points since the last one, as a message; None without any. `silent`: end the step now."""
-        if silent and self._step:
-            self._end_step()
-        if not self._points:
+        """The points of the steps that are over, as a message; None without any. `silent`: of all steps."""
+        if not self._samples:
             return None
-        times, values = zip(*self._points, strict=True)
-        self._points.clear()
-        columns = zip(*values, strict=True)
+        samples, newest = self._samples, self._samples[-1]
+        steps = np.array([time_ns // STEP_NS for time_ns, _ in samples])
+        end = len(steps) if silent else int(np.argmax(steps == steps[-1]))
+        if not end:
+            return None
+        self._samples = samples[end:]
+        times = np.array([time_ns for time_ns, _ in samples[:end]])
+        values = np.array([row for _, row in samples[:end]]) * self._scale
+        values[~np.isfinite(values)] = math.nan
+        first = np.flatnonzero(np.diff(steps[:end], prepend=-1))
+        last = np.append(first[1:], end) - 1
+        ends = np.fmin.reduceat(values, first), np.fmax.reduceat(values, first)
+        falls = values[first] > values[last]
+        points = np.stack([np.where(falls, *ends[::-1]), np.where(falls, *ends)], axis=1)
+        kept = np.stack([np.full(len(first), True), last > first], axis=1)
+        at = np.stack([times[first], times[last]], axis=1)[kept]
         return {
             "points": self._position,
-            "start": times[0] * 1e-9,
-            "times": [_plain((time_ns - times[0]) * 1e-9) for time_ns in times],
-            "newest": list(map(_plain, self._newest, self._scale)),
-            "columns": [
-                [_plain(v, s) for v in column] for column, s in zip(columns, self._scale, strict=True)
-            ],
+            "start": int(at[0]) * 1e-9,
+            "times": _rounded((at - at[0]) * 1e-9),
+            "newest": _rounded(np.multiply(newest[1], self._scale)),
+            "columns": [_rounded(column) for column in points[kept].T],
         }
 
-    def _end_step(self) -> None:
-        times, samples = zip(*self._step, strict=True)
-        first, second = zip(*map(_extremes, zip(*samples, strict=True)), strict=True)
-        self._points.append((times[0], first))
-        if len(times) > 1:
-            self._points.append((times[-1], second))
-        self._step.clear()
 
-
-def _plain(value: float, scale: float = 1.0) -> float | None:
-    return round(value * scale, 6) if math.isfinite(value) else None
-
-
-def _extremes(column: Values) -> tuple[float, float]:
-    """Minimum and maximum in the order in which they came."""
-    if not math.isfinite(sum(column)):
-        column = tuple(value for value in column if math.isfinite(value)) or (math.nan,)
-    low, high = min(column), max(column)
-    return (low, high) if column.index(low) < column.index(high) else (high, low)
+def _rounded(values: Floats) -> list[float | None]:
+    return [value if math.isfinite(value) else None for value in np.round(values, 6).tolist()]
 
 
 class WebModel(Model):
