@@ -216,10 +216,6 @@ def test_frames_that_the_client_did_not_take_are_told_apart_from_those_the_serve
     assert (series.lost, series.withheld) == (80, 80)
 
 
-def test_one_frame_in_some_is_no_loss(frames: tuple[DataMessage, ...]) -> None:
-    assert expect(subject_of(frames[::4], ROW)).series.step == 4
-
-
 def test_invalid_frames_are_a_silence(frames: tuple[DataMessage, ...]) -> None:
     kept = flagged(frames, DataFlag.INVALID, range(2000, 2025))  # 62 ms, and 0.9 %
     assert expect(subject_of(kept, ROW), {SILENT: (TROUBLE, "25 frames were invalid")}).series.lost == 0

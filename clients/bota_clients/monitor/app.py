@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ClassVar, Final
+from typing import Final
 
 from rich.text import Text
 from textual import events
@@ -64,7 +64,6 @@ class Monitor(App[None]):
         #body { height: 1fr; }
     """
     ENABLE_COMMAND_PALETTE = False
-    BINDINGS: ClassVar = [("ctrl+z", "suspend_process", "suspend")]
 
     def __init__(
         self,
@@ -93,7 +92,6 @@ class Monitor(App[None]):
 
     def on_mount(self) -> None:
         call_on(asyncio.get_running_loop(), self.exit, "SIGTERM", "SIGHUP")
-        self.app_resume_signal.subscribe(self, lambda _: self.refresh(layout=True))
         self._views[1].focus()
         self.set_interval(REFRESH_S, self.draw)
         if self._seconds is not None:
@@ -121,19 +119,12 @@ class Monitor(App[None]):
         for view, rows in zip(self._views, screen, strict=True):
             view.show(rows)
 
-    def action_suspend_process(self) -> None:
-        """Ctrl-Z stops the whole process, a recording too: not before that is stopped."""
-        if self.recorder.running:
-            self._model.say("A recording is running: stop it before suspending (r)", True)
-        else:
-            super().action_suspend_process()
-
     def action_help_quit(self) -> None:
         """Ctrl-C quits, instead of Textual's hint at another key."""
         self.exit()
 
     def on_key(self, event: events.Key) -> None:
-        if event.key in {"ctrl+c", "ctrl+q", "ctrl+z"}:
+        if event.key in {"ctrl+c", "ctrl+q"}:
             return
         event.stop()
         look, key = self._view, (event.character or "").lower()

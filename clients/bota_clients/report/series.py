@@ -142,18 +142,15 @@ class Series:
         self.not_finite: Bools = ~self.finite.all(axis=1) | ~np.isfinite(samples.temperature)  # (n,)
         self.imu_off = subject.settings.get("imu_active") == 0
         self.intervals: Floats = np.diff(self.time)  # (n - 1,) s
-        jumps = np.diff(frames.sequence)
-        self.step = max(1, int(np.median(jumps))) if len(jumps) else 1  # `every` of the subscription
-        nominal = subject.nominal_period_s
-        self.nominal_period = None if nominal is None else nominal * self.step  # s, by the settings
+        self.nominal_period = subject.nominal_period_s  # by the settings
         forward = self.intervals[self.intervals > 0]
         # The usual interval, s; what the settings say if there are none.
         self.period = float(np.median(forward)) if len(forward) else self.nominal_period or 1e-3
         self.width = max(self.duration, self.period)  # of the plots over time, s
         self.silent: Bools = np.diff(np.flatnonzero(frames.fresh)) > 1  # REPEATED or INVALID frames between
-        accounting = StreamAccounting(every=self.step, fresh_only=False)
+        accounting = StreamAccounting(fresh_only=False)
         # Not the usual interval: where every other sample is lost, that is two periods.
-        accounting.rate_hz = self.step / (self.nominal_period or self.period)
+        accounting.rate_hz = 1 / (self.nominal_period or self.period)
         self.counts = accounting.counts  # the frames' kinds, as every client counts them
         self.missing = self._missing(accounting)
         # Whether the samples on either side do not follow one another.
@@ -174,7 +171,7 @@ class Series:
         self.silences = self._silences()
         self.lost = int(self.missing.sum())  # samples, except those of a silent sensor
         # Those of the lost samples that the server had numbered: the client or recorder was too slow.
-        self.withheld = min(self.counts.withheld // self.step, self.lost)
+        self.withheld = min(self.counts.withheld, self.lost)
 
     def _missing(self, accounting: StreamAccounting) -> Ints:
         """(n - 1,) how many samples are missing between one and the next, as every client counts them."""
@@ -183,7 +180,7 @@ class Series:
         for head in zip(*heads, strict=True):
             accounting.take(*head)
             summed.append(self.counts.missing)
-        return np.diff(np.array(summed, np.int64)[frames.fresh]) // self.step
+        return np.diff(np.array(summed, np.int64)[frames.fresh])
 
     def _silences(self) -> Floats:
         """How long the sensor was silent each time, s, the time before the first and after the last too."""
