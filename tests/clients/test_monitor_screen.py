@@ -51,7 +51,7 @@ def test_no_row_is_wider_than_the_screen(name: str, look: ViewOptions) -> None:
             "Fx", "Fy", "Fz!", "Mx", "My", "Mz", "Stream", "saturated: Fz", "Reduce sensor loading",
         )),
         ("gone", 80, (
-            "SERVER GONE 1m05s", "gone at 12:00:00: no server answers (Connection refused)",
+            "SERVER GONE 1m05s", "gone: no server answers (Connection refused)",
             "values 1m05s old",
         )),
     ],

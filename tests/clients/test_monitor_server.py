@@ -298,9 +298,7 @@ def test_a_restart_of_the_server_is_seen_and_survived() -> None:
         wait_until(lambda: samples(model) > 20, "samples")
         first.close()
         wait_until(lambda: not state(model).server.connected, "the end of the connection")
-        gone = state(model).server
-        assert gone.since_clock
-        assert gone.reason
+        assert state(model).server.reason
         with served(*SENSORS, port=first.port, sinc_length=512):
             wait_until(lambda: state(model).server.connected, "a new connection")
             wait_until(lambda: samples(model) > 20, "samples again")

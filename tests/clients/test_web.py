@@ -317,7 +317,7 @@ def test_a_page_says_what_the_monitor_says() -> None:
     assert any("5 on the way here" in row for row in found["table"])
     assert found["message"] == {"text": "12:00:00 Sensor 0 is not tared: it is not at rest", "bad": True}
     gone = json.loads(state_text(made.gone()))["state"]
-    assert gone["trouble"] == "gone at 12:00:00: no server answers (Connection refused); reconnecting"
+    assert gone["trouble"] == "gone: no server answers (Connection refused); reconnecting"
     assert gone["sensors"][0]["old"] == "1m05s"
 
 

@@ -125,7 +125,6 @@ class ServerState:
     address: str
     connected: bool = False
     since_s: float | None = None  # since it was connected or disconnected
-    since_clock: str = ""  # the time of day of that
     reason: str = ""  # why it is not connected: one sentence
     heard_s: float | None = None  # since anything came from it, while connected
     version: str = ""
@@ -289,7 +288,7 @@ class Model:
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
         """Connected; `own_peer` is the address of this end, as in `status`."""
         with self._lock:
-            self._server = replace(self._server, connected=True, reason="", since_clock=clock_text())
+            self._server = replace(self._server, connected=True, reason="")
             self._since_s = self._heard_s = now_s
             self._own_peer, self._status, self._clients = own_peer, Status(), ()
             self._describe(description, now_s, anew=True)
@@ -302,7 +301,7 @@ class Model:
         """Disconnected, for this reason."""
         with self._lock:
             if self._server.connected or self._since_s is None:
-                self._since_s, self._server = now_s, replace(self._server, since_clock=clock_text())
+                self._since_s = now_s
             self._server = replace(self._server, connected=False, reason=text(reason))
             self._clients = ()
 

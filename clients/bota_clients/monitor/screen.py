@@ -33,12 +33,6 @@ KEYS: Final = (
 _HELP: Final = """
 Arrows, Page Up and Page Down scroll. Bars are centered on zero; their scale
 grows with the marked peaks, for which every sample counts.
-age     of a sample on arrival; only on the server's own machine
-jitter  of the intervals between the samples' stamps
-Delay   of the sensor's filters, which comes before the age
-lost    on the bus since the server started; on the way here since connecting
-Clock   locked: the server follows the sensor's own clock, else oversampling
-Fx!     this axis is saturated; warnings stay listed until the reset
 
 Press any key to return."""
 

@@ -31,7 +31,7 @@ def trouble(server: ServerState) -> str | None:
     if server.since_s is None:
         return None
     if not server.connected:
-        return f"gone at {server.since_clock}: {server.reason}; reconnecting"
+        return f"gone: {server.reason}; reconnecting"
     silent = f"nothing came for {duration(server.heard_s or 0)}: it may be stopped, or its machine too busy"
     return silent if server.silent else None
 
