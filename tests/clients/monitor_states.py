@@ -107,12 +107,6 @@ def fed(model: Model, sensors: int, frames: Mapping[int, Values] | None = None) 
     return now(count - 1)
 
 
-def settled(state: State) -> State:
-    """Without what depends on the time of day."""
-    message = state.message and state.message._replace(text=f"12:00:00{state.message.text[8:]}")
-    return replace(state, message=message)
-
-
 @functools.cache
 def healthy() -> State:
     """One sensor, all well."""
@@ -137,7 +131,9 @@ def troubled() -> State:
     model.add_frames([frame(6405, sensor=0, flags=DataFlag.GAP)], end_s)
     model.add_status(status(2, mode="oversampling"), START_S + 7.9)
     model.say("Sensor 0 is not tared: it is not at rest", bad=True)
-    return settled(model.state(end_s))
+    state = model.state(end_s)
+    assert state.message is not None
+    return replace(state, message=state.message._replace(text=f"12:00:00{state.message.text[8:]}"))
 
 
 @functools.cache

@@ -15,7 +15,6 @@ from bota_clients.numbers import figure, share
 from bota_clients.report import plots
 from bota_clients.report.checks import Examination
 from bota_clients.report.series import CHANNELS, GROUPS, limit_origin
-from bota_ethercat.health.verdict import Level
 from bota_ethercat.sensor.meaning import meaning, value_meaning
 from bota_ethercat.settings import SETTINGS
 from bota_ethercat.text.untrusted import printable, visible
@@ -36,7 +35,6 @@ _PAGE: Final = jinja2.Environment(
 )
 _PAGE.filters |= {name: getattr(numbers, name) for name in ("count", "figure", "moment", "seconds", "share")}
 _PAGE.globals |= {"plots": plots, "GROUPS": GROUPS, "limit_origin": limit_origin}
-_PAGE.globals["not_possible"] = Level.NOT_POSSIBLE
 
 
 def render(examinations: Sequence[Examination], *, made: str, program: str, note: str = "") -> str:
