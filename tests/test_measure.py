@@ -76,9 +76,8 @@ def test_what_was_withheld_from_the_servers_client_may_be_a_message_and_is_lost_
 
 
 def test_the_live_figure_of_what_is_lost_is_the_summarys(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
     measurement = measured()
     for each in (frame(805, DataFlag.GAP), frame(806)):
         measurement.add_frame(each)
@@ -87,8 +86,7 @@ def test_the_live_figure_of_what_is_lost_is_the_summarys(
     assert re.match(r" *\d+\.\d Hz  age 0\.40 ms  lost 5  repeated 0  N \+0", capsys.readouterr().out)
     program.print_summary(measurement.summary(), {"rate_hz": 800})
     shown = capsys.readouterr().out
-    assert re.search(r"Lost +│ +5 ", shown)
-    assert max(map(len, shown.splitlines())) <= 80, "the terminal would break words"
+    assert re.search(r"Lost +5\n", shown)
     assert "Samples are missing" in shown
 
 

@@ -14,9 +14,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from rich.console import Console
-from rich.table import Table
-
 from bota_ethercat.client import Client
 from bota_ethercat.pdo import SampleDecoder
 from bota_ethercat.program.arguments import number
@@ -101,8 +98,7 @@ def show(measurement: Measurement, messages: int) -> None:
 
 def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
     """The figures of the whole run."""
-    table = Table("", "", title="What arrived on the ROS topic", title_justify="left", show_header=False)
-    table.columns[1].justify = "right"
+    print("What arrived on the ROS topic:")
     for name, value in (
         ("Messages", summary.messages),
         ("Mean rate", f"{summary.rate_hz:.1f} Hz"),
@@ -116,14 +112,9 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
         ("All finite", "yes" if summary.all_finite else "NO"),
         ("All are samples of the sensor", "NO" if summary.unknown else "yes"),
     ):
-        table.add_row(name, str(value))
-    console = Console(highlight=False, markup=False)
-    console.print(table)
+        print(f"  {name:<34}{value:>10}")
     if summary.lost + summary.lost_before:
-        console.print(
-            "Samples are missing: other programs or a hypervisor had the processors for some time. "
-            "docs/tuning.md helps."
-        )
+        print("Samples are missing: other programs had the processors for some time. docs/tuning.md helps.")
 
 
 def run(seconds: float | None) -> int:
