@@ -78,4 +78,4 @@ def test_the_demo_needs_no_tools_of_developers() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     (asked,) = re.findall(r"^make_owners_environment (\S+)", (ROOT / "scripts/demo").read_text(), re.M)
     names = {re.split(r"[\[=<>]", line)[0] for extra in asked.split(",") for line in extras[extra]}
-    assert names == {"ros-rclpy", "ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "numpy", "rich"}
+    assert names == {"ros-rclpy", "ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "numpy"}

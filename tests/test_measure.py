@@ -8,103 +8,85 @@ import re
 import pytest
 
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.pdo import SampleDecoder, encode
+from bota_ethercat.pdo import encode
 from scripts.demonstration import program
 from scripts.demonstration.measure import Measurement, verdict
-from scripts.demonstration.program import Screen, print_summary
 
 PERIOD_NS = 1_250_000
 
 
 def frame(number: int, flags: int = 0) -> DataMessage:
-    data = encode(61, {"force.x": number, "acceleration.z": 1.0})
-    return DataMessage(number, 0, number * PERIOD_NS, 0, flags, 3, data)
+    return DataMessage(number, 10**18 + number * PERIOD_NS, number * PERIOD_NS, 0, flags, 3, encode(61, {}))
 
 
-def values(number: int) -> list[float]:
-    return SampleDecoder(61).decode(frame(number).process_data).array
+def message(measurement: Measurement, number: int, value: float = 1.0) -> None:
+    """Of the sample with this number, 0.4 ms later."""
+    stamp_ns = frame(number).stamp_ns
+    measurement.add_message(stamp_ns, [value] * 6, stamp_ns + 400_000)
 
 
-def measured(count: int = 801) -> Measurement:
+def measured(first: int = 0, count: int = 801) -> Measurement:
     measurement = Measurement(800.0)
-    for number in range(count):
-        measurement.take_frame(frame(number))
-        measurement.take_message(values(number), number * PERIOD_NS + 400_000)
+    for number in range(first, first + count):
+        measurement.add_frame(frame(number))
+        message(measurement, number)
     return measurement
 
 
-def test_a_good_run_and_another_after_it() -> None:
-    measurement = Measurement(800.0)
-    for run in range(2):
-        measurement.begin()
-        for number in range(801 * run, 801 * run + 801):
-            measurement.take_frame(frame(number))
-            measurement.take_message(values(number), number * PERIOD_NS + 400_000)
-        summary = measurement.summary()
-        assert (summary.messages, summary.lost, summary.repeated, summary.rate_hz) == (801, 0, 0, 800.0)
-        assert summary.age_ms == [0.4, 0.4]
-        assert verdict(summary, 800) is None
-
-
-def test_a_message_is_not_judged_before_its_sample_has_come_or_if_that_was_withheld() -> None:
-    measurement = measured()
-    measurement.take_message(values(801), 801 * PERIOD_NS + 100_000)
-    measurement.take_frame(frame(801))
-    assert (measurement.messages, measurement.age_ns) == (802, 100_000)
-    measurement.take_message(values(802), 802 * PERIOD_NS + 100_000)
-    for number in range(802, 900):  # this process was held up
-        measurement.take_frame(frame(number))
-    assert (measurement.messages, measurement.summary().all_decoded_right) == (803, True)
-    measurement.take_message(values(900), 900 * PERIOD_NS + 100_000)
-    for number in range(901, 999):
-        measurement.take_frame(frame(number, DataFlag.GAP if number == 901 else 0))
-    assert (measurement.messages, measurement.summary().all_decoded_right) == (804, True)
+def test_a_good_run_of_which_the_last_sample_has_not_come_yet() -> None:
+    measurement = measured(100)
+    message(measurement, 901)
+    summary = measurement.summary()
+    assert (summary.messages, summary.lost, summary.repeated, summary.unknown) == (802, 0, 0, 0)
+    assert summary.rate_hz == pytest.approx(800)
+    assert summary.age_ms == [0.4, 0.4]
+    assert verdict(summary, 800) is None
+    measurement.begin()
+    assert "nothing" in str(verdict(measurement.summary(), 800))
 
 
 @pytest.mark.parametrize(
     ("messages", "words"),
     [
-        ([values(802)], None),
-        ([values(800)], "1 messages came twice"),
-        ([[1.5] * 12], "no sample"),
-        ([[math.inf] * 12], "not finite"),
+        ([(802, 1.0)], None),
+        ([(800, 1.0)], "1 messages came twice"),
+        ([(802.5, 1.0)], "no sample"),
+        ([(802, math.inf)], "not finite"),
     ],
 )
-def test_each_fault_is_found(messages: list[list[float]], words: str | None) -> None:
+def test_each_fault_is_found(messages: list[tuple[int, float]], words: str | None) -> None:
     measurement = measured()
     for number in range(801, 830):
-        measurement.take_frame(frame(number))
-    for message in messages:
-        measurement.take_message(message, 810 * PERIOD_NS)
-    measurement.take_message(values(829), 829 * PERIOD_NS)
+        measurement.add_frame(frame(number))
+    for number, value in messages:
+        measurement.add_message(10**18 + round(number * PERIOD_NS), [value] * 6, 10**18 + 810 * PERIOD_NS)
+    message(measurement, 829)
     summary = measurement.summary()
     assert words in str(verdict(summary, 800)) if words else verdict(summary, 800) is None
-    assert summary.lost == (27 if words is None else 28)
+    assert summary.lost == (27 if messages[0][0] == 802 else 28)
 
 
-def test_the_rate_is_judged_and_what_came_before_is_lost_too() -> None:
+def test_what_was_withheld_from_the_servers_client_may_be_a_message_and_is_lost_before() -> None:
+    measurement = measured()
+    message(measurement, 802)
+    measurement.add_frame(frame(805, DataFlag.GAP))
+    summary = measurement.summary()
+    assert (summary.lost_before, summary.unknown, verdict(summary, 800)) == (4, 0, None)
     assert "800.0 messages/s" in str(verdict(measured().summary(), 1600))
-    assert "nothing" in str(verdict(Measurement(800.0).summary(), 800))
-    gap = measured()
-    gap.take_frame(frame(805, DataFlag.GAP))
-    assert gap.summary().lost_before == 4
 
 
 def test_the_live_figure_of_what_is_lost_is_the_summarys(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
     measurement = measured()
-    measurement.take_frame(frame(805, DataFlag.GAP))
-    measurement.take_frame(frame(806))
-    measurement.take_message(values(806), 806 * PERIOD_NS)
-    sensor = {"name": "BFT-SENS-ECAT-M8", "serial": 1, "rate_hz": 800}
-    Screen(sensor).show(measurement)
-    assert "lost 5 " in capsys.readouterr().out
-    print_summary(measurement.summary(), sensor)
+    for each in (frame(805, DataFlag.GAP), frame(806)):
+        measurement.add_frame(each)
+    message(measurement, 806)
+    program.show(measurement, 802)
+    assert re.match(r" *\d+\.\d Hz  age 0\.40 ms  lost 5  repeated 0  N \+0", capsys.readouterr().out)
+    program.print_summary(measurement.summary(), {"rate_hz": 800})
     shown = capsys.readouterr().out
-    assert re.search(r"Lost +│ +5 ", shown)
-    assert max(map(len, shown.splitlines())) <= 80, "the terminal would break words"
+    assert re.search(r"Lost +5\n", shown)
     assert "Samples are missing" in shown
 
 

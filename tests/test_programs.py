@@ -97,7 +97,7 @@ def test_nobody_reads_what_the_virtual_sensor_answers(tmp_path: Path) -> None:
     [
         ("ethercat-sensor", "argparse", "--help"),
         ("ethercat-doctor", "ethercat_server.daemon.options", "--help"),
-        ("ethercat-report", "jinja2", "--seconds 1"),
+        ("ethercat-report", "jinja2", "run.mcap"),
         ("ethercat-monitor", "bota_clients.monitor.screen", "--once"),
         ("ethercat-monitor", "textual.app", ""),
         ("ethercat-server", "ethercat_server.process.logs", "--help"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ipaddress
 
 from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
@@ -38,6 +39,16 @@ def add_imu_units(parser: argparse.ArgumentParser) -> None:
         help="units in which the sensor sends acceleration and angular rate "
         f"(default {ImuUnits.G_DPS.value})",
     )  # fmt: skip
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host, without port, is this machine."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _position(text: str) -> int:

@@ -24,7 +24,6 @@ def figure(value: float, digits: int = 3) -> str:
 
 
 def share(part: float, whole: float) -> str:
-    """A part of a whole in percent."""
     return f"{figure(100 * part / whole, 2)} %" if whole else "not known"
 
 
@@ -41,7 +40,6 @@ def count(number: int, noun: str) -> str:
 
 
 def seconds(value: float) -> str:
-    """A duration with its unit: `250 ms`."""
     if value == 0:
         return "0 s"
     if value < 1e-3:
@@ -54,7 +52,6 @@ def seconds(value: float) -> str:
 
 
 def moment(stamp_ns: int) -> str:
-    """A CLOCK_REALTIME stamp in UTC."""
     if not 0 < stamp_ns < _LAST_STAMP_NS:
         return "at an invalid time"
     then = datetime.datetime.fromtimestamp(stamp_ns // 10**9, datetime.UTC)

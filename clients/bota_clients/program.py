@@ -27,7 +27,6 @@ _OF_DATASETS: Final = ("pyarrow", "zarr", "rosbags", "yaml")
 
 
 def say(program: str, sentence: str) -> None:
-    """Print a sentence on standard error."""
     sys.stderr.write(f"{program}: {sentence}\n")
     sys.stderr.flush()
 
@@ -45,6 +44,9 @@ def start(program: str, module: str, *arguments: object) -> int:
         code = not_installed(program, error)
     except (ClientError, ProtocolError) as error:
         say(program, str(error))
+        code = 1
+    except KeyboardInterrupt:  # of those that write a file at the end
+        say(program, "stopped: nothing was written")
         code = 1
     return code
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from bota_clients.export.cli import main as export
 from bota_clients.identify.cli import main as identify
-from bota_clients.record.recorder import Recorder, Source
+from bota_clients.record.recorder import Recorder, RecordingClient
 from bota_clients.recording.columns import columns
-from bota_clients.recording.reader import Description, Event, open_recording
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_clients.report.cli import main as report
 from bota_ethercat.address import Address
 from bota_ethercat.framing import DataMessage, encode_data
@@ -59,7 +59,7 @@ def cut_power(server: Simulation) -> object:
 def recorded(path: Path, server: Simulation, seconds: float, *steps: Step) -> Path:
     with (
         mock.patch("bota_ethercat.client.client.TcpChannel", return_value=MemoryChannel(server)),
-        contextlib.closing(Source(Address("localhost", 12001), None)) as source,
+        contextlib.closing(RecordingClient(Address("localhost", 12001), None)) as source,
     ):
         source.connect()
         recorder = Recorder(path, "test", {}, overwrite=False)
@@ -151,11 +151,12 @@ def test_the_exported_wrench_follows_the_offset(heard: Recorded, tool: Path) -> 
     assert is_no_contact(wrench), np.abs(wrench).max(axis=0)
 
 
-Items = list[DataMessage | Description | Event]
+Items = list[DataMessage | RecordedDescription | RecordedEvent]
 
 
 def described(items: Items) -> dict[str, Any]:
-    reply = next(item.reply for item in items if isinstance(item, Description))
+    """What the server says of itself, first."""
+    reply = next(item.reply for item in items if isinstance(item, RecordedDescription))
     return {name: value for name, value in reply.items() if name not in ("reply", "id")}
 
 
@@ -176,7 +177,7 @@ class Again(Server):
                 if item.monotonic_ns > self.now_ns:
                     break
                 self.send_raw(encode_data(*item))
-            elif isinstance(item, Event) and not item.by_recorder:
+            elif isinstance(item, RecordedEvent) and not item.by_recorder:
                 self.send_json(item.event)
             self.items.pop()
 
@@ -216,7 +217,7 @@ def test_the_plugins_wrench_is_the_exported_one(heard: Recorded, tool: Path) -> 
         loop.opened(played.port, payload_file=tool)
         checked = 0
         for item in items:
-            if isinstance(item, Event) and not item.by_recorder:
+            if isinstance(item, RecordedEvent) and not item.by_recorder:
                 played.send(item.event)
             if not isinstance(item, DataMessage):
                 continue

@@ -101,16 +101,10 @@ def fed(model: Model, sensors: int, frames: Mapping[int, Values] | None = None) 
             for k in numbers
             for position in range(sensors)
         ]
-        model.take(batch, now(numbers[-1]))
+        model.add_frames(batch, now(numbers[-1]))
         for last in batch[-sensors:]:
             model.note_age(last, last.monotonic_ns + 190_000 + first * first % 61_000)
     return now(count - 1)
-
-
-def settled(state: State) -> State:
-    """Without what depends on the time of day."""
-    message = state.message and state.message._replace(text=f"12:00:00{state.message.text[8:]}")
-    return replace(state, server=replace(state.server, since_clock="12:00:00"), message=message)
 
 
 @functools.cache
@@ -118,10 +112,10 @@ def healthy() -> State:
     """One sensor, all well."""
     model = Model(ADDRESS)
     model.connected(description(), OWN_PEER, START_S)
-    model.take_status(status(), START_S + 6.9)
+    model.add_status(status(), START_S + 6.9)
     end_s = fed(model, 1)
-    model.take_status(status(sent=800), START_S + 7.9)
-    return settled(model.state(end_s))
+    model.add_status(status(sent=800), START_S + 7.9)
+    return model.state(end_s)
 
 
 @functools.cache
@@ -134,10 +128,12 @@ def troubled() -> State:
     frames |= {k: {**frames.get(k, {}), "warnings": 0b100000 | int(frames.get(k, {}).get("warnings", 0))}
                for k in range(6000, 6400)}  # fmt: skip
     end_s = fed(model, 2, frames)
-    model.take([frame(6405, sensor=0, flags=DataFlag.GAP)], end_s)
-    model.take_status(status(2, mode="oversampling"), START_S + 7.9)
+    model.add_frames([frame(6405, sensor=0, flags=DataFlag.GAP)], end_s)
+    model.add_status(status(2, mode="oversampling"), START_S + 7.9)
     model.say("Sensor 0 is not tared: it is not at rest", bad=True)
-    return settled(model.state(end_s))
+    state = model.state(end_s)
+    assert state.message is not None
+    return replace(state, message=state.message._replace(text=f"12:00:00{state.message.text[8:]}"))
 
 
 @functools.cache
@@ -146,6 +142,6 @@ def gone() -> State:
     model = Model(ADDRESS)
     model.connected(description(), OWN_PEER, START_S)
     end_s = fed(model, 1)
-    model.take_event({"event": Event.SHUTTING_DOWN}, end_s)
+    model.add_event({"event": Event.SHUTTING_DOWN}, end_s)
     model.gone("no server answers (Connection refused)", end_s)
-    return replace(settled(model.state(end_s + 65)), events=())
+    return replace(model.state(end_s + 65), events=())

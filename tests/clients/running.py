@@ -1,7 +1,6 @@
-"""Runs `ethercat-replay` and `ethercat-record` in threads and as processes.
+"""Runs `ethercat-replay` and `ethercat-record` in threads.
 
-A replay is a server that needs no bus. A thread is enough wherever a test is about what is sent or written;
-a process is for what others do to it.
+A replay is a server that needs no bus.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from bota_clients.recording.reader import open_recording
 from bota_clients.replay import program as replay
 from bota_clients.replay.cli import parse_options as replay_options
 from bota_ethercat.client import Client as StreamClient
-from tests.server.running import PATIENCE_S, Program, free_port, wait_until
+from tests.server.running import PATIENCE_S, free_port, wait_until
 
 
 def signalled(
@@ -142,10 +141,3 @@ def frames_in(path: Path) -> int:
             return sum(1 for _ in opened.frames())
     except RecordingError:
         return 0
-
-
-class RecorderProcess(Program):
-    """`ethercat-record` of what is on `port`, as a process."""
-
-    def __init__(self, path: Path, port: int, *arguments: str) -> None:
-        super().__init__("bota_clients.record.cli", [*arguments, str(path), "--server", str(port)])

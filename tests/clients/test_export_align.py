@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bota_clients.errors import RecordingError
 from bota_clients.export.align import _robot_rates, find_offset
 from bota_clients.export.cli import main
-from bota_clients.export.dataset import Clock
+from bota_clients.export.dataset import ForeignClock
 from tests.clients.bags import imu, joint_states, write_bag
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
 from tests.ended import run_here
@@ -92,7 +92,7 @@ def test_the_offset_and_drift_of_a_robots_clock(tmp_path: Path, topic: str) -> N
     assert ended.json["left_out"] == left_out
     assert (f"{left_out} messages left out, without finite angles or rates" in ended.err) is bool(left_out)
     assert ended.json["bend_ms"] == 0.0
-    found = Clock(ended.json["stamp_ns"], ended.json["monotonic_ns"], ended.json["drift_ppm"])
+    found = ForeignClock(ended.json["stamp_ns"], ended.json["monotonic_ns"], ended.json["drift_ppm"])
     exact_ns = START_NS + np.rint(1e9 * stamps).astype(np.int64)
     error_ms = found.instants(exact_ns) * 1e-6 - instants * 1e3
     assert abs(error_ms).max() < 0.5

@@ -72,19 +72,6 @@ def test_tare_asks_first_and_only_y_does_it() -> None:
     play(scene)
 
 
-def test_a_recording_is_not_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
-    stopped: list[int] = []
-    monkeypatch.setattr("os.kill", lambda _, number: stopped.append(number))
-
-    async def scene(stage: Stage) -> None:
-        monkeypatch.setattr(type(stage.app.recorder), "running", True)
-        monkeypatch.setattr(type(stage.app.recorder), "ended", lambda _: None)
-        assert "A recording is running: stop it" in await stage.press("ctrl+z")
-
-    play(scene)
-    assert not stopped
-
-
 def test_what_does_not_fit_is_scrolled_to_and_another_size_is_drawn_anew() -> None:
     async def scene(stage: Stage) -> None:
         assert "Clients" not in stage.shown()
@@ -105,7 +92,7 @@ def test_what_does_not_fit_is_scrolled_to_and_another_size_is_drawn_anew() -> No
 def test_pause_reset_and_help() -> None:
     async def scene(stage: Stage) -> None:
         assert "PAUSED" in await stage.press("p")
-        stage.model.take([made.frame(6400, {"force.x": 77.0})], stage.now_s)
+        stage.model.add_frames([made.frame(6400, {"force.x": 77.0})], stage.now_s)
         assert "+77.00" not in stage.shown()
         text = await stage.press("p")
         assert "PAUSED" not in text

@@ -160,23 +160,6 @@ def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
     assert ended.value.code == 2
 
 
-def test_json_has_what_the_stream_and_its_server_are_like(shared: ServedSimulation, run: Run) -> None:
-    code, out, _ = run("--json", "--seconds", "1", "--server", str(shared.port))
-    assert code == 0
-    [line] = [json.loads(line) for line in out.splitlines()]
-    assert line["connected"] is True
-    assert line["server"]["missed_deadlines"] >= 0
-    sensor = line["sensors"][1]
-    for value, (low, high) in zip(sensor["force"], sensor["force_min_max"], strict=True):
-        assert low <= value <= high
-        assert low < high
-    assert sensor["units"] == ["N", "Nm"]
-    assert sensor["clock"]["mode"] in {"locked", "oversampling"}
-    assert sensor["rate_hz"] > 0
-    assert sensor["jitter_us"] is not None
-    assert sum(client["this"] for client in line["clients"]) == 1
-
-
 def test_a_reader_that_goes_is_no_traceback(shared: ServedSimulation) -> None:
     command = f"set -o pipefail; {COMMAND} --json --server {shared.port} | head -n 1"
     done = subprocess.run(
@@ -315,9 +298,7 @@ def test_a_restart_of_the_server_is_seen_and_survived() -> None:
         wait_until(lambda: samples(model) > 20, "samples")
         first.close()
         wait_until(lambda: not state(model).server.connected, "the end of the connection")
-        gone = state(model).server
-        assert gone.since_clock
-        assert gone.reason
+        assert state(model).server.reason
         with served(*SENSORS, port=first.port, sinc_length=512):
             wait_until(lambda: state(model).server.connected, "a new connection")
             wait_until(lambda: samples(model) > 20, "samples again")

@@ -16,7 +16,7 @@ from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_clients.recording.columns import columns
 from bota_clients.recording.container import MAX_CHUNK, McapFile
-from bota_clients.recording.reader import Description, Event, open_recording
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import SampleDecoder
 from tests.clients.recordings import START_NS, describe, frame, record, writer
@@ -63,7 +63,10 @@ def test_sensors_are_told_apart(path: Path) -> None:
     record(path, (frame(n, sensor=n % 2) for n in range(100)), sensors=(0, 1))
     with open_recording(path) as recording:
         assert [f.sequence for f in recording.frames(1)] == list(range(1, 100, 2))
-        assert [(s.sensor, s.serial, s.frames) for s in recording.sensors] == [(0, 100, 50), (1, 101, 50)]
+        assert [(s.sensor, s.info.serial, s.frames) for s in recording.sensors] == [
+            (0, 100, 50),
+            (1, 101, 50),
+        ]
         assert list(recording.frames(7)) == []
 
 
@@ -81,13 +84,12 @@ def test_settings_are_known_over_time(path: Path) -> None:
     made.finish({"reason": "asked to"})
     with open_recording(path) as recording:
         (sensor,) = recording.sensors
-        assert sensor.serial == 2**32 - 1
-        assert sensor.settings == {"sinc_length": 64, "chop": False}
-        assert [(s.stamp_ns - START_NS, s.values["sinc_length"], s.rate_hz) for s in sensor.history] == [
-            (0, 64, 800), (10, 32, 1600),
-        ]  # fmt: skip
+        assert sensor.info.serial == 2**32 - 1
+        assert sensor.info.settings == {"sinc_length": 64, "chop": False}
+        history = [(at - START_NS, info.settings["sinc_length"], info.rate_hz) for at, info in sensor.history]
+        assert history == [(0, 64, 800), (10, 32, 1600)]
         assert [type(item) for item in recording.everything()] == [
-            Description, DataMessage, Event, Description, DataMessage,
+            RecordedDescription, DataMessage, RecordedEvent, RecordedDescription, DataMessage,
         ]  # fmt: skip
         assert recording.events[0].name == "reconfigured"
         assert not recording.events[0].by_recorder

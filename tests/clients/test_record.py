@@ -25,12 +25,12 @@ from rosbags.rosbag2 import Reader
 from bota_clients.record import cli, program, recorder
 from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch
 from bota_clients.recording.file_format import frame_topic
-from bota_clients.recording.reader import Description, Event, open_recording
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer, description
 from tests.clients.recordings import frame, record
-from tests.clients.running import Recorder, RecorderProcess, Replay, frames_in, signalled
+from tests.clients.running import Recorder, Replay, frames_in, signalled
 from tests.ended import run_here
 from tests.golden_vectors import odd_messages
 from tests.served_simulation import served
@@ -101,17 +101,6 @@ def test_record_replay_record_gives_the_same_frames(source: Path, out: Path) -> 
     assert original == again
 
 
-def test_it_ends_by_itself_and_says_what_it_has(endless: Replay, out: Path) -> None:
-    code, said = run(out, "--server", endless.port, "--seconds", "0.5")
-    assert code == 0
-    assert end(out)["reason"] == "time is up"
-    with open_recording(out) as opened:
-        assert [sensor.serial for sensor in opened.sensors] == [100, 101]
-        assert opened.metadata["server"] == f"localhost:{endless.port}"
-        assert f"{opened.frame_count} frames of 2 sensors" in said
-        assert is_whole(list(opened.frames()))
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_cleanly(
     endless: Replay, out: Path, number: int, capsys: pytest.CaptureFixture[str]
@@ -148,7 +137,7 @@ def test_it_records_on_across_restarts_even_without_a_sensor_that_the_server_lac
         assert [event.by_recorder for event in opened.events] == [name != "shutting_down" for name in names]
         about = [event.event.get("message") for event in opened.events if event.name == "connected"]
         assert about == [None, "without sensor 1", None]
-        assert sum(isinstance(item, Description) for item in opened.everything()) == 3
+        assert sum(isinstance(item, RecordedDescription) for item in opened.everything()) == 3
 
 
 def test_a_refusal_does_not_end_a_recording_that_runs(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -182,10 +171,10 @@ def later(sent: DataMessage, ms: float) -> DataMessage:
         ),
         (  # 800 Hz, and 400 Hz later
             [
-                Description(0, description()),
+                RecordedDescription(0, description()),
                 frame(1),
                 later(frame(2, 0, DataFlag.GAP), 12.5),
-                Event(0, {"event": "reconfigured", "sensor": 0, "rate_hz": 400}),
+                RecordedEvent(0, {"event": "reconfigured", "sensor": 0, "rate_hz": 400}),
                 later(frame(3, 0, DataFlag.GAP), 32.5),
             ],
             "16 samples of sensor 0 lost on the bus (estimated)",
@@ -200,7 +189,7 @@ def test_what_was_lost_is_said(frames: Batch, sentence: str, out: Path) -> None:
     recorder = new_recorder(out)
     recorder.put([*frames])
     recorder.stop("")
-    assert recorder.so_far.endswith(f"; {sentence}")
+    assert recorder.summary.endswith(f"; {sentence}")
 
 
 def new_recorder(out: Path) -> recorder.Recorder:
@@ -257,22 +246,6 @@ def test_of_a_file_that_is_removed_nothing_is_said_to_be_there(out: Path) -> Non
     removed.stop("asked to stop")
     assert str(removed.error) == f"{out} was removed while it was written: nothing of it is left"
     assert (removed.saved, removed.dropped) == (0, 11)
-
-
-def test_killed_it_leaves_what_was_there(endless: Replay, out: Path) -> None:
-    recorder = RecorderProcess(out, endless.port, "--force")
-    try:
-        recorder.wait_for("Ctrl-C ends it")
-        wait_until(lambda: frames_in(out) > 500, "frames")
-        before = frames_in(out)
-        recorder.signal(signal.SIGKILL)
-        recorder.wait()
-    finally:
-        recorder.close()
-    left = read(out)
-    assert len(left) >= before
-    assert is_whole(left)
-    assert {item.sensor for item in left} == {0, 1}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -447,7 +420,7 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
     def last_setting() -> tuple[object, float]:
         with open_recording(out) as opened:
             (sensor,) = opened.sensors
-            return sensor.history[-1].values["sinc_length"], sensor.history[-1].rate_hz
+            return sensor.history[-1].info.settings["sinc_length"], sensor.history[-1].info.rate_hz
 
     with served(sinc_length=512) as server, server.client() as client, Recorder(out, server.port) as recorder:
         recorder.wait_for_frames(1)
@@ -456,7 +429,7 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
         recorder.wait_for_frames(20)
         assert recorder.stop() == 0
     with open_recording(out) as opened:
-        assert opened.sensors[0].settings["sinc_length"] == 512
+        assert opened.sensors[0].info.settings["sinc_length"] == 512
         assert is_whole(list(opened.frames()))
 
 

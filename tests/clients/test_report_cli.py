@@ -1,4 +1,4 @@
-"""`ethercat-report` as people call it: from a file, from a server, and with what cannot be."""
+"""`ethercat-report` as people call it, and with what cannot be."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Final
 
 import pytest
 
-from bota_clients.report import cli, page, plots, subjects
+from bota_clients.report import cli, page, plots
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import writer
 from tests.clients.simulated import STARTED_AT_NS, described, simulate
-from tests.simulation import simulated_bus, simulated_server
 
 SINC, SPLIT = 128, 600
 
@@ -163,9 +161,6 @@ def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(report: Report) 
         number(frames()[SPLIT:]),
     )
     assert report.lacks(*words, "The settings were changed") == ["The settings were changed"]
-    assert "serial 4711): Not conclusive" in report.again("--sensor", "serial:4711")[1]
-    assert report.lacks(number(frames()[:SPLIT])) == []
-    assert "serial 4711), 0 (BFT-SENS-ECAT-M8, serial 99)" in report.again("--sensor", "serial:7")[2]
 
 
 def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(report: Report) -> None:
@@ -173,8 +168,6 @@ def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(report: Report) -> N
     code, out = report.of(describe(*rows), frames(), sensors="0 4")
     assert (code, out.count("serial")) == (0, 1)
     assert report.lacks("Not recorded, because others were chosen: sensor 1 and 2.") == []
-    code, _, err = report.again("--sensor", "1")
-    assert (code, "has no sensor 1: it has 0 (BFT-SENS-ECAT-M8, serial 100)\n" in err) == (1, True)
 
 
 def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(report: Report) -> None:
@@ -184,25 +177,12 @@ def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(report: R
         assert "The recording was cut off: it has no footer" in said
 
 
-def test_sensors_are_chosen_by_place_serial_or_name(report: Report) -> None:
-    record(report.path, SENSOR, frames())
-    code, _, err = report.run(report.path, "--sensor", "serial:9")
-    assert (code, report.out.exists()) == (1, False)
-    assert "has no sensor serial:9: it has 0 (BFT-SENS-ECAT-M8, serial 4711)" in err
-    for choice in ("serial:4711", "0", "BFT-SENS-ECAT-M8"):
-        assert report.again("--sensor", choice)[0] == 0
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("a.mcap --server localhost:1", "give a recording, or --server"),
-        ("a.mcap --seconds 5", "--seconds is for listening"),
-        ("--server localhost:x", "HOST:PORT"),
-        ("--server localhost --seconds 0", "from 1 to"),
-        ("--server localhost --seconds nan", "from 1 to"),
+        ("", "required"),
+        ("localhost:1", "record its stream first"),
         ("a.mcap -o a.mcap", "would overwrite the recording"),
-        ("a.mcap --sensor=", "must be"),
     ],
 )
 def test_wrong_usage(report: Report, arguments: str, words: str) -> None:
@@ -235,21 +215,5 @@ def test_ctrl_c_leaves_nothing(report: Report, monkeypatch: pytest.MonkeyPatch) 
 
     record(report.path, SENSOR, frames())
     monkeypatch.setattr(page, "render", interrupted)
-    assert report.run(report.path) == (1, "", "ethercat-report: stopped: no report was written\n")
+    assert report.run(report.path) == (1, "", "ethercat-report: stopped: nothing was written\n")
     assert list(report.folder.iterdir()) == [report.path]
-
-
-def test_live_sensors_are_reported_on(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
-    with simulated_bus("--serial", "10,20", "--sinc", "512") as bus, simulated_server(bus) as server:
-        monkeypatch.setattr(subjects, "time", SimpleNamespace(monotonic=lambda: bus.clock.now_ns * 1e-9))
-        live = "--server", server.address, "--seconds", "5", "-o", report.out
-        code, said, err = report.run(*live, "--json")
-        assert code == 0, err
-        sensors = json.loads(said)
-        assert [(each["serial"], each["source"]) for each in sensors] == [
-            (n, server.address) for n in (10, 20)
-        ]
-        assert {check["outcome"] for each in sensors for check in each["checks"]} == {"good"}
-        assert report.lacks("BFT-SENS-ECAT-M8", "Largest wrench since") == []
-        code, _, err = report.run(*live, "--force", "--sensor", "7")
-    assert (code, "has no sensor 7: it has 0 (BFT-SENS-ECAT-M8" in err) == (1, True)

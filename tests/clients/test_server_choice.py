@@ -9,7 +9,6 @@ import pytest
 from bota_clients.monitor import cli as monitor
 from bota_clients.record import cli as record
 from bota_clients.replay import cli as replay
-from bota_clients.report import cli as report
 from bota_ethercat.program.server_choice import default_server, is_address, own_server
 from ethercat_server.access import sensors
 
@@ -32,11 +31,6 @@ def replayed(argv: list[str]) -> tuple[str, str]:
     return str(found.path), f"{','.join(found.hosts)} {found.port}"
 
 
-def reported(argv: list[str]) -> tuple[str, str]:
-    found = report.parse_options(argv)
-    return str(found.recording or ""), str(found.server or "")
-
-
 @pytest.mark.parametrize(
     ("read", "argv", "path", "server"),
     [
@@ -50,9 +44,6 @@ def reported(argv: list[str]) -> tuple[str, str]:
         (replayed, "--loop a.mcap --server 14101", "a.mcap", "127.0.0.1,::1 14101"),
         (replayed, "a.mcap --server 0.0.0.0:14101", "a.mcap", "0.0.0.0 14101"),
         (replayed, "a.mcap --server localhost:14101", "a.mcap", "127.0.0.1,::1 14101"),
-        (reported, "a.mcap", "a.mcap", ""),
-        (reported, "", "", "localhost:12001"),
-        (reported, "--server :14101 --seconds 3", "", "localhost:14101"),
     ],
 )
 def test_the_server_and_the_file(read: Read, argv: str, path: str, server: str) -> None:
@@ -72,7 +63,6 @@ def test_the_server_and_the_file(read: Read, argv: str, path: str, server: str) 
         (recorded, "a.mcap robot:1", "unrecognized arguments: robot:1"),
         (monitored, "--server ::1", "in brackets"),
         (replayed, "a.mcap --server robot", "'robot': it must be an IP address of this machine"),
-        (reported, "localhost:14101", "write --server localhost:14101"),
     ],
 )
 def test_what_is_ambiguous_is_said(

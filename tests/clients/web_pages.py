@@ -1,4 +1,4 @@
-"""`ethercat-monitor --web` in a thread: real sockets, a model that the test feeds, and its clock."""
+"""`ethercat-monitor --web` in a thread: real sockets, and a model that the test feeds."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 
 from bota_clients.monitor.tare import Say
-from bota_clients.monitor.web.hub import Hub, WebModel
+from bota_clients.monitor.web.pages import Pages, WebModel
 from bota_clients.monitor.web.server import serving
-from bota_ethercat.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S
 from tests.server.running import PATIENCE_S
@@ -23,8 +22,7 @@ class Web:
     def __init__(self, *names: str) -> None:
         self.model = WebModel(made.ADDRESS)
         self.model.connected(made.description(*[names] * bool(names)), made.OWN_PEER, START_S)
-        self.hub = Hub(self.model, self.tare)
-        self.now_s = START_S
+        self.pages = Pages(self.model, self.tare)
         self.port = 0
         self.tared: list[tuple[int, str]] = []  # the positions that were to be tared, and the way
 
@@ -33,21 +31,13 @@ class Web:
         say(f"Sensor {position} was tared", False)
         return threading.Thread()
 
-    @property
-    def origin(self) -> str:
-        return f"http://localhost:{self.port}"
-
-    def feed(self, *frames: DataMessage) -> None:
-        self.now_s = made.now(frames[-1].sequence)
-        self.model.take(frames, self.now_s)
-
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
         """On the same port when it is served again."""
         ready, loop, stop = Future[int](), asyncio.new_event_loop(), asyncio.Event()
 
         async def serve() -> None:
-            async with serving(self.hub, "localhost", self.port, lambda: self.now_s) as at:
+            async with serving(self.pages, "localhost", self.port, lambda: START_S) as at:
                 ready.set_result(at)
                 await stop.wait()
 

@@ -25,14 +25,13 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import PROGRAM
-from bota_clients.export.dataset import Clock, messages
+from bota_clients.export.dataset import ForeignClock, messages
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.program import interrupt_on_signals, say
 from bota_clients.recording.columns import Ints, columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import angular_rate_response
-from bota_ethercat.settings import known_settings
 from ft_compensation.identification.delay import at_times, hann_window, lowest, smoothed
 
 Array = npt.NDArray[np.float64]
@@ -56,7 +55,7 @@ _STEPPING: Final = 25.0
 
 def find_offset(
     times_ns: Ints, rates: Array, robot_ns: Ints, robot_rates: Array
-) -> tuple[Clock, dict[str, float]]:
+) -> tuple[ForeignClock, dict[str, float]]:
     """From (n,), (n, 3) rad/s of the sensor and (m,), (m, 3) of the robot, each by its own clock.
 
     The robot's clock, half of the 95 % intervals, and `bend_ms`, by how much the clocks are off the line if
@@ -64,10 +63,10 @@ def find_offset(
     """
     sensor, robot = _smooth("sensor", times_ns, rates), _smooth("robot", robot_ns, robot_rates)
 
-    def left(looks: Array, offset: float | Array) -> float:
+    def residual(instants: Array, offset: float | Array) -> float:
         """The squares of the sensor's rates that no rotation of the robot's explains, (rad/s)²."""
-        basis = np.linalg.qr(np.column_stack([at_times(looks, *robot), np.ones(len(looks))]))[0]
-        felt = at_times(looks + offset, *sensor)
+        basis = np.linalg.qr(np.column_stack([at_times(instants, *robot), np.ones(len(instants))]))[0]
+        felt = at_times(instants + offset, *sensor)
         return float(((felt - basis @ (basis.T @ felt)) ** 2).sum())
 
     sizes = [at_times(np.arange(0, times[-1], _STEP_S), times, turned) for times, turned in (sensor, robot)]
@@ -79,10 +78,12 @@ def find_offset(
     best = int(np.argmax(agree))
     coarse = float(lags[best]) * _STEP_S
     begin, end = max(0.0, -coarse), min(robot[0][-1], sensor[0][-1] - coarse)
-    looks = np.arange(begin + _AROUND_S, end - _AROUND_S, _STEP_S / 2)
+    instants = np.arange(begin + _AROUND_S, end - _AROUND_S, _STEP_S / 2)
     rest = 1.0
     if end - begin > _SHORTEST_S / 2:
-        rest = left(looks, coarse) / float(len(looks) * at_times(looks + coarse, *sensor).var(axis=0).sum())
+        rest = residual(instants, coarse) / float(
+            len(instants) * at_times(instants + coarse, *sensor).var(axis=0).sum()
+        )
     if rest > 1 - _EXPLAINED:
         raise RecordingError(
             f"the robot's motion explains only {100 * (1 - rest):.0f} % of the sensor's: record both "
@@ -90,16 +91,16 @@ def find_offset(
         )
     if agree[abs(lags - lags[best]) * _STEP_S > _APART_S].max() > _OTHER * agree[best]:
         raise RecordingError("the motion repeats itself, so several offsets fit: move without a rhythm")
-    middle, line = float(looks.mean()), np.array([0.0, coarse])
+    middle, line = float(instants.mean()), np.array([0.0, coarse])
 
     def offsets_of(parts: int, around: Array) -> tuple[Array, Array, Array]:
         """Of so many parts: instants, offsets from the line, and weights, each (count,)."""
         rows = []
-        for part in np.array_split(looks, parts):
+        for part in np.array_split(instants, parts):
             expected = np.polyval(line, part - middle)
 
             def missed(offset: float, part: Array = part, expected: Array = expected) -> float:
-                return left(part, expected + offset)
+                return residual(part, expected + offset)
 
             fits = lowest(missed, min(around.tolist(), key=missed), _STEP_S)
             curve = missed(fits - _STEP_S) - 2 * missed(fits) + missed(fits + _STEP_S)
@@ -119,7 +120,7 @@ def find_offset(
     bend = _bend(*offsets_of(2 * _PARTS, np.zeros(1)))
     interval, drift_interval = interval + bend, drift_interval + 2 * bend / (at[-1] - at[0])
     stamp_ns, monotonic_ns = (round(at_s * 1e9) for at_s in (middle, middle + line[1]))
-    clock = Clock(int(robot_ns[0]) + stamp_ns, int(times_ns[0]) + monotonic_ns, float(line[0]) * 1e6)
+    clock = ForeignClock(int(robot_ns[0]) + stamp_ns, int(times_ns[0]) + monotonic_ns, float(line[0]) * 1e6)
     intervals = {"interval_ms": interval * 1e3, "drift_interval_ppm": drift_interval * 1e6}
     return clock, intervals | {"bend_ms": bend * 1e3}
 
@@ -268,14 +269,13 @@ def _turned(vectors: Array) -> Array:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find it; returns the exit code. RecordingError."""
     interrupt_on_signals()
     with open_recording(options.recording) as recording:
         rows = []
-        for settings, frames in recording.batches(choose(recording, options.sensor).sensor):
+        for info, frames in recording.batches(choose(recording, options.sensor).sensor):
             table = columns(frames, options.imu_units)
             table = table.where(table.fresh & np.isfinite(table.angular_rate).all(axis=1))
-            delay_s = angular_rate_response(known_settings(settings.values)).delay_s or 0.0
+            delay_s = angular_rate_response(info.settings).delay_s or 0.0
             rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
     instants, rates = map(np.concatenate, zip(*rows, strict=True))
     if (np.diff(instants) <= 0).any():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Final
@@ -18,7 +18,6 @@ from bota_ethercat.program.output import ends_with_its_reader
 PROGRAM: Final = "ethercat-export"
 DATASETS: Final = (".parquet", ".zarr", ".npz")
 _MOST_SAMPLES: Final = 100_000  # in a window
-Advance = Callable[[int], object]  # is told how many DATA frames were read since the last call
 
 
 def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -51,7 +50,6 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="clock of the stamps, by 'ethercat-export align' (default: the server's)")  # fmt: skip
     add("--tool", type=Path, metavar="YAML",
         help="also the compensated wrench, with these parameters of the ROS 2 node")  # fmt: skip
-    add("--hold", action="store_true", help="repeat the last sample where one was lost, instead of NaN")
     options = made.parse_args(argv)
     has_frames = options.at is not None or options.fps is not None
     options.output = options.output or options.recording.with_suffix(DATASETS[0] if has_frames else ".csv")
@@ -63,7 +61,6 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def parse_align(argv: Sequence[str]) -> argparse.Namespace:
-    """Read the command line after `align`."""
     made = Parser(
         f"{PROGRAM} align",
         "Finds the offset between the server's clock and a robot's, and its drift: from the angular rate of "
@@ -92,28 +89,18 @@ def run(options: argparse.Namespace) -> int:
 
     Ctrl-C ends it at any time and leaves no file.
     """
-    from rich.console import Console  # noqa: PLC0415 - needs the extra, and so do these
-    from rich.progress import Progress  # noqa: PLC0415
-
-    from bota_clients.recording.reader import open_recording  # noqa: PLC0415
+    from bota_clients.recording.reader import open_recording  # noqa: PLC0415 - needs the extra
 
     write = import_module(
         f"bota_clients.export.{'dataset' if options.output.suffix in DATASETS else 'table'}"
     ).write
     interrupt_on_signals()
-    console = Console(stderr=True)
-    progress = Progress(console=console, transient=True, disable=not console.is_terminal)
     try:
-        with open_recording(options.recording) as recording, progress:
+        with open_recording(options.recording) as recording:
             if recording.cut_off is not None:
                 how = f"was cut off ({recording.cut_off}): the intact part is exported"
                 say(PROGRAM, f"{recording.path} {how}")
-            chosen = [each.frames for each in recording.sensors if options.sensor in {None, each.sensor}]
-            task = progress.add_task("", total=sum(chosen))
-            written = write(options, recording, lambda frames: progress.advance(task, frames))
-    except KeyboardInterrupt:
-        say(PROGRAM, "stopped: nothing was written")
-        return 1
+            written = write(options, recording)
     except OSError as error:
         raise FileError(f"{options.output} cannot be written: {error.strerror or error}") from None
     say(PROGRAM, f"{options.output}: {written}")
@@ -122,7 +109,6 @@ def run(options: argparse.Namespace) -> int:
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Export; returns the exit code."""
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["align"]:
         return start(PROGRAM, "export.align", parse_align(given[1:]))

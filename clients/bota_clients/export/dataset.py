@@ -18,7 +18,6 @@ import json
 import math
 import shutil
 import tempfile
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -27,8 +26,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.cli import DATASETS, PROGRAM, Advance
-from bota_clients.export.windows import Array, Arrays, Windows, offset_of, read_tool
+from bota_clients.export.cli import DATASETS, PROGRAM
+from bota_clients.export.windows import Arrays, Windows, offset_of, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
@@ -37,7 +36,6 @@ from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor.response import delays_ms
-from bota_ethercat.settings import known_settings
 from bota_ethercat.text.json_text import parse_json_object
 
 _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
@@ -50,7 +48,7 @@ _COARSEST_S: Final = 0.001
 _NEAR_NS: Final = 366 * 86400 * _SECOND
 
 
-class Clock(NamedTuple):
+class ForeignClock(NamedTuple):
     """Another clock than the server's, as `ethercat-export align` finds it."""
 
     stamp_ns: int  # of that clock, ...
@@ -58,7 +56,7 @@ class Clock(NamedTuple):
     drift_ppm: float  # by which the server's is faster
 
     @classmethod
-    def read(cls, path: Path) -> Clock:
+    def read(cls, path: Path) -> ForeignClock:
         """What `ethercat-export align` printed; RecordingError."""
         try:
             found = parse_json_object(path.read_bytes())
@@ -93,7 +91,11 @@ class Stamped:
     """Frames in the order of their instants, stamped so long after the exposure."""
 
     def __init__(
-        self, stamps_ns: Ints, source: str = "the frames", latency_s: float = 0.0, clock: Clock | None = None
+        self,
+        stamps_ns: Ints,
+        source: str = "the frames",
+        latency_s: float = 0.0,
+        clock: ForeignClock | None = None,
     ) -> None:
         """`source` is for errors; `clock` made the stamps, if not the server's CLOCK_REALTIME."""
         self.count, self._stamps, self._source, self._clock = len(stamps_ns), stamps_ns, source, clock
@@ -275,18 +277,17 @@ def windows_of(
     frames: Periodic | Stamped,
     windows: Windows,
     sensor: int = 0,
-    advance: Advance = lambda _: None,
 ) -> Iterator[Arrays]:
     """Blocks of f frames: `stamp_ns` as given, `monotonic_ns` of the exposure, and their `Windows.at`.
 
     RecordingError for the first frame without a window.
     """
     done, clocks, waiting = 0, np.zeros((2, 0), np.int64), np.zeros((2, 0), np.int64)
-    for settings, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
+    for info, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
         until_ns = windows.until_ns
-        if settings is not None:
-            windows.configure(settings.values, settings.rate_hz, settings.identity.name, settings.offset)
-            samples = windows.take(batch)
+        if info is not None:
+            windows.configure(info.settings, info.rate_hz, info.name, info.offset)
+            samples = windows.add(batch)
             clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
             if clocks.size:
                 waiting = np.hstack([waiting, frames.exposed(*clocks)])
@@ -299,7 +300,6 @@ def windows_of(
             yield {"stamp_ns": ready[0], "monotonic_ns": ready[1], **windows.at(ready[1])}
         done, waiting = done + len(ready[0]), waiting[:, len(ready[0]) :]
         windows.forget(min([until_ns, *waiting[1, :1].tolist()]))
-        advance(len(batch))
     if not clocks.size:
         raise RecordingError(f"{recording.path} has no new and valid samples")
     if isinstance(frames, Stamped) and done < frames.count:
@@ -310,9 +310,9 @@ def windows_of(
         raise RecordingError("the recording is too short for a frame")
 
 
-def write(options: argparse.Namespace, recording: Recording, advance: Advance) -> str:
+def write(options: argparse.Namespace, recording: Recording) -> str:
     """Windows for the frames that are asked for, into a file; says of how many samples."""
-    clock = options.clock and Clock.read(options.clock)
+    clock = options.clock and ForeignClock.read(options.clock)
     tool = options.tool and read_tool(options.tool)
     length, sensor, path = int(options.window), choose(recording, options.sensor), options.output
     frames: Periodic | Stamped
@@ -322,7 +322,7 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         frames = Stamped(read_stamps(options.at, options.column), str(options.at), options.latency, clock)
     if tool and any(tool.get("bias", ())):
         _check_offsets(options.tool, tool, recording, sensor.offsets)
-    windows = Windows(length, hold=options.hold, tool=tool, imu_units=options.imu_units)
+    windows = Windows(length, tool=tool, imu_units=options.imu_units)
     about = {
         "program": f"{PROGRAM} {VERSION}",
         "options": vars(options),
@@ -330,8 +330,8 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
         # In force from `stamp_ns` on, with delays of the filters; null: unknown, and taken to be 0.
         "settings": [
             {
-                **row._asdict(), "offset": None, "identity": row.identity._asdict(),
-                "delay_ms": delays_ms(known_settings(row.values), row.rate_hz),
+                "stamp_ns": row.stamp_ns, **row.info._asdict(), "offset": None,
+                "delay_ms": delays_ms(row.info.settings, row.info.rate_hz),
             }
             for row in sensor.history
         ],
@@ -344,7 +344,7 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
     if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
         raise FileError(f"{path} {EXISTS}")
     with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
-        made, blocks = Path(folder, path.name), windows_of(recording, frames, windows, sensor.sensor, advance)
+        made, blocks = Path(folder, path.name), windows_of(recording, frames, windows, sensor.sensor)
         _WRITERS[path.suffix](made, json.dumps(about, default=str), _in_chunks(blocks))
         if path.is_dir():
             shutil.rmtree(path)
@@ -398,19 +398,10 @@ def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
 
 
 def _npz(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
-    """An array for each name, and `attributes`, text; on disk until their length is known."""
-    like = Arrays()
-    for like in blocks:
-        for name, array in like.items():
-            with (path.parent / name).open("ab") as file:
-                array.tofile(file)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, array in (like | {"attributes": np.array(about)}).items():
-            whole: Array = array
-            if name in like:
-                whole = np.memmap(path.parent / name, array.dtype, "r").reshape(-1, *array.shape[1:])
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, whole, allow_pickle=False)
+    """An array for each name, and `attributes`, text."""
+    made = list(blocks)
+    arrays: dict[str, Any] = {name: np.concatenate([block[name] for block in made]) for name in made[0]}
+    np.savez(path, attributes=np.array(about), **arrays)
 
 
 def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:

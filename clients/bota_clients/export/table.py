@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.cli import Advance
 from bota_clients.numbers import count
 from bota_clients.recording.reader import Recording
 from bota_ethercat.accounting import NOT_NEW
@@ -33,7 +32,7 @@ COLUMNS: Final = (
 )  # fmt: skip
 
 
-def write(options: argparse.Namespace, recording: Recording, advance: Advance) -> str:
+def write(options: argparse.Namespace, recording: Recording) -> str:
     """The names, then a line for each sample, into a file; says how many. PdoSizeError."""
     there = {sensor.sensor for sensor in recording.sensors if sensor.frames}
     if not there or options.sensor not in {None, *there}:
@@ -46,7 +45,6 @@ def write(options: argparse.Namespace, recording: Recording, advance: Advance) -
     with NewFile(options.output, force=options.force) as file:
         file.write(",".join(COLUMNS) + "\n")
         for frame in recording.frames(options.sensor):
-            advance(1)
             # A gap before a frame that is left out is before the next sample.
             flags = frame.flags | gaps.pop(frame.sensor, 0)
             if flags & NOT_NEW and not options.all:

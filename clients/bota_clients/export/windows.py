@@ -2,7 +2,7 @@
 
     windows = Windows(32)
     windows.configure(row["settings"], row["rate_hz"], row["name"], row["offset"])  # whenever they change
-    windows.take(frames)  # DATA messages of one sensor, in order
+    windows.add(frames)  # DATA messages of one sensor, in order
     arrays = windows.at(np.array([windows.until_ns]))
 
 Samples are in slots, one for each period of the sensor; the slot of a lost sample stays empty. A sample was
@@ -81,16 +81,12 @@ class Windows:
         self,
         length: int,
         *,
-        hold: bool = False,
         tool: Mapping[str, Any] | None = None,
         imu_units: ImuUnits = ImuUnits.G_DPS,
     ) -> None:
-        """Of `length` samples. With a `tool`, parameters of the ROS 2 node, there is a compensated wrench.
-
-        `hold`: an empty slot has value and age of the last valid one of its window, instead of NaN.
-        """
+        """Of `length` samples. With a `tool`, parameters of the ROS 2 node, there is a compensated wrench."""
         self.begin_ns = -1
-        self._length, self._hold, self._units, self._compensator = length, hold, imu_units, None
+        self._length, self._units, self._compensator = length, imu_units, None
         self._slots = np.zeros(0, _SLOT)
         self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._in_force: tuple[Mapping[str, object], float] | None = None
@@ -163,7 +159,7 @@ class Windows:
         """The last instant of which nothing that comes later can be a part; -1 before the first sample."""
         return int(self._slots["measured_ns"].max(axis=0, initial=-1).min())
 
-    def take(self, frames: Sequence[DataMessage]) -> Columns:
+    def add(self, frames: Sequence[DataMessage]) -> Columns:
         """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
         samples = columns((each for each in frames if not each.flags & NOT_NEW), self._units)
         if not len(samples):
@@ -237,13 +233,10 @@ class Windows:
         for channel, (name, part) in enumerate(_CHANNELS.items()):
             index = self._ends(instants_ns, channel)[:, np.newaxis] + np.arange(-self._length, 0)
             is_there, index = index >= 0, np.maximum(index, 0)
-            filled = valid = slots["valid"][index, channel] & is_there
-            if self._hold:
-                held = np.maximum.accumulate(np.where(valid, np.arange(self._length), -1), axis=1)
-                index, filled = np.take_along_axis(index, held, 1), held >= 0
+            valid = slots["valid"][index, channel] & is_there
             age_s = (instants_ns[:, np.newaxis] - slots["measured_ns"][index, channel]) * 1e-9
             values, wrench = slots["values"][index, part], slots["compensated"][index]
-            age_s[~filled] = values[~filled] = wrench[~filled] = math.nan
+            age_s[~valid] = values[~valid] = wrench[~valid] = math.nan
             found |= {name: values, f"{name}_age": age_s.astype(np.float32), f"{name}_valid": valid}
             if self._compensator is not None and not channel:
                 found[f"{name}_compensated"] = wrench

@@ -9,24 +9,12 @@ from pathlib import Path
 
 from bota_clients.arguments import add_force, add_imu_units, position
 from bota_clients.program import start
-from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
+from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.arguments import Parser, number
 from bota_ethercat.program.output import ends_with_its_reader
 
 
-class IdentifyOptions(argparse.Namespace):
-    """What to read, and how."""
-
-    path: Path
-    sensor: int | None
-    imu_units: ImuUnits
-    gravity: float | None  # m/s², if given
-    yaml: Path | None
-    force: bool
-    json: bool
-
-
-def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
+def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; argparse exits with 2 if it is wrong."""
     made = Parser(
         "ethercat-identify",
@@ -43,11 +31,10 @@ def parse_options(argv: Sequence[str] | None) -> IdentifyOptions:
     add("--yaml", type=Path, metavar="OUT", help="write the result as parameters of the ROS 2 node")
     add_force(made)
     add("--json", action="store_true", help="print everything as JSON instead of a table")
-    return made.parse_args(argv, IdentifyOptions())
+    return made.parse_args(argv)
 
 
-def parse_delay(argv: Sequence[str]) -> IdentifyOptions:
-    """Read the command line after `delay`."""
+def parse_delay(argv: Sequence[str]) -> argparse.Namespace:
     made = Parser(
         "ethercat-identify delay",
         "Tells from a recording how much later force and torque are than the accelerometer.",
@@ -56,7 +43,7 @@ def parse_delay(argv: Sequence[str]) -> IdentifyOptions:
     )
     _add_recording(made)
     made.add_argument("--json", action="store_true", help="print JSON instead of a sentence")
-    return made.parse_args(argv, IdentifyOptions())
+    return made.parse_args(argv)
 
 
 def _add_recording(made: argparse.ArgumentParser) -> None:
@@ -68,7 +55,6 @@ def _add_recording(made: argparse.ArgumentParser) -> None:
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Identify; returns the exit code."""
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["delay"]:
         return start("ethercat-identify", "identify.delay", parse_delay(given[1:]))

@@ -2,38 +2,38 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from bota_clients.errors import RecordingError
-from bota_clients.identify.cli import IdentifyOptions
 from bota_clients.identify.program import choose
 from bota_clients.program import say
 from bota_clients.recording.columns import Columns
 from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, force_lag_s
-from bota_ethercat.settings import SettingValue, known_settings
+from bota_ethercat.settings import SettingValue
 from ft_compensation.identification.delay import Lag, find_lag
 from ft_compensation.quantities import CompensationError
 
 
-def run(options: IdentifyOptions) -> int:
-    """Find it; returns the exit code."""
+def run(options: argparse.Namespace) -> int:
     with open_recording(options.path) as recording:
         sensor = choose(recording, options.sensor)
         data, _ = at_last_offset(recording, sensor, options.imu_units)
-    if any(row.values != sensor.settings for row in sensor.history):
+    if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise RecordingError(f"{options.path}: settings were changed during it: record without that")
-    settings, found, error = known_settings(sensor.settings), None, ""
+    settings, found, error = sensor.info.settings, None, ""
     try:
         found = _find(data, settings)
     except CompensationError as refusal:
         error = str(refusal)
-    expected_s = force_lag_s(settings, sensor.rate_hz or None)
+    expected_s = force_lag_s(settings, sensor.info.rate_hz or None)
     expected_ms = None if expected_s is None else expected_s * 1e3
     if options.json:
         sys.stdout.write(json.dumps(_as_json(found, expected_ms, error), indent=1) + "\n")
@@ -48,7 +48,7 @@ def run(options: IdentifyOptions) -> int:
     return int(found is None)
 
 
-def _find(data: Columns, settings: dict[str, SettingValue]) -> Lag:
+def _find(data: Columns, settings: Mapping[str, SettingValue]) -> Lag:
     data = data.where(data.fresh)
     force, acceleration, rate = data.force, data.acceleration, data.angular_rate
     usable = np.isfinite(np.concatenate([force, acceleration, rate], axis=1)).all(axis=1)

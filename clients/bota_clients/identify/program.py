@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -12,14 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 from bota_clients.errors import RecordingError
-from bota_clients.identify.cli import IdentifyOptions
 from bota_clients.identify.stationary_periods import LEAST_S, StationaryPeriod, find_stationary_periods
 from bota_clients.program import say
 from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
-from bota_ethercat.settings import known_settings
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
@@ -34,7 +33,6 @@ _say = partial(say, "ethercat-identify")
 
 
 def show_poses(console: Console, poses: Poses, result: Identified | None) -> None:
-    """The poses with their residuals."""
     table = Table(title="poses", title_justify="left")
     for head in ("", "at s", "for s", "samples", "up x", "up y", "up z", "residual N", "residual Nm"):
         table.add_column(head, justify="right")
@@ -124,8 +122,7 @@ def as_json(
     }
 
 
-def run(options: IdentifyOptions) -> int:
-    """Identify; returns the exit code."""
+def run(options: argparse.Namespace) -> int:
     if options.yaml is not None:
         refuse_existing(options.yaml, force=options.force)
     with open_recording(options.path) as recording:
@@ -133,7 +130,7 @@ def run(options: IdentifyOptions) -> int:
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
         for row in sensor.history:
-            known = known_settings(row.values)
+            known = row.info.settings
             if why := not_newtons(known, has_tool=True) or hides_gravity(known):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")
         data, offset = at_last_offset(recording, sensor, options.imu_units)
@@ -157,7 +154,7 @@ def run(options: IdentifyOptions) -> int:
         _say(error or "no result")
         return 1
     if options.yaml is not None:
-        who = f"{sensor.name}, serial number {sensor.serial}, from {options.path.name}"
+        who = f"{sensor.info.name}, serial number {sensor.info.serial}, from {options.path.name}"
         gravity = None if options.gravity is None else (0.0, 0.0, -options.gravity)
         write_yaml(
             options.yaml,
@@ -186,7 +183,7 @@ def choose(recording: Recording, position: int | None) -> RecordedSensor:
     sensor = there.get(next(iter(there)) if position is None else position)
     if sensor is None:
         raise RecordingError(f"{recording.path} has no samples of sensor {position}")
-    serials = list(dict.fromkeys(row.identity.serial for row in sensor.history))
+    serials = list(dict.fromkeys(row.info.serial for row in sensor.history))
     if len(serials) > 1:
         raise RecordingError(
             f"{recording.path}: sensor {sensor.sensor} was replaced during it (serial numbers "
@@ -196,7 +193,7 @@ def choose(recording: Recording, position: int | None) -> RecordedSensor:
 
 
 def _solve(
-    periods: Sequence[StationaryPeriod], options: IdentifyOptions
+    periods: Sequence[StationaryPeriod], options: argparse.Namespace
 ) -> tuple[Poses, Identified | None, str | None]:
     """The periods that are poses, and the result or why there is none."""
     poses: list[tuple[StationaryPeriod, Pose]] = []

@@ -37,8 +37,6 @@ Bools = npt.NDArray[np.bool_]
 
 
 class StationaryPeriod(NamedTuple):
-    """A stationary period."""
-
     begin_s: float  # from the beginning of the recording
     seconds: float
     means: StationaryMeans
@@ -104,7 +102,7 @@ def _stretches(times: Floats, rows: Floats, good: Bools) -> Iterator[tuple[int, 
     quiet &= (deviation <= _LIMITS.deviations).all(axis=1)
     quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= _LIMITS.angular_rate
 
-    def goes_on(start: int, number: int) -> bool:
+    def is_same_period(start: int, number: int) -> bool:
         """Whether block `number` belongs to the period that began with block `start`."""
         if not (quiet[start] and quiet[number]):
             return False
@@ -118,7 +116,7 @@ def _stretches(times: Floats, rows: Floats, good: Bools) -> Iterator[tuple[int, 
 
     start = 0
     for number in range(1, count + 1):
-        if number < count and goes_on(start, number):
+        if number < count and is_same_period(start, number):
             continue
         if quiet[start] and number - start >= 3:
             yield (start + 1) * size, (number - 1) * size

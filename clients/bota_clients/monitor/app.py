@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ClassVar, Final
+from typing import Final
 
 from rich.text import Text
 from textual import events
@@ -20,8 +20,8 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from bota_clients.monitor.model import Model, State, clock_text
-from bota_clients.monitor.recorder import Recorder
-from bota_clients.monitor.screen import Look, Screen, render
+from bota_clients.monitor.recording import MonitorRecording
+from bota_clients.monitor.screen import Screen, ViewOptions, render
 from bota_clients.monitor.tare import start_tare
 from bota_clients.numbers import duration
 from bota_clients.program import call_on
@@ -39,7 +39,6 @@ class View(ScrollView, can_focus=True):
         self._rows: list[Text] = []
 
     def show(self, rows: list[Text]) -> None:
-        """Show these rows."""
         before, self._rows = self._rows, rows
         if len(rows) != len(before):
             self.virtual_size = Size(0, len(rows))
@@ -65,7 +64,6 @@ class Monitor(App[None]):
         #body { height: 1fr; }
     """
     ENABLE_COMMAND_PALETTE = False
-    BINDINGS: ClassVar = [("ctrl+z", "suspend_process", "suspend")]
 
     def __init__(
         self,
@@ -82,28 +80,24 @@ class Monitor(App[None]):
         self._model = model
         self._address = address
         self._clock = clock
-        self._look = Look()
+        self._view = ViewOptions()
         self._views = [View(id=name) for name in Screen._fields]
         self._seconds = seconds
-        self.recorder = Recorder(address)
+        self.recorder = MonitorRecording(address)
         self._state: State | None = None
         self._to_tare = 0  # the position that the question is about
 
     def compose(self) -> ComposeResult:
-        """What stays, and between them what scrolls."""
         yield from self._views
 
     def on_mount(self) -> None:
-        """Start the timers and the signal handlers."""
         call_on(asyncio.get_running_loop(), self.exit, "SIGTERM", "SIGHUP")
-        self.app_resume_signal.subscribe(self, lambda _: self.refresh(layout=True))
         self._views[1].focus()
         self.set_interval(REFRESH_S, self.draw)
         if self._seconds is not None:
             self.set_timer(self._seconds, self.exit)
 
     def on_resize(self) -> None:
-        """Draw for the new size."""
         self.call_after_refresh(self.draw)
 
     def draw(self) -> None:
@@ -115,54 +109,44 @@ class Monitor(App[None]):
         if ended := self.recorder.ended():
             self._model.say(*ended)
         state = self._model.state(now_s)
-        if self._look.paused and self._state is not None:
+        if self._view.paused and self._state is not None:
             state = replace(self._state, message=state.message)
         self._state = state
         recording = f"REC {duration(now_s - self.recorder.since_s)}" if self.recorder.running else ""
         width = self._views[1].scrollable_content_region.width
-        screen = render(state, replace(self._look, recording=recording), width)
+        screen = render(state, replace(self._view, recording=recording), width)
         self._views[2].styles.height = len(screen.foot)
         for view, rows in zip(self._views, screen, strict=True):
             view.show(rows)
-
-    def action_suspend_process(self) -> None:
-        """Ctrl-Z stops the whole process, a recording too: not before that is stopped."""
-        if self.recorder.running:
-            self._model.say("A recording is running: stop it before suspending (r)", True)
-        else:
-            super().action_suspend_process()
 
     def action_help_quit(self) -> None:
         """Ctrl-C quits, instead of Textual's hint at another key."""
         self.exit()
 
     def on_key(self, event: events.Key) -> None:
-        """Handle a key."""
-        if event.key in {"ctrl+c", "ctrl+q", "ctrl+z"}:
+        if event.key in {"ctrl+c", "ctrl+q"}:
             return
         event.stop()
-        look, key = self._look, (event.character or "").lower()
+        look, key = self._view, (event.character or "").lower()
         if event.key == "ctrl+l":
             self.refresh(layout=True)
         elif look.question:
             self._answer(key)
-        elif look.page:
-            self._look = replace(look, page="")
+        elif look.help:
+            self._view = replace(look, help=False)
         elif key == "t":
             self._ask_tare()
         elif key == "r":
             self._record()
         elif key in {"p", " "}:
-            self._look = replace(look, paused="" if look.paused else clock_text())
+            self._view = replace(look, paused="" if look.paused else clock_text())
         elif key == "0":
             self._model.reset()
             self._model.say("Peaks and past warnings are reset")
         elif key == "n":
             self._next()
         elif key in {"?", "h"}:
-            self._look = replace(look, page="help")
-        elif key == "w":
-            self._look = replace(look, page="warnings")
+            self._view = replace(look, help=True)
         elif key == "q":
             self.exit()
         self.draw()
@@ -172,12 +156,12 @@ class Monitor(App[None]):
         if state is None or not state.sensors or not state.server.connected:
             self._model.say("No sensor to tare: not connected to the server", True)
             return
-        self._to_tare = state.sensors[self._look.selected % len(state.sensors)].position
+        self._to_tare = state.sensors[self._view.selected % len(state.sensors)].position
         answers = "y: yes, u: undo the last tare, c: clear it, any other key: no"
-        self._look = replace(self._look, question=f"Tare sensor {self._to_tare}? {answers}")
+        self._view = replace(self._view, question=f"Tare sensor {self._to_tare}? {answers}")
 
     def _answer(self, key: str) -> None:
-        self._look = replace(self._look, question="")
+        self._view = replace(self._view, question="")
         if key in _ANSWERS:
             start_tare(self._address, self._to_tare, self._model.say, _ANSWERS[key])
         else:
@@ -195,4 +179,4 @@ class Monitor(App[None]):
         if count < 2:
             self._model.say("There is only one sensor" if count else "There is no sensor")
         else:
-            self._look = replace(self._look, selected=(self._look.selected + 1) % count)
+            self._view = replace(self._view, selected=(self._view.selected + 1) % count)

@@ -15,16 +15,14 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from bota_clients.arguments import add_imu_units, add_server, address, server_of
+from bota_clients.arguments import add_imu_units, add_server, address, is_loopback, server_of
 from bota_clients.monitor.model import Model
 from bota_clients.monitor.reader import Reader
-from bota_clients.monitor.web.hub import is_loopback
 from bota_clients.monitor.words import json_line, verdict
 from bota_clients.program import interrupt_on_signals, not_installed
 from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.health.limits import Level
 from bota_ethercat.health.sentences import no_server
-from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.arguments import Parser, seconds
 from bota_ethercat.program.output import discard_output, ends_with_its_reader
 
@@ -34,20 +32,8 @@ _ONCE_S: Final = 1.0
 _ANSWER_S: Final = 6.0
 
 
-class Options(argparse.Namespace):
-    """What to show, and how."""
-
-    address: Address
-    once: bool
-    json: bool
-    seconds: float | None
-    imu_units: ImuUnits
-    web: Address | None
-
-
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the monitor; returns its exit code."""
     options = parse(argv)
     try:
         return run(options)
@@ -62,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return not_installed("ethercat-monitor", error)
 
 
-def parse(argv: Sequence[str] | None) -> Options:
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; argparse exits with 2 if it is wrong."""
     made = Parser(
         "ethercat-monitor",
@@ -80,7 +66,7 @@ def parse(argv: Sequence[str] | None) -> Options:
         "--web", type=_loopback, nargs="?", const=DEFAULT_WEB, metavar="PORT",
         help=f"show it in a browser instead, on this port of this machine (default {DEFAULT_WEB.port})",
     )  # fmt: skip
-    options = made.parse_args(argv, Options())
+    options = made.parse_args(argv)
     options.address = server_of(made, options.server)
     if options.once and options.seconds is not None:
         made.error("--seconds cannot be combined with --once")
@@ -98,8 +84,7 @@ def _loopback(text: str) -> Address:
     )
 
 
-def run(options: Options) -> int:
-    """Run the monitor; returns the exit code."""
+def run(options: argparse.Namespace) -> int:
     if options.web is not None:
         from bota_clients.monitor.web.server import run_web  # noqa: PLC0415
 
@@ -128,7 +113,7 @@ def run(options: Options) -> int:
         reader.close()
 
 
-def _once(options: Options, model: Model, *, answered: bool) -> int:
+def _once(options: argparse.Namespace, model: Model, *, answered: bool) -> int:
     from bota_clients.monitor.screen import table  # noqa: PLC0415
 
     if answered:
@@ -145,7 +130,7 @@ def _once(options: Options, model: Model, *, answered: bool) -> int:
     return 1 if verdict(state)[0] is Level.TROUBLE else 0
 
 
-def _live(options: Options, model: Model) -> int:
+def _live(options: argparse.Namespace, model: Model) -> int:
     from bota_clients.monitor.app import Monitor  # noqa: PLC0415
 
     app = Monitor(model, options.address, seconds=options.seconds)
@@ -160,7 +145,7 @@ def _live(options: Options, model: Model) -> int:
     return app.return_code or 0
 
 
-def _each_second(options: Options, model: Model) -> int:
+def _each_second(options: argparse.Namespace, model: Model) -> int:
     for _ in itertools.count() if options.seconds is None else range(math.ceil(options.seconds)):
         time.sleep(_PERIOD_S)
         _say(json_line(model.state(time.monotonic()), time.time()))

@@ -16,10 +16,11 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.health import sentences
 from bota_ethercat.health.judge import judge, saturated_axes
 from bota_ethercat.health.limits import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
-from bota_ethercat.health.sentences import drift, event_sentence
+from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.replies import (
     Description,
@@ -41,13 +42,11 @@ _MESSAGE_S: Final = 30.0
 
 
 class Range(NamedTuple):
-    """Minimum and maximum."""
-
     low: float
     high: float
 
 
-class Spread(NamedTuple):
+class Percentiles(NamedTuple):
     """A distribution in µs: its median, and p99 or the worst, as `which` says."""
 
     p50: float
@@ -64,7 +63,7 @@ class Alert(NamedTuple):
     ago_s: float | None
 
 
-class Client(NamedTuple):
+class ServerClient(NamedTuple):
     """A client of the server; its rate is that of the frames sent to it between two replies to `status`."""
 
     peer: str
@@ -75,8 +74,6 @@ class Client(NamedTuple):
 
 
 class Message(NamedTuple):
-    """The latest message for the user."""
-
     text: str
     bad: bool = False
 
@@ -99,13 +96,13 @@ class SensorState:
     rate_hz: float | None = None
     jitter_us: float | None = None  # standard deviation of the intervals between stamps
     jitter_worst_us: float | None = None  # the interval furthest from the mean one
-    age_us: Spread | None = None  # on arrival; only on the server's own machine
+    age_us: Percentiles | None = None  # on arrival; only on the server's own machine
     missed: int = 0  # frames that the server numbered and that did not come
     gaps: int = 0
     repeated: int = 0
     invalid: int = 0
     silent_s: float | None = None  # since the last new sample
-    hand_out_us: Spread | None = None  # age when the server hands them out
+    hand_out_us: Percentiles | None = None  # age when the server hands them out
     zero: str = ""  # its drift, in words
 
     @property
@@ -115,7 +112,6 @@ class SensorState:
 
     @property
     def imu_off(self) -> bool:
-        """Whether the IMU is off."""
         return self.info.settings.get("imu_active") == 0
 
     @property
@@ -126,20 +122,17 @@ class SensorState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerState:
-    """The server."""
-
     address: str
     connected: bool = False
     since_s: float | None = None  # since it was connected or disconnected
-    since_clock: str = ""  # the time of day of that
     reason: str = ""  # why it is not connected: one sentence
     heard_s: float | None = None  # since anything came from it, while connected
     version: str = ""
     replay: str = ""  # what it replays; empty if it has sensors
     uptime_s: float | None = None
     status: Status = field(default_factory=Status)
-    wake_us: Spread | None = None
-    exchange_us: Spread | None = None
+    wake_us: Percentiles | None = None
+    exchange_us: Percentiles | None = None
 
     @property
     def silent(self) -> bool:
@@ -153,7 +146,7 @@ class State:
 
     server: ServerState
     sensors: tuple[SensorState, ...] = ()
-    clients: tuple[Client, ...] = ()
+    clients: tuple[ServerClient, ...] = ()
     message: Message | None = None
     events: tuple[str, ...] = ()  # in words, oldest first
 
@@ -174,7 +167,6 @@ class _Sensor:
         self._seen: dict[str, tuple[Finding, float]] = {}  # since the reset, each at its worst, and when last
 
     def reset(self) -> None:
-        """Reset peaks and past warnings."""
         self.peaks, self._seen = None, {}
         self.observer.forget()
 
@@ -190,13 +182,11 @@ class _Sensor:
         if anew or (info.rate_hz, info.serial) != (before.rate_hz, before.serial):
             self.observer.begin(info.rate_hz, now_ns)
 
-    def take_status(self, status: Status, now_s: float) -> None:
-        """Take a reply to `status`."""
+    def add_status(self, status: Status, now_s: float) -> None:
         self.observer.add_status(status, self.position, _ns(now_s))
         self._hand_out = status.recent_age_us(self.position)
 
-    def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
-        """Frames of this sensor as they came, oldest first."""
+    def add_frames(self, frames: Sequence[DataMessage], now_s: float) -> None:
         samples = self.observer.add_frames(frames, _ns(now_s))
         self._judge(now_s)
         if not samples:
@@ -246,8 +236,8 @@ class _Sensor:
             saturated=self._saturated,
             verdict=self._verdict,
             alerts=tuple(alerts),
-            hand_out_us=_spread(self._hand_out),
-            zero=drift(status),
+            hand_out_us=_percentiles(self._hand_out),
+            zero=sentences.drift(status),
             **self._stream(_ns(now_s)),
         )
 
@@ -267,7 +257,7 @@ class _Sensor:
         if jitter := observer.jitter_us(now_ns):
             found["jitter_us"], found["jitter_worst_us"] = jitter
         if ages := sorted(observer.ages_us(now_ns)):
-            found["age_us"] = Spread(ages[len(ages) // 2], ages[-1], "worst")
+            found["age_us"] = Percentiles(ages[len(ages) // 2], ages[-1], "worst")
         return found
 
 
@@ -285,7 +275,7 @@ class Model:
         self._read_s = math.inf  # when somebody looked last whether anything had come
         self._status = Status()
         self._status_s = 0.0
-        self._clients: tuple[Client, ...] = ()
+        self._clients: tuple[ServerClient, ...] = ()
         self._message: Message | None = None
         self._message_ends_s = 0.0  # 0: it has not been shown yet
         self._events: deque[str] = deque(maxlen=8)
@@ -293,13 +283,12 @@ class Model:
     def connected(self, description: JsonObject, own_peer: str, now_s: float) -> None:
         """Connected; `own_peer` is the address of this end, as in `status`."""
         with self._lock:
-            self._server = replace(self._server, connected=True, reason="", since_clock=clock_text())
+            self._server = replace(self._server, connected=True, reason="")
             self._since_s = self._heard_s = now_s
             self._own_peer, self._status, self._clients = own_peer, Status(), ()
             self._describe(description, now_s, anew=True)
 
     def described(self, description: JsonObject, now_s: float) -> None:
-        """A later reply to `describe`."""
         with self._lock:
             self._describe(description, now_s, anew=False)
 
@@ -307,21 +296,20 @@ class Model:
         """Disconnected, for this reason."""
         with self._lock:
             if self._server.connected or self._since_s is None:
-                self._since_s, self._server = now_s, replace(self._server, since_clock=clock_text())
+                self._since_s = now_s
             self._server = replace(self._server, connected=False, reason=text(reason))
             self._clients = ()
 
-    def take(self, frames: Sequence[DataMessage], now_s: float) -> None:
-        """Take frames in order of arrival."""
+    def add_frames(self, frames: Sequence[DataMessage], now_s: float) -> None:
         with self._lock:
             if frames:
                 self._heard_s = now_s
             for position, of_one in by_sensor(frames).items():
                 if position in self._sensors:
-                    self._sensors[position].take(of_one, now_s)
+                    self._sensors[position].add_frames(of_one, now_s)
 
     def note_unread(self, seconds: float, busy: bool, now_s: float) -> None:
-        """The frames that come next were not read for so long; see `Client.take_unread`."""
+        """The frames that come next were not read for so long; see `ServerClient.take_unread`."""
         with self._lock:
             self._read_s = now_s
             if seconds >= SILENT_S:
@@ -334,24 +322,22 @@ class Model:
             if frame.sensor in self._sensors:
                 self._sensors[frame.sensor].observer.note_age(frame, now_ns)
 
-    def take_status(self, reply: JsonObject, now_s: float) -> None:
-        """A reply to `status`."""
+    def add_status(self, reply: JsonObject, now_s: float) -> None:
         status = Status.parse(reply)
         with self._lock:
             self._heard_s = now_s
             for sensor in self._sensors.values():
-                sensor.take_status(status, now_s)
+                sensor.add_status(status, now_s)
             seconds, before = now_s - self._status_s, {client.peer: client.sent for client in self._clients}
             clients = []
             for row in status.clients:
                 peer, sent = row.peer, row.sent or 0
                 rate = (sent - before[peer]) / seconds if peer in before and seconds > 0 else None
-                clients.append(Client(peer, peer == self._own_peer, rate, sent, row.withheld or 0))
+                clients.append(ServerClient(peer, peer == self._own_peer, rate, sent, row.withheld or 0))
             self._clients = tuple(sorted(clients, key=lambda c: (not c.this, -c.withheld, -c.sent)))
             self._status, self._status_s = status, now_s
 
-    def take_event(self, event: JsonObject, now_s: float) -> None:
-        """An event of the server."""
+    def add_event(self, event: JsonObject, now_s: float) -> None:
         with self._lock:
             self._heard_s = now_s
             position = position_of(event)
@@ -362,7 +348,6 @@ class Model:
             self._events.append(f"{clock_text()} {event_sentence(event)}")
 
     def reset(self) -> None:
-        """Reset peaks and past warnings."""
         with self._lock:
             for sensor in self._sensors.values():
                 sensor.reset()
@@ -373,7 +358,6 @@ class Model:
             self._message, self._message_ends_s = Message(f"{clock_text()} {text(message)}", bad), 0.0
 
     def state(self, now_s: float) -> State:
-        """The current state."""
         with self._lock:
             self._message_ends_s = self._message_ends_s or now_s + _MESSAGE_S
             if now_s > self._message_ends_s:
@@ -386,8 +370,8 @@ class Model:
                 heard_s=max(min(now_s, self._read_s) - self._heard_s, 0.0) if connected else None,
                 uptime_s=up_s + now_s - self._status_s if up_s is not None and connected else up_s,
                 status=status,
-                wake_us=_spread(recent.wake_us) or _spread(status.wake_us),
-                exchange_us=_spread(recent.exchange_us) or _spread(status.exchange_us),
+                wake_us=_percentiles(recent.wake_us) or _percentiles(status.wake_us),
+                exchange_us=_percentiles(recent.exchange_us) or _percentiles(status.exchange_us),
             )
             speaks = server.connected and not server.silent
             sensors = [self._sensors[position] for position in sorted(self._sensors)]
@@ -414,7 +398,6 @@ class Model:
 
 
 def clock_text() -> str:
-    """The time of day."""
     return time.strftime("%H:%M:%S")
 
 
@@ -424,9 +407,9 @@ def _range(column: Sequence[float]) -> Range:
     return Range(min(column), max(column))
 
 
-def _spread(known: DistributionStatus) -> Spread | None:
+def _percentiles(known: DistributionStatus) -> Percentiles | None:
     """A distribution in a reply to `status`; None if it is not known."""
-    return None if known.p50 is None or known.p99 is None else Spread(known.p50, known.p99)
+    return None if known.p50 is None or known.p99 is None else Percentiles(known.p50, known.p99)
 
 
 def _ns(seconds: float) -> int:

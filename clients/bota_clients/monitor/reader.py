@@ -28,8 +28,6 @@ _ANSWER_TIMEOUT_S: Final = 10.0  # timeout for a reply of the server
 
 
 class Reader(threading.Thread):
-    """Reads until closed."""
-
     def __init__(self, address: Address, model: Model, batch_s: float = BATCH_S) -> None:
         """`batch_s`: how long samples queue before they are taken."""
         super().__init__(name="reader", daemon=True)
@@ -41,13 +39,11 @@ class Reader(threading.Thread):
         self.tried = threading.Event()  # there was a reply to `status`, or a failed connection
 
     def close(self) -> None:
-        """End the connection and the thread."""
         self._closing.set()
         self._client.close()
         self.join(timeout=2.0)
 
     def run(self) -> None:
-        """The thread."""
         status_at_s = 0.0
         with self._client as client, contextlib.suppress(ConnectionFailedError):
             while not self._closing.wait(self._batch_s):
@@ -61,7 +57,7 @@ class Reader(threading.Thread):
         fresh = self._sort(client, client.poll_all(_NEXT_SAMPLE_S))
         now_ns = time.monotonic_ns()
         self._model.note_unread(*client.take_unread(), now_ns * 1e-9)
-        self._model.take(piled_up + fresh, now_ns * 1e-9)
+        self._model.add_frames(piled_up + fresh, now_ns * 1e-9)
         # What arrived while this thread decoded waited for it: its age is not that of the server.
         if len(piled_up) < _MOST_PILED and client.session.same_machine:
             first = {frame.sensor: frame for frame in reversed(fresh)}
@@ -79,7 +75,7 @@ class Reader(threading.Thread):
             elif isinstance(item, Disconnected):
                 self._failed(item, now_s)
             else:
-                self._model.take_event(item, now_s)
+                self._model.add_event(item, now_s)
                 if item.get("event") in {Event.SENSOR_BACK, Event.RECONFIGURED}:
                     with contextlib.suppress(ConnectionFailedError):
                         self._model.described(client.ask("describe", _ANSWER_TIMEOUT_S), time.monotonic())
@@ -95,7 +91,7 @@ class Reader(threading.Thread):
 
     def _ask_status(self, client: Client) -> None:
         try:
-            self._model.take_status(client.ask("status", _ANSWER_TIMEOUT_S), time.monotonic())
+            self._model.add_status(client.ask("status", _ANSWER_TIMEOUT_S), time.monotonic())
         except ConnectionFailedError:
             return  # an event says why
         except RefusedError:

@@ -26,7 +26,6 @@ KEYS: Final = (
     ("r", "record", "start or stop a recording in this folder, as of ethercat-record"),
     ("p", "pause", "freeze the display; samples and peaks still count"),
     ("0", "reset", "reset peaks and past warnings"),
-    ("w", "warnings", "of all sensors, present and past"),
     ("n", "next", "the next sensor of the chain"),
     ("?", "help", "this page"),
     ("q", "quit", "also Ctrl-C; Ctrl-L redraws the screen"),
@@ -34,12 +33,6 @@ KEYS: Final = (
 _HELP: Final = """
 Arrows, Page Up and Page Down scroll. Bars are centered on zero; their scale
 grows with the marked peaks, for which every sample counts.
-age     of a sample on arrival; only on the server's own machine
-jitter  of the intervals between the samples' stamps
-Delay   of the sensor's filters, which comes before the age
-lost    on the bus since the server started; on the way here since connecting
-Clock   locked: the server follows the sensor's own clock, else oversampling
-Fx!     this axis is saturated; warnings stay listed until the reset
 
 Press any key to return."""
 
@@ -60,14 +53,12 @@ _WITH_PEAKS: Final = 56  # width from which the peaks are shown as numbers too
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """The user's choices."""
-
+class ViewOptions:
     selected: int = 0  # which sensor comes first, counted from 0 in the state's order
     paused: str = ""  # time of day of the pause; empty if not paused
     recording: str = ""  # the running recording, in words
     question: str = ""  # the pending question
-    page: str = ""  # "help" or "warnings" in place of the overview
+    help: bool = False  # in place of the overview
 
 
 class Screen(NamedTuple):
@@ -78,12 +69,8 @@ class Screen(NamedTuple):
     foot: list[Text]
 
 
-def render(state: State, look: Look, width: int) -> Screen:
-    """The screen."""
-    if look.page:
-        body = _help() if look.page == "help" else _warnings(state, width)
-    else:
-        body = _overview(state, look, width)
+def render(state: State, look: ViewOptions, width: int) -> Screen:
+    body = _help() if look.help else _overview(state, look, width)
     screen = Screen([_title(state, look, width)], body, [*_message(state, look, width), _keys(look, width)])
     for row in (row for part in screen for row in part):
         row.no_wrap = True
@@ -112,17 +99,7 @@ def _help() -> list[Text]:
     return [*rows, *map(Text, _HELP.splitlines())]
 
 
-def _warnings(state: State, width: int) -> list[Text]:
-    """Of all sensors."""
-    rows = [
-        row
-        for sensor in state.sensors
-        for row in (Text(words.identity(sensor), VALUE), *_alerts(sensor, width), Text())
-    ]
-    return [*rows, Text("Press any key to return.")]
-
-
-def _overview(state: State, look: Look, width: int) -> list[Text]:
+def _overview(state: State, look: ViewOptions, width: int) -> list[Text]:
     """Server, sensors from the selected one on, clients."""
     rows = _server(state, width)
     if not state.sensors:
@@ -134,7 +111,7 @@ def _overview(state: State, look: Look, width: int) -> list[Text]:
     return [*rows, _clients(state)]
 
 
-def _title(state: State, look: Look, width: int) -> Text:
+def _title(state: State, look: ViewOptions, width: int) -> Text:
     """Address, what is special, sensors that have findings, connection."""
     server = state.server
     left = Text(server.address, VALUE)
@@ -165,8 +142,7 @@ def _clients(state: State) -> Text:
     return _field("Clients", known if state.server.connected else "not known")
 
 
-def _message(state: State, look: Look, width: int) -> list[Text]:
-    """The question or the latest message."""
+def _message(state: State, look: ViewOptions, width: int) -> list[Text]:
     text, style = state.events[-1] if state.events else "", LABEL
     if look.question:
         text, style = look.question, NOTICE
@@ -176,7 +152,7 @@ def _message(state: State, look: Look, width: int) -> list[Text]:
     return [Text(line, style) for line in lines or [""]]
 
 
-def _keys(look: Look, width: int) -> Text:
+def _keys(look: ViewOptions, width: int) -> Text:
     other = {"r": "stop"} if look.recording else {}
     other |= {"p": "resume"} if look.paused else {}
     row = Text()
@@ -186,7 +162,6 @@ def _keys(look: Look, width: int) -> Text:
 
 
 def _panel(sensor: SensorState, width: int, *, bars: bool = True) -> list[Text]:
-    """The rows of one sensor."""
     stream = f"{words.rate(sensor)}   age {words.times(sensor.age_us)}   jitter {words.jitter(sensor)}"
     lost = _field("Lost", "")
     for number, (text, bad) in enumerate(words.losses(sensor)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from bota_clients.monitor.model import Alert, Client, SensorState, ServerState, Spread, State
+from bota_clients.monitor.model import Alert, Percentiles, SensorState, ServerClient, ServerState, State
 from bota_clients.numbers import duration, milliseconds
 from bota_ethercat.health.limits import Level
 from bota_ethercat.text.json_text import finite
@@ -31,7 +31,7 @@ def trouble(server: ServerState) -> str | None:
     if server.since_s is None:
         return None
     if not server.connected:
-        return f"gone at {server.since_clock}: {server.reason}; reconnecting"
+        return f"gone: {server.reason}; reconnecting"
     silent = f"nothing came for {duration(server.heard_s or 0)}: it may be stopped, or its machine too busy"
     return silent if server.silent else None
 
@@ -86,13 +86,11 @@ def delays(sensor: SensorState) -> str:
 
 
 def rate(sensor: SensorState) -> str:
-    """Measured and nominal rate."""
     found = "no samples" if sensor.rate_hz is None else f"{sensor.rate_hz:.1f}"
     return f"{found} of {sensor.info.rate_hz:g} Hz" if sensor.info.rate_hz else f"{found} Hz"
 
 
 def jitter(sensor: SensorState) -> str:
-    """Standard deviation and worst interval."""
     if sensor.jitter_us is None or sensor.jitter_worst_us is None:
         return "not known"
     return f"{sensor.jitter_us:.0f} µs, worst {sensor.jitter_worst_us:.0f}"
@@ -119,15 +117,14 @@ def clock(sensor: SensorState) -> str:
     return text or "not known"
 
 
-def client(one: Client) -> str:
-    """One client of the server."""
+def client(one: ServerClient) -> str:
     text = "this one" if one.this else one.peer
     if one.rate_hz is not None:
         text += f" {one.rate_hz:.0f}/s"
     return f"{text}, {one.withheld} withheld" if one.withheld else text
 
 
-def times(spread: Spread | None) -> str:
+def times(spread: Percentiles | None) -> str:
     """Median and p99 or worst of a distribution."""
     if spread is None:
         return "not known"
@@ -135,24 +132,26 @@ def times(spread: Spread | None) -> str:
 
 
 def count(value: int | None) -> str:
-    """A count that may not be known."""
     return "?" if value is None else str(value)
 
 
 def seen(ago_s: float | None) -> str:
-    """When something was last seen."""
     return "now" if ago_s is None else f"{duration(ago_s)} ago"
 
 
 def alert(one: Alert) -> dict[str, str]:
-    """An alert for programs."""
     return {"severity": one.level.key, "text": one.text, "remedy": one.remedy}
 
 
 def json_line(state: State, unix_s: float) -> str:
-    """The state as one JSON object, for programs: docs/schemas/monitor.json. What is not known is null."""
+    """The state in one line, for programs: docs/schemas/monitor.json."""
+    return json.dumps(finite(json_object(state, unix_s)), allow_nan=False)
+
+
+def json_object(state: State, unix_s: float) -> dict[str, Any]:
+    """The state for programs; what is not known is null."""
     server = state.server
-    found = {
+    return {
         "time": unix_s,
         **_plain(server, "address connected since_s heard_s"),
         "reason": server.reason or None,
@@ -160,15 +159,14 @@ def json_line(state: State, unix_s: float) -> str:
         "server": {
             **_plain(server, "version uptime_s"),
             **_plain(server.status, "cycles missed_deadlines lost_frames"),
-            "wake_us": _spread(server.wake_us),
-            "exchange_us": _spread(server.exchange_us),
+            "wake_us": _percentiles(server.wake_us),
+            "exchange_us": _percentiles(server.exchange_us),
         }
         if server.connected
         else None,
         "sensors": [_sensor(sensor) for sensor in state.sensors],
         "clients": [client._asdict() for client in state.clients],
     }
-    return json.dumps(finite(found), allow_nan=False)
 
 
 def _sensor(sensor: SensorState) -> dict[str, Any]:
@@ -194,9 +192,9 @@ def _sensor(sensor: SensorState) -> dict[str, Any]:
         **_plain(sensor, "samples rate_hz jitter_us jitter_worst_us missed gaps repeated invalid silent_s"),
         "lost_on_bus": status.lost_samples,
         "recoveries": status.recoveries,
-        "age_us": _spread(sensor.age_us),
+        "age_us": _percentiles(sensor.age_us),
         "clock": _plain(status.clock, "mode offset_ppm uncertainty_us") if status.clock.mode else None,
-        "hand_out_us": _spread(sensor.hand_out_us),
+        "hand_out_us": _percentiles(sensor.hand_out_us),
     }
 
 
@@ -204,5 +202,5 @@ def _plain(thing: object, names: str) -> dict[str, Any]:
     return {name: getattr(thing, name) for name in names.split()}
 
 
-def _spread(spread: Spread | None) -> dict[str, float] | None:
+def _percentiles(spread: Percentiles | None) -> dict[str, float] | None:
     return None if spread is None else {"p50": spread.p50, spread.which: spread.high}

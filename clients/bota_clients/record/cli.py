@@ -11,24 +11,12 @@ from typing import Final
 
 from bota_clients.arguments import add_force, add_server, position, server_of
 from bota_clients.program import Signals, start
-from bota_ethercat.address import Address
 from bota_ethercat.program.arguments import Parser, typed
 from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.server_choice import is_address
 
 _UNITS_S: Final = {"": 1, "s": 1, "m": 60, "h": 3600}  # by their first letter
 _UNIT: Final = "s(?:ec(?:ond)?s?)?|m(?:in(?:ute)?s?)?|h(?:(?:ou)?rs?)?"
-
-
-class RecordOptions(argparse.Namespace):
-    """What to record, and where."""
-
-    path: Path
-    address: Address
-    sensors: list[int] | None  # positions on the bus, ascending; None for all
-    seconds: float | None
-    force: bool
-    reconnect: bool
 
 
 def _duration(text: str) -> float:
@@ -38,8 +26,8 @@ def _duration(text: str) -> float:
     raise ValueError
 
 
-def parse_options(argv: Sequence[str] | None) -> RecordOptions:
-    """Read the command line; argparse exits with 2 if it is wrong."""
+def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line; argparse exits with 2 if it is wrong. `sensors` are ascending; None: all."""
     made = Parser(
         "ethercat-record",
         "Records the unmodified stream of ethercat-server into an MCAP file.",
@@ -60,7 +48,7 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
     for at in range(len(words) - 3, -1, -1):  # `--for 5 minutes`
         if words[at] in ("--for", "--seconds") and re.fullmatch(_UNIT, words[at + 2]):
             words[at + 1 : at + 3] = [" ".join(words[at + 1 : at + 3])]
-    options = made.parse_args(words, RecordOptions())
+    options = made.parse_args(words)
     name: str = options.name
     if is_address(name):
         made.error(
@@ -75,7 +63,6 @@ def parse_options(argv: Sequence[str] | None) -> RecordOptions:
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Record; returns the exit code."""
     signals = Signals()
     return start("ethercat-record", "record.program", parse_options(argv), signals)
 

@@ -5,6 +5,7 @@ Progress is a line on standard error, if that is a terminal.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import time
 from collections.abc import Callable
@@ -16,9 +17,8 @@ from rich.text import Text
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import duration
 from bota_clients.program import Signals, say
-from bota_clients.record.cli import RecordOptions
-from bota_clients.record.recorder import BATCH_S, NAME, Batch, Recorder, Source, notes
-from bota_clients.recording.reader import Event
+from bota_clients.record.recorder import NAME, Batch, Recorder, RecordingClient, notes, record
+from bota_clients.recording.reader import RecordedEvent
 from bota_ethercat.errors import RefusedError
 from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.program.new_file import refuse_existing
@@ -27,9 +27,8 @@ from bota_ethercat.text.untrusted import printable
 _say = partial(say, "ethercat-record")
 
 
-def run(options: RecordOptions, signals: Signals) -> int:
-    """Record; returns the exit code."""
-    with contextlib.closing(Source(options.address, options.sensors)) as source:
+def run(options: argparse.Namespace, signals: Signals) -> int:
+    with contextlib.closing(RecordingClient(options.address, options.sensors)) as source:
         try:
             refuse_existing(options.path, force=options.force)
             source.connect()
@@ -38,42 +37,37 @@ def run(options: RecordOptions, signals: Signals) -> int:
         return _record(source, options, signals)
 
 
-def _record(source: Source, options: RecordOptions, signals: Signals) -> int:
+def _record(source: RecordingClient, options: argparse.Namespace, signals: Signals) -> int:
     console = Console(stderr=True, highlight=False)
     show = partial(console.print, markup=False, soft_wrap=True)
-    began, reason = time.monotonic(), "asked to stop"
-    made = Recorder(options.path, NAME, notes(source), overwrite=options.force)
-    with made as recorder, console.status("") as status:
+    began = time.monotonic()
+
+    recorder = Recorder(options.path, NAME, notes(source), overwrite=options.force)
+
+    def until(batch: Batch) -> str | None:
+        _report(batch, show)
+        connected, passed_s = source.session.connected, time.monotonic() - began
+        of = "" if options.seconds is None else f" of {duration(options.seconds)}"
+        state = "" if connected else "no server, reconnecting; "
+        status.update(Text(f"{state}{duration(passed_s)}{of}, {recorder.summary}"))
+        if signals.asked:
+            return "asked to stop"
+        if options.seconds is not None and passed_s >= options.seconds:
+            return "time is up"
+        return None if connected or options.reconnect else "the server ended"
+
+    with recorder, console.status("") as status:
         show(f"recording {options.address} to {options.path}; Ctrl-C ends it")
-        while True:
-            batch = source.batch()
-            recorder.put(batch)
-            _report(batch, show)
-            connected, passed_s = source.session.connected, time.monotonic() - began
-            if recorder.failed or signals.asked:
-                break
-            if options.seconds is not None and passed_s >= options.seconds:
-                reason = "time is up"
-                break
-            if not (connected or options.reconnect):
-                reason = "the server ended"
-                break
-            of = "" if options.seconds is None else f" of {duration(options.seconds)}"
-            state = "" if connected else "no server, reconnecting; "
-            status.update(Text(f"{state}{duration(passed_s)}{of}, {recorder.so_far}"))
-            time.sleep(BATCH_S)
-        passed_s = time.monotonic() - began
-        source.close()
-        recorder.stop(reason)
+        record(source, recorder, until)
     if recorder.error is not None:
         _say(str(recorder.error))
-    _say(f"{options.path}: {duration(passed_s)}, {recorder.so_far}")
+    _say(f"{options.path}: {duration(time.monotonic() - began)}, {recorder.summary}")
     return int(recorder.error is not None)
 
 
 def _report(batch: Batch, show: Callable[[str], None]) -> None:
     for item in batch:
-        if isinstance(item, Event):
+        if isinstance(item, RecordedEvent):
             words = item.event.get("message") or item.event.get("reason") or ""
             if not item.by_recorder:
                 show(event_sentence(item.event))

@@ -14,7 +14,7 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,12 +25,12 @@ from rich.filesize import decimal
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
 from bota_clients.recording.file_format import RECORDER
-from bota_clients.recording.reader import Description, Event
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent
 from bota_clients.recording.writer import DiskFile, RecordingWriter
 from bota_ethercat.accounting import StreamAccounting, StreamCounts
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client, Connected, Disconnected
-from bota_ethercat.control import Event as ServerEvent
+from bota_ethercat.control import Event
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.version import VERSION
@@ -39,13 +39,13 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
 NAME: Final = f"ethercat-record {VERSION}"
-Batch = list[DataMessage | Description | Event]
+Batch = list[DataMessage | RecordedDescription | RecordedEvent]
 
 BATCH_S: Final = 0.02  # two sensors at 1600 Hz make 64 frames in this time
 # Bytes that the kernel may buffer, as far as it allows: seconds in which nothing is lost.
 _RECEIVE_BUFFER: Final = 4 * 1024 * 1024
 # After these events the server is asked to describe itself again.
-_CHANGES: Final = frozenset({ServerEvent.RECONFIGURED, ServerEvent.SENSOR_BACK})
+_CHANGES: Final = frozenset({Event.RECONFIGURED, Event.SENSOR_BACK})
 FLUSH_S: Final = 0.4  # longest time until received frames are in the file
 # Maximum number of queued frames: a minute of two sensors at 1600 Hz, some 80 MB.
 MAX_BACKLOG: Final = 200_000
@@ -53,7 +53,7 @@ MAX_BACKLOG: Final = 200_000
 _END_S: Final = 3.0
 
 
-class Source(Client):
+class RecordingClient(Client):
     """A client that renews its subscription whenever the connection ends, to those sensors that are there."""
 
     def __init__(self, address: Address, sensors: Sequence[int] | None) -> None:
@@ -80,7 +80,7 @@ class Source(Client):
                 said = {"message": f"without sensor {missing}"} if missing else {}
                 same_machine = self.session.same_machine
                 batch.append(_noted("connected", server=str(self.address), same_machine=same_machine, **said))
-                batch.append(Description(time.time_ns(), item.description))
+                batch.append(RecordedDescription(time.time_ns(), item.description))
             elif isinstance(item, Disconnected):
                 if item.was_connected:
                     batch.append(_noted("disconnected", reason=item.reason))
@@ -91,19 +91,18 @@ class Source(Client):
             else:
                 if item.get("source") == RECORDER:
                     del item["source"]  # reserved for the recorder's own events
-                batch.append(Event(time.time_ns(), item))
+                batch.append(RecordedEvent(time.time_ns(), item))
                 if item["event"] in _CHANGES:
                     with contextlib.suppress(ProtocolError):
-                        batch.append(Description(time.time_ns(), self.ask("describe")))
+                        batch.append(RecordedDescription(time.time_ns(), self.ask("describe")))
         return batch
 
 
-def _noted(name: str, **values: object) -> Event:
-    """An event of the recorder."""
-    return Event(time.time_ns(), {"event": name, "source": RECORDER, **values})
+def _noted(name: str, **values: object) -> RecordedEvent:
+    return RecordedEvent(time.time_ns(), {"event": name, "source": RECORDER, **values})
 
 
-def notes(source: Source) -> dict[str, str]:
+def notes(source: RecordingClient) -> dict[str, str]:
     """The notes at the beginning of a recording of a source that is connected."""
     wanted = source.session.wanted
     return {
@@ -116,7 +115,7 @@ def notes(source: Source) -> dict[str, str]:
     }
 
 
-def lost(frames: int, reason: str) -> Event:
+def lost(frames: int, reason: str) -> RecordedEvent:
     """The event that `frames` frames were received but not recorded."""
     return _noted("lost", frames=frames, reason=reason)
 
@@ -158,7 +157,7 @@ class Recorder:
         return not self._thread.is_alive()
 
     @property
-    def so_far(self) -> str:
+    def summary(self) -> str:
         """What is recorded and what was lost, in words."""
         frames = f"{self.saved} frames of {count(len(self._counts()), 'sensor')}"
         found = [f"{count(self.dropped, 'frame')} came but could not be written"] if self.dropped else []
@@ -247,14 +246,14 @@ class Recorder:
                 self._writer.flush()
                 self._unflushed = 0
 
-    def _write(self, item: DataMessage | Description | Event) -> None:
+    def _write(self, item: DataMessage | RecordedDescription | RecordedEvent) -> None:
         writer = self._writer
         if isinstance(item, DataMessage):
             self._unflushed += 1
             self.saved += 1
             self._stream(item.sensor).count(item.sequence, item.monotonic_ns, item.flags)
             writer.frame(item)
-        elif isinstance(item, Description):
+        elif isinstance(item, RecordedDescription):
             writer.describe(item.stamp_ns, item.reply)
             self._take_rates(rows(item.reply.get("sensors")))
         else:
@@ -283,6 +282,22 @@ class Recorder:
         counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self._counts().items()}
         dropped = str(self.dropped)
         self._writer.finish({"reason": self._reason, "dropped": dropped, "sensors": json.dumps(counts)})
+
+
+def record(source: RecordingClient, recorder: Recorder, until: Callable[[Batch], str | None]) -> None:
+    """Record what a connected source gives, and close both.
+
+    Until `until`, which is told each batch, has a reason to end, or nothing more can be written.
+    """
+    with recorder:
+        reason = None
+        while not (reason or recorder.failed):
+            recorder.put(batch := source.batch())
+            reason = until(batch)
+            if not reason:
+                time.sleep(BATCH_S)
+        source.close()
+        recorder.stop(reason or "")
 
 
 def _frames_in(batch: Iterable[object]) -> int:

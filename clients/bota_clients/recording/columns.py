@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -97,3 +97,7 @@ def columns(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS)
         acceleration_saturated=whole("acceleration_saturated"),
         angular_rate_saturated=whole("angular_rate_saturated"),
     )  # fmt: skip
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    return Columns(*(np.concatenate([getattr(part, name) for part in parts]) for name in Columns.__slots__))

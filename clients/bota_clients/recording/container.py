@@ -85,7 +85,6 @@ class McapFile:
             raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from None
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -118,10 +117,10 @@ class McapFile:
         if has_footer and not ended:
             raise self._damaged(end, "a record is incomplete")
         if not has_footer:
-            self._forgive(self._size - end)
+            self._ignore_truncated_end(self._size - end)
         for chunk in self._chunks:
             if not chunk.counts or not chunk.counts.keys() <= self.topics.keys():
-                self._learn(chunk)
+                self._index_chunk(chunk)
             self.counts.update(chunk.counts)
 
     def _scan(self) -> tuple[int, bool]:
@@ -137,11 +136,11 @@ class McapFile:
                 return position, opcode == Opcode.DATA_END
             if (opcode == Opcode.HEADER) != (position == len(MAGIC)):
                 raise RecordingError(f"{self.path} is not an MCAP file: its header is missing or repeated")
-            self._take(opcode, body, length)
+            self._index_record(opcode, body, length)
             position = body + length
         return position, False
 
-    def _forgive(self, left: int) -> None:
+    def _ignore_truncated_end(self, left: int) -> None:
         """It was cut off: ignore the `left` bytes of an incomplete record, and damaged chunks before them."""
         if left == self._size - len(MAGIC):
             raise RecordingError(f"{self.path} was cut off before anything was recorded")
@@ -155,7 +154,7 @@ class McapFile:
                 more = ", and its last chunk, which is damaged, was ignored"
         self.cut_off = f"it has no footer{more}"
 
-    def _take(self, opcode: int, body: int, length: int) -> None:
+    def _index_record(self, opcode: int, body: int, length: int) -> None:
         if opcode == Opcode.METADATA:
             self._bound(body, length, MAX_METADATA)
             record = self._parse(Metadata, self._read_at(body, length), body)
@@ -173,7 +172,7 @@ class McapFile:
         elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
             raise RecordingError(f"{self.path} has messages outside of chunks: it is no recording")
 
-    def _learn(self, chunk: _ChunkRecord) -> None:
+    def _index_chunk(self, chunk: _ChunkRecord) -> None:
         """Take the channels that a chunk introduces, and count its messages."""
         chunk.counts.clear()
         for opcode, body in self._records_in(chunk):

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from bota_clients.errors import RecordingError
-from bota_clients.recording.columns import Columns, columns
+from bota_clients.recording.columns import Columns, columns, joined
 from bota_clients.recording.reader import RecordedSensor, Recording
 from bota_ethercat.pdo import ImuUnits
 
@@ -43,16 +43,16 @@ def at_last_offset(
         )
     last = np.array(told[-1])
     parts, in_doubt, before = list[Columns](), list[tuple[int, int]](), last
-    for settings, batch in recording.batches(sensor.sensor):
-        part, shift = columns(batch, imu_units), last - settings.offset
+    for info, batch in recording.batches(sensor.sensor):
+        part, shift = columns(batch, imu_units), last - info.offset
         if parts and (shift != before).any():
-            at_ns, rate_hz = batch[0].monotonic_ns, settings.rate_hz or 1.0
+            at_ns, rate_hz = batch[0].monotonic_ns, info.rate_hz or 1.0
             in_doubt.append((at_ns - doubt_ns(rate_hz), at_ns + round(DOUBT_AFTER * 1e9 / rate_hz)))
         part.force[:] += shift[:3]
         part.torque[:] += shift[3:]
         parts.append(part)
         before = shift
-    found = Columns(*(np.concatenate([getattr(part, name) for part in parts]) for name in Columns.__slots__))
+    found = joined(parts)
     is_sure = np.ones(len(found), bool)
     for begin_ns, end_ns in in_doubt:
         is_sure &= (found.monotonic_ns < begin_ns) | (found.monotonic_ns > end_ns)

@@ -12,33 +12,31 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_clients.recording.container import McapFile
-from bota_ethercat.control import known_six
-from bota_ethercat.errors import SettingError
+from bota_ethercat import replies
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.settings import SETTINGS, sampling_rate_hz
+from bota_ethercat.replies import SensorInfo, position_of
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import rows, visible, whole
 
 _MAX_NOTES: Final = 1_000_000  # descriptions and events
 _BATCH: Final = 4096  # frames
 _LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions
 
 
-class Description(NamedTuple):
+class RecordedDescription(NamedTuple):
     """A reply to `describe`."""
 
     stamp_ns: int  # when it was received, ns since 1970
     reply: JsonObject
 
 
-class Event(NamedTuple):
+class RecordedEvent(NamedTuple):
     """An event of the server, or of the recorder (`by_recorder`)."""
 
     stamp_ns: int  # when it was received, ns since 1970
@@ -46,7 +44,6 @@ class Event(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the event."""
         return str(self.event.get("event", "?"))
 
     @property
@@ -55,24 +52,17 @@ class Event(NamedTuple):
         return self.event.get("source") == file_format.RECORDER
 
 
-class Identity(NamedTuple):
-    """Identity of a sensor."""
+class InForce(NamedTuple):
+    """What a sensor was from a time on: its identity, settings, rate, and its latest own offset."""
 
-    name: str = "?"
-    serial: int = 0
-    hardware: str = "?"
-    firmware: str = "?"
-    pdo_size: int = 0
+    stamp_ns: int
+    info: SensorInfo
 
-
-class Settings(NamedTuple):
-    """Settings, sampling rate and identity of a sensor from a time on, and its latest own offset."""
-
-    stamp_ns: int = 0
-    values: Mapping[str, Any] = {}
-    rate_hz: float = 0.0  # 0 if unknown
-    identity: Identity = Identity()
-    offset: tuple[float, ...] | None = None  # that it adds (0x8000), N and Nm; None if unknown
+    def is_changed(self, info: SensorInfo) -> bool:
+        """Whether `info` is of another sensor, or has other settings."""
+        before = self.info
+        is_other = _identity(before) not in (_identity(info), _identity(SensorInfo()))
+        return is_other or before.settings != info.settings
 
 
 class Offset(NamedTuple):
@@ -83,89 +73,56 @@ class Offset(NamedTuple):
 
 
 class RecordedSensor(NamedTuple):
-    """A sensor of the recording, as first described."""
+    """A sensor of the recording."""
 
     sensor: int  # position on the bus, from 0
-    name: str
-    serial: int
-    hardware: str
-    firmware: str
-    pdo_size: int
-    rate_hz: float  # nominal; 0 if unknown
-    settings: Mapping[str, Any]
-    history: tuple[Settings, ...]  # over time, oldest first; the first are the ones here
+    info: SensorInfo  # as first described
+    history: tuple[InForce, ...]  # over time, oldest first; empty if it was never described
     frames: int  # number of its frames in the recording
-    offsets: tuple[Offset, ...] = ()  # over time, oldest first
+    offsets: tuple[Offset, ...]  # over time, oldest first
 
 
 class Histories:
     """The histories of all sensors, built from descriptions and events in file order."""
 
     def __init__(self) -> None:
-        self._of: dict[int, list[Settings]] = {}
+        self._of: dict[int, list[InForce]] = {}
         self._offsets: dict[int, list[Offset]] = {}
 
-    def take(self, note: Description | Event) -> None:
+    def apply(self, note: RecordedDescription | RecordedEvent) -> None:
         """Take the next description or event of the file."""
-        described = isinstance(note, Description)
-        for row in rows(note.reply.get("sensors")) if isinstance(note, Description) else [note.event]:
-            position = whole(row.get("sensor"))
-            if position is None or not 0 <= position <= file_format.MAX_SENSOR:
-                continue
-            if isinstance(row.get("settings"), dict) or (not described and "offset" in row):
-                self._learn(position, note.stamp_ns, row, described=described)
+        if isinstance(note, RecordedDescription):
+            for info in replies.Description.parse(note.reply).sensors:
+                self._learn(note.stamp_ns, info)
+        elif (position := position_of(note.event)) is not None and {"settings", "offset"} & note.event.keys():
+            self._learn(note.stamp_ns, self.newest(position).changed_by(note.event))
 
-    def of(self, position: int) -> Sequence[Settings]:
-        """The history so far of the sensor at this position."""
-        return self._of.get(position, ())
+    def newest(self, position: int) -> SensorInfo:
+        """What the sensor at this position is by all that was taken."""
+        history = self._of.get(position)
+        return history[-1].info if history else SensorInfo(position)
 
     def sensors(self, frames: Mapping[int, int]) -> tuple[RecordedSensor, ...]:
         """All sensors that were described or that have `frames`, which are counts by position."""
         found = []
         for position in sorted(self._of.keys() | frames.keys()):
-            history = tuple(self.of(position))
-            first = history[0] if history else Settings()
-            about = (*first.identity, first.rate_hz, first.values, history)
-            offsets = tuple(self._offsets.get(position, ()))
-            found.append(RecordedSensor(position, *about, frames.get(position, 0), offsets))
+            history, offsets = tuple(self._of.get(position, ())), tuple(self._offsets.get(position, ()))
+            first = history[0].info if history else SensorInfo(position)
+            found.append(RecordedSensor(position, first, history, frames.get(position, 0), offsets))
         return tuple(found)
 
-    def _learn(self, position: int, stamp_ns: int, row: JsonObject, *, described: bool) -> None:
-        known, offsets = self._of.setdefault(position, []), self._offsets.setdefault(position, [])
-        last = known[-1] if known else Settings()
-        identity, values = last.identity, row.get("settings")
-        values = values if isinstance(values, dict) else last.values
-        offset = known_six(row["offset"]) if "offset" in row else last.offset
-        if not offsets or offsets[-1].offset != offset:
-            offsets.append(Offset(stamp_ns, offset))
-        if described:
-            name, hardware, firmware = (_text(row.get(key)) for key in ("name", "hardware", "firmware"))
-            serial, size = (int(_number(row.get(key))) for key in ("serial", "pdo_size"))
-            identity = Identity(name, serial, hardware, firmware, size)
-        rate = _number(row.get("rate_hz"))
-        if known and last.values == values and last.identity in (identity, Identity()):
-            # The description that follows an event completes the same entry.
-            known[-1] = last._replace(rate_hz=rate or last.rate_hz, identity=identity, offset=offset)
-        else:
-            known.append(Settings(stamp_ns, values, rate or _rate(values, last), identity, offset))
+    def _learn(self, stamp_ns: int, info: SensorInfo) -> None:
+        known, offsets = self._of.setdefault(info.sensor, []), self._offsets.setdefault(info.sensor, [])
+        if not offsets or offsets[-1].offset != info.offset:
+            offsets.append(Offset(stamp_ns, info.offset))
+        if not known or known[-1].is_changed(info):
+            known.append(InForce(stamp_ns, info))
+        else:  # the description that follows an event completes the same entry
+            known[-1] = known[-1]._replace(info=info)
 
 
-def _rate(values: Mapping[str, Any], last: Settings) -> float:
-    """The rate that the settings imply where it is not given."""
-    try:
-        length = SETTINGS["sinc_length"].check(values.get("sinc_length"))
-    except SettingError:
-        return last.rate_hz
-    return last.rate_hz if length == last.values.get("sinc_length") else float(sampling_rate_hz(length))
-
-
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) and 0 < value < 2**32 else 0.0
-
-
-def _text(value: object) -> str:
-    """Text from a file, safe to print: no control characters, limited length."""
-    return visible(str(value)[:80]) if value is not None else "?"
+def _identity(info: SensorInfo) -> tuple[object, ...]:
+    return info.name, info.serial, info.hardware, info.firmware
 
 
 class Recording(McapFile):
@@ -203,14 +160,14 @@ class Recording(McapFile):
             elif topic in (file_format.DESCRIPTION_TOPIC, file_format.EVENTS_TOPIC):
                 self._noted.add(number)
         self.frame_count = counts.total()
-        self.events: list[Event] = []
+        self.events: list[RecordedEvent] = []
         histories = Histories()
         for taken, note in enumerate(self._read(self._noted)):
             if taken == _MAX_NOTES:
                 raise RecordingError(f"{self.path} has more than {_MAX_NOTES} events")
             if not isinstance(note, DataMessage):
-                histories.take(note)
-            if isinstance(note, Event):
+                histories.apply(note)
+            if isinstance(note, RecordedEvent):
                 self.events.append(note)
         self.sensors: tuple[RecordedSensor, ...] = histories.sensors(counts)
 
@@ -222,38 +179,40 @@ class Recording(McapFile):
         frames = self._read(self._channels(sensor))
         return cast(Iterator[DataMessage], frames)
 
-    def everything(self, sensor: int | None = None) -> Iterator[DataMessage | Description | Event]:
+    def everything(
+        self, sensor: int | None = None
+    ) -> Iterator[DataMessage | RecordedDescription | RecordedEvent]:
         """Descriptions, events and the frames of the sensor at this position, or of all, as they came."""
         return self._read(self._channels(sensor) | self._noted)
 
-    def batches(self, sensor: int) -> Iterator[tuple[Settings, list[DataMessage]]]:
+    def batches(self, sensor: int) -> Iterator[tuple[SensorInfo, list[DataMessage]]]:
         """Frames of the sensor at this position, a few thousand at once, with what was in force."""
-        histories = Histories()
-        known = [each for each in self.sensors if each.sensor == sensor and each.history]
-        settings = Settings()
-        for each in known:
-            settings = each.history[0]._replace(offset=each.offsets[0].offset)
+        histories, info = Histories(), SensorInfo(sensor)
+        for known in self.sensors:
+            if known.sensor == sensor and known.history:  # in force before it was told
+                info = known.info._replace(offset=known.offsets[0].offset)
         for kind, items in itertools.groupby(self.everything(sensor), type):
             while batch := cast(Any, [*itertools.islice(items, _BATCH)]):
                 if kind is DataMessage:
-                    yield settings, batch
+                    yield info, batch
                 else:
                     for note in batch:
-                        histories.take(note)
-                    settings = (histories.of(sensor) or (settings,))[-1]
+                        histories.apply(note)
+                    newest = histories.newest(sensor)
+                    info = info if newest == SensorInfo(sensor) else newest
 
     def _channels(self, sensor: int | None) -> set[int]:
         return {number for number, position in self._sensor_of.items() if sensor in (None, position)}
 
-    def _read(self, channels: set[int]) -> Iterator[DataMessage | Description | Event]:
+    def _read(self, channels: set[int]) -> Iterator[DataMessage | RecordedDescription | RecordedEvent]:
         for channel, log_time_ns, body in self.messages(channels):
             position, topic = self._sensor_of.get(channel), self.topics[channel]
             if position is not None:
                 yield file_format.unpack_frame(body, position)
             elif topic == file_format.DESCRIPTION_TOPIC:
-                yield Description(log_time_ns, file_format.unpack_json(body, topic))
+                yield RecordedDescription(log_time_ns, file_format.unpack_json(body, topic))
             else:
-                yield Event(log_time_ns, file_format.unpack_json(body, topic))
+                yield RecordedEvent(log_time_ns, file_format.unpack_json(body, topic))
 
 
 def open_recording(path: Path) -> Recording:

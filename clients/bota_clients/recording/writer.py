@@ -76,7 +76,6 @@ class DiskFile:
         return len(data)
 
     def tell(self) -> int:
-        """Position of the next byte."""
         return self._position
 
     def flush(self) -> None:
@@ -138,7 +137,6 @@ class RecordingWriter:
         self._frame_channels: dict[int, int] = {}
 
     def describe(self, stamp_ns: int, description: JsonObject) -> None:
-        """Write a reply to `describe`."""
         self._note(self._descriptions, stamp_ns, description)
 
     def event(self, stamp_ns: int, event: JsonObject) -> None:
@@ -146,7 +144,6 @@ class RecordingWriter:
         self._note(self._events, stamp_ns, event)
 
     def frame(self, frame: DataMessage) -> None:
-        """Write a frame."""
         channel = self._frame_channels.get(frame.sensor)
         if channel is None:
             channel = self._channel(file_format.frame_topic(frame.sensor), file_format.FRAME_SCHEMA)

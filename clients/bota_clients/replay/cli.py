@@ -19,18 +19,8 @@ from bota_ethercat.program.server_choice import own_server
 _HOSTS: Final = ["127.0.0.1", "::1"]
 
 
-class ReplayOptions(argparse.Namespace):
-    """What to play, and how."""
-
-    path: Path
-    port: int
-    hosts: list[str]
-    speed: float  # 1 = as recorded; infinite = as fast as the clients read
-    loop: bool
-
-
-def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
-    """Read the command line; argparse exits with 2 if it is wrong."""
+def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line; argparse exits with 2 if it is wrong. `speed` inf: as fast as clients read."""
     made = Parser(
         "ethercat-replay",
         "Serves a recording over the same protocol as ethercat-server.",
@@ -44,7 +34,7 @@ def parse_options(argv: Sequence[str] | None) -> ReplayOptions:
     add("--speed", type=_speed, default=1.0, metavar="X",
         help="times the recorded speed; 'max': as fast as clients read, without loss")  # fmt: skip
     add("--loop", action="store_true", help="start again at the end, until Ctrl-C")
-    options = made.parse_args(argv, ReplayOptions())
+    options = made.parse_args(argv)
     try:
         server: Address = options.server or own_server()
         own = _HOSTS if server.host == DEFAULT_HOST else [_host(server.host)]
@@ -63,6 +53,5 @@ _host = typed(lambda text: str(ipaddress.ip_address(text)), "an IP address of th
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Replay; returns the exit code."""
     signals = Signals()
     return start("ethercat-replay", "replay.program", parse_options(argv), signals)

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import logging
 import math
 import sys
 import time
 from functools import partial
-from itertools import takewhile
 from typing import Any, Final, NoReturn
 
 from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
-from bota_clients.recording.reader import Description, Event, Recording, open_recording
-from bota_clients.replay.cli import ReplayOptions
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording, open_recording
 from bota_clients.replay.sensors import ReplayedSensors, needs_sensor
 from bota_clients.replay.timeline import Timeline
-from bota_ethercat.control import Event as ServerEvent
-from bota_ethercat.control import event
+from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataMessage, encode_data
 from ethercat_server.errors import ServerError
 from ethercat_server.serving.actions import Actions
@@ -35,8 +33,7 @@ _DRAIN_NS: Final = 10_000_000_000  # timeout for clients that do not read the la
 _say = partial(say, "ethercat-replay")
 
 
-def run(options: ReplayOptions, signals: Signals) -> int:
-    """Replay; returns the exit code."""
+def run(options: argparse.Namespace, signals: Signals) -> int:
     logging.basicConfig(level=logging.INFO, format="ethercat-replay: %(message)s", stream=sys.stderr)
     try:
         with open_recording(options.path) as recording:
@@ -54,15 +51,11 @@ def run(options: ReplayOptions, signals: Signals) -> int:
 class Player:
     """What produces the frames, in place of the server's `Cycle`."""
 
-    def __init__(self, recording: Recording, options: ReplayOptions, signals: Signals) -> None:
+    def __init__(self, recording: Recording, options: argparse.Namespace, signals: Signals) -> None:
         """RecordingError if there is nothing to play, ServerError if it cannot be served."""
-        self.sensors = ReplayedSensors(recording.sensors)
+        self.sensors = ReplayedSensors(recording)
         if not self.sensors.sensors:
             raise RecordingError(f"{recording.path} has neither frames nor sensors: there is nothing to play")
-        # As the first subscriber finds it: its description comes before its first frame.
-        for item in takewhile(lambda item: not isinstance(item, DataMessage), recording.everything()):
-            if isinstance(item, Description):
-                self.sensors.describe(item)
         self.hub = Hub(SocketTransport(options.hosts, options.port))
         self._recording = recording
         self._options = options
@@ -71,11 +64,9 @@ class Player:
         self._serve_by = 0
 
     def stop(self) -> None:
-        """End `run` soon."""
         self._signals.asked = True
 
     def status(self) -> dict[str, Any]:
-        """Its part of the `status` reply."""
         return self.sensors.status()
 
     def trace(self, offset: int) -> NoReturn:  # noqa: ARG002
@@ -83,7 +74,6 @@ class Player:
         raise needs_sensor("trace")
 
     def run(self) -> None:
-        """Play from the first subscriber on."""
         hub, options, recording = self.hub, self._options, self._recording
         hub.start(Actions(hub, self, self.sensors, lambda: {"replay": self._about()}).handle)
         name = f"{recording.path.name}, {recording.frame_count} frames,"
@@ -95,7 +85,7 @@ class Player:
                 self._timeline.begin_again()
             self._drain()
         finally:
-            hub.broadcast(event(ServerEvent.SHUTTING_DOWN))
+            hub.broadcast(event(Event.SHUTTING_DOWN))
         _say(f"{'stopped' if self._signals.asked else 'ended'} after {self.sensors.sent} frames")
 
     def _about(self) -> dict[str, object]:
@@ -117,7 +107,7 @@ class Player:
                 return False
             if isinstance(item, DataMessage):
                 self._send(item)
-            elif isinstance(item, Description):
+            elif isinstance(item, RecordedDescription):
                 self.sensors.describe(item)
             else:
                 self._happen(item)
@@ -126,14 +116,14 @@ class Player:
     def _has_subscriber(self) -> bool:
         return any(c.subscription is not None for c in self.hub.connections.values())
 
-    def _happen(self, event: Event) -> None:
+    def _happen(self, event: RecordedEvent) -> None:
         if event.by_recorder:
             if event.name == "connected":
                 self._timeline.reconnected()
             return
-        self.sensors.take(event)
+        self.sensors.apply(event)
         # It was the recorded server that shut down, not this one.
-        if event.name != ServerEvent.SHUTTING_DOWN:
+        if event.name != Event.SHUTTING_DOWN:
             self.hub.broadcast(event.event)
 
     def _send(self, frame: DataMessage) -> None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable
+from itertools import takewhile
 from typing import Any, Final, NoReturn
 
-from bota_clients.recording.reader import Description, Event, Identity, RecordedSensor
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording
 from bota_ethercat.accounting import NOT_NEW
-from bota_ethercat.control import ErrorCode, Request
-from bota_ethercat.control import Event as ServerEvent
+from bota_ethercat.control import ErrorCode, Event, Request
 from bota_ethercat.errors import RequestError
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import is_finite
@@ -25,45 +24,38 @@ _IN_FORCE: Final = ("settings", "rate_hz", "delay_ms", "offset")
 class ReplayedSensor:
     """One sensor as the recording last described it, and what was sent of it."""
 
-    def __init__(self, recorded: RecordedSensor) -> None:
-        self.row: dict[str, Any] = {**recorded._asdict(), "state": "OP"}
-        for name in ("history", "frames", "offsets"):
-            del self.row[name]
-        if recorded.offsets and recorded.offsets[0].offset is not None:
-            self.row["offset"] = recorded.offsets[0].offset
-        if recorded.rate_hz.is_integer():
-            self.row["rate_hz"] = int(recorded.rate_hz)
+    def __init__(self, position: int) -> None:
+        self.row: dict[str, Any] = {
+            "sensor": position, "name": "?", "serial": 0, "hardware": "?", "firmware": "?", "pdo_size": 0,
+            "rate_hz": 0.0, "settings": {}, "state": "OP",
+        }  # fmt: skip
         self._frames = Counter[int]()  # by the flags that say that they are not new
         self._not_finite = 0
         self._emergencies = 0
         self._emergency: dict[str, Any] | None = None
         self._emergency_at = 0.0
 
-    def take(self, event: Event) -> None:
-        """Apply an event of the recording."""
+    def apply(self, event: RecordedEvent) -> None:
         said = event.event
-        if event.name == ServerEvent.EMERGENCY:
+        if event.name == Event.EMERGENCY:
             self._emergencies += 1
             self._emergency = {key: said.get(key) for key in ("code", "text", "register", "data")}
             self._emergency_at = time.monotonic()
         self.row |= {key: said[key] for key in _IN_FORCE if key in said}
-        if event.name == ServerEvent.SENSOR_LOST:
+        if event.name == Event.SENSOR_LOST:
             self.row["state"] = "REFUSED" if said.get("reason") == "different_sensor" else "LOST"
-        elif event.name == ServerEvent.SENSOR_BACK:
+        elif event.name == Event.SENSOR_BACK:
             self.row["state"] = "OP"
 
     def count(self, frame: DataMessage) -> None:
-        """A frame was sent."""
         old = frame.flags & NOT_NEW
         self._frames[old] += 1
         self._not_finite += not old and not is_finite(frame.process_data)
 
     def describe(self) -> dict[str, Any]:
-        """Its part of the `describe` reply."""
         return self.row
 
     def status(self) -> dict[str, Any]:
-        """Its part of the `status` reply."""
         rate_hz = self.row.get("rate_hz")
         ago_s = round(time.monotonic() - self._emergency_at, 3)
         return {
@@ -105,28 +97,26 @@ class ReplayedSensors:
         sent: number of frames.
     """
 
-    def __init__(self, recorded: Iterable[RecordedSensor]) -> None:
-        found = {sensor.sensor: sensor for sensor in recorded}
-        self.sensors = [
-            ReplayedSensor(found.get(at) or RecordedSensor(at, *Identity(), 0.0, {}, (), 0))
-            for at in range(max(found, default=-1) + 1)
-        ]
+    def __init__(self, recording: Recording) -> None:
+        count = max((sensor.sensor + 1 for sensor in recording.sensors), default=0)
+        self.sensors = [ReplayedSensor(position) for position in range(count)]
+        # As the first subscriber finds them: their description comes before their first frame.
+        for item in takewhile(lambda item: not isinstance(item, DataMessage), recording.everything()):
+            if isinstance(item, RecordedDescription):
+                self.describe(item)
         self.sent = 0
         self._started = time.monotonic()
 
-    def describe(self, description: Description) -> None:
-        """Take a later description of the recording."""
+    def describe(self, description: RecordedDescription) -> None:
         for row in rows(description.reply.get("sensors")):
             if (sensor := self._at(row.get("sensor"))) is not None:
                 sensor.row |= {**row, "settling": False}  # it was, when it was described
 
-    def take(self, event: Event) -> None:
-        """Apply an event of the recording to the descriptions."""
+    def apply(self, event: RecordedEvent) -> None:
         if (sensor := self._at(event.event.get("sensor"))) is not None:
-            sensor.take(event)
+            sensor.apply(event)
 
     def count(self, frame: DataMessage) -> None:
-        """A frame was sent."""
         self.sent += 1
         self.sensors[frame.sensor].count(frame)
 

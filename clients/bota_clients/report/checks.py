@@ -1,7 +1,7 @@
 """Every check of a sensor, and the verdict that they come to.
 
-What every program judges (losses, silence, rate, ...) is judged by `bota_ethercat.health.judge`; the checks
-add figures and places to it. Noise, stuck values, stamps and gravity are this report's own.
+What every program judges (losses, silence, rate, ...) is judged by `bota_ethercat.health.judge`. Noise, stuck
+values, stamps and gravity are this report's own.
 
 Stuck values: force and torque come from high-resolution converters through a matrix, so successive values
 are hardly ever equal. The values of the IMU are steps of a coarser converter behind a filter that may be
@@ -15,16 +15,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from bota_clients.numbers import count, figure, listing, seconds, share
+from bota_clients.numbers import count, figure, listing, seconds
 from bota_clients.recording.columns import Floats
-from bota_clients.report.measure import (
-    FEWEST_WINDOWS,
-    Noise,
-    measure_noise,
-)
+from bota_clients.report.measure import FEWEST_WINDOWS, Noise, measure_noise
 from bota_clients.report.series import CHANNELS, Series, Subject, bits
 from bota_ethercat.health.judge import SATURATIONS, Observation, judge
-from bota_ethercat.health.limits import LIMITS, Finding, Level
+from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.pdo import STANDARD_GRAVITY
 
 
@@ -52,7 +48,6 @@ class Examination:
 
     @property
     def headline(self) -> str:
-        """The verdict in one or two words."""
         return "Not conclusive" if self.level is Level.NOT_POSSIBLE else self.level.words.capitalize()
 
 
@@ -84,24 +79,24 @@ class _Kind(NamedTuple):
     name: str
     keys: Collection[str]  # of the findings of the judge of streams that belong to it
     fewest: int  # samples that it needs
-    # Adds to what was found, or checks by itself; None: the check is there only if something was found.
-    make: Callable[[Series, Noise, Sequence[Finding]], Check] | None
+    # Adds to what the judge found, or checks by itself.
+    make: Callable[[Series, Noise], Check] | None
     matters: str = ""  # why it matters if something is found
     remedy: str = ""
-    good: str = ""  # the outcome if nothing is found; `make` is not called then
+    good: str = ""  # the outcome if nothing is found; "": then there is no such check, or `make` has it
 
 
 def _made(kind: _Kind, examination: Examination) -> Check | None:
     series = examination.series
     findings = [finding for finding in examination.stream.findings if finding.key in kind.keys]
-    if kind.make is None and not findings:
+    if not (kind.make or kind.good or findings):
         return None
-    if series.count < kind.fewest:
+    if series.count < kind.fewest and not (findings and kind.fewest == 1):  # of a sensor that sends none
         findings, result = [], _too_few(series.count)
-    elif kind.make is None or (kind.good and not findings):
-        result = Check(kind.good)
+    elif kind.make is None:
+        result = Check("" if findings else kind.good)
     else:
-        result = kind.make(series, examination.noise, findings)
+        result = kind.make(series, examination.noise)
     level = max([result.level, *(finding.level for finding in findings)])
     found = " ".join([*(f"{finding.found}." for finding in findings), result.found]).rstrip()
     is_wrong = level >= Level.LOOK
@@ -119,58 +114,24 @@ def _too_few(samples: int) -> Check:
     return _not_possible(found if samples else "There are no samples.", "Record for at least 10 s.")
 
 
-def _losses(series: Series, _: Noise, findings: Sequence[Finding]) -> Check:
-    lost, withheld = series.lost, series.withheld
-    if not lost:
-        return Check("")
-    places = count(int(np.sum(series.missing > 0)), "place")
-    every = all(finding.size == lost for finding in findings)
-    found = f"In {places}." if every else f"{lost} of them where the sensor was not silent, in {places}."
+def _stamps(series: Series, _: Noise) -> Check:
+    off = [max(each, 1e-7) for each in (series.usual_deviation, np.abs(series.deviations).max(initial=0.0))]
+    found = [
+        f"95 % of the intervals are within {seconds(off[0])} of {seconds(series.period)}, all within "
+        f"{seconds(off[1])}."
+    ]
     remedies = []
-    if withheld:
-        found += f" {withheld} of them were available at the server, but not read in time."
-        remedies.append("Record on a less busy machine, or fewer sensors at once.")
-    if withheld < lost:
-        found += f" {f'{lost - withheld} of them' if withheld else 'All of them'} never reached the server."
-        remedies.append("If missed_deadlines and lost_frames in status are zero, the sensor skipped them.")
-    return Check(found, remedy=" ".join(remedies))
-
-
-def _silence(series: Series, _: Noise, findings: Sequence[Finding]) -> Check:
-    if series.duration <= 0:
-        return _not_possible("There are no frames.", "Record again.")
-    if not findings:
-        return Check("The sensor sent new samples all the time.")
-    spans = series.silences
-    return Check(
-        f"In {count(len(spans), 'stretch')} without a new sample, the longest "
-        f"{seconds(spans.max(initial=0.0))}, together {seconds(spans.sum())}: "
-        f"{count(series.counts.repeated, 'repeated frame')}, {count(series.counts.invalid, 'invalid one')}."
-    )
-
-
-def _stamps(series: Series, _: Noise, findings: Sequence[Finding]) -> Check:
-    def bound(deviation_s: float) -> str:
-        return seconds(max(deviation_s, 1e-7))  # no finer than stamps mean anything
-
-    wrong, remedies = [], []
     if backwards := int(np.sum(series.intervals <= 0)):
-        wrong.append(f"{count(backwards, 'stamp')} not later than the one before.")
+        found.append(f"{count(backwards, 'stamp')} not later than the one before.")
         remedies.append("Was the server's machine restarted? Record without interruption.")
     if len(steps := series.clock_steps):
         biggest = figure(max(steps, key=abs))
-        wrong.append(f"The system clock was adjusted {count(len(steps), 'time')}, by up to {biggest} s.")
+        found.append(f"The system clock was adjusted {count(len(steps), 'time')}, by up to {biggest} s.")
         remedies.append("Wait for chrony or NTP to converge before recording.")
-    level = Level.LOOK if wrong else Level.GOOD
-    if findings or not wrong:
-        wrong.append(
-            f"95 % of the intervals are within {bound(series.usual_deviation)} of {seconds(series.period)}, "
-            f"all within {bound(np.abs(series.deviations).max(initial=0.0))}."
-        )
-    return Check(" ".join(wrong), level, " ".join(remedies))
+    return Check(" ".join(found), Level.LOOK if remedies else Level.GOOD, " ".join(remedies))
 
 
-def _rate(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
+def _rate(series: Series, _: Noise) -> Check:
     if series.nominal_period is None:
         return _not_possible("Neither settings nor rate are known.", "Record the settings too.")
     rate, wanted = 1 / series.mean_period, 1 / series.nominal_period
@@ -178,7 +139,7 @@ def _rate(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
     return Check(f"{rate:.3f} Hz; the settings say {wanted:.3f} Hz ({ppm:+.0f} ppm).")
 
 
-def _force_torque(series: Series, noise: Noise, _: Sequence[Finding]) -> Check:
+def _force_torque(series: Series, noise: Noise) -> Check:
     if series.subject.sinc_length is None:
         found = "The SINC length is not known, so no limit is known."
         return _not_possible(found, "Record the settings too.")
@@ -190,7 +151,7 @@ def _force_torque(series: Series, noise: Noise, _: Sequence[Finding]) -> Check:
     return _noise(noise, range(6))
 
 
-def _imu(series: Series, noise: Noise, _: Sequence[Finding]) -> Check:
+def _imu(series: Series, noise: Noise) -> Check:
     if series.imu_off:
         return Check("The IMU is off.", level=Level.NOT_APPLICABLE)
     return _noise(noise, range(6, 12))
@@ -241,7 +202,7 @@ _WHOLE: Final = 0.9  # a channel that is constant for this share of a short reco
 _SHORTEST_S: Final = 1.0  # shorter recordings say nothing about the IMU
 
 
-def _stuck(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
+def _stuck(series: Series, _: Noise) -> Check:
     if series.duration < _SHORTEST_S:
         found = f"The recording is only {seconds(series.duration)} long."
         return _not_possible(found, "Record for at least 10 s.")
@@ -271,39 +232,10 @@ def _stuck(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
     return Check(f"No channel is stuck; the longest constant run of a force or torque is {run_text}.")
 
 
-def _saturation(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
-    texts = [
-        f"{channel.title} was saturated in {count(len(times), 'sample')} "
-        f"({share(len(times), series.count)}), first {seconds(times[0])} after the start"
-        for channel, times in series.saturations
-    ]
-    if any(bits(getattr(series.samples, field)) >> len(axes) for field, axes, _ in SATURATIONS):
-        texts.append("a saturation field has an undefined bit")
-    return Check(f"{listing(texts)}." if texts else "")
-
-
-def _warnings(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
-    texts = [
-        f"{meaning.meaning} ({meaning.severity.value}) in {count(len(times), 'sample')}, "
-        f"first {seconds(times[0])} after the start"
-        for meaning, times in series.warnings
-        if f"warning {meaning.flag}" not in _SATURATED
-    ]
-    return Check(f"{listing(texts)}." if texts else "")
-
-
-def _numbers(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
-    channels = [channel.title for n, channel in enumerate(CHANNELS) if not series.finite[:, n].all()]
-    if not np.isfinite(series.samples.temperature).all():
-        channels.append("Temperature")
-    wrong = int(series.not_finite.sum())
-    return Check(f"{count(wrong, 'sample')} ({share(wrong, series.count)}): {listing(channels)}.")
-
-
 _GRAVITY_TOLERANCE: Final = 1.0  # m/s²: an accelerometer's offset is well below it
 
 
-def _gravity(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
+def _gravity(series: Series, _: Noise) -> Check:
     if series.imu_off:
         return Check("The IMU is off.", level=Level.NOT_APPLICABLE)
     lengths = np.linalg.norm(series.samples.acceleration[series.finite[:, 6:9].all(axis=1)], axis=1)
@@ -321,7 +253,7 @@ def _gravity(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
     return Check(found, Level.LOOK, remedy)
 
 
-def _temperature(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
+def _temperature(series: Series, _: Noise) -> Check:
     known = series.samples.temperature[np.isfinite(series.samples.temperature)]
     return Check(f"{figure(known.min())} to {figure(known.max())} °C.") if len(known) else _too_few(0)
 
@@ -329,10 +261,10 @@ def _temperature(series: Series, _: Noise, __: Sequence[Finding]) -> Check:
 _FEWEST: Final = 100  # samples to judge their intervals by
 _SATURATED: Final = {f"warning {int(row.flag)}" for row in SATURATIONS}
 _CHECKS: Final = (
-    _Kind("Lost samples", ["lost"], _FEWEST, _losses,
+    _Kind("Lost samples", ["lost"], _FEWEST, None,
           "A controller acts on stale data; derivatives are wrong there.", good="None."),
-    _Kind("Silent or stuck sensor", ["silence", "invalid", "repeated"], 0, _silence,
-          "What is published in the meantime is stale."),
+    _Kind("Silent or stuck sensor", ["silence", "invalid", "repeated"], 1, None,
+          "What is published in the meantime is stale.", good="The sensor sent new samples all the time."),
     _Kind("Stuck values", [], 1, _stuck, "The channel does not measure.",
           "Power-cycle the sensor. If it persists, it needs repair."),
     _Kind("Noise of force and torque", [], 0, _force_torque,
@@ -341,12 +273,12 @@ _CHECKS: Final = (
           "supply, then contact the manufacturer."),
     _Kind("Noise of the IMU", [], 0, _imu, "Gravity compensation and the like become noisy.",
           "Record again with the sensor stationary. If it persists, contact the manufacturer."),
-    _Kind("Saturation", _SATURATED, 1, _saturation, "The measured values are less than the real ones.",
+    _Kind("Saturation", _SATURATED, 1, None, "The measured values are less than the real ones.",
           "If it is unloaded, it may have been damaged by overload: tare it and compare.",
           "No channel was saturated."),
-    _Kind("Warnings", {f"warning {1 << bit}" for bit in range(32)} - _SATURATED, 1, _warnings,
+    _Kind("Warnings", {f"warning {1 << bit}" for bit in range(32)} - _SATURATED, 1, None,
           "The sensor reports it.", good="The sensor reported none, but those of saturation."),
-    _Kind("Numbers", ["not_finite"], 1, _numbers, "A single one of them corrupts every sum and filter.",
+    _Kind("Numbers", ["not_finite"], 1, None, "A single one of them corrupts every sum and filter.",
           good="Every value is a finite number."),
     _Kind("Stamps", ["clock"], _FEWEST, _stamps, "Sensor fusion and derivatives suffer."),
     _Kind("Sampling rate", ["rate"], _FEWEST, _rate),

@@ -1,137 +1,81 @@
-"""`ethercat-report`: command line, progress and output. Reads or listens, examines, writes the page."""
+"""`ethercat-report`: command line and output. Reads a recording, examines, writes the page."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bota_clients.arguments import add_force, add_imu_units, add_server, server_of
+from bota_clients.arguments import add_force, add_imu_units
 from bota_clients.program import interrupt_on_signals, say, start
-from bota_ethercat.address import Address
 from bota_ethercat.health.limits import Level
-from bota_ethercat.pdo import ImuUnits
-from bota_ethercat.program.arguments import Parser, number, typed
+from bota_ethercat.program.arguments import Parser
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.output import discard_output, ends_with_its_reader
 from bota_ethercat.program.server_choice import is_address
 from bota_ethercat.program.version import VERSION
-from bota_ethercat.sensor_choice import MEANING, SensorChoice
 
 if TYPE_CHECKING:
     from bota_clients.report.checks import Examination
 
 _PROGRAM: Final = "ethercat-report"
-_LONGEST_S: Final = 1800.0
-_DEFAULT_S: Final = 10.0
 
 
-class ReportOptions(argparse.Namespace):
-    """What to report on, and where to."""
-
-    recording: Path | None  # None: live
-    server: Address | None  # None: from a recording
-    seconds: float
-    output: Path
-    force: bool
-    sensor: SensorChoice | None
-    imu_units: ImuUnits
-    note: str
-    json: bool
-
-
-def parse_options(argv: Sequence[str] | None) -> ReportOptions:
+def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; argparse exits with 2 if it is wrong."""
     made = Parser(
         _PROGRAM,
-        "Writes a one-page sensor health report (HTML) from a recording or a live stream.",
+        "Writes a one-page sensor health report (HTML) from a recording.",
         "exit code: 0 good, worth a look or not conclusive, 1 trouble, or no report was made, 2 wrong usage",
     )
     add = made.add_argument
-    add("recording", type=Path, nargs="?", metavar="FILE.mcap",
-        help="a recording of ethercat-record (default: listen to the server)")  # fmt: skip
-    add_server(made, "listen to this server")
-    longest = f"a number of seconds from 1 to {_LONGEST_S:g}; for longer make a recording"
-    add("--seconds", type=number(1, _LONGEST_S, longest), metavar="S",
-        help=f"how long to listen (default {_DEFAULT_S:g})")  # fmt: skip
+    add("recording", type=Path, metavar="FILE.mcap", help="a recording of ethercat-record")
     add("-o", "--output", type=Path, metavar="REPORT.html",
-        help="where to write the page (default: beside the recording, or report.html)")  # fmt: skip
+        help="where to write the page (default: beside the recording)")  # fmt: skip
     add_force(made)
-    add("--sensor", type=typed(SensorChoice.parse, MEANING), metavar="S", help=f"only this sensor: {MEANING}")
     add_imu_units(made)
     add("--note", default="", metavar="TEXT", help="a remark for the head of the page")
     add("--json", action="store_true", help="print the checks as JSON")
-    options = made.parse_args(argv, ReportOptions())
-    recording, listen_s = options.recording, vars(options)["seconds"]
-    if recording is not None and is_address(str(recording)) and not recording.exists():
-        made.error(f"{recording} is a server's address, no recording: write --server {recording}")
-    if recording is None:
-        options.server = server_of(made, options.server)
-    elif options.server is not None:
-        made.error("give a recording, or --server HOST:PORT, not both")
-    elif listen_s is not None:
-        made.error("--seconds is for listening to a server: the whole recording is examined")
-    options.seconds = listen_s or _DEFAULT_S
-    options.output = options.output or (recording.with_suffix(".html") if recording else Path("report.html"))
-    if recording is not None and options.output.absolute() == recording.absolute():
+    options = made.parse_args(argv)
+    recording = options.recording
+    if is_address(str(recording)) and not recording.exists():
+        made.error(f"{recording} is a server's address: record its stream first, with ethercat-record")
+    options.output = options.output or recording.with_suffix(".html")
+    if options.output.absolute() == recording.absolute():
         made.error("the report would overwrite the recording: give another name with -o")
     return options
 
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make a report; returns the exit code."""
     return start(_PROGRAM, "report.cli", parse_options(argv))
 
 
-def run(options: ReportOptions) -> int:
-    """Make a report; returns the exit code."""
-    try:
-        words, exit_code = make(options)
-    except KeyboardInterrupt:
-        say(_PROGRAM, "stopped: no report was written")
-        return 1
-    try:
-        print(words, flush=True)
-    except BrokenPipeError:
-        discard_output()  # the report is in its file
-    say(_PROGRAM, f"the report is in {options.output}")
-    return exit_code
-
-
-def make(options: ReportOptions) -> tuple[str, int]:
-    """Write the report; the words for the standard output, and the exit code."""
-    from rich.console import Console  # noqa: PLC0415 - needs the extra, and so do these
-    from rich.progress import Progress  # noqa: PLC0415
-
-    from bota_clients.report import checks, page, subjects  # noqa: PLC0415
+def run(options: argparse.Namespace) -> int:
+    from bota_clients.report import checks, page, subjects  # noqa: PLC0415 - needs the extra
 
     interrupt_on_signals()
     with NewFile(options.output, force=options.force) as file:
-        which = options.sensor, options.imu_units
-        if options.recording is not None:
-            found = subjects.of_recording(options.recording, *which)
-        else:
-            assert options.server is not None
-            console = Console(stderr=True)
-            with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-                task = progress.add_task("listening", total=options.seconds)
-                show = partial(progress.update, task)
-                found = subjects.of_server(options.server, options.seconds, *which, show)
+        found = subjects.of_recording(options.recording, options.imu_units)
         examinations = [checks.Examination(each) for each in found]
         now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         file.write(page.render(examinations, made=now, program=f"{_PROGRAM} {VERSION}", note=options.note))
         file.finish()
-    words = page.as_json(examinations) if options.json else "\n".join(map(_summary, examinations))
-    return words, int(any(each.level is Level.TROUBLE for each in examinations))
+    try:
+        print(
+            page.as_json(examinations) if options.json else "\n".join(map(_summary, examinations)), flush=True
+        )
+    except BrokenPipeError:
+        discard_output()  # the report is in its file
+    say(_PROGRAM, f"the report is in {options.output}")
+    return int(any(each.level is Level.TROUBLE for each in examinations))
 
 
 def _summary(examination: Examination) -> str:
     subject = examination.subject
-    who = f"Sensor {subject.position} ({subject.who})"
+    who = f"Sensor {subject.info.sensor} ({subject.who})"
     lines = [f"{who}: {examination.headline}. {examination.sentence}"]
     lines += [f"  {remark}" for remark in subject.remarks]
     for check in examination.checks:

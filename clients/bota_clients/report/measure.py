@@ -23,6 +23,7 @@ FEWEST_WINDOWS: Final = 8  # to judge by
 _ORDER: Final = 3
 # A window above this multiple of the limit is noisy; one of few samples needs more, to allow for chance.
 _NOISY: Final = 1.5
+_CONTACT_S: Final = 0.1  # a contact builds up in no less, which second differences of slow samples show, too
 _TO_DEVIATION: Final = 1.4826 / math.sqrt(6)  # median size of second differences of white noise to its std
 _FILLED: Final = 0.8  # share of its samples that a window must have
 
@@ -45,7 +46,6 @@ class Noise(NamedTuple):
 
 
 def measure_noise(series: Series) -> Noise:
-    """The noise of all channels."""
     length = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
     limit = _limits(series)
     usable = series.finite & ~series.saturated
@@ -70,7 +70,8 @@ def measure_noise(series: Series) -> Noise:
     deviation[measured] = np.nanmedian(calm[:, measured], axis=0)
     rough = np.where(_shaken(deviations, limit)[:, None], np.nan, roughs)
     sizes = np.array([part.stop - part.start for part in kept])
-    noisy = rough > limit * np.maximum(_NOISY, 1 + 5 / np.sqrt(sizes))[:, None]
+    touched = ranges * (series.period / _CONTACT_S) ** 2
+    noisy = rough > limit * np.maximum(_NOISY, 1 + 5 / np.sqrt(sizes))[:, None] + touched
     worst = np.where(noisy, rough, 0.0).max(axis=0)
     return Noise(deviation, limit, len(kept), len(calm), length, noisy.sum(axis=0), worst)
 

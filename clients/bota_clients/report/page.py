@@ -15,7 +15,6 @@ from bota_clients.numbers import figure, share
 from bota_clients.report import plots
 from bota_clients.report.checks import Examination
 from bota_clients.report.series import CHANNELS, GROUPS, limit_origin
-from bota_ethercat.health.limits import Level
 from bota_ethercat.sensor.meaning import meaning, value_meaning
 from bota_ethercat.settings import SETTINGS
 from bota_ethercat.text.untrusted import printable, visible
@@ -36,7 +35,6 @@ _PAGE: Final = jinja2.Environment(
 )
 _PAGE.filters |= {name: getattr(numbers, name) for name in ("count", "figure", "moment", "seconds", "share")}
 _PAGE.globals |= {"plots": plots, "GROUPS": GROUPS, "limit_origin": limit_origin}
-_PAGE.globals["not_possible"] = Level.NOT_POSSIBLE
 
 
 def render(examinations: Sequence[Examination], *, made: str, program: str, note: str = "") -> str:
@@ -55,11 +53,11 @@ def render(examinations: Sequence[Examination], *, made: str, program: str, note
 def _view(examination: Examination) -> dict[str, Any]:
     """What the template shows of one sensor, beside the examination's own."""
     subject, series = examination.subject, examination.series
-    rate_hz, chop = round(subject.rate_hz), subject.settings.get("chop")
+    rate_hz, chop = round(subject.info.rate_hz), subject.settings.get("chop")
     groups = [group for group in GROUPS if not (group.is_imu and series.imu_off)]
     return {
         "headline": examination.headline,
-        "name": f"Sensor {subject.position}: {subject.who}",
+        "name": f"Sensor {subject.info.sensor}: {subject.who}",
         "settings": [
             (setting, str(value).lower(), value_meaning(setting, value, rate_hz, chop))
             for setting in SETTINGS
@@ -95,11 +93,11 @@ def _noise_rows(examination: Examination) -> list[tuple[str, ...]]:
 
 
 def as_json(examinations: Sequence[Examination]) -> str:
-    """The verdicts and checks for programs."""
     return json.dumps(
         [
             {
-                "sensor": each.subject.position, "name": each.subject.name, "serial": each.subject.serial,
+                "sensor": each.subject.info.sensor, "name": each.subject.info.name,
+                "serial": each.subject.info.serial,
                 "source": each.subject.source, "verdict": each.level.key,
                 "sentence": each.sentence, "remarks": list(each.subject.remarks),
                 "stream": {"verdict": each.stream.level.key, "sentence": each.stream.sentence},

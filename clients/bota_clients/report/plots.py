@@ -1,14 +1,9 @@
-"""The plots of the page, as inline SVG: colors as CSS variables, text as text, reproducible.
-
-Figures are drawn in placeholder colors, which become CSS variables: the style sheet defines `--ink` or
-`--x` for light, dark and print. No text from a device is drawn.
-"""
+"""The plots of the page, as pictures in it. No text from a device is drawn."""
 
 from __future__ import annotations
 
-import html
+import base64
 import io
-import re
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -16,24 +11,19 @@ import matplotlib as mpl
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bota_clients.numbers import count, seconds
 from bota_clients.numbers import figure as number
+from bota_clients.numbers import seconds
 from bota_clients.recording.columns import Floats, Ints
 from bota_clients.report.series import GROUPS, Group, Series
 
-_VARIABLES: Final = {
-    f"#0101{number}": f"--{name}"
-    for number, name in enumerate(["ink", "muted", "grid", "x", "y", "z", "bad", "limit", "plain"], start=10)
-}
-INK, MUTED, GRID, X, Y, Z, BAD, LIMIT, PLAIN = _VARIABLES
-AXES: Final = (X, Y, Z)
+# Those of the axes differ in lightness as well as in hue (after Okabe and Ito).
+AXES: Final = ("#c44601", "#00795c", "#1763c6")
+INK, MUTED, GRID, BAD, LIMIT, PLAIN = "#1b1f24", "#5b6570", "#e3e7eb", "#b3201b", "#7a3e9d", "#5d7896"
 
 STYLE: Final[dict[str, Any]] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "ethercat-report",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 8.5,
     "text.color": INK,
@@ -56,52 +46,24 @@ STYLE: Final[dict[str, Any]] = {
     "xtick.labelcolor": INK,
     "ytick.labelcolor": INK,
     "lines.linewidth": 1.0,
-    "path.simplify_threshold": 0.2,
 }
 
-_DROPPED: Final = re.compile(
-    r"<\?xml.*?\?>|<!DOCTYPE.*?>|<!--.*?-->|<metadata>.*?</metadata>|<style type=\"text/css\">.*?</style>",
-    re.DOTALL,
-)
-_OPENING: Final = re.compile(r"<svg\b[^>]*?(viewBox=\"[^\"]*\")[^>]*>", re.DOTALL)
-_COLOR: Final = re.compile("|".join(_VARIABLES))
-_PATH: Final = re.compile(r'\bd="([^"]*)"')
-_NUMBER: Final = re.compile(r"-?\d+\.\d+")
-_IDENTIFIER: Final = re.compile(r'(\bid="|url\(#|href="#)')
-_FONT_FAMILY: Final = re.compile(r"'?DejaVu Sans'?(, sans-serif)*")
+_DPI: Final = 120
 
 
-def draw(name: str, title: str, paint: Callable[..., str], *arguments: Any) -> str | None:
-    """The SVG of the figure that one of the functions below paints from `arguments`.
+def draw(paint: Callable[..., str], *arguments: Any) -> tuple[str, str] | None:
+    """The figure that one of the functions below paints from `arguments`, as a data URL, and what it shows.
 
-    `paint` returns what is in the plot, for screen readers, as `title` is; None if it has nothing to show.
-    `name` must be unique in the page.
+    None if it has nothing to show.
     """
     with mpl.style.context(STYLE, after_reset=True):
         figure = Figure()
-        FigureCanvasSVG(figure)
-        description = paint(figure, *arguments)
-        if not description:
+        FigureCanvasAgg(figure)
+        if not (description := paint(figure, *arguments)):
             return None
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    svg = _DROPPED.sub("", buffer.getvalue())
-    svg = _PATH.sub(lambda m: f'd="{_NUMBER.sub(_rounded, " ".join(m[1].split()))}"', svg)
-    svg = _IDENTIFIER.sub(rf"\1{name}-", svg)
-    svg = _COLOR.sub(lambda m: f"var({_VARIABLES[m[0]]})", svg)
-    svg = _FONT_FAMILY.sub("var(--font)", svg)
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" {{box}} '
-        f'role="img" aria-labelledby="{name}-title {name}-desc">'
-        f'<title id="{name}-title">{html.escape(title)}</title>'
-        f'<desc id="{name}-desc">{html.escape(description)}</desc>'
-    )
-    svg = _OPENING.sub(lambda m: head.format(box=m[1]), svg, count=1)
-    return "\n".join(line.strip() for line in svg.splitlines() if line.strip())
-
-
-def _rounded(match: re.Match[str]) -> str:
-    return f"{float(match[0]):.2f}".rstrip("0").rstrip(".")
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=_DPI)
+    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}", description
 
 
 def _margins(figure: Figure, **space: float) -> None:
@@ -197,30 +159,3 @@ def temperature(figure: Figure, series: Series) -> str:
     panel.plot(time[known], mean[known], color=PLAIN)
     panel.set(xlim=(0, series.width), xlabel="time, s", ylabel="°C")
     return f"Temperature from {number(np.nanmin(low))} to {number(np.nanmax(high))} °C."
-
-
-def intervals(figure: Figure, series: Series) -> str:
-    """Intervals over time, and how those without a loss are distributed."""
-    deviations = series.deviations * 1e6
-    if len(deviations) < 2:
-        return ""
-    off = np.abs(deviations)
-    reach = max(float(np.quantile(off, 0.999)), 1.0) * 1.2
-    figure.set_figheight(4.0)
-    _margins(figure, hspace=0.4)
-    upper, lower = figure.subplots(2, 1)
-    time, low, high, _ = envelope(series.time[1:], series.intervals * 1e3, series.width)
-    upper.fill_between(time, low, high, color=PLAIN, alpha=0.5, linewidth=0.4)
-    upper.plot(time, high, ".", color=PLAIN, markersize=1.5)
-    upper.set(xlim=(0, series.width), xlabel="time, s", ylabel="interval, ms")
-    lower.hist(np.clip(deviations, -reach, reach), 120, range=(-reach, reach), color=PLAIN, log=True)
-    lower.axvline(0, color=LIMIT, linestyle="--", linewidth=1)
-    typical = f"interval minus the typical one of {number(series.period * 1e3, 5)} ms, µs"
-    lower.set(xlim=(-reach, reach), xlabel=typical, ylabel="samples")
-    lower.yaxis.set_major_formatter("{x:g}")  # instead of exponents
-    lower.yaxis.set_minor_formatter("")
-    return (
-        f"{count(len(deviations), 'interval')} without a loss; the standard deviation is "
-        f"{number(deviations.std())} µs, the greatest deviation {number(off.max())} µs; "
-        f"{np.sum(off > reach)} beyond the ends are counted in the outermost bars."
-    )

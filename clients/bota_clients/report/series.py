@@ -1,7 +1,6 @@
 """What a report is about: one sensor's settings and frames, and its new, valid samples on a time axis.
 
-Everything comes from a file or the network: texts are cut to one printable line; settings that are unknown
-or invalid are omitted, with a remark. A sample is a frame that is neither REPEATED nor INVALID. Times are
+A sample is a frame that is neither REPEATED nor INVALID. Times are
 seconds of CLOCK_MONOTONIC since the first frame.
 """
 
@@ -9,91 +8,55 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from bota_clients.numbers import listing
 from bota_clients.recording.columns import Columns, Floats, Ints
 from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.health.limits import LIMITS
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.filters import LONG_SINC, SHORT_SINC, noise_limit
-from bota_ethercat.sensor.warnings_register import explain
-from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, known_settings, rate_divisor
-from bota_ethercat.text.untrusted import printable, whole
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
+from bota_ethercat.text.untrusted import printable
 
 Bools = npt.NDArray[np.bool_]
 
-_LONGEST_TEXT: Final = 80
 _HIGHEST_RATE_HZ: Final = 100_000.0
 
 
 @dataclass(frozen=True)
 class Subject:
-    """One sensor and its frames."""
-
-    position: int
-    name: str
-    serial: int | None
-    hardware: str
-    firmware: str
-    rate_hz: float  # nominal, as described; 0 if unknown
-    settings: Mapping[str, SettingValue]  # those that exist and have a valid value
+    info: SensorInfo
     columns: Columns
-    source: str  # a file name or a server's address
+    source: str  # a file name
     remarks: tuple[str, ...] = ()  # sentences about the recording for the reader of the report
 
     @property
     def who(self) -> str:
-        """Name and serial number."""
-        return f"{self.name}, serial {_text(self.serial)}"
+        return f"{self.info.name or '?'}, serial {'?' if self.info.serial is None else self.info.serial}"
+
+    @property
+    def settings(self) -> Mapping[str, SettingValue]:
+        """Those that are known."""
+        return self.info.settings
 
     @property
     def sinc_length(self) -> int | None:
-        """None if unknown."""
         return self.settings.get("sinc_length")
 
     @property
     def nominal_period_s(self) -> float | None:
         """From the settings; None if unknown."""
+        rate_hz = self.info.rate_hz
         if self.sinc_length is not None:
-            divisor = rate_divisor(self.sinc_length, round(self.rate_hz), self.settings.get("chop"))
+            divisor = rate_divisor(self.sinc_length, round(rate_hz), self.settings.get("chop"))
             return self.sinc_length * (divisor or 1) / BASE_SAMPLING_RATE_HZ
-        return 1 / self.rate_hz if 0 < self.rate_hz <= _HIGHEST_RATE_HZ else None
+        return 1 / rate_hz if 0 < rate_hz <= _HIGHEST_RATE_HZ else None
 
     def with_remarks(self, remarks: Iterable[str]) -> Subject:
-        """The same with more remarks."""
         return replace(self, remarks=(*self.remarks, *(printable(remark, 300) for remark in remarks)))
-
-
-def subject(
-    description: Mapping[str, Any], settings: object, columns: Columns, source: str, position: int
-) -> Subject:
-    """The sensor that one row of a reply to `describe` describes."""
-    known, remarks = known_settings(settings), list[str]()
-    if not isinstance(settings, dict):
-        remarks.append("The settings are not known.")
-    elif ignored := [printable(name, 40) for name in settings if name not in known]:
-        remarks.append(
-            f"Settings that do not exist, or not with this value, were ignored: {listing(ignored)}."
-        )
-    rate = description.get("rate_hz")
-    return Subject(
-        position=position,
-        name=_text(description.get("name")),
-        serial=whole(description.get("serial")),
-        hardware=_text(description.get("hardware")),
-        firmware=_text(description.get("firmware")),
-        rate_hz=float(rate) if isinstance(rate, int | float) and 0 < rate <= _HIGHEST_RATE_HZ else 0.0,
-        settings=known,
-        columns=columns,
-        source=printable(source),
-    ).with_remarks(remarks)
-
-
-def _text(value: object) -> str:
-    return "not known" if value is None or value == "" else printable(value, _LONGEST_TEXT)
 
 
 class Group(NamedTuple):
@@ -120,8 +83,6 @@ GROUPS: Final = (
 
 
 class Channel(NamedTuple):
-    """One measured quantity."""
-
     group: Group
     axis: int  # 0, 1, 2 for x, y, z
     title: str  # for people: Force z
@@ -154,11 +115,6 @@ def limit_origin(sinc_length: int) -> str:
 
 
 _LONG: Final = 2.5  # an interval of more than this many periods is none between two successive samples
-# Beside a silence, samples are lost if more periods and more time than this pass without any frame; ...
-_COVERED_PERIODS: Final = 4
-_COVERED_S: Final = 0.01
-# ... between two REPEATED or INVALID ones more time: the server polls a sensor that it has lost less often.
-_COVERED_BETWEEN_S: Final = 0.1
 # CLOCK_REALTIME that moves against CLOCK_MONOTONIC by more than this between two samples was adjusted.
 _STEP_NS: Final = 1_000_000
 
@@ -186,18 +142,15 @@ class Series:
         self.not_finite: Bools = ~self.finite.all(axis=1) | ~np.isfinite(samples.temperature)  # (n,)
         self.imu_off = subject.settings.get("imu_active") == 0
         self.intervals: Floats = np.diff(self.time)  # (n - 1,) s
-        jumps = np.diff(frames.sequence)
-        self.step = max(1, int(np.median(jumps))) if len(jumps) else 1  # `every` of the subscription
-        nominal = subject.nominal_period_s
-        self.nominal_period = None if nominal is None else nominal * self.step  # s, by the settings
+        self.nominal_period = subject.nominal_period_s  # by the settings
         forward = self.intervals[self.intervals > 0]
         # The usual interval, s; what the settings say if there are none.
         self.period = float(np.median(forward)) if len(forward) else self.nominal_period or 1e-3
         self.width = max(self.duration, self.period)  # of the plots over time, s
         self.silent: Bools = np.diff(np.flatnonzero(frames.fresh)) > 1  # REPEATED or INVALID frames between
-        accounting = StreamAccounting(every=self.step, fresh_only=False)
+        accounting = StreamAccounting(fresh_only=False)
         # Not the usual interval: where every other sample is lost, that is two periods.
-        accounting.rate_hz = self.step / (self.nominal_period or self.period)
+        accounting.rate_hz = 1 / (self.nominal_period or self.period)
         self.counts = accounting.counts  # the frames' kinds, as every client counts them
         self.missing = self._missing(accounting)
         # Whether the samples on either side do not follow one another.
@@ -218,35 +171,16 @@ class Series:
         self.silences = self._silences()
         self.lost = int(self.missing.sum())  # samples, except those of a silent sensor
         # Those of the lost samples that the server had numbered: the client or recorder was too slow.
-        self.withheld = min(self.counts.withheld // self.step, self.lost)
-        # What the sensor warned of, and which channels were saturated: when, s.
-        self.warnings = [
-            (meaning, self.time[samples.warnings & meaning.flag != 0])
-            for meaning in explain(bits(samples.warnings))
-        ]
-        self.saturations = [
-            (channel, self.time[column])
-            for channel, column in zip(CHANNELS, self.saturated.T, strict=True)
-            if column.any()
-        ]
+        self.withheld = min(self.counts.withheld, self.lost)
 
     def _missing(self, accounting: StreamAccounting) -> Ints:
-        """(n - 1,) how many samples are missing between one and the next, beside those of a silent sensor.
-
-        As every client counts them. Where the sensor was silent, as many as have room between frames too far
-        apart to tell of a silence.
-        """
+        """(n - 1,) how many samples are missing between one and the next, as every client counts them."""
         frames, summed = self.frames, list[int]()
         heads = (array.tolist() for array in (frames.sequence, frames.monotonic_ns, frames.flags))
         for head in zip(*heads, strict=True):
             accounting.count(*head)
             summed.append(self.counts.missing)
-        lost = np.diff(np.array(summed, np.int64)[frames.fresh]) // self.step
-        fresh, intervals = frames.fresh, np.diff(self.frame_time)
-        near = np.where(fresh[:-1] | fresh[1:], _COVERED_S, _COVERED_BETWEEN_S)
-        untold = intervals > np.maximum(near, _COVERED_PERIODS * self.period)
-        told = np.cumsum(np.where(untold, _room(intervals / self.period), 0))
-        return np.where(self.silent, np.diff(np.append(0, told)[np.flatnonzero(fresh)]), lost)
+        return np.diff(np.array(summed, np.int64)[frames.fresh])
 
     def _silences(self) -> Floats:
         """How long the sensor was silent each time, s, the time before the first and after the last too."""
@@ -257,11 +191,6 @@ class Series:
         ends = [] if fresh[0] else [self.time[0] - self.frame_time[0]]
         ends += [] if fresh[-1] else [self.frame_time[-1] - self.time[-1]]
         return np.asarray(np.maximum(np.concatenate([spans, ends]), 0.0), np.float64)
-
-
-def _room(periods: Floats) -> Ints:
-    """Samples missing in intervals of this many periods."""
-    return np.round(np.clip(periods, 0, 1e12)).astype(np.int64) - 1
 
 
 def bits(fields: Ints) -> int:

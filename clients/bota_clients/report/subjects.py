@@ -1,39 +1,22 @@
-"""The sensors to report on, from a recording that `ethercat-record` made or from some seconds of a server's
-stream."""
+"""The sensors to report on, from a recording that `ethercat-record` made."""
 
 from __future__ import annotations
 
-import contextlib
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from bota_clients.errors import ClientError
+from bota_clients.errors import RecordingError
 from bota_clients.numbers import count, listing, moment
-from bota_clients.record.recorder import Recorder, Source
-from bota_clients.recording.columns import Columns, columns
-from bota_clients.recording.reader import (
-    Histories,
-    Identity,
-    RecordedSensor,
-    Recording,
-    Settings,
-    open_recording,
-)
-from bota_clients.report.series import Subject, subject
-from bota_ethercat.address import Address
-from bota_ethercat.errors import ProtocolError
-from bota_ethercat.framing import DataMessage
-from bota_ethercat.health import sentences
+from bota_clients.recording.columns import Columns, columns, joined
+from bota_clients.recording.reader import InForce, RecordedSensor, Recording, open_recording
+from bota_clients.report.series import Subject
 from bota_ethercat.pdo import ImuUnits
-from bota_ethercat.replies import Status
-from bota_ethercat.sensor_choice import SensorChoice
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.text.untrusted import printable
 
 _MOST_EVENTS_NAMED: Final = 10
@@ -41,41 +24,17 @@ _MOST_SENSORS_NAMED: Final = 4
 _LONGEST_CHANGE_NS: Final = 2_000_000_000  # a change of settings takes the sensor out of operation for less
 
 
-def of_recording(
-    path: Path, choice: SensorChoice | None, imu_units: ImuUnits, source: str = ""
-) -> list[Subject]:
-    """The sensors of the recording at `path`, or those chosen, by position; it is named as `source`.
-
-    RecordingError if it cannot be read, ClientError if it has no such sensor.
-    """
+def of_recording(path: Path, imu_units: ImuUnits) -> list[Subject]:
+    """The sensors of the recording at `path`, by position; RecordingError if there is none to be read."""
     with open_recording(path) as recording:
         recorded = [s for s in recording.sensors if not recording.chosen or s.sensor in recording.chosen]
-        found = [sensor for sensor in recorded if _meant(sensor, choice)]
-        if not found:
-            there = [
-                (s.sensor, who.name, who.serial)
-                for s in recorded
-                for row in s.history
-                for who in [row.identity]
-            ]
-            raise _no_sensor(source or str(path), choice, dict.fromkeys(there))
+        if not recorded:
+            raise RecordingError(f"{path} has no sensor")
         remarks = [f"The recording was cut off: {recording.cut_off}."] if recording.cut_off else []
         if others := [str(sensor.sensor) for sensor in recording.sensors if sensor not in recorded]:
             remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
         remarks += _event_remarks(event.name for event in recording.events)
-        source = source or path.name
-        subjects = [_subject(recording, sensor, choice, imu_units, source) for sensor in found]
-        return [subject.with_remarks(remarks) for subject in subjects]
-
-
-def _no_sensor(
-    where: str, choice: SensorChoice | None, there: Iterable[tuple[object, object, object]]
-) -> ClientError:
-    """The error that the chosen sensor does not exist, with those that do."""
-    known = [printable(f"{position} ({name}, serial {serial})", 80) for position, name, serial in there]
-    if choice is None or not known:
-        return ClientError(f"{where} has no sensor")
-    return ClientError(f"{where} has no sensor {choice}: it has {', '.join(known[:16])}")
+        return [_subject(recording, sensor, imu_units).with_remarks(remarks) for sensor in recorded]
 
 
 def _event_remarks(names: Iterable[str]) -> list[str]:
@@ -86,120 +45,45 @@ def _event_remarks(names: Iterable[str]) -> list[str]:
     return [f"Events of the whole recording: {listing(told, _MOST_EVENTS_NAMED)}."] if told else []
 
 
-def _meant(sensor: RecordedSensor, choice: SensorChoice | None) -> list[int]:
-    """Which entries of its history are of a chosen sensor; [0] if there is no history."""
-    told = [settings.identity for settings in sensor.history] or [Identity()]
-    return [
-        number
-        for number, who in enumerate(told)
-        if choice is None or choice.matches(sensor.sensor, who.name, who.serial)
-    ]
-
-
-def _frames(recording: Recording, sensor: int, before: list[int]) -> Iterator[DataMessage]:
-    """The frames of a sensor; `before` gets how many of them came before each entry of its history.
-
-    The order in the file decides what came first, because clocks differ.
-    """
-    histories, so_far = Histories(), 0
-    for item in recording.everything(sensor):
-        if isinstance(item, DataMessage):
-            so_far += 1
-            yield item
-        else:
-            histories.take(item)
-            before += [so_far] * (len(histories.of(sensor)) - len(before))
-
-
-def _subject(
-    recording: Recording,
-    sensor: RecordedSensor,
-    choice: SensorChoice | None,
-    imu_units: ImuUnits,
-    source: str,
-) -> Subject:
+def _subject(recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) -> Subject:
     """Its longest stretch without a change of settings or sensor."""
-    before, history = list[int](), sensor.history
-    frames = columns(_frames(recording, sensor.sensor, before), imu_units)
-    row, values, remarks = sensor._asdict(), None, list[str]()
-    if history:
-        # The first settings were in effect before they were received.
-        ends = [0, *before[1:], len(frames)]
-        longest = max(_meant(sensor, choice), key=lambda number: ends[number + 1] - ends[number])
-        kept, numbers = history[longest], np.arange(len(frames))
-        row |= {**kept.identity._asdict(), "rate_hz": kept.rate_hz}
-        values = kept.values
-        frames = frames.where((numbers >= ends[longest]) & (numbers < ends[longest + 1]))
-        if longest + 1 < len(history):
-            # Without the end in which the change was made already: the sensor gives nothing then.
-            last = np.flatnonzero(frames.fresh)[-1:].max(initial=-1)
-            changing = frames.monotonic_ns > frames.monotonic_ns[-1:] - _LONGEST_CHANGE_NS
-            frames = frames.where(~changing | (np.arange(len(frames)) <= last))
-        remarks = _remarks(history, kept, frames)
+    # The order in the file decides what came first, because clocks differ.
+    stretches: list[tuple[SensorInfo, list[Columns]]] = [(sensor.info, [columns([])])]
+    for info, frames in recording.batches(sensor.sensor):
+        if InForce(0, stretches[-1][0]).is_changed(info):
+            stretches.append((info, []))
+        stretches[-1][1].append(columns(frames, imu_units))
+    longest = max(range(len(stretches)), key=lambda number: sum(map(len, stretches[number][1])))
+    kept, found = stretches[longest][0], joined(stretches[longest][1])
+    if longest + 1 < len(stretches):
+        # Without the end in which the change was made already: the sensor gives nothing then.
+        last = np.flatnonzero(found.fresh)[-1:].max(initial=-1)
+        changing = found.monotonic_ns > found.monotonic_ns[-1:] - _LONGEST_CHANGE_NS
+        found = found.where(~changing | (np.arange(len(found)) <= last))
+    remarks = [] if kept.settings else ["The settings are not known."]
+    remarks += _remarks([row.info for row in sensor.history], kept, found)
     if (tared := len(sensor.offsets) - 1) > 0:
         remarks.append(
             f"The sensor's own offset was changed {count(tared, 'time')} (by a tare, say): forces before and "
             "after differ by that."
         )
-    made = subject(row, values, frames, source, sensor.sensor)
-    return made.with_remarks(remarks)
+    return Subject(kept, found, recording.path.name).with_remarks(remarks)
 
 
-def _remarks(history: Sequence[Settings], kept: Settings, frames: Columns) -> list[str]:
+def _remarks(history: Sequence[SensorInfo], kept: SensorInfo, frames: Columns) -> list[str]:
     """What was changed while it was recorded, and which part this is."""
-    if len(history) == 1:
+    if len(history) < 2:
         return []
     remarks = []
-    sensors = list(dict.fromkeys(settings.identity for settings in history))
-    if len(sensors) > 1:
-        there = [f"{who.name}, serial {who.serial}, firmware {who.firmware}" for who in sensors]
+    there = dict.fromkeys(f"{who.name}, serial {who.serial}, firmware {who.firmware}" for who in history)
+    if len(there) > 1:
         remarks.append(
-            f"The sensor was exchanged while it was recorded ({'; '.join(there[:_MOST_SENSORS_NAMED])}): "
-            f"this report is of serial {kept.identity.serial}; --sensor serial:N chooses."
+            f"The sensor was exchanged while it was recorded ({'; '.join([*there][:_MOST_SENSORS_NAMED])}): "
+            f"this report is of serial {kept.serial}."
         )
-    if changes := sum(new.identity == old.identity for old, new in pairwise(history)):
+    if changes := sum(new.serial == old.serial for old, new in pairwise(history)):
         remarks.append(f"The settings were changed {count(changes, 'time')} while it was recorded.")
     if len(frames):
         first, last = (moment(int(frames.stamp_ns[row])) for row in (0, -1))
         remarks.append(f"This report is of the longest stretch without a change, from {first} to {last}.")
     return remarks
-
-
-_BATCH_S: Final = 0.05
-
-
-def of_server(
-    address: Address,
-    seconds: float,
-    choice: SensorChoice | None,
-    imu_units: ImuUnits,
-    show: Callable[..., None],
-) -> list[Subject]:
-    """The server's sensors, or those chosen, from a recording of `seconds`, which is not kept.
-
-    `show` gets the time so far, s, as `completed`. ConnectionFailedError or RefusedError if there is no
-    stream; ClientError if there is no such sensor.
-    """
-    with TemporaryDirectory() as folder, contextlib.closing(Source(address, None)) as source:
-        source.connect()
-        path = Path(folder, "live.mcap")
-        recorder = Recorder(path, "", {}, overwrite=False)
-        begin = time.monotonic()
-        while (passed := time.monotonic() - begin) < seconds:
-            show(completed=passed)
-            recorder.put(source.batch(min(_BATCH_S, seconds - passed)))
-        recorder.stop("")
-        status: Mapping[str, Any] = {}
-        with contextlib.suppress(ProtocolError):  # the stream is enough
-            status = source.ask("status")
-        subjects = of_recording(path, choice, imu_units, str(address))
-        return [each.with_remarks(past(status, each.position)) for each in subjects]
-
-
-def past(status: Mapping[str, Any], position: int) -> list[str]:
-    """What the server knows of a sensor's past, from its reply to `status`: sentences."""
-    row = Status.parse(status).find(position)
-    overload, overloaded = sentences.overload(row)
-    texts = [sentences.drift(row), overload]
-    texts += ["have it checked for damage by overload"] if overloaded else []
-    return [f"{text[0].upper()}{text[1:]}." for text in texts if text]

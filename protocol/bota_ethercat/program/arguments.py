@@ -36,9 +36,9 @@ ethercat-replay run.mcap --speed max --server 12002        # as fast as clients 
 ethercat-export run.mcap                                   # writes run.csv
 ethercat-export run.mcap /dev/stdout                       # into a pipe
 ethercat-export run.mcap --at frames.csv                   # what was measured before each camera frame
-ethercat-report                                            # listen to the server, write report.html
-ethercat-report run.mcap                                   # of a recording, write run.html
-ethercat-report --sensor serial:1234 --note 'cell 3'       # of one sensor, with a remark
+ethercat-report run.mcap                                   # write run.html
+ethercat-report run.mcap -o cell3.html --note 'cell 3'     # into another file, with a remark
+ethercat-report run.mcap --json                            # print the checks, too
 ethercat-identify poses.mcap                               # mass, center of gravity, bias, with intervals
 ethercat-identify poses.mcap --yaml tool.yaml              # also as parameters of the node
 ethercat-identify delay shaken.mcap                        # how late force is, by a shaken sensor

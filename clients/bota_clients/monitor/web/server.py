@@ -21,14 +21,15 @@ from importlib.resources import files
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from websockets.asyncio.server import ServerConnection, broadcast, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from bota_clients.arguments import is_loopback
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.tare import start_tare
-from bota_clients.monitor.web.hub import MOST_BYTES, TOO_MANY, Hub, WebModel, is_loopback
+from bota_clients.monitor.web.pages import MOST_BYTES, TOO_MANY, Page, Pages, WebModel
 from bota_clients.program import call_on, say
 from bota_ethercat.address import Address
 from bota_ethercat.pdo import ImuUnits
@@ -81,11 +82,11 @@ async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: f
     stop = asyncio.Event()
     call_on(asyncio.get_running_loop(), stop.set, "SIGINT", "SIGTERM", "SIGHUP")
     model = WebModel(str(address), imu_units)
-    hub = Hub(model, partial(start_tare, address))
+    pages = Pages(model, partial(start_tare, address))
     reader = Reader(address, model, POINTS_S)
-    async with serving(hub, *where) as port:
+    async with serving(pages, *where) as port:
         sys.stdout.write(
-            f"Open http://{Address(where.host, port)}/#token={hub.token}\n"
+            f"Open http://{Address(where.host, port)}/#token={pages.token}\n"
             "With this link the page can tare the sensor; without #token=... it only shows. Ctrl-C ends it.\n"
         )
         sys.stdout.flush()
@@ -99,7 +100,7 @@ async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: f
 
 @contextlib.asynccontextmanager
 async def serving(
-    hub: Hub, host: str, port: int, clock: Callable[[], float] = time.monotonic
+    pages: Pages, host: str, port: int, clock: Callable[[], float] = time.monotonic
 ) -> AsyncIterator[int]:
     """Serve on a loopback address; yields the port. OSError if it cannot be bound.
 
@@ -107,31 +108,42 @@ async def serving(
     """
     page_files = read_page()
     options: dict[str, Any] = {
-        "process_request": lambda _, request: answer(page_files, request),
+        "process_request": lambda _, request: respond(page_files, request),
         "compression": None, "max_size": MOST_BYTES, "max_queue": 4, "open_timeout": 5.0,
         "close_timeout": 0.5, "server_header": None, "logger": _QUIET,
     }  # fmt: skip
 
     async def converse(connection: ServerConnection) -> None:
-        page = hub.join(partial(broadcast, [connection]), clock())
+        page = pages.join()
         if page is None:
             await connection.close(_TRY_AGAIN_LATER, TOO_MANY)
             return
+        sending = asyncio.create_task(send(connection, page))
         try:
             async for text in connection:
-                hub.take(page, text)
+                if answer := pages.handle(page, text):
+                    await connection.send(answer)
                 if page.end:
                     await connection.close(_POLICY_VIOLATION, page.end)
         except ConnectionClosed:
             pass
         finally:
-            hub.leave(page)
+            sending.cancel()
+            pages.connected.discard(page)
 
-    async def send() -> None:
-        for count in itertools.count():
-            if count % POINTS_A_STATE == 0:
-                hub.send_states(clock())
-            hub.send_points(clock())
+    async def send(connection: ServerConnection, page: Page) -> None:
+        """As fast as the page reads: what it has no time for waits in the pages."""
+        with contextlib.suppress(ConnectionClosed):
+            for count in itertools.count():
+                if count % POINTS_A_STATE == 0:
+                    await connection.send(pages.state(clock()))
+                for text in pages.points(page):
+                    await connection.send(text)
+                await asyncio.sleep(POINTS_S)
+
+    async def collect() -> None:
+        while True:
+            pages.collect(clock())
             await asyncio.sleep(POINTS_S)
 
     async with contextlib.AsyncExitStack() as stack:
@@ -142,11 +154,11 @@ async def serving(
                 if (host, address) != ("localhost", "::1") or error.errno not in _NO_ADDRESS:
                     raise
             port = next(iter(server.sockets)).getsockname()[1]
-        sending = asyncio.create_task(send())
+        collecting = asyncio.create_task(collect())
         try:
             yield port
         finally:
-            sending.cancel()
+            collecting.cancel()
 
 
 def read_page() -> dict[str, tuple[bytes, str]]:
@@ -162,7 +174,7 @@ def read_page() -> dict[str, tuple[bytes, str]]:
     return found
 
 
-def answer(page_files: dict[str, tuple[bytes, str]], request: Request) -> Response | None:
+def respond(page_files: dict[str, tuple[bytes, str]], request: Request) -> Response | None:
     """The answer to a GET; None for a stream that may be opened."""
     path = request.path.partition("?")[0]
     host, origin = (_only(request.headers.get_all(name)) for name in ("Host", "Origin"))

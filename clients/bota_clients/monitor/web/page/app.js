@@ -1,9 +1,8 @@
-// Puts the page together: what comes over the link goes into traces, readings, arrows and cards.
+// Puts the page together: what comes over the link goes into traces, readings and cards.
 
-import { byId, dark, element, fill, setText } from "./dom.js";
+import { byId, element, fill, setText } from "./dom.js";
 import { Link } from "./link.js";
-import { GROUPS, History, Trace } from "./traces.js";
-import { Wrench } from "./wrench.js";
+import { GROUPS, History, signed, Trace } from "./traces.js";
 
 const SPANS_S = [5, 10, 30, 60];
 const READ_MS = 200;
@@ -11,7 +10,6 @@ const DRAW_MS = 40;
 
 const history = new History();
 const traces = GROUPS.map((group) => new Trace(group));
-const wrench = new Wrench(byId("wrench"));
 let paused = null;
 let span = 10;
 let newest = null;
@@ -31,6 +29,7 @@ const link = new Link({
     history.add(batch, sensor?.nominal_hz ? 1 / sensor.nominal_hz : 0.01);
     newest = batch.newest;
   },
+  anew: () => history.clear(),
   state: showState,
   reply(message) {
     control = message.control;
@@ -46,65 +45,46 @@ const link = new Link({
   },
 });
 
-// What the server is, in words that it gives.
+// What is known, in the words of the terminal.
 
 function showState(state) {
-  const { address, message } = state;
   troubles.server = state.trouble;
-  sensor = state.sensor;
-  setText(byId("link").lastElementChild, `${address} ${state.link}`);
-  if (!sensor && state.sensors.length) choose(state.sensors[0].position);
+  sensor = state.sensors.find((each) => each.sensor === link.sensor) ?? null;
+  setText(byId("link").lastElementChild, `${state.address} ${state.link}`);
+  if (!sensor && state.sensors.length) choose(state.sensors[0].sensor);
   if (sensor) showSensor(sensor);
-  fill(byId("sensors"), [state.sensors, link.sensor], ([sensors, shown]) => sensors.map((each) => {
-    const button = element("button", { type: "button", "aria-pressed": each.position === shown, class: each.ok === false ? "bad" : "" },
-      each.ok === null ? `${each.position}` : `${each.position} ${each.ok ? "ok" : "error"}`);
-    button.title = each.name;
-    button.addEventListener("click", () => choose(each.position));
-    return button;
-  }));
+  fill(byId("sensors"), [state.sensors.map((each) => [each.sensor, each.name, each.verdict]), link.sensor], ([rows, shown]) =>
+    rows.map(([position, name, verdict]) => {
+      const button = element("button", { type: "button", "aria-pressed": position === shown, title: name,
+        class: verdict === "trouble" ? "bad" : "" }, `${position} ${verdict === "trouble" ? "error" : "ok"}`);
+      button.addEventListener("click", () => choose(position));
+      return button;
+    }));
   byId("sensors").hidden = state.sensors.length < 2;
-  const rows = [...state.server, ...state.clients.map((client, i) => [i ? "" : "Clients", client])];
-  fill(byId("server").lastElementChild, rows, pairs);
-  fill(byId("events").lastElementChild, state.events, (events) => events.map((text) => element("li", {}, text)).reverse());
-  byId("events").hidden = !state.events.length;
-  showMessage(message);
+  setText(byId("table"), state.table.join("\n"));
+  showMessage(state.message);
   showControl();
   showTrouble();
 }
 
 function showSensor(found) {
   setText(byId("identity"), found.identity);
-  fill(byId("warnings").lastElementChild, [found.alerts, found.has_sample], warnings);
+  fill(byId("warnings").lastElementChild, [found.alerts, found.force !== null], warnings);
   const present = found.alerts.filter((alert) => alert.present);
   const bad = present.some((alert) => alert.severity === "trouble");
   byId("warnings").classList.toggle("bad", bad);
   byId("warnings").classList.toggle("warn", present.length > 0 && !bad);
-  fill(byId("stream").lastElementChild, found.stream, pairs);
-  fill(byId("lost").lastElementChild, found.losses, (losses) =>
-    losses.map(([text, bad]) => element("li", { class: bad ? "bad" : "" }, text)));
-  fill(byId("settings").querySelector("dl"), found.settings, (settings) => settings.flatMap(([name, value, meaning]) => [
-    element("dt", {}, ...broken(name)), element("dd", {}, element("b", {}, value), element("small", {}, meaning))]));
-  for (const trace of traces) {
-    const { group } = trace;
-    if (!group.imu) {
-      const i = group.id === "force" ? 0 : 1;
-      trace.unit = found.units[i];
-      trace.digits = trace.unit === "counts" ? 0 : group.digits;
-      setText(trace.unitText, trace.unit);
-    }
-    trace.card.classList.toggle("off", Boolean(group.imu && found.imu_off));
-    for (const reading of trace.readings) {
-      const range = found.peaks?.[reading.axis];
-      setText(reading.peaks, range ? range.map((value) => value === null ? "--" : value.toFixed(trace.digits).replace("-", "−")).join(" … ") : "");
+  const peaks = [...found.force_min_max ?? [], ...found.torque_min_max ?? []];
+  traces.forEach((trace, i) => {
+    trace.units(found.units[i]);
+    trace.card.classList.toggle("off", i > 1 && found.force !== null && found.acceleration === null);
+    trace.readings.forEach((reading, axis) => {
+      const range = peaks[3 * i + axis];
+      setText(reading.peaks, range ? range.map((value) => signed(value, trace.digits)).join(" … ") : "");
       reading.row.classList.toggle("saturated", found.saturated.includes(reading.axis));
-    }
-  }
+    });
+  });
 }
-
-/** A name that may be broken after an underscore. */
-const broken = (name) => name.split(/(?<=_)/).flatMap((part) => [part, element("wbr", {})]);
-
-const pairs = (rows) => rows.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]);
 
 function warnings([alerts, hasSample]) {
   if (!alerts.length) return [element("p", { class: "none" }, hasSample ? "none" : "no sample yet")];
@@ -119,9 +99,9 @@ function showTrouble() {
   const old = !text && sensor?.old ? `No new sample for ${sensor.old}: these values are old` : null;
   byId("trouble").hidden = !text && !old;
   setText(byId("trouble"), text ?? old ?? "");
-  document.body.classList.toggle("stale", Boolean(text || old || !sensor?.has_sample));
+  document.body.classList.toggle("stale", Boolean(text || old || !sensor || sensor.force === null));
   if (troubles.link) setText(byId("link").lastElementChild, "connection lost");
-  document.title = `${text || old ? "✗ " : ""}${sensor ? `Sensor ${sensor.position} – ` : ""}ethercat-monitor`;
+  document.title = `${text || old ? "✗ " : ""}${sensor ? `Sensor ${sensor.sensor} – ` : ""}ethercat-monitor`;
   byId("link").className = text ? "bad" : old ? "warn" : "good";
 }
 
@@ -203,7 +183,6 @@ function frame(now) {
   if (edge !== null && now - drawn >= Math.max(DRAW_MS, (span / width) * 1000) - 4) {
     drawn = now;
     for (const trace of traces) trace.draw(paused?.history ?? history, edge);
-    if (!paused) arrows();
   }
   if (!paused && now - read >= READ_MS) {
     read = now;
@@ -211,19 +190,4 @@ function frame(now) {
   }
 }
 
-function arrows() {
-  const units = [traces[0].unit, traces[1].unit];
-  const vectors = newest ? [newest.slice(0, 3), newest.slice(3, 6)].map((vector) => vector.map((v) => v ?? NaN)) : [null, null];
-  const full = wrench.draw(...vectors, units);
-  ["force", "torque"].forEach((name, i) => {
-    const size = vectors[i] ? Math.hypot(...vectors[i]).toFixed(traces[i].digits) : "--";
-    setText(byId(`${name}-length`), `${size} ${units[i]} (full arrow ${full[i]} ${units[i]})`);
-  });
-}
-
-dark.addEventListener("change", () => {
-  drawn = 0;
-  for (const trace of traces) trace.plot.redraw();
-});
-wrench.draw(null, null, ["N", "Nm"]);
 requestAnimationFrame(frame);

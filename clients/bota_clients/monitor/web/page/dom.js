@@ -24,15 +24,6 @@ export function fill(node, value, make) {
   node.replaceChildren(...make(value));
 }
 
-/** The colors of the style sheet as a canvas needs them; renewed when the system turns light or dark. */
-export const colors = {};
-export const dark = matchMedia("(prefers-color-scheme: dark)");
-
-function renew() {
-  const style = getComputedStyle(document.documentElement);
-  for (const name of ["raised", "ink", "muted", "grid", "missed", "x", "y", "z", "torque"])
-    colors[name] = style.getPropertyValue(`--${name}`).trim();
-}
-
-dark.addEventListener("change", renew);
-renew();
+/** The colors of the style sheet as a canvas needs them. */
+const style = getComputedStyle(document.documentElement);
+export const colors = Object.fromEntries(["muted", "grid", "x", "y", "z"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));

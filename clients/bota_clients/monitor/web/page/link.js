@@ -5,7 +5,7 @@ const SILENT_MS = 1500;
 const GIVEN_UP_MS = 5000;
 export const CHANNELS = 13;
 
-/** Calls `on.state`, `on.points` (monitor/web/hub.py says what they are), `on.reply` with messages and `on.trouble` with a text, or null. */
+/** Calls `on.state`, `on.points`, `on.anew` (see monitor/web/pages.py), `on.reply` with messages and `on.trouble` with a text, or null. */
 export class Link {
   constructor(on) {
     this.on = on;
@@ -53,10 +53,10 @@ export class Link {
     this.heard = performance.now();
     const message = JSON.parse(data);
     if ("points" in message) this.on.points(message);
+    else if ("anew" in message) this.on.anew();
     else if ("state" in message) {
-      this.send({ seen: message.state });
       this.on.trouble(null);
-      this.on.state(message);
+      this.on.state(message.state);
     } else this.on.reply(message);
   }
 

@@ -17,19 +17,17 @@ export class History {
 
   clear() {
     this.times = [];
-    this.skipped = []; // where this page was too slow: [from, to]
     this.columns = Array.from({ length: CHANNELS }, () => []);
     this.offset = null;
   }
 
   /** `period`: of the samples, in seconds. */
-  add({ skipped, start, times, columns }, period) {
+  add({ start, times, columns }, period) {
     let last = this.times.at(-1);
     if (start <= last) this.clear(); // another server, or a restarted machine
     times.forEach((after, i) => {
       if (start + after - last > 2.5 * Math.max(STEP_S, period)) {
         this.#push(last + 1e-4);
-        if (skipped && !i) this.skipped.push([last, start]);
       }
       last = start + after;
       this.#push(last, columns, i);
@@ -60,7 +58,6 @@ export class History {
   #trim(before) {
     const count = this.times.findIndex((time) => time >= before);
     this.times.splice(0, count);
-    this.skipped = this.skipped.filter(([, to]) => to >= before);
     for (const column of this.columns) column.splice(0, count);
   }
 }
@@ -92,10 +89,9 @@ export class Trace {
       return { axis, value, peaks, row: element("div", { class: `reading ${"xyz"[i]}` }, element("span", {}, axis), value, peaks) };
     });
     this.unitText = element("small", {}, group.unit);
-    this.at = element("span", { class: "at" });
     this.box = element("div", { class: "plot", role: "img", "aria-label": `${group.title} over time` });
     this.card = element("section", { id: group.id, class: "card trace" },
-      element("div", { class: "head" }, element("h2", {}, `${group.title} `, this.unitText), this.at),
+      element("div", { class: "head" }, element("h2", {}, `${group.title} `, this.unitText)),
       element("div", { class: "readings" }, ...this.readings.map(({ row }) => row)), this.box);
   }
 
@@ -103,11 +99,11 @@ export class Trace {
   start() {
     // Whole pixels: uPlot takes the digits before "px" and multiplies them by the device pixel ratio.
     const em = Math.round(0.78 * parseFloat(getComputedStyle(document.documentElement).fontSize));
-    const axis = { stroke: () => colors.muted, font: `${em}px system-ui, sans-serif`,
-      grid: { stroke: () => colors.grid, width: 1 }, ticks: { show: false } };
+    const axis = { stroke: colors.muted, font: `${em}px system-ui, sans-serif`,
+      grid: { stroke: colors.grid, width: 1 }, ticks: { show: false } };
     this.plot = new uPlot({
       ...this.#size(), padding: [6, 8, 0, 0], legend: { show: false }, pxAlign: 0,
-      cursor: { y: false, drag: { x: false, y: false }, points: { size: 6 }, sync: { key: "traces" } },
+      cursor: { show: false },
       scales: { x: { time: false }, y: { range: (_, low, high) => this.#range(low, high) } },
       axes: [
         { ...axis, size: 2 * em, gap: 4, splits: () => this.#splits(),
@@ -116,17 +112,20 @@ export class Trace {
           values: (_, at) => at.map((value) => String(Number(value.toPrecision(6))).replace("-", "−")) },
       ],
       series: [{}, ...["x", "y", "z"].map((name) => (
-        { stroke: () => colors[name], width: 1, points: { show: false }, spanGaps: false }))],
-      hooks: { setCursor: [(u) => this.#point(u)], drawClear: [(u) => this.#missed(u)] },
+        { stroke: colors[name], width: 1, points: { show: false }, spanGaps: false }))],
     }, [[], [], [], []], this.box);
-    this.plot.skipped = [];
-    this.card.plot = this.plot;
     new ResizeObserver(() => this.plot.setSize(this.#size())).observe(this.box);
+  }
+
+  /** Of force and torque: those of the sensor. */
+  units(unit) {
+    this.unit = unit ?? this.group.unit;
+    this.digits = this.unit === "counts" ? 0 : this.group.digits;
+    this.unitText.textContent = this.unit;
   }
 
   draw(history, edge) {
     const { first } = this.group;
-    this.plot.skipped = history.skipped;
     this.plot.batch(() => {
       this.plot.setData([history.times, ...history.columns.slice(first, first + 3)], false);
       this.plot.setScale("x", { min: edge - this.span, max: edge });
@@ -163,36 +162,5 @@ export class Trace {
 
   get least() {
     return this.unit === "counts" ? 1000 : this.group.least;
-  }
-
-  /** What this page missed is shaded: nothing was lost there. */
-  #missed({ ctx, axes, bbox, skipped, valToPos }) {
-    ctx.save();
-    ctx.font = axes[0].font[0];
-    ctx.textAlign = "center";
-    ctx.textBaseline = "top";
-    for (const [from, to] of skipped ?? []) {
-      const [left, right] = [from, to].map((time) => Math.min(Math.max(valToPos(time, "x", true), bbox.left), bbox.left + bbox.width));
-      ctx.fillStyle = colors.missed;
-      ctx.fillRect(left, bbox.top, right - left, bbox.height);
-      ctx.fillStyle = colors.muted;
-      if (ctx.measureText("page was slow").width < right - left) ctx.fillText("page was slow", (left + right) / 2, bbox.top);
-    }
-    ctx.restore();
-  }
-
-  #point(u) {
-    const at = u.cursor.idx;
-    const time = u.posToVal(u.cursor.left, "x");
-    if (u.cursor.left >= 0 && u.skipped.some(([from, to]) => from < time && time < to)) {
-      this.at.textContent = "this page was too slow to show what came here";
-      return;
-    }
-    if (at === null || at === undefined || u.data[1][at] === null || !(u.cursor.left >= 0)) {
-      this.at.textContent = "";
-      return;
-    }
-    const values = this.group.axes.map((axis, i) => `${axis} ${signed(u.data[i + 1][at], this.digits)}`);
-    this.at.textContent = `${signed(u.data[0][at] - u.scales.x.max, 2)} s: ${values.join("  ")}`;
   }
 }

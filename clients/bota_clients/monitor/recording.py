@@ -13,7 +13,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.errors import ProtocolError
 
 
-class Recorder:
+class MonitorRecording:
     """At most one recording at a time."""
 
     def __init__(self, address: Address) -> None:
@@ -29,7 +29,6 @@ class Recorder:
         return self._thread is not None
 
     def start(self, now_s: float) -> str:
-        """Start a recording; a message."""
         path = Path(time.strftime("recording-%Y%m%d-%H%M%S.mcap"))
         self._asked.clear()
         self._thread = threading.Thread(target=self._run, args=(path,), name="recording")
@@ -63,13 +62,10 @@ class Recorder:
             self._said = f"The recording failed: {error}", True
 
     def _record(self, path: Path) -> str:
-        with contextlib.closing(files.Source(self._address, None)) as source:
+        with contextlib.closing(files.RecordingClient(self._address, None)) as source:
             source.connect()
-            with files.Recorder(path, files.NAME, files.notes(source), overwrite=False) as recorder:
-                while not (self._asked.wait(files.BATCH_S) or recorder.failed):
-                    recorder.put(source.batch())
-                source.close()
-                recorder.stop("asked to stop")
+            recorder = files.Recorder(path, files.NAME, files.notes(source), overwrite=False)
+            files.record(source, recorder, lambda _: "asked to stop" if self._asked.is_set() else None)
         if recorder.error is not None:
             raise recorder.error
-        return recorder.so_far
+        return recorder.summary
