@@ -6,7 +6,7 @@ import math
 from typing import Final, NamedTuple
 
 SILENT_PERIODS: Final = 3  # periods without a new sample after which a sensor is silent, not just late
-ONE_ONLY: Final = 0.8  # time without a PDI read, in periods, in which only one sample can have come
+ONE_ONLY: Final = 0.9  # time without a PDI read, in periods, in which only one sample can have come
 
 
 class Expected(NamedTuple):

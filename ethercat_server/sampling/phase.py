@@ -15,12 +15,13 @@ from ethercat_server.sampling.constants import (
     CONTRADICTS,
     DRIFT,
     IN_A_ROW,
-    JITTER,
+    JITTER_NS,
     KNOWN_ERROR,
     LARGEST_ERROR,
     PERIOD_ERROR,
     QUICK_GAIN,
     RESOLUTION_NS,
+    UNLIKELY_RUN,
     WRONG_BIT,
 )
 
@@ -85,19 +86,20 @@ class Phase:
 class SensorPhase(Phase):
     """That of a sensor's sampling clock. `phase_ns` is when the next sample comes to be."""
 
-    __slots__ = ("_contradictions", "_deviation", "_most_noise", "_nominal_ns", "log_noise")
+    __slots__ = ("_contradictions", "_deviation", "_most_noise", "_nominal_ns", "_run", "log_noise")
 
     def __init__(self, period_ns: float) -> None:
         """`period_ns` is the nominal period."""
         super().__init__(
             0.0, period_ns, (_UNKNOWN * period_ns) ** 2, (PERIOD_ERROR * period_ns) ** 2,
-            JITTER * period_ns, DRIFT * period_ns**3,
+            JITTER_NS**2, (DRIFT * period_ns) ** 2,
         )  # fmt: skip
         self._nominal_ns = period_ns
-        self._most_noise = math.log((_UNKNOWN * period_ns) ** 2 / (JITTER * period_ns))
+        self._most_noise = math.log((_UNKNOWN * period_ns) ** 2 / (JITTER_NS**2))
         self._deviation = PERIOD_ERROR
         # Logarithm of the factor by which its process noise exceeds a crystal's, as that of a program does.
         self.log_noise = 0.0
+        self._run = 0.0  # negative log-likelihood of the reads since the last that was early
         self._contradictions = 0
 
     @property
@@ -155,8 +157,12 @@ class SensorPhase(Phase):
         self._move(-slope)
         surprise = -math.log(chance)
         if sign > 0 and late > 0:
-            pass  # a late read bounds the phase on one side only: it pulls, but reduces no variance
+            # A late read bounds the phase on one side only: it pulls, but reduces no variance.
+            self._run += surprise
+            if self._run > UNLIKELY_RUN:
+                self.log_noise += QUICK_GAIN * self._run
         else:
+            self._run = 0.0
             self._narrow(slope * slope + slope * late / deviation_ns)
         self._adapt_noise((1 - chance) * (surprise + math.log(1 - chance)))
 
@@ -174,15 +180,15 @@ class SensorPhase(Phase):
 
     def expect_noise(self, variance: float) -> None:
         """The instants have about this variance about those of a crystal."""
-        self._adapt_noise(math.log(max(variance / (JITTER * self._nominal_ns), 1.0)) / QUICK_GAIN)
+        self._adapt_noise(math.log(max(variance / JITTER_NS**2, 1.0)) / QUICK_GAIN)
 
     def _adapt_noise(self, excess: float) -> None:
         """A measurement was more surprising than the model expects, by `excess`."""
         log_noise = self.log_noise + QUICK_GAIN * excess
         if log_noise > 0 or self.log_noise > 0:
             self.log_noise = min(max(log_noise, 0.0), self._most_noise)
-            self._phase_noise = math.exp(self.log_noise) * JITTER * self._nominal_ns
-            self._period_noise = math.exp(self.log_noise) * DRIFT * self._nominal_ns**3
+            self._phase_noise = math.exp(self.log_noise) * JITTER_NS**2
+            self._period_noise = math.exp(self.log_noise) * (DRIFT * self._nominal_ns) ** 2
 
     def _move(self, weight: float) -> None:
         period_ns = self.period_ns

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 from ethercat_server.sampling.constants import (
-    CONTRADICTS,
     EARLY_POLLS,
+    LOSS_PERIODS,
     POLLS_UNLOCKED,
     QUICK_GAIN,
     RESOLUTION_NS,
@@ -35,7 +35,8 @@ class Schedule:
         # Whether the next poll is to be early: polls can tell the phase better, or did not for long.
         self._probing = False
         self._hits = 0  # samples since a poll was early
-        self._scale = CONTRADICTS  # κ, the margin in standard deviations
+        # κ, the fraction of the margin that is needed: reads are distributed less evenly than it assumes.
+        self._scale = 1.0
         self.margin_ns = 0.0
         self.aim_after_ns = 0.0
 
@@ -51,17 +52,19 @@ class Schedule:
     def early(self, *, counts: bool) -> None:
         """A poll was early; `counts`: by the margin, which is to grow therefore."""
         if counts and self._hits:
-            self._scale = min(self._scale + QUICK_GAIN * self._scale, CONTRADICTS)
+            self._scale = min(self._scale + QUICK_GAIN * self._scale, 1.0)
         self._hits = 0
 
     def derive(self, *, by_events: bool) -> None:
         """Derive from phase and round trips what the next poll needs."""
         phase, round_trip, variance = self._phase, self._round_trip, self._phase.variance
         self.single = round_trip.usual_ns > phase.period_ns / 2
-        deviation_ns = math.sqrt(variance + round_trip.variance)
+        cost_ns = LOSS_PERIODS * phase.period_ns if self.single else round_trip.usual_ns
+        margin_ns = best_margin_ns(cost_ns, math.sqrt(variance + round_trip.variance))
         follows_events = by_events and not self.single
-        scale = CONTRADICTS if self.single else self._scale
-        self.margin_ns = min(scale * deviation_ns, phase.period_ns / 2)
+        self.margin_ns = min(
+            margin_ns * (1.0 if self.single or by_events else self._scale), phase.period_ns / 2
+        )
         probed_above = (round_trip.read_variance + RESOLUTION_NS**2) / 4
         self._probing = self._hits > UNPROBED or (variance > probed_above and not follows_events)
         self.aim_after_ns = self.margin_ns - round_trip.read_ns
@@ -96,3 +99,13 @@ class Schedule:
         # It was early: poll again at once, or in steps if the sample is overdue.
         return sent_ns + period_ns / POLLS_UNLOCKED if overdue else sent_ns
 
+
+def best_margin_ns(cost_ns: float, deviation_ns: float) -> float:
+    """How long after the expected instant to read, so that samples are youngest on the whole.
+
+    `cost_ns` of an early poll, as age; `deviation_ns` (standard) of the instant of the read from the
+    sample's. The margin is where a little more of it costs as much as it saves: where the density of the
+    read's instant is 1 / cost.
+    """
+    ratio = cost_ns / (deviation_ns * math.sqrt(2 * math.pi))
+    return deviation_ns * math.sqrt(2 * math.log(ratio)) if ratio > 1 else 0.0
