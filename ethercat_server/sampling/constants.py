@@ -10,7 +10,8 @@ CONTRADICTS: Final = 3.0
 CERTAIN: Final = 5.0
 IN_A_ROW: Final = 4  # contradictions in a row after which what they contradict has started anew
 GAIN: Final = 1 / 64  # of running averages of single exchanges and samples
-QUICK_GAIN: Final = 1 / 16  # of those that control something, and of averages of blocks of exchanges
+QUICK_GAIN: Final = 1 / 16  # of those that control something
+BLOCK_GAIN: Final = 1 / 8  # of those of blocks of exchanges
 
 # -- physics of crystals and of the machine
 JITTER_NS: Final = 30.0  # standard deviation of a sample period
@@ -32,6 +33,7 @@ LEARN_EVERY_NS: Final = 10e6  # interval at which a steady clock learns from a s
 
 # -- when to poll
 EARLY_POLLS: Final = 0.11  # fraction of the samples whose first poll is to be early, as it tells the phase
+WASTED: Final = 1.5  # factor by which an early poll costs more where events date samples: nothing is learned
 LOSS_PERIODS: Final = 10.0  # cost of a lost sample, as age in periods
 POLLS_UNLOCKED: Final = 4  # exchanges per sample while the clock is not followed
 UNPROBED: Final = 500  # samples without an early poll after which the phase is probed

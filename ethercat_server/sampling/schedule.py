@@ -15,6 +15,7 @@ from ethercat_server.sampling.constants import (
     QUICK_GAIN,
     RESOLUTION_NS,
     UNPROBED,
+    WASTED,
 )
 from ethercat_server.sampling.phase import SensorPhase
 from ethercat_server.sampling.round_trip import RoundTrip
@@ -59,7 +60,11 @@ class Schedule:
         """Derive from phase and round trips what the next poll needs."""
         phase, round_trip, variance = self._phase, self._round_trip, self._phase.variance
         self.single = round_trip.usual_ns > phase.period_ns / 2
-        cost_ns = LOSS_PERIODS * phase.period_ns if self.single else round_trip.usual_ns
+        cost_ns = (
+            LOSS_PERIODS * phase.period_ns
+            if self.single
+            else round_trip.usual_ns * (WASTED if by_events else 1.0)
+        )
         margin_ns = best_margin_ns(cost_ns, math.sqrt(variance + round_trip.variance))
         follows_events = by_events and not self.single
         self.margin_ns = min(
@@ -97,7 +102,7 @@ class Schedule:
         if sent_ns < aim_ns:
             return aim_ns
         # It was early: poll again at once, or in steps if the sample is overdue.
-        return sent_ns + period_ns / POLLS_UNLOCKED if overdue else sent_ns
+        return sent_ns + period_ns / (2 * POLLS_UNLOCKED) if overdue else sent_ns
 
 
 def best_margin_ns(cost_ns: float, deviation_ns: float) -> float:

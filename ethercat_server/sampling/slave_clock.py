@@ -12,11 +12,11 @@ from typing import Final
 
 from ethercat_server.sampling.constants import (
     ASYMMETRY,
+    BLOCK_GAIN,
     CERTAIN,
     CRYSTAL_ERROR,
     EVENT_ERROR_NS,
     IN_A_ROW,
-    QUICK_GAIN,
     RESOLUTION_NS,
 )
 from ethercat_server.sampling.observation import DistributedClock, Latched
@@ -84,7 +84,7 @@ class LocalClock:
             self._block = self._left = min(_BLOCK, self._block + IN_A_ROW)
             best_took_ns, self._best_took_ns = self._best_took_ns, math.inf
             excess_ns = best_took_ns - self._round_trip.least_ns
-            self.excess_ns += QUICK_GAIN * (excess_ns - self.excess_ns)
+            self.excess_ns += BLOCK_GAIN * (excess_ns - self.excess_ns)
             self._correct(best_took_ns, excess_ns)
         self.short_ns = self._best_took_ns + self._round_trip.taking_over_ns
 
@@ -109,7 +109,7 @@ class LocalClock:
                 self._restart()
             return
         self._contradictions, self._took_ns = 0, took_ns
-        self._bias += QUICK_GAIN * (_beyond(error_ns, excess_ns / 2) / deviation_ns - self._bias)
+        self._bias += BLOCK_GAIN * (_beyond(error_ns, excess_ns / 2) / deviation_ns - self._bias)
         self._move(beyond_ns)
         before_ns = phase.phase_ns
         phase.correct(error_ns - beyond_ns, variance)
