@@ -10,15 +10,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from ethercat_server.sampling.constants import (
-    ASYMMETRY,
-    BLOCK_GAIN,
-    CERTAIN,
-    CRYSTAL_ERROR,
-    EVENT_ERROR_NS,
-    IN_A_ROW,
-    RESOLUTION_NS,
-)
+from ethercat_server.sampling.constants import CERTAIN, RESOLUTION_NS
 from ethercat_server.sampling.observation import DistributedClock, Latched
 from ethercat_server.sampling.phase import Phase
 from ethercat_server.sampling.round_trip import RoundTrip
@@ -26,10 +18,27 @@ from ethercat_server.sampling.trust import Trust
 
 _WRAP: Final = 1 << 32  # local times are given modulo this, in ns: 4.3 s
 _HALF: Final = 1 << 31
-# Variances that the phase and the rate of a crystal gain in each ns: (10 ns)² in a ms; 1 ppm in a minute.
-_JITTER: Final = 1e-4
-_DRIFT: Final = 1.7e-23
+# -- the local clock
 _BLOCK: Final = 32  # exchanges of a block; the first ones are shorter
+_FIRST_BLOCK: Final = 4
+_LEAST_VARIANCE: Final = 4_000.0**2  # of the middle of the shortest round trip
+_FIRST_RATE: Final = 200e-6  # standard deviation of the rate's error at first; crystals: 100e-6 at most
+_JITTER: Final = 1e-4  # variance that the phase gains, ns² in each ns: 10 ns in a ms
+_DRIFT: Final = 1.7e-23  # variance that the rate gains in each ns: 1 ppm in a minute
+_EXCESS_GAIN: Final = 1 / 8
+_JUMPED: Final = 3  # consecutive contradictions after which the clock has jumped
+_BIAS_GAIN: Final = 0.15
+_BIASED: Final = 1.0  # mean error, in standard deviations, beyond which the rate has changed
+_RATE_STEP: Final = 50e-6  # by about this
+# The clock is known after `_KNOWN_BLOCKS` blocks, once its standard deviation is below `_KNOWN_NS` or the
+# part `_KNOWN` of the shortest round trip, and until it certainly exceeds that.
+_KNOWN_BLOCKS: Final = 12
+_KNOWN_NS: Final = 10_000.0
+_KNOWN: Final = 1 / 32
+# -- events
+_SLACK_NS: Final = 5_000  # tolerance between the latched times of an event and of a frame's arrival
+_OLDEST: Final = 1.5  # age of the newest event, in periods, beyond which samples have come without events
+_ASYMMETRY: Final = 1 / 24  # standard deviation of the outward part of a round trip, as part of the shortest
 
 
 class LocalClock:
@@ -57,11 +66,11 @@ class LocalClock:
         self.restarts += 1
         self.is_known = False
         self._blocks = self._contradictions = 0
-        self._block = self._left = IN_A_ROW
+        self._block = self._left = _FIRST_BLOCK
         self._best_took_ns = math.inf
         self._best_ns, self._best_local = 0.0, 0
         self._took_ns = 0.0  # by the exchange of the last correction
-        self.phase = Phase(0.0, 1.0, 0.0, CRYSTAL_ERROR**2, _JITTER, _DRIFT)
+        self.phase = Phase(0.0, 1.0, 0.0, _FIRST_RATE**2, _JITTER, _DRIFT)
         self.local_at = 0  # local time at the phase
         self._bias = self.doubt_ns = 0.0
 
@@ -81,10 +90,10 @@ class LocalClock:
             self._best_local, self._best_ns = self.local, sent_ns + took_ns / 2
         self._left -= count
         if self._left <= 0:
-            self._block = self._left = min(_BLOCK, self._block + IN_A_ROW)
+            self._block = self._left = min(_BLOCK, self._block + _FIRST_BLOCK)
             best_took_ns, self._best_took_ns = self._best_took_ns, math.inf
             excess_ns = best_took_ns - self._round_trip.least_ns
-            self.excess_ns += BLOCK_GAIN * (excess_ns - self.excess_ns)
+            self.excess_ns += _EXCESS_GAIN * (excess_ns - self.excess_ns)
             self._correct(best_took_ns, excess_ns)
         self.short_ns = self._best_took_ns + self._round_trip.taking_over_ns
 
@@ -92,7 +101,7 @@ class LocalClock:
         """Correct it by the best exchange of a block, which took so long, and longer than the shortest."""
         phase = self.phase
         # The position of the slave within the excess is unknown, and the bias may be the same every time.
-        variance = excess_ns * excess_ns / 4 + RESOLUTION_NS**2
+        variance = excess_ns * excess_ns / 4 + _LEAST_VARIANCE
         if not self._blocks:
             self._blocks = 1
             phase.phase_ns, phase.variance, self.local_at = self._best_ns, variance, self._best_local
@@ -105,27 +114,25 @@ class LocalClock:
         beyond_ns = _beyond(error_ns, took_ns / 2)
         if abs(beyond_ns) > max(CERTAIN * deviation_ns, self._took_ns / 2):
             self._contradictions += 1
-            if self._contradictions == IN_A_ROW:
+            if self._contradictions == _JUMPED:
                 self._restart()
             return
         self._contradictions, self._took_ns = 0, took_ns
-        self._bias += BLOCK_GAIN * (_beyond(error_ns, excess_ns / 2) / deviation_ns - self._bias)
+        self._bias += _BIAS_GAIN * (_beyond(error_ns, excess_ns / 2) / deviation_ns - self._bias)
         self._move(beyond_ns)
         before_ns = phase.phase_ns
         phase.correct(error_ns - beyond_ns, variance)
         self.moved_ns += phase.phase_ns - before_ns
-        if abs(self._bias) > 1.0:
+        if abs(self._bias) > _BIASED:
             self._bias = 0.0
-            phase.period_variance += CRYSTAL_ERROR**2
+            phase.period_variance += _RATE_STEP**2
         self._blocks += 1
-        if abs(phase.period_ns - 1) > CERTAIN * CRYSTAL_ERROR:
+        if abs(phase.period_ns - 1) > CERTAIN * _FIRST_RATE:
             self._restart()
         else:
             self.doubt_ns = CERTAIN * math.sqrt(phase.variance)
-            enough_ns = max(EVENT_ERROR_NS, ASYMMETRY * self._round_trip.least_ns) * (
-                CERTAIN if self.is_known else 1
-            )
-            self.is_known = self._blocks >= _BLOCK // IN_A_ROW and phase.variance < enough_ns * enough_ns
+            enough_ns = max(_KNOWN_NS, _KNOWN * self._round_trip.least_ns) * (CERTAIN if self.is_known else 1)
+            self.is_known = self._blocks >= _KNOWN_BLOCKS and phase.variance < enough_ns * enough_ns
 
     def _move(self, by_ns: float) -> None:
         self.phase.phase_ns += by_ns
@@ -222,10 +229,10 @@ class EventTimes:
             return
         self._event = event = local - ((local - change + _HALF) % _WRAP - _HALF)
         # Between these the process data passed: in the frame before, and in this one.
-        oldest, newest = before + self._data_offset_ns - EVENT_ERROR_NS, local + self._data_offset_ns
+        oldest, newest = before + self._data_offset_ns - _SLACK_NS, local + self._data_offset_ns
         self._is_next = newest < event < local + self._reading_ns and event - period_ns > oldest
         self._is_certain = self._is_next or event <= newest
-        if clock.is_known and (self._is_next or oldest < event <= newest + EVENT_ERROR_NS):
+        if clock.is_known and (self._is_next or oldest < event <= newest + _SLACK_NS):
             phase = clock.phase
             at_ns = phase.phase_ns + (local - clock.local_at) * phase.period_ns
             # Else the clock has jumped.
@@ -251,7 +258,7 @@ class EventTimes:
             off_ns = abs(late - round(late) if late > -0.5 else late) * period_ns
             doubt_ns = CERTAIN * math.sqrt(variance + self.variance)
             self.is_doubtful = off_ns > doubt_ns or doubt_ns > period_ns / 2
-            is_old = sent_ns - self.instant_ns > 1.5 * period_ns
+            is_old = sent_ns - self.instant_ns > _OLDEST * period_ns
             # If the process data had passed when this sample's own event came, that is late: it lies.
             is_late = self._is_next and late < -0.5
             # A jump of the local clock by more than half a round trip is noticed by `observe`: a larger
@@ -280,7 +287,7 @@ class EventTimes:
             is_new=is_new, counts=self._counts and not self._is_next,
         )  # fmt: skip
         # Polling does not tell where on its way a round trip takes its time.
-        asymmetry_ns = ASYMMETRY * self._round_trip.least_ns
+        asymmetry_ns = _ASYMMETRY * self._round_trip.least_ns
         variance += self.variance + asymmetry_ns * asymmetry_ns
         found = self.trust.judge(variance, back_ns, self.local_clock.restarts)
         self.are_trusted = self.trust.is_trusted
