@@ -17,8 +17,9 @@ from bota_ethercat.pdo import is_finite, layout_for
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import FIRST_INDEX
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
+from ethercat_server.sampling.constants import PERIOD_ERROR
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.sample_clock import PLAUSIBLE_ERROR, SampleClock
+from ethercat_server.sampling.sample_clock import SampleClock
 from ethercat_server.sampling.trust import TrustState
 
 SLOW_US: Final = 300.0  # a usual round trip above this is a slow network card's, or a slow driver's
@@ -192,7 +193,7 @@ class SampleHealth:
     def _check_rate(self, clock: SampleClock) -> None:
         """Log once that the sensor samples at another rate than it is set to."""
         error = clock.phase.period_error
-        deviates = clock.locked and abs(error) > PLAUSIBLE_ERROR
+        deviates = clock.locked and abs(error) > 2 * PERIOD_ERROR
         self._deviating_s = self._deviating_s + 1 if deviates else 0
         if self._deviating_s == _DEVIATING_SECONDS and not self._rate_reported:
             self._rate_reported = True

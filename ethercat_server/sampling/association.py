@@ -6,12 +6,7 @@ import math
 from typing import Final, NamedTuple
 
 SILENT_PERIODS: Final = 3  # periods without a new sample after which a sensor is silent, not just late
-_EARLY: Final = -0.25  # lateness in periods below which a sample is the one expected before
-# Time without a PDI read, in periods: below the first only one sample can have come, above the second more
-# may.
-_ONE_ONLY, _MISSABLE = 0.8, 1.25
-# Excess of an exchange, in periods, beyond which it says nothing of when the process data was read.
-_LONGEST_READ: Final = 0.5
+ONE_ONLY: Final = 0.9  # time without a PDI read, in periods, in which only one sample can have come
 
 
 class Expected(NamedTuple):
@@ -51,13 +46,13 @@ def by_polls(expected: Expected, read: Read, *, has_events: bool, lost_track: bo
     read_ns = read.sent_ns + read_delay_ns(excess_ns, period_ns)
     most = math.floor((read.sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
     unread_ns = read.back_ns - read.before_ns
-    if unread_ns - read.least_ns < _ONE_ONLY * period_ns:
+    if unread_ns - read.least_ns < ONE_ONLY * period_ns:
         # It came between two reads: it is the one expected nearest to them.
         late = ((read.before_ns + read_ns) / 2 - phase_ns) / period_ns
         return Association(1 + (min(round(late), most) if has_events else round(late)), late, False)
     late = (read_ns - phase_ns) / period_ns
     least = math.floor((read.sent_ns - phase_ns - doubt_ns) / period_ns)
-    lost_track = lost_track and unread_ns > _MISSABLE * period_ns
+    lost_track = lost_track and unread_ns > period_ns
     return Association(1 + math.floor(late), late, is_doubtful or lost_track or (most > 0 and least < most))
 
 
@@ -79,7 +74,7 @@ def count(found: Association, *, is_doubtful: bool, absent: int, unchanged_perio
         number = 0 if is_doubtful and found.late < -0.5 else 1
     if absent >= SILENT_PERIODS and unchanged_periods > SILENT_PERIODS - 1:
         return number, 1  # a silent sensor loses nothing
-    return number, number + absent if found.late > _EARLY else number
+    return number, number + absent if found.late > -0.5 else number
 
 
 def read_delay_ns(excess_ns: float, period_ns: float) -> float:
@@ -88,4 +83,4 @@ def read_delay_ns(excess_ns: float, period_ns: float) -> float:
     A long exchange is taken for a stall after the frame had left: what it brought is dated from before, never
     as younger than it may be.
     """
-    return excess_ns / 2 if excess_ns < _LONGEST_READ * period_ns else 0.0
+    return excess_ns / 2 if excess_ns < period_ns / 2 else 0.0

@@ -9,19 +9,16 @@ process data or after.
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any
 
-_GAIN: Final = 1 / 64
-_TURNS: Final = 7  # exchanges after which what follows from the averages is derived anew
-_WINDOW_NS: Final = 2_000_000_000  # the shortest round trip is that of the last one or two of these
-_FIRST_GUESS_NS: Final = 100_000.0
-_FIRST_EXCESS_NS: Final = 20_000.0
-_FIRST_LATE_NS: Final = 15_000.0
-_LEAST_VARIANCE: Final = 1_000.0**2
-_MOVED_NS: Final = 20_000.0  # change of the shortest round trip from which it is another; below, it is jitter
-_OUTLIER: Final = 4.0  # standard deviations at which outliers are clipped: a stall is no jitter
-_ROOM_NS: Final = 10_000.0
-_PATIENCE_NS: Final = 100_000.0
+from ethercat_server.sampling.constants import (
+    CONTRADICTS,
+    GAIN,
+    MACHINE_JITTER_NS,
+    PATIENCE_NS,
+    RESOLUTION_NS,
+    WINDOW_NS,
+)
 
 
 class RoundTrip:
@@ -47,24 +44,24 @@ class RoundTrip:
         self.least_ns = math.inf
         self.moved_ns = 0.0
         self.late_ns = 0.0
-        self.excess_ns = _FIRST_EXCESS_NS
-        self._excess_square = 2 * _FIRST_EXCESS_NS**2
-        self._late_variance = _FIRST_LATE_NS**2
+        self.excess_ns = MACHINE_JITTER_NS
+        self._excess_square = 2 * MACHINE_JITTER_NS**2
+        self._late_variance = MACHINE_JITTER_NS**2
         self.taking_over_ns = 0.0
         self._least_now_ns = math.inf
-        self._roll_at_ns = self._turn = 0
+        self._roll_at_ns = 0
         self._derive()
 
     def _derive(self) -> None:
         self.read_ns = self.excess_ns / 2
         # Uniform within the excess: E[(x·e)²] = E[e²]/3.
-        self.read_variance = max(self._excess_square / 3 - self.read_ns * self.read_ns, _LEAST_VARIANCE)
+        self.read_variance = max(self._excess_square / 3 - self.read_ns * self.read_ns, RESOLUTION_NS**2)
         self.variance = self.read_variance + self._late_variance
-        least_ns = self.least_ns if self.least_ns < math.inf else _FIRST_GUESS_NS
+        least_ns = self.least_ns if self.least_ns < math.inf else PATIENCE_NS
         self.usual_ns = least_ns + self.excess_ns + self._wire_ns
-        self._most_excess_ns = _OUTLIER * math.sqrt(self._excess_square) + _ROOM_NS
-        self._most_late_ns = _OUTLIER * math.sqrt(self._late_variance) + _ROOM_NS
-        self.patience_ns = self.usual_ns + 3 * self.excess_ns + _PATIENCE_NS
+        self._most_excess_ns = CONTRADICTS * math.sqrt(self._excess_square) + MACHINE_JITTER_NS
+        self._most_late_ns = CONTRADICTS * math.sqrt(self._late_variance) + MACHINE_JITTER_NS
+        self.patience_ns = self.usual_ns + CONTRADICTS * self.excess_ns + PATIENCE_NS
 
     def learn(self, sent_ns: int, arrived_ns: int, back_ns: int, late_ns: float | None = None) -> None:
         """Learn from an exchange whose answer began to arrive, and was there, then.
@@ -76,21 +73,18 @@ class RoundTrip:
             self._learn_wake_up(late_ns)
         self.shorten(sent_ns, arrived_ns)
         excess_ns = min(arrived_ns - sent_ns - self.least_ns, self._most_excess_ns)
-        self.excess_ns += _GAIN * (excess_ns - self.excess_ns)
-        self._excess_square += _GAIN * (excess_ns * excess_ns - self._excess_square)
-        took_over_ns = min(back_ns - arrived_ns, self.taking_over_ns + _ROOM_NS)
-        self.taking_over_ns += _GAIN * (took_over_ns - self.taking_over_ns)
-        self._turn -= 1
-        if self._turn < 0:
-            self._turn = _TURNS
-            self._derive()
+        self.excess_ns += GAIN * (excess_ns - self.excess_ns)
+        self._excess_square += GAIN * (excess_ns * excess_ns - self._excess_square)
+        took_over_ns = min(back_ns - arrived_ns, self.taking_over_ns + MACHINE_JITTER_NS)
+        self.taking_over_ns += GAIN * (took_over_ns - self.taking_over_ns)
+        self._derive()
 
     def shorten(self, sent_ns: int, arrived_ns: int) -> None:
         """Learn from an exchange, which may be a short one, what the shortest is."""
         took_ns = arrived_ns - sent_ns
         before_ns = self.least_ns
         if arrived_ns >= self._roll_at_ns:
-            self._roll_at_ns = arrived_ns + _WINDOW_NS
+            self._roll_at_ns = arrived_ns + WINDOW_NS
             if self._least_now_ns < math.inf:
                 self.least_ns = self._least_now_ns
             self._least_now_ns = math.inf
@@ -98,7 +92,7 @@ class RoundTrip:
             self._least_now_ns = took_ns
             self.least_ns = min(self.least_ns, took_ns)
         more_ns = before_ns - self.least_ns
-        if not -_MOVED_NS < more_ns < _MOVED_NS and before_ns < math.inf:
+        if not -MACHINE_JITTER_NS < more_ns < MACHINE_JITTER_NS and before_ns < math.inf:
             # Round trips take what they took before: the excess is another, and where phases count from.
             more_ns = max(more_ns, -self.excess_ns)
             self._excess_square = max(self._excess_square + more_ns * (2 * self.excess_ns + more_ns), 0.0)
@@ -109,8 +103,8 @@ class RoundTrip:
         error, most = late_ns - self.late_ns, self._most_late_ns
         if not -most < error < most:
             error = math.copysign(most, error)
-        self.late_ns += _GAIN * error
-        self._late_variance += _GAIN * (error * error - self._late_variance)
+        self.late_ns += GAIN * error
+        self._late_variance += GAIN * (error * error - self._late_variance)
 
     def read(self, sent_ns: int, arrived_ns: int) -> tuple[float, float]:
         """When the slaves read their data in an exchange, less the outward part of the shortest one.

@@ -8,7 +8,6 @@ machine stood still, leaves the estimate as it is: it holds over, and its uncert
 from __future__ import annotations
 
 import math
-from typing import Final
 
 from ethercat_server.sampling.association import (
     Association,
@@ -18,20 +17,18 @@ from ethercat_server.sampling.association import (
     by_polls,
     count,
 )
+from ethercat_server.sampling.constants import (
+    CERTAIN,
+    CONTRADICTS,
+    GAIN,
+    LEARN_EVERY_NS,
+    LOCKED,
+)
 from ethercat_server.sampling.observation import Latched
-from ethercat_server.sampling.phase import CERTAIN, CONTRADICTS, SensorPhase
+from ethercat_server.sampling.phase import SensorPhase
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.schedule import Schedule
 from ethercat_server.sampling.slave_clock import EventTimes
-
-# Standard deviation of the phase, in periods, below which the clock is followed.
-_LOCKED: Final = 0.125
-_OVERDUE: Final = 2.0  # standard deviations after which a sample is overdue
-PLAUSIBLE_ERROR: Final = 0.002  # a real sensor's period differs from the nominal one by less than this part
-# Interval at which a steady clock learns from a sample: by its event, and by polls.
-_LEARN_BY_EVENT_EVERY_NS: Final = 10e6
-_LEARN_BY_POLL_EVERY_NS: Final = 6.25e6
-_BIAS_GAIN: Final = 1 / 64
 
 
 class SampleClock:
@@ -215,7 +212,7 @@ class SampleClock:
             late = events.date(expected_ns, period_ns, phase.variance, sent_ns, back_ns)
             if late is not None:
                 if schedule.single:
-                    self._bias_ns += _BIAS_GAIN * (late - round(late)) * period_ns
+                    self._bias_ns += GAIN * (late - round(late)) * period_ns
                 else:
                     self._by_event = events.instant_ns - outward_ns
                 self._count(by_event(late, uncertain=events.is_doubtful), self._read_at_ns - self._seen_by_ns)
@@ -284,8 +281,7 @@ class SampleClock:
         else:
             self._learn_absence(sent_ns, read_ns, variance)
         self._derive()
-        every_ns = _LEARN_BY_EVENT_EVERY_NS if self.by_events else _LEARN_BY_POLL_EVERY_NS
-        self._skips = round(every_ns / phase.period_ns) - 1 if self._steady and self._fresh else 0
+        self._skips = round(LEARN_EVERY_NS / phase.period_ns) - 1 if self._steady and self._fresh else 0
 
     def _learn_sample(self, before_ns: int, read_ns: float, variance: float) -> None:
         """A sample was there at the read, with this variance, and not in the exchange sent before."""
@@ -315,7 +311,7 @@ class SampleClock:
         if (absent := int((sent_ns - phase.phase_ns - doubt_ns) // phase.period_ns)) > 0:
             phase.advance(absent)
             self._absent += absent
-        self._overdue = read_ns > phase.phase_ns + _OVERDUE * math.sqrt(phase.variance + variance)
+        self._overdue = read_ns > phase.phase_ns + 2.0 * math.sqrt(phase.variance + variance)
         # In doubt it may have been seen already; late it may have been skipped: the next one shows.
         if self.locked and not (self._doubtful or self._is_late(read_ns, variance)):
             if not follows_events:
@@ -333,8 +329,9 @@ class SampleClock:
         round_trip, phase, events, schedule = self._round_trip, self.phase, self.events, self._schedule
         variance, period_ns = phase.variance, phase.period_ns
         deviation_ns = math.sqrt(variance)
-        self.locked = self._begun and deviation_ns < _LOCKED * period_ns
-        if schedule.derive(by_events=self.by_events) and not schedule.single:
+        self.locked = self._begun and deviation_ns < LOCKED * period_ns
+        schedule.derive(by_events=self.by_events)
+        if self._bias_ns and not schedule.single:
             # Phase and period are learned from events again.
             phase.phase_ns += self._bias_ns
             self._bias_ns = 0.0
@@ -342,7 +339,7 @@ class SampleClock:
         self._outward_ns = round_trip.least_ns / 2 + self._data_offset_ns
         doubt_ns = self._doubt_ns = CERTAIN * math.sqrt(variance + (events.variance if events else 0.0))
         self._sure_ns = period_ns + round_trip.least_ns * 3 / 4 - doubt_ns
-        self._late_ns = _OVERDUE * math.sqrt(variance + round_trip.read_variance)
+        self._late_ns = 2.0 * math.sqrt(variance + round_trip.read_variance)
         # The new sample was the expected one, after another one that was.
         followed = self.steps == self._number == 1 and not (self.uncertain or self._doubtful or self._overdue)
         self._steady = (

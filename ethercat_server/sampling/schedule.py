@@ -7,30 +7,18 @@ derives the margin.
 from __future__ import annotations
 
 import math
-from typing import Final
 
+from ethercat_server.sampling.constants import (
+    EARLY_POLLS,
+    LOSS_PERIODS,
+    POLLS_UNLOCKED,
+    QUICK_GAIN,
+    RESOLUTION_NS,
+    UNPROBED,
+    WASTED,
+)
 from ethercat_server.sampling.phase import SensorPhase
 from ethercat_server.sampling.round_trip import RoundTrip
-
-_ROOT_2_PI: Final = math.sqrt(2 * math.pi)
-# Cost of an exchange, as age.
-_PRICE_NS: Final = 15_000.0
-# Cost of a lost sample, as age in periods, where there is no time for a second poll.
-_LOSS_PERIODS: Final = 10.0
-_NO_TIME: Final = 0.5  # round trip, in periods, beyond which there is no time for one
-_LARGEST_MARGIN: Final = 0.4
-# Factor by which an early poll costs more where nothing is learned from it: events date the samples.
-_NOTHING_LEARNED: Final = 1.2
-_POLLS_UNLOCKED: Final = 4  # exchanges per sample while the clock is not followed
-_SEARCH_STEPS: Final = 8  # exchanges per period once a sample is overdue
-_EARLY_POLLS: Final = 0.11  # fraction of the samples whose first poll is to be early
-_MARGIN_GAIN: Final = 0.05
-# Calls of `derive` after which the margin is derived anew, and change of the variance by which it is at once.
-_TURNS: Final = 3
-_CHANGED: Final = 1.25
-# Variance of the phase below which no probes are needed, however precise polls are.
-_PROBE_BELOW: Final = 5_000.0**2
-_UNPROBED: Final = 500  # samples without an early poll after which the phase is probed
 
 
 class Schedule:
@@ -50,9 +38,7 @@ class Schedule:
         self._hits = 0  # samples since a poll was early
         # κ, the fraction of the margin that is needed: reads are distributed less evenly than it assumes.
         self._scale = 1.0
-        # Between these variances the margin is as it was derived last.
-        self._turn, self._least_variance, self._most_variance = 0, 0.0, 0.0
-        self._usual_margin_ns = self.margin_ns = self._probed_above = 0.0
+        self.margin_ns = 0.0
         self.aim_after_ns = 0.0
 
     def hit(self, samples: int = 1) -> None:
@@ -62,38 +48,33 @@ class Schedule:
     def hit_by_poll(self) -> None:
         """The first poll of a sample that polls date brought it."""
         if self._hits:
-            self._scale -= _MARGIN_GAIN * _EARLY_POLLS * self._scale
+            self._scale -= QUICK_GAIN * EARLY_POLLS * self._scale
 
     def early(self, *, counts: bool) -> None:
         """A poll was early; `counts`: by the margin, which is to grow therefore."""
         if counts and self._hits:
-            self._scale = min(self._scale + _MARGIN_GAIN * self._scale, 1.0)
+            self._scale = min(self._scale + QUICK_GAIN * self._scale, 1.0)
         self._hits = 0
 
-    def derive(self, *, by_events: bool) -> bool:
-        """Derive from phase and round trips what the next poll needs; whether `single` was looked at."""
+    def derive(self, *, by_events: bool) -> None:
+        """Derive from phase and round trips what the next poll needs."""
         phase, round_trip, variance = self._phase, self._round_trip, self._phase.variance
-        self._turn -= 1
-        if anew := self._turn < 0 or not self._least_variance < variance < self._most_variance:
-            self._turn = _TURNS
-            self._least_variance, self._most_variance = variance / _CHANGED, variance * _CHANGED
-            self.single = round_trip.usual_ns > _NO_TIME * phase.period_ns
-            if self.single:
-                cost_ns = _LOSS_PERIODS * phase.period_ns
-            else:
-                cost_ns = (round_trip.usual_ns + _PRICE_NS) * (_NOTHING_LEARNED if by_events else 1.0)
-            deviation_ns = math.sqrt(variance + round_trip.variance)
-            self._usual_margin_ns = min(
-                best_margin_ns(cost_ns, deviation_ns), _LARGEST_MARGIN * phase.period_ns
-            )
-            self._probed_above = (round_trip.read_variance + _PROBE_BELOW) / 4
+        self.single = round_trip.usual_ns > phase.period_ns / 2
+        cost_ns = (
+            LOSS_PERIODS * phase.period_ns
+            if self.single
+            else round_trip.usual_ns * (WASTED if by_events else 1.0)
+        )
+        margin_ns = best_margin_ns(cost_ns, math.sqrt(variance + round_trip.variance))
         follows_events = by_events and not self.single
-        self.margin_ns = self._usual_margin_ns * (1.0 if self.single or by_events else self._scale)
-        self._probing = self._hits > _UNPROBED or (variance > self._probed_above and not follows_events)
+        self.margin_ns = min(
+            margin_ns * (1.0 if self.single or by_events else self._scale), phase.period_ns / 2
+        )
+        probed_above = (round_trip.read_variance + RESOLUTION_NS**2) / 4
+        self._probing = self._hits > UNPROBED or (variance > probed_above and not follows_events)
         self.aim_after_ns = self.margin_ns - round_trip.read_ns
         if self._probing and follows_events:
             self.aim_after_ns -= 2 * self.margin_ns
-        return anew
 
     def next_poll_ns(
         self, sent_ns: int, unanswered: int, *, in_flight: bool, locked: bool, overdue: bool
@@ -106,7 +87,7 @@ class Schedule:
         phase, round_trip = self._phase, self._round_trip
         aim_ns, period_ns = phase.phase_ns + self.aim_after_ns, phase.period_ns
         if not locked:
-            return sent_ns + period_ns / _POLLS_UNLOCKED
+            return sent_ns + period_ns / POLLS_UNLOCKED
         if self.single:
             # The polls in flight are for the samples before: the next is for the first that has none.
             guard_ns = self.margin_ns / 2
@@ -121,7 +102,7 @@ class Schedule:
         if sent_ns < aim_ns:
             return aim_ns
         # It was early: poll again at once, or in steps if the sample is overdue.
-        return sent_ns + period_ns / _SEARCH_STEPS if overdue else sent_ns
+        return sent_ns + period_ns / (2 * POLLS_UNLOCKED) if overdue else sent_ns
 
 
 def best_margin_ns(cost_ns: float, deviation_ns: float) -> float:
@@ -131,5 +112,5 @@ def best_margin_ns(cost_ns: float, deviation_ns: float) -> float:
     sample's. The margin is where a little more of it costs as much as it saves: where the density of the
     read's instant is 1 / cost.
     """
-    ratio = cost_ns / (deviation_ns * _ROOT_2_PI)
+    ratio = cost_ns / (deviation_ns * math.sqrt(2 * math.pi))
     return deviation_ns * math.sqrt(2 * math.log(ratio)) if ratio > 1 else 0.0

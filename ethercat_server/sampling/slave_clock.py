@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from ethercat_server.sampling.constants import CERTAIN, RESOLUTION_NS
 from ethercat_server.sampling.observation import DistributedClock, Latched
-from ethercat_server.sampling.phase import CERTAIN, Phase
+from ethercat_server.sampling.phase import Phase
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.trust import Trust
 
@@ -22,7 +23,6 @@ _BLOCK: Final = 32  # exchanges of a block; the first ones are shorter
 _FIRST_BLOCK: Final = 4
 _LEAST_VARIANCE: Final = 4_000.0**2  # of the middle of the shortest round trip
 _FIRST_RATE: Final = 200e-6  # standard deviation of the rate's error at first; crystals: 100e-6 at most
-_MOST_RATE: Final = 0.001  # a clock that is further off is none
 _JITTER: Final = 1e-4  # variance that the phase gains, ns² in each ns: 10 ns in a ms
 _DRIFT: Final = 1.7e-23  # variance that the rate gains in each ns: 1 ppm in a minute
 _EXCESS_GAIN: Final = 1 / 8
@@ -31,15 +31,13 @@ _BIAS_GAIN: Final = 0.15
 _BIASED: Final = 1.0  # mean error, in standard deviations, beyond which the rate has changed
 _RATE_STEP: Final = 50e-6  # by about this
 # The clock is known after `_KNOWN_BLOCKS` blocks, once its standard deviation is below `_KNOWN_NS` or the
-# part `_KNOWN` of the shortest round trip, and until it exceeds that `_STILL` times.
+# part `_KNOWN` of the shortest round trip, and until it certainly exceeds that.
 _KNOWN_BLOCKS: Final = 12
 _KNOWN_NS: Final = 10_000.0
 _KNOWN: Final = 1 / 32
-_STILL: Final = 5
 # -- events
 _SLACK_NS: Final = 5_000  # tolerance between the latched times of an event and of a frame's arrival
 _OLDEST: Final = 1.5  # age of the newest event, in periods, beyond which samples have come without events
-_EVENT_VARIANCE: Final = 3_000.0**2
 _ASYMMETRY: Final = 1 / 24  # standard deviation of the outward part of a round trip, as part of the shortest
 
 
@@ -129,11 +127,11 @@ class LocalClock:
             self._bias = 0.0
             phase.period_variance += _RATE_STEP**2
         self._blocks += 1
-        if abs(phase.period_ns - 1) > _MOST_RATE:
+        if abs(phase.period_ns - 1) > CERTAIN * _FIRST_RATE:
             self._restart()
         else:
             self.doubt_ns = CERTAIN * math.sqrt(phase.variance)
-            enough_ns = max(_KNOWN_NS, _KNOWN * self._round_trip.least_ns) * (_STILL if self.is_known else 1)
+            enough_ns = max(_KNOWN_NS, _KNOWN * self._round_trip.least_ns) * (CERTAIN if self.is_known else 1)
             self.is_known = self._blocks >= _KNOWN_BLOCKS and phase.variance < enough_ns * enough_ns
 
     def _move(self, by_ns: float) -> None:
@@ -201,7 +199,7 @@ class EventTimes:
     @property
     def variance(self) -> float:
         """Variance of `instant_ns`, without the asymmetry of the round trip."""
-        return self.local_clock.phase.variance + _EVENT_VARIANCE
+        return self.local_clock.phase.variance + RESOLUTION_NS**2
 
     @property
     def way_ns(self) -> float:

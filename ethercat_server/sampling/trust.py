@@ -10,20 +10,11 @@ import math
 from enum import Enum, auto
 from typing import Final
 
-from ethercat_server.sampling.phase import CONTRADICTS
+from ethercat_server.sampling.constants import CONTRADICTS, IN_A_ROW, TRIAL_NS, TRIAL_SAMPLES
 
-_SAMPLES: Final = 100  # samples of a trial at least
-_TRIAL_NS: Final = 500_000_000  # duration of a trial at least
-# Fraction of them whose events must lie between the frames around the sample. All are in the same clock, so
-# right ones always do. One that is off at random does not only where a poll came close, as one in ten does.
-_FITTING: Final = 0.99
-_RESTARTS: Final = 3  # restarts of the local clock in one trial beyond which it counts as not running
-_MOST_FAILURES: Final = 5  # failed trials after which event times are not used, for a while
-_FIRST_PAUSE_NS: Final = 10_000_000_000  # that while at first; it doubles with each trial that fails after it
+_FIRST_PAUSE_NS: Final = 10_000_000_000  # of refused ones, at first; it doubles with each trial that fails
 _LONGEST_PAUSE_NS: Final = 320_000_000_000
 _PROVEN_NS: Final = 60_000_000_000  # time trusted after which earlier failures are forgotten
-_MOST_CONTRADICTIONS: Final = 4.0  # at which the trust ends
-_FORGET: Final = 1 / 100  # part of a contradiction that each sample which fits takes back
 
 
 class TrustState(Enum):
@@ -40,7 +31,7 @@ class Finding(Enum):
 
     FITS = auto()
     CONTRADICTS = auto()
-    FAILS_AGAIN = auto()  # for the `_MOST_FAILURES`th time
+    FAILS_AGAIN = auto()  # for the fifth time
     SHOWS_NONE = auto()  # the local clock or the events stand still
     IS_RETRIED = auto()
 
@@ -107,12 +98,12 @@ class Trust:
     def confirm(self) -> None:
         """A sample is dated by its event."""
         if self.contradictions > 0:
-            self.contradictions -= _FORGET
+            self.contradictions -= 1 / TRIAL_SAMPLES
 
     def contradict(self, now_ns: int, restarts: int) -> None:
         """A sample has no event that can be its own, or none that agrees with the sensor's clock."""
         self.contradictions += 1
-        if self.contradictions > _MOST_CONTRADICTIONS:
+        if self.contradictions > IN_A_ROW:
             if now_ns - self._since_ns > _PROVEN_NS:
                 self._failures, self._pause_ns = 0, _FIRST_PAUSE_NS
             self._fail("they contradict the frames or the sensor's own clock", now_ns, restarts)
@@ -146,16 +137,16 @@ class Trust:
             return 0.0
         if not self._since_ns:
             self._begin(now_ns, restarts)
-        if now_ns - self._since_ns < _TRIAL_NS:
+        if now_ns - self._since_ns < TRIAL_NS:
             return 0.0
         count = self._compared + self._unfit
-        if restarts - self._restarts > _RESTARTS:
+        if restarts - self._restarts > IN_A_ROW:
             self._show_none("its local clock does not run", now_ns)
-        elif count < _SAMPLES:
+        elif count < TRIAL_SAMPLES:
             pass
         elif not self._events:
             self._show_none("they stand still", now_ns)
-        elif self._compared < _FITTING * count:
+        elif self._unfit > count / TRIAL_SAMPLES:
             self._fail("they contradict the frames", now_ns, restarts)
         elif abs(self.mean_ns) > CONTRADICTS * math.sqrt(variance):
             why = f"they differ from what polling shows by {self.mean_ns / 1000:+.0f} µs"
@@ -174,7 +165,7 @@ class Trust:
     def _fail(self, why: str, now_ns: int, restarts: int) -> None:
         self._failures += 1
         self.why = why
-        if self._failures >= _MOST_FAILURES:
+        if self._failures > IN_A_ROW:
             self._pause(now_ns)
             self._enter(Finding.FAILS_AGAIN)
         else:

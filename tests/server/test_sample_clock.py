@@ -234,11 +234,16 @@ def assert_right(outcome: Outcome) -> None:
 
 @pytest.mark.parametrize(("rate_hz", "seconds"), [(1600.0, 3.0), (150.0, 12.0), (25.0, 40.0)])
 def test_events_date_samples_with_one_exchange_each(rate_hz: float, seconds: float) -> None:
-    runs = [run(HONEST, Sensor(rate_hz, ppm=-300.0), seconds=seconds, seed=seed) for seed in range(1, 4)]
+    runs = [run(HONEST, Sensor(rate_hz, ppm=-300.0), seconds=seconds, seed=seed) for seed in range(1, 7)]
     assert {state(simulation) for simulation in runs} == {TrustState.TRUSTED}
     by_polling = run(None, Sensor(rate_hz, ppm=-300.0), seconds=seconds).outcome(seconds / 2)
-    for outcome in (simulation.outcome(seconds / 2) for simulation in runs):
-        assert_right(outcome)
+    outcomes = [simulation.outcome(seconds / 2) for simulation in runs]
+    # The error of one run is nearly constant, as the shortest round trips of that run were: it says little.
+    errors_ns = sorted(error_ns for outcome in outcomes for error_ns in outcome.errors_ns)
+    assert percentile(errors_ns, 50) < 3e3
+    assert percentile(errors_ns, 99) < 10e3
+    for outcome in outcomes:
+        assert outcome.lost == outcome.unflagged == outcome.outside == 0
         assert outcome.counted == outcome.unlocked == 0
         assert outcome.exchanges < 1.05
         assert outcome.exchanges < by_polling.exchanges - 0.05
