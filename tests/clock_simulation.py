@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 from ethercat_server.sampling.observation import DistributedClock, Latched
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.sample_clock import SampleClock
+from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_short
 from ethercat_server.sampling.slave_clock import EventTimes
 
 SECOND: Final = 1e9
@@ -267,12 +267,10 @@ class ClockSimulation:
             self.samples.append(Sample(number, self.instants_ns[number], back, clock.instant_ns, *told))
         self._in_flight, self._unanswered = sent < self._sent_ns, 0
         if clock.learns:
-            self.round_trip.learn(sent, arrived, arrived, self._woke_late_ns)
+            learn(self.round_trip, [clock], sent, arrived, arrived, self._woke_late_ns)
             self._woke_late_ns = None
-            clock.learn(arrived)
         elif clock.events is not None and back - sent < clock.events.local_clock.short_ns:
-            self.round_trip.shorten(sent, arrived)
-            clock.learn_events(sent, arrived)
+            learn_short(self.round_trip, [clock], sent, arrived)
         if clock.events is not None and exchange.latched is not None and clock.events.trust.is_due(back):
             clock.events.retry(_DISTRIBUTED)
         if not clock.locked:

@@ -23,7 +23,7 @@ from ethercat_server.acquisition.tracing import Tracing
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.exchange import DUPLICATE, LATCHED, Exchange
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.sample_clock import SampleClock
+from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_short
 from ethercat_server.sampling.trace import Kind, learned
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
@@ -290,16 +290,13 @@ class Cycle:
         arrived = max(sent, arrived - self._wire_ns[which])
         if learners:
             self.tracing.notes.append(learned(exchange, arrived, Kind.LEARNED, self._woke_late_ns))
-            round_trip.learn(sent, arrived, back, self._woke_late_ns)
+            learn(round_trip, learners, sent, arrived, back, self._woke_late_ns)
             self._woke_late_ns = None
-            for clock in learners:
-                clock.learn(arrived)
             self._cost_ns += _COST_GAIN * (self._bus.clock.monotonic_ns() - back - self._cost_ns)
         else:
             self.tracing.notes.append(learned(exchange, arrived))
-            round_trip.shorten(sent, arrived)
-            for row in self._carried[which]:
-                row[-1].learn_short(exchange, arrived)
+            clocks = [row[-1].clock for row in self._carried[which] if row[-1].took(exchange)]
+            learn_short(round_trip, clocks, sent, arrived)
         if self._local_clocks:
             self._short_ns = max([each.short_ns for each in self._local_clocks])
 

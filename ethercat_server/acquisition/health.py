@@ -89,13 +89,18 @@ class Causes:
         self._stalled_ns += int(late_ns)
         self._stall_ns = now_ns
 
+    def known(self, now_ns: int) -> str:
+        """What explains the loss of a sensor now; "" if nothing does."""
+        if now_ns - self._frame_ns < _RECENT_NS:
+            return f"check for another EtherCAT master, whose frames arrive on {self._bus.ifname}"
+        if now_ns - self._stall_ns < _RECENT_NS and self._stalled_ns > _STALL_NS:
+            return f"this {STOOD_STILL.format(f' for {self._stalled_ns / 1e6:.0f} ms')}"
+        return ""
+
     def explain(self, reason: str, now_ns: int, otherwise: str = "") -> str:
         """Why a sensor is lost, with what explains it; `otherwise` if nothing does."""
-        if now_ns - self._frame_ns < _RECENT_NS:
-            otherwise = f"check for another EtherCAT master, whose frames arrive on {self._bus.ifname}"
-        elif now_ns - self._stall_ns < _RECENT_NS and self._stalled_ns > _STALL_NS:
-            otherwise = f"this {STOOD_STILL.format(f' for {self._stalled_ns / 1e6:.0f} ms')}"
-        return f"{reason}: {otherwise}" if otherwise else reason
+        cause = self.known(now_ns) or otherwise
+        return f"{reason}: {cause}" if cause else reason
 
     def check(self) -> None:
         """Log once that there is another master, and once that it has gone."""

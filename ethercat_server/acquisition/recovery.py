@@ -203,7 +203,9 @@ class SensorRecovery:
         change.done(extended(error, LATER))
 
     def _report_lost(self, reason: str) -> None:
-        self._lost_at_ns = self._bus.clock.monotonic_ns()
+        now_ns = self._lost_at_ns = self._bus.clock.monotonic_ns()
+        if not self._recovery.causes.known(now_ns):
+            self._recovery.on_unexplained_loss()
         log.warning("sensor %d (%s) is lost: %s", self._number, self._sensor.identity, reason)
         message = f"sensor {self._number} is lost: {reason}"
         self._announce(event(Event.SENSOR_LOST, sensor=self._number, reason=reason, message=message))
@@ -363,6 +365,7 @@ class Recovery:
         short: while it is 0 `attend` need not be called for an exchange in which all sensors took part.
         alive_wkc: the working counter of each frame if all sensors take part that are not lost.
         polled: the streams of those sensors; empty if no sensor is left to be read.
+        on_unexplained_loss: called when a sensor is lost and neither this computer nor another master is why.
     """
 
     def __init__(
@@ -380,6 +383,7 @@ class Recovery:
         self.sensors = [
             SensorRecovery(self, sensor, stream) for sensor, stream in zip(sensors, streams, strict=True)
         ]
+        self.on_unexplained_loss: Callable[[], object] = lambda: None
         self.short = 0
         self._looking: list[Task] = []
         self._checked_ns = self._look_ns = 0

@@ -136,10 +136,9 @@ class SensorStream:
                 self.health.newest.append(self.process_data)
         return self.clock.learns
 
-    def learn_short(self, exchange: Exchange, arrived_ns: int) -> None:
-        """An exchange needed no `clock.learn`, but was a short one: it tells the slave's time well."""
-        if exchange is self._exchange:
-            self.clock.learn_events(exchange.sent_ns, arrived_ns)
+    def took(self, exchange: Exchange) -> bool:
+        """Whether it is the last one that was valid for this sensor."""
+        return exchange is self._exchange
 
     def invalid(self, exchange: Exchange) -> OutgoingFrame | None:
         """The frame for an exchange that brought nothing of this sensor, as `idle`."""

@@ -12,7 +12,7 @@ from typing import Any, Final
 from bota_ethercat.program.version import VERSION
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.trace import Clocks, Note, Ring
+from ethercat_server.sampling.trace import Clocks, FrozenTrace, Note, Ring
 
 _SNAPSHOT_EVERY_S: Final = 20
 _PART: Final = 24 << 10  # bytes of a trace in one reply
@@ -27,8 +27,9 @@ class Tracing:
         self.notes: list[Note] = []
         for stream in streams:
             stream.notes, stream.on_change = self.notes, self.snapshot
-        self._snapshot_in_s = self._size = 0
+        self._snapshot_in_s = 0
         self.snapshot()
+        self._frozen = self.freeze()  # what clients read
 
     def pack(self) -> None:
         """Make records of the notes."""
@@ -47,11 +48,15 @@ class Tracing:
         if self._snapshot_in_s <= 0:
             self.snapshot()
 
+    def freeze(self) -> FrozenTrace:
+        """A trace file of the last minute."""
+        self.pack()
+        sensors = [{"model": stream.model, "nominal_hz": stream.nominal_hz} for stream in self._streams]
+        return self._ring.freeze({"program": f"ethercat-server {VERSION}", "sensors": sensors})
+
     def part(self, offset: int) -> dict[str, Any]:
         """A part of a trace file, from `offset` on; that from 0 on begins a new one."""
         if not offset:
-            self.pack()
-            sensors = [{"model": stream.model, "nominal_hz": stream.nominal_hz} for stream in self._streams]
-            self._size = self._ring.freeze({"program": f"ethercat-server {VERSION}", "sensors": sensors})
-        data = self._ring.read(offset, _PART)
-        return {"size": self._size, "data": base64.b64encode(data).decode()}
+            self._frozen = self.freeze()
+        data = self._frozen.read(offset, _PART)
+        return {"size": self._frozen.size, "data": base64.b64encode(data).decode()}

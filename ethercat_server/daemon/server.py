@@ -15,6 +15,7 @@ from typing import Final
 from bota_ethercat.program.signals import Signals
 from ethercat_server.daemon.histories import kept
 from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
+from ethercat_server.daemon.traces import Traces
 from ethercat_server.errors import StopRequestedError
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
@@ -60,7 +61,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
                 raise StopRequestedError("stopped during start-up")
 
         server = Server(bus, hub, options, check_interrupt, watchdog=notifier)
-        server.cycle.every_second = partial(every_second, server, notifier)
+        server.cycle.every_second = partial(every_second, server, notifier, Traces(server))
         signals.call(server.stop)
         for sensor in server.sensors:
             log.info(
@@ -73,7 +74,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
                 log.warning("listening on %s: every machine that can reach it may read the sensors", host)
         log.info("streaming %s on port %d", bus.ifname, options.port)
         notifier.send("READY=1")
-        every_second(server, notifier)
+        notifier.update(server)
         try:
             with kept([stream.drift for stream in server.streams]):
                 server.run()
@@ -82,7 +83,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         log.info("shutting down: the sensors go to INIT")
 
 
-def every_second(server: Server, notifier: Notifier) -> None:
+def every_second(server: Server, notifier: Notifier, traces: Traces) -> None:
     """What the loop has done once a second.
 
     Nothing should be left in reference cycles. For what is all the same, a look at what was made since the
@@ -90,6 +91,7 @@ def every_second(server: Server, notifier: Notifier) -> None:
     """
     gc.collect(0)
     notifier.update(server)
+    traces.second()
 
 
 def _give_up_root(user: User | None, options: ServerOptions) -> None:

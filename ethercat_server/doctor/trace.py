@@ -21,7 +21,7 @@ from ethercat_server.errors import ServerError
 from ethercat_server.sampling.trace import Kind, Step, Trace, TraceError
 
 SUFFIX: Final = ".trace"
-_LATE: Final = 1.5  # periods between two exchanges, or in one, beyond which samples pass
+_LATE: Final = 1.5  # periods between two exchanges beyond which samples pass
 _MOST_SHOWN: Final = 20
 _CELL_S: Final = 0.1  # of the picture
 _CELLS: Final = 100  # in a line
@@ -101,7 +101,11 @@ def find_losses(number: int, steps: Sequence[Step]) -> Iterator[Loss]:
     fresh_ns = [step.record.sent_ns for step in steps if step.record.kind is Kind.FRESH]
     gaps = sorted(after - before for before, after in pairwise(fresh_ns))
     period_ns = gaps[len(gaps) // 2] if gaps else 0
-    before_ns, invalid, was_uncertain = 0, 0, False
+    took = sorted(step.record.duration_ns for step in steps)
+    long_ns = took[len(took) // 2] + period_ns / 2 if took else 0
+    before_ns, invalid = 0, 0
+    # Why the count at the sample before was uncertain; that of the first is, with nothing before it.
+    doubt: tuple[str, str] | None = ("uncertain", "what came before is not in the trace")
     for step in steps:
         record = step.record
         sent_ns, back_ns = record.sent_ns, record.sent_ns + record.duration_ns
@@ -115,21 +119,24 @@ def find_losses(number: int, steps: Sequence[Step]) -> Iterator[Loss]:
             continue
         if record.kind is not Kind.FRESH:
             continue
-        lost, took = step.steps - 1, f"{record.duration_ns / 1e6:.2f} ms"
+        lost = step.steps - 1
+        if invalid:
+            why = "not in the exchange", "while it took no part"
+        elif asleep_ns > _LATE * period_ns:
+            why = "machine", f"this computer sent nothing for {asleep_ns / 1e6:.2f} ms"
+        elif record.duration_ns > long_ns:
+            why = "card or slave", f"an exchange took {record.duration_ns / 1e6:.2f} ms"
+        elif doubt is not None:  # what was in doubt there is counted here
+            why = doubt
+        else:
+            why = "sensor", "it was polled and gave none"
         if step.steps == 0:
             yield Loss(sent_ns, number, "uncertain", "a sample that was counted as lost came late")
-        elif lost and invalid:
-            yield Loss(sent_ns, number, "not in the exchange", f"{lost} lost while it took no part")
-        elif lost and asleep_ns > _LATE * period_ns:
-            text = f"{lost} lost: this computer sent nothing for {asleep_ns / 1e6:.2f} ms"
-            yield Loss(sent_ns, number, "machine", text)
-        elif lost and record.duration_ns > _LATE * period_ns:
-            yield Loss(sent_ns, number, "card or slave", f"{lost} lost in an exchange that took {took}")
         elif lost:
-            yield Loss(sent_ns, number, "sensor", f"{lost} lost though it was polled: the sensor gave none")
-        elif step.uncertain and not was_uncertain:
-            yield Loss(sent_ns, number, "uncertain", f"maybe one lost: the exchange took {took}")
-        invalid, was_uncertain = 0, step.uncertain
+            yield Loss(sent_ns, number, why[0], f"{lost} lost: {why[1]}")
+        elif step.uncertain and doubt is None:
+            yield Loss(sent_ns, number, "uncertain", f"maybe one lost: {why[1]}")
+        invalid, doubt = 0, why if step.uncertain else None
 
 
 def _table(steps: Sequence[Step]) -> Iterator[str]:

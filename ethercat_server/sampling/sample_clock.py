@@ -8,6 +8,7 @@ machine stood still, leaves the estimate as it is: it holds over, and its uncert
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from ethercat_server.sampling.association import (
     Association,
@@ -350,3 +351,27 @@ class SampleClock:
             and 8 * round_trip.excess_ns < period_ns
             and (events is None or events.trust.is_steady)
         )
+
+
+def learn(
+    round_trip: RoundTrip,
+    clocks: Iterable[SampleClock],
+    sent_ns: int,
+    arrived_ns: int,
+    back_ns: int,
+    late_ns: float | None,
+) -> None:
+    """Have the `clocks` whose `observe` asked for it learn from an exchange, after `round_trip` has.
+
+    The answer began to arrive, and was there, then; `late_ns` as in `RoundTrip.learn`.
+    """
+    round_trip.learn(sent_ns, arrived_ns, back_ns, late_ns)
+    for clock in clocks:
+        clock.learn(arrived_ns)
+
+
+def learn_short(round_trip: RoundTrip, clocks: Iterable[SampleClock], sent_ns: int, arrived_ns: int) -> None:
+    """Nothing is to be learned of samples, but a short exchange tells a slave controller's time well."""
+    round_trip.shorten(sent_ns, arrived_ns)
+    for clock in clocks:
+        clock.learn_events(sent_ns, arrived_ns)

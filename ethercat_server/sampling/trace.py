@@ -28,7 +28,7 @@ from typing import Any, Final, NamedTuple
 
 from ethercat_server.sampling.observation import DistributedClock, Latched
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.sample_clock import SampleClock
+from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_short
 from ethercat_server.sampling.slave_clock import EventTimes
 from ethercat_server.sampling.trust import TrustState
 
@@ -164,7 +164,6 @@ class Ring:
         self._ring = bytearray(max(1, min(size, _LARGEST) // _RECORD.size) * _RECORD.size)
         self._end = 0  # bytes of records so far; the ring has the last of them
         self._snapshots: list[tuple[int, dict[str, Any]]] = []  # with the records before each, in bytes
-        self._header, self._begin, self._until = b"", 0, 0
 
     def add(self, notes: Sequence[Note]) -> None:
         """Make records of the notes."""
@@ -180,31 +179,45 @@ class Ring:
         self._snapshots = [row for row in self._snapshots if row[0] >= oldest]
         self._snapshots.append((self._end, clocks.state()))
 
-    def freeze(self, about: dict[str, Any]) -> int:
-        """Begin a trace file of what there is now, for `read`; its size. `about` says of which sensors."""
+    def freeze(self, about: dict[str, Any]) -> FrozenTrace:
+        """What there is now, as a file. `about` says of which sensors."""
         oldest = self._end - len(self._ring)
         rows = [row for row in self._snapshots if row[0] >= oldest]
-        self._begin, self._until = rows[0][0] if rows else self._end, self._end
-        snapshots = [{"before": (at - self._begin) // _RECORD.size, **state} for at, state in rows]
+        begin = rows[0][0] if rows else self._end
+        snapshots = [{"before": (at - begin) // _RECORD.size, **state} for at, state in rows]
         header = {"format": FORMAT, "version": VERSION, **about, "snapshots": snapshots}
-        self._header = json.dumps(header).encode() + b"\n"
-        return len(self._header) + self._until - self._begin
+        return FrozenTrace(self, json.dumps(header).encode() + b"\n", begin, self._end)
 
-    def read(self, offset: int, length: int) -> bytes:
-        """Bytes of the trace file; what the ring has lost meanwhile are zeros.
-
-        It is to be read from the beginning, and faster than records come.
-        """
-        data = self._header[offset : offset + length]
-        at = self._begin + max(0, offset - len(self._header))
-        end = min(at + length - len(data), self._until)
-        while at < end:
-            part = min(end - at, len(self._ring) - at % len(self._ring))
+    def read(self, at: int, length: int) -> bytes:
+        """Records from the byte `at` on; zeros for those that the ring has lost."""
+        data = b""
+        while length:
             start = at % len(self._ring)
+            part = min(length, len(self._ring) - start)
             is_there = at >= self._end - len(self._ring)
             data += self._ring[start : start + part] if is_there else bytes(part)
-            at += part
+            at, length = at + part, length - part
         return data
+
+
+class FrozenTrace(NamedTuple):
+    """A trace file, of which the records are still in the ring: to be read faster than others come."""
+
+    ring: Ring
+    header: bytes
+    begin: int  # of the records in the ring, and where they end
+    end: int
+
+    @property
+    def size(self) -> int:
+        """In bytes."""
+        return len(self.header) + self.end - self.begin
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Bytes of the file; fewer than `length` at its end."""
+        data = self.header[offset : offset + length]
+        at = self.begin + max(0, offset - len(self.header))
+        return data + self.ring.read(at, max(0, min(length - len(data), self.end - at)))
 
 
 class Step(NamedTuple):
@@ -245,26 +258,53 @@ class Trace:
             raise TraceError("it is damaged") from error
         self.about: dict[str, Any] = header
 
-    def replay(self) -> Iterator[Step]:
-        """What the clocks make of each record of a sensor; TraceError where a record cannot be."""
+    def replay(self, *, anew: bool = False) -> Iterator[Step]:
+        """What the clocks make of each record of a sensor; TraceError where a record cannot be.
+
+        `anew`: not from the state of the snapshots, but from the beginning, as a server that starts there:
+        for a trace of another version of the clocks.
+        """
         try:
-            yield from self._replay()
-        except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
+            yield from self._replay(anew)
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             raise TraceError("its snapshots are damaged, or of another version") from error
 
-    def _replay(self) -> Iterator[Step]:
+    def _begin_anew(self, state: Any, before: Clocks | None) -> Clocks:
+        """Clocks that know nothing; of those `before` the ones that did not begin anew here."""
+        round_trip = before.round_trip if before else RoundTrip(state["round_trip"]["_wire_ns"])
+        clocks = list(before.sensors) if before else []
+        for number, each in enumerate(state["sensors"]):
+            if number < len(clocks) and each["_begun"]:
+                continue
+            events, offset_ns = each["events"], each["_data_offset_ns"]
+            if events is not None:
+                loop_ns = round(2 * events["_half_loop_ns"])
+                slave = DistributedClock(events["_offset"], loop_ns, events["_reading_ns"])
+                events = EventTimes(slave, round_trip, offset_ns)
+            period_ns = 1e9 / self.about["sensors"][number]["nominal_hz"]
+            clocks[number : number + 1] = [SampleClock(period_ns, round_trip, events, offset_ns)]
+        return Clocks(round_trip, clocks)
+
+    def _replay(self, anew: bool) -> Iterator[Step]:
         waiting = list(self._snapshots)
         clocks: Clocks | None = None
         pending: list[SampleClock] = []
         pending_ns = 0
         for number, record in enumerate(self.records):
             while waiting and waiting[0][0] <= number:
-                clocks = clocks_of(waiting.pop(0)[1])
+                state = waiting.pop(0)[1]
+                clocks = self._begin_anew(state, clocks) if anew else clocks_of(state)
             if clocks is None:
                 continue
             sent_ns, back_ns = record.sent_ns, record.sent_ns + record.duration_ns
-            if record.kind in (Kind.LEARNED, Kind.SHORT):
-                _learn(clocks, pending, record)
+            if record.kind is Kind.LEARNED:
+                late_ns = record.b - 1.0 if record.b else None
+                learners = [clock for clock in pending if clock.learns]
+                learn(clocks.round_trip, learners, sent_ns, sent_ns + record.a, back_ns, late_ns)
+                pending = []
+                continue
+            if record.kind is Kind.SHORT:
+                learn_short(clocks.round_trip, pending, sent_ns, sent_ns + record.a)
                 pending = []
                 continue
             if record.sensor >= len(clocks.sensors):
@@ -283,17 +323,3 @@ class Trace:
                 record, clock.instant_ns if record.kind is Kind.FRESH else math.nan, clock.steps,
                 clock.uncertain, clock.locked, clock.by_events,
             )  # fmt: skip
-
-
-def _learn(clocks: Clocks, pending: Sequence[SampleClock], record: Record) -> None:
-    sent_ns, arrived_ns = record.sent_ns, record.sent_ns + record.a
-    if record.kind is Kind.LEARNED:
-        late_ns = record.b - 1.0 if record.b else None
-        clocks.round_trip.learn(sent_ns, arrived_ns, sent_ns + record.duration_ns, late_ns)
-        for clock in pending:
-            if clock.learns:
-                clock.learn(arrived_ns)
-    else:
-        clocks.round_trip.shorten(sent_ns, arrived_ns)
-        for clock in pending:
-            clock.learn_events(sent_ns, arrived_ns)
