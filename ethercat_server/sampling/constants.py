@@ -51,6 +51,7 @@ LOSS_PERIODS: Final = (
 )
 # Exchanges per sample while the clock is not followed, and half those per period while one is overdue.
 POLLS_UNLOCKED: Final = 4
+OVERDUE: Final = 2.0  # standard deviations after which a sample should have come
 UNPROBED: Final = 500  # samples without an early poll after which the phase is probed
 
 # -- event times

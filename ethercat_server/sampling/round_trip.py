@@ -59,8 +59,6 @@ class RoundTrip:
         self.variance = self.read_variance + self._late_variance
         least_ns = self.least_ns if self.least_ns < math.inf else PATIENCE_NS
         self.usual_ns = least_ns + self.excess_ns + self._wire_ns
-        self._most_excess_ns = CONTRADICTS * math.sqrt(self._excess_square) + MACHINE_JITTER_NS
-        self._most_late_ns = CONTRADICTS * math.sqrt(self._late_variance) + MACHINE_JITTER_NS
         self.patience_ns = self.usual_ns + CONTRADICTS * self.excess_ns + PATIENCE_NS
 
     def learn(self, sent_ns: int, arrived_ns: int, back_ns: int, late_ns: float | None = None) -> None:
@@ -72,7 +70,8 @@ class RoundTrip:
         if late_ns is not None:
             self._learn_wake_up(late_ns)
         self.shorten(sent_ns, arrived_ns)
-        excess_ns = min(arrived_ns - sent_ns - self.least_ns, self._most_excess_ns)
+        most_ns = CONTRADICTS * math.sqrt(self._excess_square) + MACHINE_JITTER_NS  # a stall is no jitter
+        excess_ns = min(arrived_ns - sent_ns - self.least_ns, most_ns)
         self.excess_ns += GAIN * (excess_ns - self.excess_ns)
         self._excess_square += GAIN * (excess_ns * excess_ns - self._excess_square)
         took_over_ns = min(back_ns - arrived_ns, self.taking_over_ns + MACHINE_JITTER_NS)
@@ -100,9 +99,8 @@ class RoundTrip:
             self.moved_ns += more_ns / 2
 
     def _learn_wake_up(self, late_ns: float) -> None:
-        error, most = late_ns - self.late_ns, self._most_late_ns
-        if not -most < error < most:
-            error = math.copysign(most, error)
+        most_ns = CONTRADICTS * math.sqrt(self._late_variance) + MACHINE_JITTER_NS
+        error = max(-most_ns, min(late_ns - self.late_ns, most_ns))
         self.late_ns += GAIN * error
         self._late_variance += GAIN * (error * error - self._late_variance)
 

@@ -24,6 +24,7 @@ from ethercat_server.sampling.constants import (
     GAIN,
     LEARN_EVERY_NS,
     LOCKED,
+    OVERDUE,
 )
 from ethercat_server.sampling.observation import Latched
 from ethercat_server.sampling.phase import SensorPhase
@@ -302,8 +303,7 @@ class SampleClock:
         if not self._by_event:
             self._schedule.hit_by_poll()
         self._schedule.hit()
-        self._absent = 0
-        self._overdue = False
+        self._absent, self._overdue = 0, False
 
     def _learn_absence(self, sent_ns: int, read_ns: float, variance: float) -> None:
         """No sample was there at the read, with this variance, in the exchange that was sent then."""
@@ -312,7 +312,7 @@ class SampleClock:
         if (absent := int((sent_ns - phase.phase_ns - doubt_ns) // phase.period_ns)) > 0:
             phase.advance(absent)
             self._absent += absent
-        self._overdue = read_ns > phase.phase_ns + 2.0 * math.sqrt(phase.variance + variance)
+        self._overdue = read_ns > phase.phase_ns + OVERDUE * math.sqrt(phase.variance + variance)
         # In doubt it may have been seen already; late it may have been skipped: the next one shows.
         if self.locked and not (self._doubtful or self._is_late(read_ns, variance)):
             if not follows_events:
@@ -328,8 +328,7 @@ class SampleClock:
     def _derive(self) -> None:
         """Derive from the phase what the next poll and the next exchange need."""
         round_trip, phase, events, schedule = self._round_trip, self.phase, self.events, self._schedule
-        variance, period_ns = phase.variance, phase.period_ns
-        deviation_ns = math.sqrt(variance)
+        variance, period_ns, deviation_ns = phase.variance, phase.period_ns, math.sqrt(phase.variance)
         self.locked = self._begun and deviation_ns < LOCKED * period_ns
         schedule.derive(by_events=self.by_events)
         if self._bias_ns and not schedule.single:
@@ -340,7 +339,7 @@ class SampleClock:
         self._outward_ns = round_trip.least_ns / 2 + self._data_offset_ns
         doubt_ns = self._doubt_ns = CERTAIN * math.sqrt(variance + (events.variance if events else 0.0))
         self._sure_ns = period_ns + round_trip.least_ns * 3 / 4 - doubt_ns
-        self._late_ns = 2.0 * math.sqrt(variance + round_trip.read_variance)
+        self._late_ns = OVERDUE * math.sqrt(variance + round_trip.read_variance)
         # The new sample was the expected one, after another one that was.
         followed = self.steps == self._number == 1 and not (self.uncertain or self._doubtful or self._overdue)
         self._steady = (

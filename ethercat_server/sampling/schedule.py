@@ -60,16 +60,15 @@ class Schedule:
         """Derive from phase and round trips what the next poll needs."""
         phase, round_trip, variance = self._phase, self._round_trip, self._phase.variance
         self.single = round_trip.usual_ns > phase.period_ns / 2
-        cost_ns = (
-            LOSS_PERIODS * phase.period_ns
-            if self.single
-            else round_trip.usual_ns * (WASTED if by_events else 1.0)
-        )
-        margin_ns = best_margin_ns(cost_ns, math.sqrt(variance + round_trip.variance))
         follows_events = by_events and not self.single
-        self.margin_ns = min(
-            margin_ns * (1.0 if self.single or by_events else self._scale), phase.period_ns / 2
-        )
+        if self.single:
+            cost_ns, scale = LOSS_PERIODS * phase.period_ns, 1.0
+        elif by_events:
+            cost_ns, scale = WASTED * round_trip.usual_ns, 1.0
+        else:
+            cost_ns, scale = round_trip.usual_ns, self._scale
+        margin_ns = scale * best_margin_ns(cost_ns, math.sqrt(variance + round_trip.variance))
+        self.margin_ns = min(margin_ns, phase.period_ns / 2)
         probed_above = (round_trip.read_variance + RESOLUTION_NS**2) / 4
         self._probing = self._hits > UNPROBED or (variance > probed_above and not follows_events)
         self.aim_after_ns = self.margin_ns - round_trip.read_ns
