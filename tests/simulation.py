@@ -190,7 +190,7 @@ class Exchange:
             left_ns = until_ns - clock.monotonic_ns()
             if left_ns <= 0 or (frame := self.bus.backend.receive(left_ns * 1e-9)) is None:
                 return -1
-            answer = process_data.take(frame, clock.monotonic_ns())
+            answer = process_data.match(frame, clock.monotonic_ns())
             if answer is not None and answer.sent_ns > began_ns:
                 awaited -= 1
                 total += answer.wkc

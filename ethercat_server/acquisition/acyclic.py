@@ -25,7 +25,7 @@ class Task:
     def __init__(self, steps: Steps[None]) -> None:
         self.steps = steps
         self.access: RegisterAccess | None = None  # what is to be sent
-        self.turn = -1  # in which it has waited for the next
+        self.turn = -1  # value of `Acyclic.turn` when the task yielded None: it waits for another
         self.resume_at_ns = 0
         self.begun = self.finished = False
 
@@ -34,15 +34,16 @@ class Acyclic:
     """The tasks of a bus.
 
     Attributes:
-        turn: to be counted up when an exchange is back; none is sent after one was lost until then.
-        due_ns: `go_on` need not be called before.
-        asking: the task whose answer is awaited; None if none is.
+        turn: number of exchanges that are back, counted by the loop. After a lost answer no datagram is sent
+            until it grows.
+        due_ns: `run` need not be called before.
+        awaiting: the task whose answer is awaited; None if none is.
     """
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
         self.turn = self.due_ns = 0
-        self.asking: Task | None = None
+        self.awaiting: Task | None = None
         self._tasks: list[Task] = []
         self._answer: Answer | None = None
         self._sent_ns = self._until_ns = 0
@@ -59,25 +60,25 @@ class Acyclic:
         """Raise `error` in a task, at what it waits for."""
         if not task.begun:
             self._resume(task, task.steps.send, None)
-        if self.asking is task:
-            self._end_asking()
+        if self.awaiting is task:
+            self._end_awaiting()
         if not task.finished:
             self._resume(task, task.steps.throw, error)
             self.due_ns = 0
 
-    def take(self, frame: bytes) -> None:
-        """Take a frame that answers no exchange."""
-        self._answer = self._bus.take(frame) or self._answer
+    def receive(self, frame: bytes) -> None:
+        """A frame arrived that answers no exchange: it may be the awaited answer."""
+        self._answer = self._bus.match(frame) or self._answer
 
-    def go_on(self, due_ns: float, now_ns: int) -> None:
+    def run(self, due_ns: float, now_ns: int) -> None:
         """Resume what has its answer or has waited; send the next frame if there is time before `due_ns`."""
-        if self.asking is not None:
+        if self.awaiting is not None:
             if self._answer is None and now_ns < self._until_ns:
                 return
-            task, answer = self.asking, self._answer
+            task, answer = self.awaiting, self._answer
             if answer is None:
                 self._silent_turn = self.turn
-            self._end_asking()
+            self._end_awaiting()
             self._resume(task, task.steps.send, answer)
         may_send = self.turn != self._silent_turn and (
             due_ns - now_ns >= _FRAME_NS or now_ns - self._sent_ns >= _AT_LEAST_EVERY_NS
@@ -94,14 +95,14 @@ class Acyclic:
 
     def _ask(self, task: Task, access: RegisterAccess, now_ns: int) -> None:
         self._tasks.remove(task)
-        self._tasks.append(task)  # it is the turn of the others
+        self._tasks.append(task)  # round robin
         task.access = None
-        self.asking, self._sent_ns = task, now_ns
+        self.awaiting, self._sent_ns = task, now_ns
         self._until_ns = self._bus.send(access)
 
-    def _end_asking(self) -> None:
+    def _end_awaiting(self) -> None:
         self._bus.give_up()
-        self.asking = self._answer = None
+        self.awaiting = self._answer = None
 
     def _resume(self, task: Task, resume: Callable[[Any], RegisterAccess | float | None], value: Any) -> None:
         task.begun, task.access, task.resume_at_ns = True, None, 0

@@ -98,7 +98,7 @@ class Cycle:
         # By frame of the exchange: where it carries what of which sensor.
         self._carried = [
             [
-                (at.start, at.end, at.untouched, at.latched, sensors[at.number], streams[at.number])
+                (at.start, at.end, at.unfilled, at.latched, sensors[at.number], streams[at.number])
                 for at in each
             ]
             for each in bus.process_data.inputs
@@ -137,10 +137,10 @@ class Cycle:
             due, now = self._due_ns(), monotonic_ns()
             if now >= acyclic.due_ns:
                 self._jobs.check()
-                # While exchanges are short, or all sensors are lost, no sample is to be in time for.
-                acyclic.go_on(due if recovery.polled and not recovery.short else inf, now)
+                # While working counters are too low, or all sensors are lost, no poll must be in time.
+                acyclic.run(due if recovery.polled and not recovery.incomplete else inf, now)
                 due, now = self._due_ns(), monotonic_ns()
-            in_flight = self._in_flight or acyclic.asking is not None
+            in_flight = self._in_flight or acyclic.awaiting is not None
             slept = slept or (due > now and not in_flight)
             if slept or now > serve_by:
                 hub.serve(now if in_flight else due)
@@ -151,10 +151,10 @@ class Cycle:
             now, slept = monotonic_ns(), False
             if self._answer is not None:
                 acyclic.turn += 1
-                if recovery.short or not self._complete:
-                    recovery.attend(complete=self._complete)
+                if recovery.incomplete or not self._complete:
+                    recovery.check_answer(complete=self._complete)
             elif self._unanswered > 1:
-                recovery.miss(now - self._unanswered_since_ns, now)
+                recovery.check_silence(now - self._unanswered_since_ns, now)
             if now >= self._chores_at_ns:
                 self._do_chores(now)
         self._slept = slept
@@ -206,7 +206,7 @@ class Cycle:
         if now - due > self._shortest_ns:
             self._count_missed(due, now)
             if slept:  # else the answer was held up, and what is due was past when it came
-                self._recovery.causes.stood_still(now - due, now)
+                self._recovery.causes.see_stall(now - due, now)
         if self._unanswered:
             if self._unanswered == 1:
                 self._unanswered_since_ns = self._sent_ns
@@ -227,7 +227,7 @@ class Cycle:
         frame, back = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0), bus.clock.monotonic_ns()
         if frame is None:
             return
-        while (exchange := bus.process_data.take(frame, back)) is DUPLICATE:
+        while (exchange := bus.process_data.match(frame, back)) is DUPLICATE:
             # The answer may be behind duplicates of others: they must not pile up.
             if back > self._sent_ns + _SERVE_EVERY_NS:
                 return
@@ -235,39 +235,39 @@ class Cycle:
             if frame is None:
                 return
         if exchange is None:
-            self._recovery.causes.stray(frame, back)
-            self._acyclic.take(frame)
+            self._recovery.causes.see_foreign(frame, back)
+            self._acyclic.receive(frame)
         else:
-            self._take(exchange, since_ns)
+            self._hand_out(exchange, since_ns)
 
-    def _take(self, exchange: Exchange, since_ns: int) -> None:
+    def _hand_out(self, exchange: Exchange, since_ns: int) -> None:
         """Hand out what an exchange brought, which was awaited since then; then learn from it."""
         sent, back, frame, wkc, which = self._answer = exchange
         round_trip, carried = self._round_trip, self._carried[which]
         new: list[OutgoingFrame] = []
         self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
-        for start, end, untouched, at, sensor, stream in carried:
+        for start, end, unfilled, at, sensor, stream in carried:
             if back < stream.clock.phase.phase_ns - stream.clock.before_ns:
                 continue  # the poll was for another sensor
             data = frame[start:end]
             # The working counter does not tell sensors apart: one that is out may be counted for another.
-            if not complete or sensor.state is not _STREAMING or data == untouched:
-                made = stream.invalid(exchange)
+            if not complete or sensor.state is not _STREAMING or data == unfilled:
+                made = stream.make_invalid(exchange)
             else:
-                made = stream.take(data, exchange, LATCHED.unpack_from(frame, at) if at else None)
+                made = stream.make_frame(data, exchange, LATCHED.unpack_from(frame, at) if at else None)
             if made is not None:
                 new.append(made)
         if new:
             self._hub.publish(new, back)
         self._in_flight, self._unanswered = sent < self._sent_ns, 0
         self._exchange.record(back - sent)
-        learners = [row[-1].clock for row in carried if row[-1].finish(exchange)]
+        learners = [row[-1].clock for row in carried if row[-1].account(exchange)]
         if learners or not self._short_ns < back - sent < round_trip.usual_ns + self._shortest_ns:
             self._learn(exchange, learners, since_ns)
 
     def _show_silence(self, now: int) -> None:
         """Hand out frames of the sensors that have been silent for too long while no answer comes."""
-        if new := [made for stream in self._streams if (made := stream.idle(now))]:
+        if new := [made for stream in self._streams if (made := stream.make_silent(now))]:
             self._hub.publish(new, now)
 
     def _count_missed(self, due_ns: float, now_ns: int) -> None:
@@ -286,7 +286,7 @@ class Cycle:
         if back - sent - round_trip.usual_ns > self._shortest_ns:  # it was held up
             self._count_missed(sent + round_trip.usual_ns, back)
             # By this computer, if it had arrived and was awaited already.
-            self._recovery.causes.stood_still(back - max(arrived, since_ns), back)
+            self._recovery.causes.see_stall(back - max(arrived, since_ns), back)
         arrived = max(sent, arrived - self._wire_ns[which])
         if learners:
             self.tracing.notes.append(learned(exchange, arrived, Kind.LEARNED, self._woke_late_ns))
@@ -295,7 +295,7 @@ class Cycle:
             self._cost_ns += _COST_GAIN * (self._bus.clock.monotonic_ns() - back - self._cost_ns)
         else:
             self.tracing.notes.append(learned(exchange, arrived))
-            clocks = [row[-1].clock for row in self._carried[which] if row[-1].took(exchange)]
+            clocks = [row[-1].clock for row in self._carried[which] if row[-1].is_newest(exchange)]
             learn_short(round_trip, clocks, sent, arrived)
         if self._local_clocks:
             self._short_ns = max([each.short_ns for each in self._local_clocks])

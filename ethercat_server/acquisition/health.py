@@ -71,8 +71,8 @@ class Causes:
         self._stalled_ns = 0  # sum of the stalls that followed each other within `_RECENT_NS`
         self._gone_s = _GONE_S
 
-    def stray(self, frame: bytes, now_ns: int) -> None:
-        """A frame has arrived that answers no exchange."""
+    def see_foreign(self, frame: bytes, now_ns: int) -> None:
+        """A frame arrived that answers no exchange: it counts if another master sent it."""
         at = SOURCE_ADDRESS
         if len(frame) <= DATAGRAM_INDEX:
             return
@@ -82,14 +82,14 @@ class Causes:
             self._frames += 1
             self._frame_ns = now_ns
 
-    def stood_still(self, late_ns: float, now_ns: int) -> None:
+    def see_stall(self, late_ns: float, now_ns: int) -> None:
         """The loop did not run for `late_ns`."""
         if now_ns - self._stall_ns > _RECENT_NS:
             self._stalled_ns = 0
         self._stalled_ns += int(late_ns)
         self._stall_ns = now_ns
 
-    def known(self, now_ns: int) -> str:
+    def known_cause(self, now_ns: int) -> str:
         """What explains the loss of a sensor now; "" if nothing does."""
         if now_ns - self._frame_ns < _RECENT_NS:
             return f"check for another EtherCAT master, whose frames arrive on {self._bus.ifname}"
@@ -99,7 +99,7 @@ class Causes:
 
     def explain(self, reason: str, now_ns: int, otherwise: str = "") -> str:
         """Why a sensor is lost, with what explains it; `otherwise` if nothing does."""
-        cause = self.known(now_ns) or otherwise
+        cause = self.known_cause(now_ns) or otherwise
         return f"{reason}: {cause}" if cause else reason
 
     def check(self) -> None:
@@ -127,14 +127,14 @@ _FINITE_SECONDS: Final = 10  # seconds with finite samples only after which it i
 class SampleHealth:
     """What the samples of the sensor `number` show of it; call `check` once a second.
 
-    `take` gets those that are finite, by field.
+    `on_samples` is called with those that are finite, by field.
     """
 
-    def __init__(self, number: int, take: Callable[[Sequence[Sequence[float]]], object]) -> None:
+    def __init__(self, number: int, on_samples: Callable[[Sequence[Sequence[float]]], object]) -> None:
         self._number = number
         self.not_finite = 0  # new samples with a number that is NaN or infinite
         self.newest: list[bytes] = []  # process data that was handed out since `count`
-        self._take = take
+        self._on_samples = on_samples
         self._checked = (0, 0, 0)  # the counts of the last check: fresh, repeated, not finite
         self._silent_s = 0
         self._finite_s = _FINITE_SECONDS
@@ -150,7 +150,7 @@ class SampleHealth:
         columns = list(zip(*layout_for(len(newest[0])).struct.iter_unpack(b"".join(newest)), strict=True))
         # An infinity or a NaN survives the sum, so that one look is enough for all of them.
         if math.isfinite(sum(map(sum, columns))):
-            self._take(columns)
+            self._on_samples(columns)
         else:
             self.not_finite += sum(not is_finite(each) for each in newest)
 

@@ -35,7 +35,7 @@ from ethercat_server.sensor.scan import OtherSlaves
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from ethercat_server.sensor.set_up import IN_FORCE, LATER, Change, identify, set_up, set_up_in_op
 
-_SHORT_EXCHANGES: Final = 2  # short working counters, almost in a row, before the sensors' states are read
+_INCOMPLETE_EXCHANGES: Final = 2  # almost in a row, before the sensors' states are read
 # Time without a frame coming back after which all sensors are lost; a single lost frame never suffices.
 _SILENCE_NS: Final = 50_000_000
 # The same for a change of settings, which goes on when frames come back.
@@ -119,7 +119,7 @@ class SensorRecovery:
         self._slave = self._bus.slaves[sensor.number]
         self.sdo = GuardedSdo(self._slave.sdo)
         self.task: Task | None = None
-        self._left_op = False  # since it was back last: also if the steps began anew
+        self._left_op = False  # since it was back last: kept if the steps begin anew
         self._lost_at_ns: int | None = None
         self._change: _Change | None = None
 
@@ -139,7 +139,7 @@ class SensorRecovery:
         sensor.wanted, sensor.asked = change.wanted, sensor.asked | set(change.names)
         self._take_out(SensorState.CHANGING, self._reconfigure())
 
-    def look(self, *, counted: bool) -> Steps[None]:
+    def check_state(self, *, counted: bool) -> Steps[None]:
         """Find out whether the sensor is in OP; `counted`: the working counter says that it takes part."""
         if not self._sensor.streams:
             return
@@ -150,10 +150,10 @@ class SensorRecovery:
         elif status is not None and not status.is_op:
             self.lose(self._recovery.explain(f"it is in {status}"))
 
-    def look_at_mailbox(self) -> Steps[None]:
+    def poll_mailbox(self) -> Steps[None]:
         """Read a message that is there: nobody else does while the sensor is asked for nothing."""
         if self._sensor.streams:
-            yield from self._slave.sdo.look()
+            yield from self._slave.sdo.poll_mailbox()
 
     def check_events(self) -> Steps[None]:
         """Try refused event times again when it is time: another master may have changed what they need."""
@@ -170,7 +170,7 @@ class SensorRecovery:
             self._take_out(SensorState.LOST, self._bring_back())
             self._report_lost(reason)
 
-    def give_up(self, reason: str) -> None:
+    def abort_change(self, reason: str) -> None:
         """A change does not come to an end: the request is answered now."""
         if self.task is not None:
             self._recovery.acyclic.throw(self.task, _GivenUpError(reason))
@@ -179,13 +179,13 @@ class SensorRecovery:
         """To be called regularly: a sensor whose change failed has a limited time to be back."""
         change = self._change
         if change is not None and change.until is not None and change.until.passed:
-            self.give_up(self._recovery.explain("it does not come back to OP"))
+            self.abort_change(self._recovery.explain("it does not come back to OP"))
 
     # -- changes of its state
 
     def _take_out(self, state: SensorState, steps: Steps[bool]) -> None:
         self._sensor.enter(state)
-        self.task = self._recovery.acyclic.start(self._come_back(steps))
+        self.task = self._recovery.acyclic.start(self._restore(steps))
         self._recovery.count_alive()
 
     def _lose_in_change(self, reason: str) -> None:
@@ -204,7 +204,7 @@ class SensorRecovery:
 
     def _report_lost(self, reason: str) -> None:
         now_ns = self._lost_at_ns = self._bus.clock.monotonic_ns()
-        if not self._recovery.causes.known(now_ns):
+        if not self._recovery.causes.known_cause(now_ns):
             self._recovery.on_unexplained_loss()
         log.warning("sensor %d (%s) is lost: %s", self._number, self._sensor.identity, reason)
         message = f"sensor {self._number} is lost: {reason}"
@@ -259,7 +259,7 @@ class SensorRecovery:
 
     # -- the steps
 
-    def _come_back(self, steps: Steps[bool]) -> Steps[None]:
+    def _restore(self, steps: Steps[bool]) -> Steps[None]:
         """Do `steps`, and what follows if they fail, until it streams."""
         while True:
             change = self._change
@@ -281,7 +281,7 @@ class SensorRecovery:
                     self._lose_in_change(f"restoring the former settings failed too: {error}")
                 else:
                     self._revert(error)
-                    steps = self._go_back()
+                    steps = self._bring_back_reverted()
             except DifferentSensorError as error:
                 self._refuse(error.found)
                 steps = self._wait_for_removal()
@@ -289,8 +289,8 @@ class SensorRecovery:
                 self._stream_again(latching, left_op=left_op)
                 return
 
-    def _go_back(self) -> Steps[bool]:
-        """After a change that failed; returns as `_bring_back`."""
+    def _bring_back_reverted(self) -> Steps[bool]:
+        """Bring back the former settings of a sensor whose change failed; returns as `_bring_back`."""
         if (yield from self._slave.status()) is None:
             raise _GivenUpError(self._recovery.explain("it does not answer any more"))
         return (yield from self._bring_back())
@@ -362,7 +362,8 @@ class Recovery:
     Attributes:
         sensors: the recovery of each, by number.
         acyclic: the access to their registers.
-        short: while it is 0 `attend` need not be called for an exchange in which all sensors took part.
+        incomplete: grows with working counters that are too low. While it is 0 `check_answer` need not be
+            called for an exchange in which all sensors took part.
         alive_wkc: the working counter of each frame if all sensors take part that are not lost.
         polled: the streams of those sensors; empty if no sensor is left to be read.
         on_unexplained_loss: called when a sensor is lost and neither this computer nor another master is why.
@@ -384,11 +385,11 @@ class Recovery:
             SensorRecovery(self, sensor, stream) for sensor, stream in zip(sensors, streams, strict=True)
         ]
         self.on_unexplained_loss: Callable[[], object] = lambda: None
-        self.short = 0
-        self._looking: list[Task] = []
-        self._checked_ns = self._look_ns = 0
+        self.incomplete = 0
+        self._checks: list[Task] = []
+        self._checked_ns = self._next_check_ns = 0
         self.count_alive()
-        bus.emergencies.tell = self._tell
+        bus.emergencies.tell = self._announce_emergency
         acyclic.start(self._watch())
 
     def check(self) -> None:
@@ -397,17 +398,17 @@ class Recovery:
         for each in self.sensors:
             self.acyclic.start(each.check_events())
 
-    def attend(self, *, complete: bool) -> None:
+    def check_answer(self, *, complete: bool) -> None:
         """To be called after an exchange that is back.
 
         `complete`: all sensors took part that are not lost.
         """
-        self.short = max(0, self.short - 1) if complete else self.short + 2
-        if self.short >= 2 * _SHORT_EXCHANGES and all(task.finished for task in self._looking):
-            self.short = 0
-            self._looking = [self.acyclic.start(each.look(counted=False)) for each in self.sensors]
+        self.incomplete = max(0, self.incomplete - 1) if complete else self.incomplete + 2
+        if self.incomplete >= 2 * _INCOMPLETE_EXCHANGES and all(task.finished for task in self._checks):
+            self.incomplete = 0
+            self._checks = [self.acyclic.start(each.check_state(counted=False)) for each in self.sensors]
 
-    def miss(self, silent_ns: int, now_ns: int) -> None:
+    def check_silence(self, silent_ns: int, now_ns: int) -> None:
         """To be called while exchanges are not answered, and have not been for `silent_ns`.
 
         Without frames coming back there is nothing that could be done. InterfaceError if the network
@@ -424,24 +425,24 @@ class Recovery:
             if silent_ns > _SILENT_CHANGE_NS:
                 for each in self.sensors:
                     if each.is_changing:
-                        each.give_up(self._silence())
+                        each.abort_change(self._silence())
 
     def _watch(self) -> Steps[None]:
-        """Look at one sensor after the other, without end."""
+        """Check one sensor after the other, without end."""
         for each in cycle(self.sensors):
-            yield from each.look_at_mailbox()
-            yield self._until_next_look_s()
+            yield from each.poll_mailbox()
+            yield self._until_next_check_s()
             # The working counter does not tell sensors apart: one that is out may be counted for another.
-            yield from each.look(counted=not any(one.task for one in self.sensors))
+            yield from each.check_state(counted=not any(one.task for one in self.sensors))
             each.check_change()
-            yield from self._others.look_at_next()
-            yield self._until_next_look_s()
+            yield from self._others.check_next()
+            yield self._until_next_check_s()
 
-    def _until_next_look_s(self) -> float:
-        """The looks are evenly spaced, however long each of them takes."""
+    def _until_next_check_s(self) -> float:
+        """Time until the next check: they are evenly spaced, however long each of them takes."""
         now_ns = self.bus.clock.monotonic_ns()
-        self._look_ns = max(self._look_ns + _WATCH_EVERY_NS // (2 * len(self.sensors)), now_ns)
-        return (self._look_ns - now_ns) * 1e-9
+        self._next_check_ns = max(self._next_check_ns + _WATCH_EVERY_NS // (2 * len(self.sensors)), now_ns)
+        return (self._next_check_ns - now_ns) * 1e-9
 
     def _silence(self) -> str:
         why, lost = self.bus.backend.why_silent(), "no frame comes back"
@@ -458,7 +459,7 @@ class Recovery:
         alive = [process_data.counters[stream.number] for stream in self.polled]
         self.alive_wkc = [sum(counts[which] for counts in alive) for which in range(len(process_data.inputs))]
 
-    def _tell(self, number: int, emergency: Emergency, count: int) -> None:
+    def _announce_emergency(self, number: int, emergency: Emergency, count: int) -> None:
         message = f"sensor {number} reports {emergency}"
         keys = {**emergency.as_json(), "count": count, "message": message}
         self.announce(event(Event.EMERGENCY, sensor=number, **keys))

@@ -37,7 +37,7 @@ REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INV
 
 
 class SensorStream:
-    """Numbers, stamps and marks the frames of a sensor."""
+    """Numbers and stamps the frames of one sensor, and sets their flags."""
 
     def __init__(
         self,
@@ -75,13 +75,13 @@ class SensorStream:
         # The last valid exchange, and whether it brought a new sample.
         self._exchange, self._fresh = DUPLICATE, False
         # The working counter of an exchange since then that was not valid; 0 for none.
-        self._short_wkc = 0
-        self._moment_ns = 0  # of the newest sample
+        self._invalid_wkc = 0
+        self._instant_ns = 0  # of the newest sample
         self.notes: list[Note] = []  # see `Tracing`
         self._latched: Latched | None = None
         self.on_change: Callable[[], None] = lambda: None  # the clock is another one, or begins anew
         self.model, self.nominal_hz = sensor.identity.name, 1e9 / sensor.period_ns
-        self.idle_at_ns = 0.0  # it is silent from then on
+        self.silent_at_ns = 0.0  # it is silent from then on
 
     def _new_clock(self, period_ns: float, latching: DistributedClock | None) -> SampleClock:
         events = latching and EventTimes(latching, self._round_trip, self._data_offset_ns)
@@ -92,10 +92,12 @@ class SensorStream:
         """Frames that brought a new sample."""
         return self.sequence - self.repeated - self.invalid_frames
 
-    def take(self, data: bytes, exchange: Exchange, latched: Latched | None = None) -> OutgoingFrame | None:
+    def make_frame(
+        self, data: bytes, exchange: Exchange, latched: Latched | None = None
+    ) -> OutgoingFrame | None:
         """The frame that a valid exchange gives; None if it gives none.
 
-        `finish` must follow. `latched` is what the slave controller has latched.
+        `account` must follow. `latched` is what the slave controller has latched.
         """
         sent_ns, back_ns, _, wkc, _ = exchange
         if sent_ns < self._exchange.sent_ns:  # overtaken
@@ -104,28 +106,28 @@ class SensorStream:
         self._fresh = fresh = data != self.process_data
         is_next = clock.observe(sent_ns, back_ns, latched, fresh=fresh)
         if not fresh:
-            return self.idle(back_ns)
+            return self.make_silent(back_ns)
         self.process_data = data
         if self._discard:
             return None
         flags = 0 if is_next and not (self._silent or self._gap) else self._count_lost()
-        if (moment_ns := int(clock.instant_ns)) <= self._moment_ns:  # the one before was dated too young
-            moment_ns = self._moment_ns + 1
-        self._moment_ns = moment_ns
-        stamp_ns = moment_ns + self.realtime_offset.ns
+        if (instant_ns := int(clock.instant_ns)) <= self._instant_ns:  # the one before was dated too late
+            instant_ns = self._instant_ns + 1
+        self._instant_ns = instant_ns
+        stamp_ns = instant_ns + self.realtime_offset.ns
         return (
-            encode_data(self.sequence, stamp_ns, moment_ns, self.number, flags, wkc, data),
+            encode_data(self.sequence, stamp_ns, instant_ns, self.number, flags, wkc, data),
             self.number,
             flags,
         )
 
-    def finish(self, exchange: Exchange) -> bool:
-        """Account for what an exchange brought, once it is handed out; whether `clock.learn` must follow."""
+    def account(self, exchange: Exchange) -> bool:
+        """Account for what an exchange brought, after it is published; whether `clock.learn` must follow."""
         if exchange is not self._exchange:
             return False
         self.notes.append((exchange, self._latched or NOTHING, self.number, self._fresh))
         if self._fresh:
-            self.idle_at_ns = exchange.back_ns + SILENT_PERIODS * self.clock.phase.period_ns
+            self.silent_at_ns = exchange.back_ns + SILENT_PERIODS * self.clock.phase.period_ns
             if self.clock.locked:
                 self.age.record(exchange.back_ns - self.clock.instant_ns)
             if self._discard:
@@ -136,25 +138,25 @@ class SensorStream:
                 self.health.newest.append(self.process_data)
         return self.clock.learns
 
-    def took(self, exchange: Exchange) -> bool:
+    def is_newest(self, exchange: Exchange) -> bool:
         """Whether it is the last one that was valid for this sensor."""
         return exchange is self._exchange
 
-    def invalid(self, exchange: Exchange) -> OutgoingFrame | None:
-        """The frame for an exchange that brought nothing of this sensor, as `idle`."""
+    def make_invalid(self, exchange: Exchange) -> OutgoingFrame | None:
+        """The frame for an exchange that brought nothing of this sensor, as `make_silent`."""
         self.notes.append((exchange, NOTHING, self.number, Kind.INVALID))
-        self._short_wkc = exchange.wkc
-        return self.idle(exchange.back_ns)
+        self._invalid_wkc = exchange.wkc
+        return self.make_silent(exchange.back_ns)
 
-    def idle(self, now_ns: int) -> OutgoingFrame | None:
+    def make_silent(self, now_ns: int) -> OutgoingFrame | None:
         """The frame that shows the sensor's silence, one a period; None if there is none to show."""
-        if now_ns < self.idle_at_ns or not self.process_data:
+        if now_ns < self.silent_at_ns or not self.process_data:
             return None
         self._silent = True
         self._handed_out = self._handed_out or self.process_data
         period_ns = self.clock.period_ns
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
-        self.idle_at_ns = max(self.idle_at_ns + period_ns, float(now_ns))
+        self.silent_at_ns = max(self.silent_at_ns + period_ns, float(now_ns))
         # INVALID means that no valid exchange was back for two periods: a single lost frame does not suffice.
         if now_ns - self._exchange.back_ns < max(2 * period_ns, self._round_trip.patience_ns):
             self._discard = 0  # a sensor that is stuck from the start has to be visible, too
@@ -162,8 +164,8 @@ class SensorStream:
             flags, wkc = REPEATED, self._exchange.wkc
         else:
             self.invalid_frames += 1
-            flags, wkc = INVALID, self._short_wkc
-            self._short_wkc = 0
+            flags, wkc = INVALID, self._invalid_wkc
+            self._invalid_wkc = 0
         stamp_ns, sequence = now_ns + self.realtime_offset.ns, self.sequence
         self.sequence += 1
         made = encode_data(sequence, stamp_ns, now_ns, self.number, flags, wkc, self._handed_out)
@@ -210,7 +212,7 @@ class SensorStream:
             self.drift.begin("return")
             self._discard = DISCARDED_AT_START
             self._gap = 1
-            self.idle_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
+            self.silent_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
             self.on_change()
 
     def status(self) -> dict[str, Any]:

@@ -87,7 +87,7 @@ class Terminal:
         bus.terminals.append((self._controller, self.slave.status.state))
         self.steps = self._keep_in_op()
 
-    def take(self, exchange: Exchange, start: int, end: int, stamp_ns: int) -> tuple[bytes, int] | None:
+    def make_frame(self, exchange: Exchange, start: int, end: int, stamp_ns: int) -> tuple[bytes, int] | None:
         """The frame for an exchange and its flags; None as long as it never had valid process data.
 
         REPEATED: the same data as before. INVALID: it did not take part, or is not in OP.
@@ -186,14 +186,14 @@ class CycleWithTerminals(Cycle):
     terminals: Sequence[Terminal] = ()
     _newest_ns = 0  # when the newest exchange that was taken was sent
 
-    def _take(self, exchange: Exchange, since_ns: int) -> None:
-        super()._take(exchange, since_ns)
+    def _hand_out(self, exchange: Exchange, since_ns: int) -> None:
+        super()._hand_out(exchange, since_ns)
         if exchange.sent_ns < self._newest_ns:  # overtaken
             return
         self._newest_ns = exchange.sent_ns
         stamp_ns, made = exchange.back_ns + self._streams[0].realtime_offset.ns, list[OutgoingFrame]()
         for number, start, end in self._bus.process_data.terminals[exchange.which]:
-            if frame := self.terminals[number].take(exchange, start, end, stamp_ns):
+            if frame := self.terminals[number].make_frame(exchange, start, end, stamp_ns):
                 made.append((frame[0], len(self._streams) + number, frame[1]))
         if made:
             self._hub.publish(made, exchange.back_ns)

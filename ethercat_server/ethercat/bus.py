@@ -59,9 +59,9 @@ class Bus(Datagrams):
         self._sii: Sequence[Sii | None] = ()  # of all slaves on the wire
         self._soem: Master | None = None
 
-    def take(self, frame: bytes) -> Answer | None:
+    def match(self, frame: bytes) -> Answer | None:
         """See `Datagrams`; it may answer an exchange."""
-        return super().take(frame) if self.process_data.take(frame, 0) is None else None
+        return super().match(frame) if self.process_data.match(frame, 0) is None else None
 
     def scan(
         self,

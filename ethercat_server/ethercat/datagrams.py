@@ -162,7 +162,7 @@ class Datagrams:
         self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
         return now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
 
-    def take(self, frame: bytes) -> Answer | None:
+    def match(self, frame: bytes) -> Answer | None:
         """The answer to the datagram that was sent last, if this frame is that."""
         if self._awaited is None or not is_answer(frame, *self._awaited):
             self._late.note(frame)
@@ -232,7 +232,7 @@ class Datagrams:
         while (left_ns := until_ns - self._monotonic_ns()) > 0:
             if (frame := self._receive(left_ns * 1e-9)) is None:
                 break
-            if (answer := self.take(frame)) is not None:
+            if (answer := self.match(frame)) is not None:
                 return answer
         self.give_up()
         return None

@@ -56,7 +56,7 @@ def latched_datagrams(station: int) -> tuple[tuple[int, int, int, bytes], ...]:
 
 
 def switch_latched(frame: bytearray, at: int, *, reads: bool) -> None:
-    """Have a frame read what is latched, to be found at `at`, or not (NOP)."""
+    """Have a frame read (FPRD) the latched times, which are at `at`, or not (NOP)."""
     for data in (at, at + LATCHED.size - COUNTER_SIZE - _TIME_SIZE):
         frame[data - DATAGRAM_HEADER] = Command.FPRD if reads else Command.NOP
 
@@ -111,7 +111,7 @@ class Inputs(NamedTuple):
     number: int  # of the sensor
     start: int
     end: int
-    untouched: bytes  # what is there after an exchange in which the sensor did not take part
+    unfilled: bytes  # what is there after an exchange in which the sensor did not take part
     # Where the times are that its controller latched (`LATCHED`); 0 if the frame does not read them.
     latched: int
 
@@ -226,7 +226,7 @@ MOST_IN_FLIGHT = 100
 # A frame counts as lost after this time, and its index is used again.
 _LOST_NS: Final = 100_000_000
 _pack_tag_into, _unpack_tag_from = struct.Struct("<I").pack_into, struct.Struct("<I").unpack_from
-# By index: when a frame was sent that is not back, else 0; which it was; its tag, -1 if there is none.
+# By index: when the frame in flight was sent (0: none is), its number in the exchange, its tag (-1: none).
 _NOT_SENT: Final = (0, 0, -1)
 _IMPOSSIBLE: Final = 0xFFFF
 
@@ -241,7 +241,7 @@ class Exchange(NamedTuple):
     which: int  # number of the frame, of those that make up an exchange
 
 
-# An answer that has been taken before.
+# What `match` gives for an answer that arrived before.
 DUPLICATE: Final = Exchange(0, 0, b"", 0, 0)
 
 
@@ -255,7 +255,7 @@ class ProcessData:
         counters: by sensor, what it adds to the working counter of each frame.
         most_wkc: by frame, the highest working counter that there can be.
         in_flight: frames that are not back, and not known to be lost.
-        duplicates: answers that came once more.
+        duplicates: answers that arrived more than once.
         blocked_until_ns: until then nothing can be sent unless an answer arrives.
     """
 
@@ -293,7 +293,10 @@ class ProcessData:
         self.blocked_until_ns = 0
 
     def read_latched(self, number: int, *, reads: bool) -> int | None:
-        """Read what a sensor's controller latches, or no longer; where, or None if it latches nothing."""
+        """Switch the reading of the times that a sensor's controller latches on or off.
+
+        Returns where they are in the frame; None if no frame reads them.
+        """
         for frame in self._frames:
             for each in frame.inputs:
                 if each.number == number and each.latched:
@@ -308,7 +311,7 @@ class ProcessData:
             index = self._index
             if self.in_flight >= MOST_IN_FLIGHT or sent[index][0]:
                 now_ns = self._monotonic_ns()
-                self._forget(now_ns)
+                self._expire(now_ns)
                 if self.in_flight >= MOST_IN_FLIGHT:
                     self.blocked_until_ns = min(row[0] for row in sent if row[0]) + _LOST_NS
                     return now_ns
@@ -324,8 +327,8 @@ class ProcessData:
             sent[index] = now_ns, which, tag
         return now_ns
 
-    def take(self, frame: bytes, back_ns: int) -> Exchange | None:
-        """Take a frame that has arrived; None if it is not an awaited answer, DUPLICATE if taken before."""
+    def match(self, frame: bytes, back_ns: int) -> Exchange | None:
+        """The exchange that a frame answers; None if none is awaited, DUPLICATE if it was answered before."""
         if len(frame) <= DATAGRAM_INDEX or frame[FRAME_HEADER] != self._command:
             return None
         index = frame[DATAGRAM_INDEX]
@@ -353,11 +356,11 @@ class ProcessData:
     @property
     def lost(self) -> int:
         """Number of frames lost."""
-        self._forget(self._monotonic_ns())
+        self._expire(self._monotonic_ns())
         return self._lost
 
-    def _forget(self, now_ns: int) -> None:
-        """Count frames as lost whose time has passed."""
+    def _expire(self, now_ns: int) -> None:
+        """Count frames as lost that are not back after `_LOST_NS`."""
         for index, (sent_ns, _, _) in enumerate(self._sent):
             if sent_ns and now_ns - sent_ns >= _LOST_NS:
                 self._sent[index] = _NOT_SENT

@@ -170,7 +170,7 @@ class OtherSlaves:
         self._unanswered = [0] * len(self.rows)
         self._turn = -1
 
-    def look_at_next(self) -> Steps[None]:
+    def check_next(self) -> Steps[None]:
         """Read the AL state of the next one, with one datagram."""
         if not self.rows:
             return

@@ -187,13 +187,13 @@ def test_an_answer_that_comes_again_is_a_duplicate_until_its_index_is_in_use_aga
     bus, backend = operational()
     process_data, backend.wire = bus.process_data, Wire(Machine(frame_jitter_ns=0))
     answer = answers(bus, backend)
-    assert awaited(process_data.take(answer, 1))
-    assert process_data.take(answer, 1) is process_data.take(answer, 1) is DUPLICATE
+    assert awaited(process_data.match(answer, 1))
+    assert process_data.match(answer, 1) is process_data.match(answer, 1) is DUPLICATE
     for _ in range(INDICES):
         later = answers(bus, backend)
-        assert process_data.take(answer, 1) in (DUPLICATE, None)
-        assert awaited(process_data.take(later, 1))
-        assert process_data.take(later, 1) is DUPLICATE
+        assert process_data.match(answer, 1) in (DUPLICATE, None)
+        assert awaited(process_data.match(later, 1))
+        assert process_data.match(later, 1) is DUPLICATE
     assert process_data.in_flight == process_data.lost == 0
 
 
@@ -204,11 +204,11 @@ def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() 
     backend.clock.sleep(0.2)
     assert process_data.lost == 1
     for _ in range(INDICES - 1):
-        assert awaited(process_data.take(answers(bus, backend), 1))
+        assert awaited(process_data.match(answers(bus, backend), 1))
     current = answers(bus, backend)
     assert current[DATAGRAM_INDEX] == late[DATAGRAM_INDEX]
-    assert process_data.take(late, 1) is None
-    assert awaited(process_data.take(current, 1)).frame == current
+    assert process_data.match(late, 1) is None
+    assert awaited(process_data.match(current, 1)).frame == current
     assert process_data.duplicates == 0, "it was given up, not taken"
 
 

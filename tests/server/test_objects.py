@@ -241,7 +241,7 @@ def test_a_fault_of_the_program_fails_the_request_alone(caplog: pytest.LogCaptur
     jobs.start(0, steps(), lambda _, error: told.append(error))
     while jobs.waiting:
         acyclic.turn += 1
-        acyclic.go_on(0, 0)
+        acyclic.run(0, 0)
     (error,) = told
     assert error is not None
     assert error.code == ErrorCode.INTERNAL

@@ -419,9 +419,9 @@ def test_three_samples_are_discarded_after_a_return_and_not_shown_as_the_last_go
                 client.wait_event("sensor_back")
     check_frames(simulation.frames)
     (stream,), period_ns = simulation.streams, 1_250_000
-    stream.idle_at_ns = 0
+    stream.silent_at_ns = 0
     stream.recover(period_ns)
-    assert stream.idle_at_ns > simulation.clock.now_ns + period_ns, "its first samples may still come"
+    assert stream.silent_at_ns > simulation.clock.now_ns + period_ns, "its first samples may still come"
 
 
 @pytest.mark.parametrize("most", more_if_long([3], [3, 20]))

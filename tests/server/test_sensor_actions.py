@@ -223,7 +223,9 @@ def test_every_path_to_a_sensor_that_writes_is_guarded() -> None:
             continue
         for used in re.findall(r"^.*\b(?:MailboxSdo\(|_ServerSdo\(|slaves\[.*\]\.sdo\b|slave\.sdo\b).*$",
                                path.read_text(), re.MULTILINE):  # fmt: skip
-            assert "GuardedSdo(" in used or "identify(" in used or ".sdo.look(" in used, f"{path}: {used}"
+            assert "GuardedSdo(" in used or "identify(" in used or ".sdo.poll_mailbox(" in used, (
+                f"{path}: {used}"
+            )
 
 
 # -- settings

@@ -276,15 +276,15 @@ class MailboxSdo:
             command, data = _DOWNLOAD | _SIZE_GIVEN, struct.pack("<I", len(data)) + data
         yield from self._transfer(index, subindex, command, data)
 
-    def look(self) -> Steps[None]:
+    def poll_mailbox(self) -> Steps[None]:
         """Read a message if one is there, unless a transfer is under way, which reads them itself."""
         if not self._in_use:
-            yield from self._alone(self._take())
+            yield from self._alone(self._receive())
 
     def drain(self, most: int = _MOST_DRAINED) -> Steps[None]:
         """Discard the messages that are there, at most `most`."""
         for _ in range(most):
-            if (yield from self._take()) == b"":
+            if (yield from self._receive()) == b"":
                 return
 
     def _transfer(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
@@ -311,7 +311,7 @@ class MailboxSdo:
                 deadline = Deadline(self.clock, _ANSWER_S)
                 while not deadline.passed:
                     yield None
-                    if (message := (yield from self._take())) is None:
+                    if (message := (yield from self._receive())) is None:
                         break  # ask again: reading and writing twice does no harm
                     if (answer := _answer(message, index, subindex, expected)) is None:
                         continue
@@ -335,11 +335,11 @@ class MailboxSdo:
         message = (header + body).ljust(self._out_size, b"\0")
         return (yield from self._bus.write_register(self._number, self._out, message))
 
-    def _take(self) -> Steps[bytes | None]:
+    def _receive(self) -> Steps[bytes | None]:
         """The CoE message that is there, or the header of one of another protocol; empty if none is.
 
-        None if the datagram that may have taken it is lost. The controller does not execute the reading of an
-        empty mailbox, so that its status need not be read first.
+        None if the datagram that may have emptied the mailbox is lost. The controller does not execute a read
+        of an empty mailbox, so its status need not be read first.
         """
         message = yield from self._bus.read_register(self._number, self._in, self._in_size)
         if not message:
