@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 from ethercat_server.sampling.observation import DistributedClock, Latched
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_short
+from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_short_exchange
 from ethercat_server.sampling.slave_clock import EventTimes
 
 SECOND: Final = 1e9
@@ -270,7 +270,7 @@ class ClockSimulation:
             learn(self.round_trip, [clock], sent, arrived, arrived, self._woke_late_ns)
             self._woke_late_ns = None
         elif clock.events is not None and back - sent < clock.events.local_clock.short_ns:
-            learn_short(self.round_trip, [clock], sent, arrived)
+            learn_short_exchange(self.round_trip, [clock], sent, arrived)
         if clock.events is not None and exchange.latched is not None and clock.events.trust.is_due(back):
             clock.events.retry(_DISTRIBUTED)
         if not clock.locked:

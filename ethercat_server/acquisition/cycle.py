@@ -23,8 +23,8 @@ from ethercat_server.acquisition.tracing import Tracing
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.exchange import DUPLICATE, LATCHED, Exchange
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_short
-from ethercat_server.sampling.trace import Kind, learned
+from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_short_exchange
+from ethercat_server.sampling.trace import RecordKind, learn_note
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
 # Sockets are served this often even if every deadline has passed,
@@ -289,14 +289,14 @@ class Cycle:
             self._recovery.causes.see_stall(back - max(arrived, since_ns), back)
         arrived = max(sent, arrived - self._wire_ns[which])
         if learners:
-            self.tracing.notes.append(learned(exchange, arrived, Kind.LEARNED, self._woke_late_ns))
+            self.tracing.notes.append(learn_note(exchange, arrived, RecordKind.LEARNED, self._woke_late_ns))
             learn(round_trip, learners, sent, arrived, back, self._woke_late_ns)
             self._woke_late_ns = None
             self._cost_ns += _COST_GAIN * (self._bus.clock.monotonic_ns() - back - self._cost_ns)
         else:
-            self.tracing.notes.append(learned(exchange, arrived))
+            self.tracing.notes.append(learn_note(exchange, arrived))
             clocks = [row[-1].clock for row in self._carried[which] if row[-1].is_newest(exchange)]
-            learn_short(round_trip, clocks, sent, arrived)
+            learn_short_exchange(round_trip, clocks, sent, arrived)
         if self._local_clocks:
             self._short_ns = max([each.short_ns for each in self._local_clocks])
 

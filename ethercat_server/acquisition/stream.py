@@ -24,7 +24,7 @@ from ethercat_server.sampling.observation import DistributedClock, Latched
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.sample_clock import SampleClock
 from ethercat_server.sampling.slave_clock import EventTimes
-from ethercat_server.sampling.trace import NOTHING, Kind, Note
+from ethercat_server.sampling.trace import NOTHING, Note, RecordKind
 from ethercat_server.sampling.trust import TrustState
 from ethercat_server.sensor.sensor import Sensor
 
@@ -144,7 +144,7 @@ class SensorStream:
 
     def make_invalid(self, exchange: Exchange) -> OutgoingFrame | None:
         """The frame for an exchange that brought nothing of this sensor, as `make_silent`."""
-        self.notes.append((exchange, NOTHING, self.number, Kind.INVALID))
+        self.notes.append((exchange, NOTHING, self.number, RecordKind.INVALID))
         self._invalid_wkc = exchange.wkc
         return self.make_silent(exchange.back_ns)
 
@@ -180,7 +180,7 @@ class SensorStream:
         self._gap = max(0, self._gap - 1)
         # Without an event, the slave may have held back the sample that ends a silence, or the one after it:
         # one may be missing after either.
-        if self._silent and ((events := self.clock.events) is None or events.has_none):
+        if self._silent and ((events := self.clock.events) is None or events.lacks_event):
             self._gap = 2
         self._silent = False
         return flags

@@ -18,7 +18,7 @@ from bota_ethercat.errors import ConnectionFailedError, ProtocolError
 from bota_ethercat.program.server_choice import default_server
 from bota_ethercat.text.untrusted import printable
 from ethercat_server.errors import ServerError
-from ethercat_server.sampling.trace import Kind, Step, Trace, TraceError
+from ethercat_server.sampling.trace import Decision, RecordKind, Trace, TraceError
 
 SUFFIX: Final = ".trace"
 _LATE: Final = 1.5  # periods between two exchanges beyond which samples pass
@@ -71,7 +71,7 @@ def show(path: Path) -> Iterator[str]:
     """The lines that show a trace file; ServerError if it is none."""
     try:
         trace = Trace(path.read_bytes())
-        steps = list(trace.replay())
+        decisions = list(trace.replay())
     except OSError as error:
         raise ServerError(f"{path} cannot be read: {error.strerror}") from None
     except TraceError as error:
@@ -80,8 +80,8 @@ def show(path: Path) -> Iterator[str]:
     rows: Sequence[Any] = sensors if isinstance(sensors, list) else ()
     yield f"written by {printable(trace.about.get('program'), 40)}, {len(trace.records)} records"
     losses = []
-    for number in sorted({step.record.sensor for step in steps}):
-        own = [step for step in steps if step.record.sensor == number]
+    for number in sorted({decision.record.sensor for decision in decisions}):
+        own = [decision for decision in decisions if decision.record.sensor == number]
         found = list(find_losses(number, own))
         losses += found
         row = rows[number] if number < len(rows) and isinstance(rows[number], dict) else {}
@@ -90,36 +90,36 @@ def show(path: Path) -> Iterator[str]:
         yield from _picture(own, found)
     losses.sort()
     for loss in losses[:_MOST_SHOWN]:
-        at_s = (loss.at_ns - steps[0].record.sent_ns) * 1e-9
+        at_s = (loss.at_ns - decisions[0].record.sent_ns) * 1e-9
         yield f"{at_s:9.4f} s  sensor {loss.sensor}: {loss.text}"
     if len(losses) > _MOST_SHOWN:
         yield f"({len(losses) - _MOST_SHOWN} more)"
 
 
-def find_losses(number: int, steps: Sequence[Step]) -> Iterator[Loss]:
+def find_losses(number: int, decisions: Sequence[Decision]) -> Iterator[Loss]:
     """What was lost, re-associated or invalid of a sensor, and why."""
-    fresh_ns = [step.record.sent_ns for step in steps if step.record.kind is Kind.FRESH]
+    fresh_ns = [decision.record.sent_ns for decision in decisions if decision.record.kind is RecordKind.FRESH]
     gaps = sorted(after - before for before, after in pairwise(fresh_ns))
     period_ns = gaps[len(gaps) // 2] if gaps else 0
-    took = sorted(step.record.duration_ns for step in steps)
+    took = sorted(decision.record.duration_ns for decision in decisions)
     long_ns = took[len(took) // 2] + period_ns / 2 if took else 0
     before_ns, invalid = 0, 0
     # Why the count at the sample before was uncertain; that of the first is, with nothing before it.
     doubt: tuple[str, str] | None = ("uncertain", "what came before is not in the trace")
-    for step in steps:
-        record = step.record
+    for decision in decisions:
+        record = decision.record
         sent_ns, back_ns = record.sent_ns, record.sent_ns + record.duration_ns
         asleep_ns = sent_ns - before_ns if before_ns else 0
         before_ns = back_ns
-        if record.kind is Kind.INVALID:
+        if record.kind is RecordKind.INVALID:
             invalid += 1
             if invalid == 1:
                 text = f"it took no part in an exchange (working counter {record.wkc})"
                 yield Loss(sent_ns, number, "not in the exchange", text)
             continue
-        if record.kind is not Kind.FRESH:
+        if record.kind is not RecordKind.FRESH:
             continue
-        lost = step.steps - 1
+        lost = decision.steps - 1
         if invalid:
             why = "not in the exchange", "while it took no part"
         elif asleep_ns > _LATE * period_ns:
@@ -130,30 +130,32 @@ def find_losses(number: int, steps: Sequence[Step]) -> Iterator[Loss]:
             why = doubt
         else:
             why = "sensor", "it was polled and gave none"
-        if step.steps == 0:
+        if decision.steps == 0:
             yield Loss(sent_ns, number, "uncertain", "a sample that was counted as lost came late")
         elif lost:
             yield Loss(sent_ns, number, why[0], f"{lost} lost: {why[1]}")
-        elif step.uncertain and doubt is None:
+        elif decision.uncertain and doubt is None:
             yield Loss(sent_ns, number, "uncertain", f"maybe one lost: {why[1]}")
-        invalid, doubt = 0, why if step.uncertain else None
+        invalid, doubt = 0, why if decision.uncertain else None
 
 
-def _table(steps: Sequence[Step]) -> Iterator[str]:
-    kinds = Counter(step.record.kind for step in steps)
-    new = [step for step in steps if step.record.kind is Kind.FRESH]
-    seconds = (steps[-1].record.sent_ns - steps[0].record.sent_ns) * 1e-9
+def _table(decisions: Sequence[Decision]) -> Iterator[str]:
+    kinds = Counter(decision.record.kind for decision in decisions)
+    new = [decision for decision in decisions if decision.record.kind is RecordKind.FRESH]
+    seconds = (decisions[-1].record.sent_ns - decisions[0].record.sent_ns) * 1e-9
     yield (
-        f"  {seconds:.1f} s: {len(new)} samples, {sum(max(0, step.steps - 1) for step in new)} lost, "
-        f"{kinds[Kind.READ]} early polls, {kinds[Kind.INVALID]} invalid exchanges"
+        f"  {seconds:.1f} s: {len(new)} samples, {sum(max(0, decision.steps - 1) for decision in new)} lost, "
+        f"{kinds[RecordKind.READ]} early polls, {kinds[RecordKind.INVALID]} invalid exchanges"
     )
     if new:
-        ages = [step.record.sent_ns + step.record.duration_ns - step.instant_ns for step in new]
+        ages = [
+            decision.record.sent_ns + decision.record.duration_ns - decision.instant_ns for decision in new
+        ]
         yield f"  age when it was here {_points(ages)} µs"
-        events = 100 * sum(step.by_events for step in new) // len(new)
-        locked = 100 * sum(step.locked for step in new) // len(new)
+        events = 100 * sum(decision.by_events for decision in new) // len(new)
+        locked = 100 * sum(decision.locked for decision in new) // len(new)
         yield f"  followed {locked} % of the time, dated by the slave controller {events} %"
-    yield f"  exchanges {_points([float(step.record.duration_ns) for step in steps])} µs"
+    yield f"  exchanges {_points([float(decision.record.duration_ns) for decision in decisions])} µs"
 
 
 def _points(values_ns: Sequence[float]) -> str:
@@ -165,10 +167,10 @@ def _points(values_ns: Sequence[float]) -> str:
     )
 
 
-def _picture(steps: Sequence[Step], losses: Sequence[Loss]) -> Iterator[str]:
+def _picture(decisions: Sequence[Decision], losses: Sequence[Loss]) -> Iterator[str]:
     """A mark for each tenth of a second: the worst that happened in it."""
-    begin_ns, order = steps[0].record.sent_ns, [*_MARKS]
-    cells = [0] * (1 + int((steps[-1].record.sent_ns - begin_ns) * 1e-9 / _CELL_S))
+    begin_ns, order = decisions[0].record.sent_ns, [*_MARKS]
+    cells = [0] * (1 + int((decisions[-1].record.sent_ns - begin_ns) * 1e-9 / _CELL_S))
     for loss in losses:
         at = min(len(cells) - 1, max(0, int((loss.at_ns - begin_ns) * 1e-9 / _CELL_S)))
         cells[at] = max(cells[at], order.index(loss.cause))

@@ -6,11 +6,11 @@ import math
 from typing import Final, NamedTuple
 
 SILENT_PERIODS: Final = 3  # periods without a new sample after which a sensor is silent, not just late
-ONE_ONLY: Final = 0.9  # time without a PDI read, in periods, in which only one sample can have come
+ONE_SAMPLE_PERIODS: Final = 0.9  # time without a PDI read, in periods, in which only one sample can have come
 
 
 class Expected(NamedTuple):
-    """What is known of the sampling clock before an exchange. Times in ns."""
+    """The sampling clock as estimated before an exchange. Times in ns."""
 
     phase_ns: float  # when the next sample comes to be, less the outward part of the shortest round trip
     period_ns: float
@@ -28,14 +28,14 @@ class Read(NamedTuple):
 
 
 class Association(NamedTuple):
-    """Which sample it is."""
+    """Which sample an exchange brought."""
 
     number: int  # counted from the one before by the phase alone: 1 if it is the next
     late: float  # by how many periods later than the expected one it came
     uncertain: bool  # whether more samples may have passed than `number` says
 
 
-def by_polls(expected: Expected, read: Read, *, has_events: bool, lost_track: bool) -> Association:
+def associate_by_polls(expected: Expected, read: Read, *, has_events: bool, lost_track: bool) -> Association:
     """Which sample it is by when the process data was read with and without it.
 
     `has_events`: the phase is so exact that no sample can have come before it: it was held back.
@@ -46,7 +46,7 @@ def by_polls(expected: Expected, read: Read, *, has_events: bool, lost_track: bo
     read_ns = read.sent_ns + read_delay_ns(excess_ns, period_ns)
     most = math.floor((read.sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
     unread_ns = read.back_ns - read.before_ns
-    if unread_ns - read.least_ns < ONE_ONLY * period_ns:
+    if unread_ns - read.least_ns < ONE_SAMPLE_PERIODS * period_ns:
         # It came between two reads: it is the one expected nearest to them.
         late = ((read.before_ns + read_ns) / 2 - phase_ns) / period_ns
         return Association(1 + (min(round(late), most) if has_events else round(late)), late, False)
@@ -56,18 +56,20 @@ def by_polls(expected: Expected, read: Read, *, has_events: bool, lost_track: bo
     return Association(1 + math.floor(late), late, is_doubtful or lost_track or (most > 0 and least < most))
 
 
-def by_event(late: float, *, uncertain: bool) -> Association:
+def associate_by_event(late: float, *, uncertain: bool) -> Association:
     """Which sample it is by its event, which is `late` periods after the expected instant."""
     return Association(1 + round(late), late, uncertain)
 
 
-def count(found: Association, *, is_doubtful: bool, absent: int, unchanged_periods: float) -> tuple[int, int]:
+def count_steps(
+    found: Association, *, is_doubtful: bool, absent: int, unchanged_periods: float
+) -> tuple[int, int]:
     """The number of the new sample by the phase, and how many samples it is after the one before.
 
-    `is_doubtful`: the sample before may have been another one. `absent`: samples that were polled for since
-    and did not come. `unchanged_periods`: time in which exchanges brought nothing new that were sent after
-    the sample before was identified. Samples that pass while the slave holds up the frames exist, although
-    none brings them.
+    `is_doubtful`: the sample before may have been another one. `absent`: number of expected samples that were
+    polled for since and did not come. `unchanged_periods`: time from the read of the sample before until the
+    last exchange that brought nothing new. Samples that pass while the slave holds up the frames do exist,
+    although no exchange brings them.
     """
     number = found.number
     if number < 1:  # too early for the next one: it is that, or one too many was counted before
@@ -78,9 +80,8 @@ def count(found: Association, *, is_doubtful: bool, absent: int, unchanged_perio
 
 
 def read_delay_ns(excess_ns: float, period_ns: float) -> float:
-    """When the process data was read after its frame was sent, by what that took beyond the shortest.
+    """Time from sending a frame to the PDI read, by the excess of its round trip over the shortest one.
 
-    A long exchange is taken for a stall after the frame had left: what it brought is dated from before, never
-    as younger than it may be.
+    A long exchange counts as a stall after the frame had left, so no sample is dated too late.
     """
     return excess_ns / 2 if excess_ns < period_ns / 2 else 0.0

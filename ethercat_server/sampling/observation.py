@@ -10,8 +10,8 @@ Latched = tuple[int, int, int, int]
 
 
 class DistributedClock(NamedTuple):
-    """That of one slave controller, as another master has set it."""
+    """The distributed clock of one slave controller, as another master has set it."""
 
-    offset: int  # DC system time less local time, modulo 2**32 ns
+    offset: int  # DC system time less local time: system time offset less propagation delay, modulo 2**32 ns
     loop_delay_ns: int  # from when a frame arrives at the slave until it is there again on its way back
     reading_ns: int  # from when a frame arrives until it has read what is latched, at most

@@ -70,21 +70,21 @@ class Phase:
     def correct(self, error_ns: float, variance: float) -> None:
         """The step happened `error_ns` later than expected, by a measurement with this variance."""
         total = self.variance + variance
-        self._move(error_ns / total)
-        self._narrow(1 / total)
+        self._shift(error_ns / total)
+        self._reduce_variance(1 / total)
 
-    def _move(self, weight: float) -> None:
+    def _shift(self, weight: float) -> None:
         self.phase_ns += self.variance * weight
         self.period_ns += self._covariance * weight
 
-    def _narrow(self, information: float) -> None:
+    def _reduce_variance(self, information: float) -> None:
         self.period_variance -= self._covariance * self._covariance * information
         self._covariance -= self.variance * self._covariance * information
         self.variance -= self.variance * self.variance * information
 
 
 class SensorPhase(Phase):
-    """That of a sensor's sampling clock. `phase_ns` is when the next sample comes to be."""
+    """Phase of a sensor's sampling clock: `phase_ns` is the instant of the next sample."""
 
     __slots__ = ("_contradictions", "_deviation", "_most_noise", "_nominal_ns", "_run", "log_noise")
 
@@ -97,7 +97,7 @@ class SensorPhase(Phase):
         self._nominal_ns = period_ns
         self._most_noise = math.log((_UNKNOWN * period_ns) ** 2 / (JITTER_NS**2))
         self._deviation = PERIOD_ERROR
-        # Logarithm of the factor by which its process noise exceeds a crystal's, as that of a program does.
+        # Logarithm of the factor by which the process noise exceeds a crystal's: a program's, for example.
         self.log_noise = 0.0
         self._run = 0.0  # negative log-likelihood of the reads since the last that was early
         self._contradictions = 0
@@ -120,7 +120,7 @@ class SensorPhase(Phase):
         self.advance(1)
 
     def hold_over(self, steps: int) -> None:
-        """See `Phase`; an unknown phase is within a period, whatever passes."""
+        """See `Phase`; the variance of the phase is at most that of an unknown one, within a period."""
         super().hold_over(steps)
         if self.variance > (most := (_UNKNOWN * self.period_ns) ** 2):
             self._covariance *= math.sqrt(most / self.variance)
@@ -154,16 +154,16 @@ class SensorPhase(Phase):
             self._contradictions = 0
         chance = WRONG_BIT + (0.5 - WRONG_BIT) * math.erfc(-sign * late * _ROOT_HALF)
         slope = (1 - 2 * WRONG_BIT) * sign * math.exp(-late * late / 2) / (_ROOT_2_PI * chance * deviation_ns)
-        self._move(-slope)
+        self._shift(-slope)
         surprise = -math.log(chance)
         if sign > 0 and late > 0:
-            # A late read bounds the phase on one side only: it pulls, but reduces no variance.
+            # A late read bounds the phase on one side only: it shifts the phase, but reduces no variance.
             self._run += surprise
             if self._run > UNLIKELY_RUN:
                 self.log_noise += QUICK_GAIN * self._run
         else:
             self._run = 0.0
-            self._narrow(slope * slope + slope * late / deviation_ns)
+            self._reduce_variance(slope * slope + slope * late / deviation_ns)
         self._adapt_noise((1 - chance) * (surprise + math.log(1 - chance)))
 
     def learn_instant(self, instant_ns: float, variance: float) -> None:
@@ -172,14 +172,14 @@ class SensorPhase(Phase):
         surprise = error_ns * error_ns / (self.variance + variance)
         if surprise > CONTRADICTS * CONTRADICTS:
             if self._is_contradicted():
-                self._move(error_ns / self.variance)
+                self._shift(error_ns / self.variance)
             return
         self._contradictions = 0
         self.correct(error_ns, variance)
         self._adapt_noise((surprise - 1) / 2)
 
     def expect_noise(self, variance: float) -> None:
-        """The instants have about this variance about those of a crystal."""
+        """Raise the process noise: samples deviate from a crystal by about this variance."""
         self._adapt_noise(math.log(max(variance / JITTER_NS**2, 1.0)) / QUICK_GAIN)
 
     def _adapt_noise(self, excess: float) -> None:
@@ -190,9 +190,9 @@ class SensorPhase(Phase):
             self._phase_noise = math.exp(self.log_noise) * JITTER_NS**2
             self._period_noise = math.exp(self.log_noise) * (DRIFT * self._nominal_ns) ** 2
 
-    def _move(self, weight: float) -> None:
+    def _shift(self, weight: float) -> None:
         period_ns = self.period_ns
-        super()._move(weight)
+        super()._shift(weight)
         if abs(self.period_ns - self._nominal_ns) > CERTAIN * LARGEST_ERROR * self._nominal_ns:
             self.period_ns = period_ns
 

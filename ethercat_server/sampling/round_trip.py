@@ -34,8 +34,8 @@ class RoundTrip:
         read_variance: of that.
         late_ns: usual lateness of a wake-up.
         variance: of the difference between the instant aimed at and that of the PDI read.
-        moved_ns: by how much instants less the outward part of the shortest are later than they were at
-        first.
+        moved_ns: total shift of all instants less the outward part of the shortest round trip, which is their
+            origin, since the start.
     """
 
     def __init__(self, wire_ns: int = 0) -> None:
@@ -69,7 +69,7 @@ class RoundTrip:
         """
         if late_ns is not None:
             self._learn_wake_up(late_ns)
-        self.shorten(sent_ns, arrived_ns)
+        self.learn_shortest(sent_ns, arrived_ns)
         most_ns = CONTRADICTS * math.sqrt(self._excess_square) + MACHINE_JITTER_NS  # a stall is no jitter
         excess_ns = min(arrived_ns - sent_ns - self.least_ns, most_ns)
         self.excess_ns += GAIN * (excess_ns - self.excess_ns)
@@ -78,8 +78,8 @@ class RoundTrip:
         self.taking_over_ns += GAIN * (took_over_ns - self.taking_over_ns)
         self._derive()
 
-    def shorten(self, sent_ns: int, arrived_ns: int) -> None:
-        """Learn from an exchange, which may be a short one, what the shortest is."""
+    def learn_shortest(self, sent_ns: int, arrived_ns: int) -> None:
+        """Learn the shortest round trip, also from an exchange that nothing else is learned from."""
         took_ns = arrived_ns - sent_ns
         before_ns = self.least_ns
         if arrived_ns >= self._roll_at_ns:
@@ -92,7 +92,7 @@ class RoundTrip:
             self.least_ns = min(self.least_ns, took_ns)
         more_ns = before_ns - self.least_ns
         if not -MACHINE_JITTER_NS < more_ns < MACHINE_JITTER_NS and before_ns < math.inf:
-            # Round trips take what they took before: the excess is another, and where phases count from.
+            # The same round trips have another excess over the shortest, and phases another origin.
             more_ns = max(more_ns, -self.excess_ns)
             self._excess_square = max(self._excess_square + more_ns * (2 * self.excess_ns + more_ns), 0.0)
             self.excess_ns += more_ns
@@ -104,7 +104,7 @@ class RoundTrip:
         self.late_ns += GAIN * error
         self._late_variance += GAIN * (error * error - self._late_variance)
 
-    def read(self, sent_ns: int, arrived_ns: int) -> tuple[float, float]:
+    def read_instant(self, sent_ns: int, arrived_ns: int) -> tuple[float, float]:
         """When the slaves read their data in an exchange, less the outward part of the shortest one.
 
         Returns the instant and its variance.
@@ -115,7 +115,7 @@ class RoundTrip:
         return sent_ns + excess_ns / 2, excess_ns * excess_ns / 12
 
     def as_json(self) -> dict[str, Any]:
-        """What `status` says of it."""
+        """The object `round_trip` of `status`."""
         known = self.least_ns < math.inf
         return {
             "least_us": round((self.least_ns + self._wire_ns) / 1000, 1) if known else None,

@@ -14,9 +14,9 @@ from ethercat_server.sampling.association import (
     Association,
     Expected,
     Read,
-    by_event,
-    by_polls,
-    count,
+    associate_by_event,
+    associate_by_polls,
+    count_steps,
 )
 from ethercat_server.sampling.constants import (
     CERTAIN,
@@ -41,7 +41,7 @@ class SampleClock:
     arrive when their first byte does.
 
     Attributes:
-        events: what the slave controller says; None if it says nothing.
+        events: event times of the slave controller; None if it latches none.
         phase: its phase is the next sample's instant less the outward part of the shortest round trip.
         locked: whether the phase is known well enough to follow it.
         instant_ns: estimated instant of the newest sample, from those before it.
@@ -49,9 +49,9 @@ class SampleClock:
             lost; 0, one was counted as lost that was not.
         uncertain: whether more may have been lost than `steps` says. The samples after it tell, and their
             `steps` put it right.
-        learns: whether `learn` is to follow: a steady clock is learned from some samples only. Which ones is
-            decided before they come: early and late polls must not be selected by what they say.
-        before_ns: an exchange that is back this long before the phase certainly brings nothing new.
+        learns: whether `learn` must follow: a steady clock learns from some samples only, which are chosen
+            before they arrive: otherwise the selection would bias the estimate.
+        before_ns: an exchange that is back by more than this before the phase cannot bring a new sample.
     """
 
     __slots__ = (
@@ -86,7 +86,7 @@ class SampleClock:
         # The last exchange: when it was sent, and whether it brought a new sample.
         self._sent_ns, self._fresh = 0, False
         self._by_event = 0.0  # instant of the newest sample by its event, less the outward part; 0: unknown
-        # When the last valid exchange was sent that was accounted for.
+        # When the last valid exchange was sent that was learned from or skipped.
         self._read_at_ns = 0
         self._moved_ns = round_trip.moved_ns
         self._bias_ns = 0.0  # by how much events are later than polls show, while polls are followed
@@ -106,7 +106,6 @@ class SampleClock:
 
     @property
     def period_ns(self) -> float:
-        """Estimated period."""
         return self.phase.period_ns
 
     @property
@@ -118,10 +117,10 @@ class SampleClock:
         """
         events, round_trip = self.events, self._round_trip
         if events is not None and events.are_trusted:
-            variance, way_ns = events.variance, events.way_ns
+            variance, path_delay_ns = events.variance, events.path_delay_ns
         else:
-            variance, way_ns = self.phase.variance, round_trip.least_ns + round_trip.excess_ns
-        return 2 * math.sqrt(variance) + way_ns / 2 + (self.phase.period_ns if self.uncertain else 0.0)
+            variance, path_delay_ns = self.phase.variance, round_trip.least_ns + round_trip.excess_ns
+        return 2 * math.sqrt(variance) + path_delay_ns / 2 + (self.phase.period_ns if self.uncertain else 0.0)
 
     @property
     def by_events(self) -> bool:
@@ -139,7 +138,7 @@ class SampleClock:
 
     @property
     def one_by_one(self) -> bool:
-        """Whether it is followed, and an exchange is back before the next one is wanted."""
+        """Whether the clock is locked, and an exchange is back before the next one is due."""
         return self.locked and not self._schedule.single
 
     def next_poll_ns(self, sent_ns: int, unanswered: int, *, in_flight: bool) -> float:
@@ -170,7 +169,7 @@ class SampleClock:
                 or self._moved_ns != self._round_trip.moved_ns
             )
             if not self.learns:
-                self._schedule.early(counts=False)
+                self._schedule.count_early(adapts=False)
                 self._read_at_ns = sent_ns
             return False
         phase_ns, outward_ns = phase.phase_ns, self._outward_ns
@@ -195,7 +194,7 @@ class SampleClock:
         return self.steps == 1 and not self.uncertain
 
     def _associate(self, sent_ns: int, back_ns: int) -> None:
-        """Date a new sample where it may not be the expected one."""
+        """Associate and date a new sample that may not be the expected one."""
         phase, round_trip = self.phase, self._round_trip
         phase_ns, period_ns, least_ns = phase.phase_ns, phase.period_ns, round_trip.least_ns
         outward_ns = least_ns / 2 + self._data_offset_ns
@@ -217,7 +216,8 @@ class SampleClock:
                     self._bias_ns += GAIN * (late - round(late)) * period_ns
                 else:
                     self._by_event = events.instant_ns - outward_ns
-                self._count(by_event(late, uncertain=events.is_doubtful), self._read_at_ns - self._seen_by_ns)
+                found = associate_by_event(late, uncertain=events.is_doubtful)
+                self._count(found, self._read_at_ns - self._seen_by_ns)
                 self.instant_ns = min(events.instant_ns, back_ns)
                 return
         excess_ns = max(0.0, back_ns - sent_ns - least_ns)
@@ -225,7 +225,7 @@ class SampleClock:
         doubt_ns = CERTAIN * math.sqrt(phase.variance)
         if not schedule.single:
             doubt_ns += least_ns / 4  # the outward part of a short round trip varies, too
-        found = by_polls(
+        found = associate_by_polls(
             Expected(phase_ns, period_ns, doubt_ns, self._doubtful),
             Read(self._read_at_ns, sent_ns, back_ns, least_ns),
             has_events=events is not None,
@@ -243,9 +243,9 @@ class SampleClock:
                 phase.expect_noise(variance)
 
     def _count(self, found: Association, unchanged_ns: float) -> None:
-        """Set `steps` and `uncertain`; see `association.count`."""
+        """Set `steps` and `uncertain`; see `count_steps`."""
         self.uncertain = found.uncertain
-        self._number, self.steps = count(
+        self._number, self.steps = count_steps(
             found, is_doubtful=self._doubtful, absent=self._absent,
             unchanged_periods=unchanged_ns / self.phase.period_ns,
         )  # fmt: skip
@@ -269,9 +269,9 @@ class SampleClock:
         self.learn_events(sent_ns, arrived_ns, 1 + self._skipped)
         if self._skipped:
             phase.hold_over(self._skipped)
-            schedule.hit(self._skipped)
+            schedule.count_hit(self._skipped)
             self._skipped = 0
-        read_ns, variance = self._round_trip.read(sent_ns, arrived_ns)
+        read_ns, variance = self._round_trip.read_instant(sent_ns, arrived_ns)
         before_ns, self._read_at_ns = self._read_at_ns, sent_ns
         if not self._begun:
             # The instant of what the first exchange brings is unknown.
@@ -301,8 +301,8 @@ class SampleClock:
         phase.advance(1)
         self._doubtful = self.uncertain
         if not self._by_event:
-            self._schedule.hit_by_poll()
-        self._schedule.hit()
+            self._schedule.count_polled_hit()
+        self._schedule.count_hit()
         self._absent, self._overdue = 0, False
 
     def _learn_absence(self, sent_ns: int, read_ns: float, variance: float) -> None:
@@ -318,7 +318,7 @@ class SampleClock:
             if not follows_events:
                 phase.learn_bit(read_ns, variance, -1)
             if read_ns > phase.phase_ns - doubt_ns - self._schedule.margin_ns * (1 + follows_events):
-                self._schedule.early(counts=not follows_events)
+                self._schedule.count_early(adapts=not follows_events)
 
     def _is_late(self, read_ns: float, variance: float) -> bool:
         """Whether a read came so late that the expected sample must have come, or was skipped."""
@@ -360,7 +360,7 @@ def learn(
     back_ns: int,
     late_ns: float | None,
 ) -> None:
-    """Have the `clocks` whose `observe` asked for it learn from an exchange, after `round_trip` has.
+    """Have `round_trip`, then the `clocks` whose `learns` is set, learn from an exchange.
 
     The answer began to arrive, and was there, then; `late_ns` as in `RoundTrip.learn`.
     """
@@ -369,8 +369,10 @@ def learn(
         clock.learn(arrived_ns)
 
 
-def learn_short(round_trip: RoundTrip, clocks: Iterable[SampleClock], sent_ns: int, arrived_ns: int) -> None:
-    """Nothing is to be learned of samples, but a short exchange tells a slave controller's time well."""
-    round_trip.shorten(sent_ns, arrived_ns)
+def learn_short_exchange(
+    round_trip: RoundTrip, clocks: Iterable[SampleClock], sent_ns: int, arrived_ns: int
+) -> None:
+    """Learn a slave controller's local time, and nothing else, from an exchange that took little time."""
+    round_trip.learn_shortest(sent_ns, arrived_ns)
     for clock in clocks:
         clock.learn_events(sent_ns, arrived_ns)

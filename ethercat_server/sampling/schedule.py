@@ -33,7 +33,7 @@ class Schedule:
     def __init__(self, phase: SensorPhase, round_trip: RoundTrip) -> None:
         self._phase, self._round_trip = phase, round_trip
         self.single = True
-        # Whether the next poll is to be early: polls can tell the phase better, or did not for long.
+        # Whether the next poll is to be early: the phase is uncertain, or was not measured for long.
         self._probing = False
         self._hits = 0  # samples since a poll was early
         # κ, the fraction of the margin that is needed: reads are distributed less evenly than it assumes.
@@ -41,18 +41,18 @@ class Schedule:
         self.margin_ns = 0.0
         self.aim_after_ns = 0.0
 
-    def hit(self, samples: int = 1) -> None:
+    def count_hit(self, samples: int = 1) -> None:
         """The first polls of these samples brought them."""
         self._hits += samples
 
-    def hit_by_poll(self) -> None:
+    def count_polled_hit(self) -> None:
         """The first poll of a sample that polls date brought it."""
         if self._hits:
             self._scale -= QUICK_GAIN * EARLY_POLLS * self._scale
 
-    def early(self, *, counts: bool) -> None:
-        """A poll was early; `counts`: by the margin, which is to grow therefore."""
-        if counts and self._hits:
+    def count_early(self, *, adapts: bool) -> None:
+        """A poll was early; `adapts`: whether the margin grows by it."""
+        if adapts and self._hits:
             self._scale = min(self._scale + QUICK_GAIN * self._scale, 1.0)
         self._hits = 0
 

@@ -46,7 +46,7 @@ class LocalClock:
 
     Attributes:
         local: local time of the newest exchange, which was back at `back_ns`.
-        moved_ns: by how much corrections have moved all events, in all.
+        moved_ns: sum of the corrections that moved all events.
         phase: CLOCK_MONOTONIC at the local time `local_at`, in steps of a local ns.
         doubt_ns: uncertainty of the phase, once the clock `is_known`.
         excess_ns: what the exchanges that count usually take beyond the shortest.
@@ -111,14 +111,14 @@ class LocalClock:
         error_ns, deviation_ns = self._best_ns - phase.phase_ns, math.sqrt(phase.variance + variance)
         # A busy machine delays frames on one way more than on the other: it is certain only that a frame was
         # at the slave after it was sent and before it was back. What is beyond contradicts the clock.
-        beyond_ns = _beyond(error_ns, took_ns / 2)
+        beyond_ns = _excess_over(error_ns, took_ns / 2)
         if abs(beyond_ns) > max(CERTAIN * deviation_ns, self._took_ns / 2):
             self._contradictions += 1
             if self._contradictions == _JUMPED:
                 self._restart()
             return
         self._contradictions, self._took_ns = 0, took_ns
-        self._bias += _BIAS_GAIN * (_beyond(error_ns, excess_ns / 2) / deviation_ns - self._bias)
+        self._bias += _BIAS_GAIN * (_excess_over(error_ns, excess_ns / 2) / deviation_ns - self._bias)
         self._move(beyond_ns)
         before_ns = phase.phase_ns
         phase.correct(error_ns - beyond_ns, variance)
@@ -139,13 +139,13 @@ class LocalClock:
         self.moved_ns += by_ns
 
 
-def _beyond(error_ns: float, limit_ns: float) -> float:
-    """By how much an error exceeds a limit."""
+def _excess_over(error_ns: float, limit_ns: float) -> float:
+    """By how much the size of an error exceeds a limit, with the sign of the error."""
     return math.copysign(max(0.0, abs(error_ns) - limit_ns), error_ns)
 
 
 class EventTimes:
-    """Event times of one sensor.
+    """The event times of one sensor, matched with its samples.
 
     `observe` every exchange; if it brought a new sample, `date` or `compare` it; then `learn`.
 
@@ -164,7 +164,7 @@ class EventTimes:
         self.are_trusted = False  # `trust.is_trusted`, read for every sample
         self.instant_ns = 0.0
         self._round_trip = round_trip
-        self._use(clock)
+        self._set_slave(clock)
         self._data_offset_ns = data_offset_ns
         # Local times of the newest sample's event, and of the newest one that was on trial.
         self._event = self._compared_event = 0
@@ -174,7 +174,7 @@ class EventTimes:
         self._is_next = self._is_certain = False
         self._answers = False  # whether the controller knows the registers
 
-    def _use(self, clock: DistributedClock) -> None:
+    def _set_slave(self, clock: DistributedClock) -> None:
         self._offset = clock.offset
         self._half_loop_ns = clock.loop_delay_ns / 2
         self._reading_ns = clock.reading_ns
@@ -183,7 +183,7 @@ class EventTimes:
         """Try them again: another master may have changed the controller's clock, which now is `clock`."""
         if clock.offset != self._offset:
             self.local_clock = LocalClock(self._round_trip)
-        self._use(clock)
+        self._set_slave(clock)
         self.trust.retry()
 
     @property
@@ -192,7 +192,7 @@ class EventTimes:
         return self._took_ns < self._round_trip.patience_ns
 
     @property
-    def _counts(self) -> bool:
+    def _is_evidence(self) -> bool:
         """Whether an event that is not the sample's counts against them all."""
         return self._is_in_time and (self.local_clock.is_known or not self._answers)
 
@@ -202,12 +202,12 @@ class EventTimes:
         return self.local_clock.phase.variance + RESOLUTION_NS**2
 
     @property
-    def way_ns(self) -> float:
-        """Time of the round trips by which the local clock is known that is not spent behind the slave."""
+    def path_delay_ns(self) -> float:
+        """Usual round trip of the exchanges that set the local clock, less the slave's loop delay."""
         return self._round_trip.least_ns + self.local_clock.excess_ns - 2 * self._half_loop_ns
 
     @property
-    def has_none(self) -> bool:
+    def lacks_event(self) -> bool:
         """Whether no event is certainly the new sample's of the newest exchange; the local clock is known."""
         return self._answers and self.local_clock.is_known and not (self.instant_ns and self._is_certain)
 
@@ -228,7 +228,7 @@ class EventTimes:
         if not fresh:
             return
         self._event = event = local - ((local - change + _HALF) % _WRAP - _HALF)
-        # Between these the process data passed: in the frame before, and in this one.
+        # Local times at which the process data passed the slave: of the frame before, and of this one.
         oldest, newest = before + self._data_offset_ns - _SLACK_NS, local + self._data_offset_ns
         self._is_next = newest < event < local + self._reading_ns and event - period_ns > oldest
         self._is_certain = self._is_next or event <= newest
@@ -259,7 +259,7 @@ class EventTimes:
             doubt_ns = CERTAIN * math.sqrt(variance + self.variance)
             self.is_doubtful = off_ns > doubt_ns or doubt_ns > period_ns / 2
             is_old = sent_ns - self.instant_ns > _OLDEST * period_ns
-            # If the process data had passed when this sample's own event came, that is late: it lies.
+            # An event after the process data that holds its sample had passed: the event time is wrong.
             is_late = self._is_next and late < -0.5
             # A jump of the local clock by more than half a round trip is noticed by `observe`: a larger
             # difference means that the sensor's own sampling clock has changed.
@@ -268,7 +268,7 @@ class EventTimes:
                 return late
             counts = self._is_in_time and not is_old
         else:
-            counts = self._counts
+            counts = self._is_evidence
         self.is_doubtful = True
         if counts:
             trust.contradict(back_ns, self.local_clock.restarts)
@@ -284,7 +284,7 @@ class EventTimes:
         is_new, self._compared_event = self._event != self._compared_event, self._event
         self.trust.compare(
             difference_ns if self.instant_ns and not self._is_next else None,
-            is_new=is_new, counts=self._counts and not self._is_next,
+            is_new=is_new, counts=self._is_evidence and not self._is_next,
         )  # fmt: skip
         # Polling does not tell where on its way a round trip takes its time.
         asymmetry_ns = _ASYMMETRY * self._round_trip.least_ns

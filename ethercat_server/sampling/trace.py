@@ -28,7 +28,7 @@ from typing import Any, Final, NamedTuple
 
 from ethercat_server.sampling.observation import DistributedClock, Latched
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_short
+from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_short_exchange
 from ethercat_server.sampling.slave_clock import EventTimes
 from ethercat_server.sampling.trust import TrustState
 
@@ -46,8 +46,8 @@ _LONGEST_HEADER: Final = 4 << 20
 _PLAIN: Final = int | float | str
 
 
-class Kind(IntEnum):
-    """Of a record; see above."""
+class RecordKind(IntEnum):
+    """What a record says; see the module."""
 
     READ = 0
     FRESH = 1
@@ -57,14 +57,14 @@ class Kind(IntEnum):
 
 
 class Record(NamedTuple):
-    """One of a trace."""
+    """One record of a trace; `a` and `b` depend on its kind."""
 
     sent_ns: int
     duration_ns: int
     a: int
     b: int
     sensor: int
-    kind: Kind
+    kind: RecordKind
     latched: bool
     wkc: int
 
@@ -76,8 +76,8 @@ Note = tuple[Exchanged, Latched, int, int]
 NOTHING: Final[Latched] = (0, 0, 0, 0)
 
 
-def learned(
-    exchange: Exchanged, arrived_ns: int, kind: Kind = Kind.SHORT, late_ns: float | None = None
+def learn_note(
+    exchange: Exchanged, arrived_ns: int, kind: RecordKind = RecordKind.SHORT, late_ns: float | None = None
 ) -> Note:
     """That the clocks learn from an exchange; see `RoundTrip.learn`."""
     late = 0 if late_ns is None else 1 + min(max(0, round(late_ns)), _MOST - 1)
@@ -124,7 +124,7 @@ def _attributes(value: Any) -> Iterator[str]:
 
 
 class Clocks(NamedTuple):
-    """Those of all sensors of a bus."""
+    """The sampling clocks of all sensors of a bus, and its round trips."""
 
     round_trip: RoundTrip
     sensors: Sequence[SampleClock]
@@ -220,8 +220,8 @@ class FrozenTrace(NamedTuple):
         return data + self.ring.read(at, max(0, min(length - len(data), self.end - at)))
 
 
-class Step(NamedTuple):
-    """What a sampling clock made of a record."""
+class Decision(NamedTuple):
+    """What a sampling clock decided about a record."""
 
     record: Record
     instant_ns: float  # of a new sample, by CLOCK_MONOTONIC
@@ -251,14 +251,14 @@ class Trace:
             self._snapshots = [(int(row["before"]), row) for row in header.pop("snapshots")]
             whole = records[: len(records) // _RECORD.size * _RECORD.size]
             self.records = [
-                Record(sent_ns, duration_ns, a, b, sensor, Kind(kind & ~_LATCHED), kind >= _LATCHED, wkc)
-                for sent_ns, duration_ns, a, b, sensor, kind, wkc in _RECORD.iter_unpack(whole)
+                Record(sent_ns, took_ns, a, b, sensor, RecordKind(kind & ~_LATCHED), kind >= _LATCHED, wkc)
+                for sent_ns, took_ns, a, b, sensor, kind, wkc in _RECORD.iter_unpack(whole)
             ]
         except (ValueError, TypeError, KeyError, struct.error, RecursionError) as error:
             raise TraceError("it is damaged") from error
         self.about: dict[str, Any] = header
 
-    def replay(self, *, anew: bool = False) -> Iterator[Step]:
+    def replay(self, *, anew: bool = False) -> Iterator[Decision]:
         """What the clocks make of each record of a sensor; TraceError where a record cannot be.
 
         `anew`: not from the state of the snapshots, but from the beginning, as a server that starts there:
@@ -285,7 +285,7 @@ class Trace:
             clocks[number : number + 1] = [SampleClock(period_ns, round_trip, events, offset_ns)]
         return Clocks(round_trip, clocks)
 
-    def _replay(self, anew: bool) -> Iterator[Step]:
+    def _replay(self, anew: bool) -> Iterator[Decision]:
         waiting = list(self._snapshots)
         clocks: Clocks | None = None
         pending: list[SampleClock] = []
@@ -297,20 +297,20 @@ class Trace:
             if clocks is None:
                 continue
             sent_ns, back_ns = record.sent_ns, record.sent_ns + record.duration_ns
-            if record.kind is Kind.LEARNED:
+            if record.kind is RecordKind.LEARNED:
                 late_ns = record.b - 1.0 if record.b else None
                 learners = [clock for clock in pending if clock.learns]
                 learn(clocks.round_trip, learners, sent_ns, sent_ns + record.a, back_ns, late_ns)
                 pending = []
                 continue
-            if record.kind is Kind.SHORT:
-                learn_short(clocks.round_trip, pending, sent_ns, sent_ns + record.a)
+            if record.kind is RecordKind.SHORT:
+                learn_short_exchange(clocks.round_trip, pending, sent_ns, sent_ns + record.a)
                 pending = []
                 continue
             if record.sensor >= len(clocks.sensors):
                 raise TraceError(f"it has a record of sensor {record.sensor}, which it does not describe")
             clock = clocks.sensors[record.sensor]
-            if record.kind is not Kind.INVALID:
+            if record.kind is not RecordKind.INVALID:
                 if pending and record.sent_ns != pending_ns:
                     pending = []
                 pending_ns = record.sent_ns
@@ -318,8 +318,8 @@ class Trace:
                 latched = (record.a, 1, record.b, 1) if record.latched else None
                 if latched is None and clock.events is not None:
                     latched = (0, 0, 0, 0)
-                clock.observe(sent_ns, back_ns, latched, fresh=record.kind is Kind.FRESH)
-            yield Step(
-                record, clock.instant_ns if record.kind is Kind.FRESH else math.nan, clock.steps,
+                clock.observe(sent_ns, back_ns, latched, fresh=record.kind is RecordKind.FRESH)
+            yield Decision(
+                record, clock.instant_ns if record.kind is RecordKind.FRESH else math.nan, clock.steps,
                 clock.uncertain, clock.locked, clock.by_events,
             )  # fmt: skip

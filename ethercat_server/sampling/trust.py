@@ -18,7 +18,7 @@ _PROVEN_NS: Final = 60_000_000_000  # time trusted after which earlier failures 
 
 
 class TrustState(Enum):
-    """What event times are worth."""
+    """Whether event times may date samples."""
 
     TRIAL = "on trial"
     TRUSTED = "trusted"
@@ -26,8 +26,8 @@ class TrustState(Enum):
     ABSENT = "absent"  # the controller has never shown any
 
 
-class Finding(Enum):
-    """What changes that."""
+class Evidence(Enum):
+    """What moves event times from one state to another."""
 
     FITS = auto()
     CONTRADICTS = auto()
@@ -38,13 +38,13 @@ class Finding(Enum):
 
 # Any other pair is a defect of this program.
 TRANSITIONS: Final = {
-    (TrustState.TRIAL, Finding.FITS): TrustState.TRUSTED,
-    (TrustState.TRIAL, Finding.CONTRADICTS): TrustState.TRIAL,
-    (TrustState.TRIAL, Finding.FAILS_AGAIN): TrustState.REFUSED,
-    (TrustState.TRIAL, Finding.SHOWS_NONE): TrustState.ABSENT,
-    (TrustState.TRUSTED, Finding.CONTRADICTS): TrustState.TRIAL,
-    (TrustState.TRUSTED, Finding.FAILS_AGAIN): TrustState.REFUSED,
-    (TrustState.REFUSED, Finding.IS_RETRIED): TrustState.TRIAL,
+    (TrustState.TRIAL, Evidence.FITS): TrustState.TRUSTED,
+    (TrustState.TRIAL, Evidence.CONTRADICTS): TrustState.TRIAL,
+    (TrustState.TRIAL, Evidence.FAILS_AGAIN): TrustState.REFUSED,
+    (TrustState.TRIAL, Evidence.SHOWS_NONE): TrustState.ABSENT,
+    (TrustState.TRUSTED, Evidence.CONTRADICTS): TrustState.TRIAL,
+    (TrustState.TRUSTED, Evidence.FAILS_AGAIN): TrustState.REFUSED,
+    (TrustState.REFUSED, Evidence.IS_RETRIED): TrustState.TRIAL,
 }
 
 
@@ -52,7 +52,7 @@ class Trust:
     """Whether the event times of one sensor are believed.
 
     Attributes:
-        state: what they are worth now.
+        state: whether they may date samples now.
         why: what was wrong with them last: part of a sentence.
         was_trusted: whether this controller's ever were: then they are not `ABSENT`.
         contradictions: evidence against trusted ones, in samples.
@@ -73,8 +73,8 @@ class Trust:
         self._events = self._compared = self._unfit = 0
         self._sum_ns = self._squares = 0.0
 
-    def _enter(self, finding: Finding) -> None:
-        self.state = TRANSITIONS[self.state, finding]
+    def _enter(self, evidence: Evidence) -> None:
+        self.state = TRANSITIONS[self.state, evidence]
 
     @property
     def is_trusted(self) -> bool:
@@ -92,7 +92,7 @@ class Trust:
 
     def retry(self) -> None:
         """Have another trial begin, though they are refused."""
-        self._enter(Finding.IS_RETRIED)
+        self._enter(Evidence.IS_RETRIED)
         self._begin(0, 0)
 
     def confirm(self) -> None:
@@ -152,7 +152,7 @@ class Trust:
             why = f"they differ from what polling shows by {self.mean_ns / 1000:+.0f} µs"
             self._fail(why, now_ns, restarts)
         else:
-            self._enter(Finding.FITS)
+            self._enter(Evidence.FITS)
             self._since_ns, self.was_trusted, self.contradictions = now_ns, True, 0.0
             return self._squares / self._compared
         return 0.0
@@ -160,16 +160,16 @@ class Trust:
     def _show_none(self, why: str, now_ns: int) -> None:
         self.why = why
         self._pause(now_ns)
-        self._enter(Finding.FAILS_AGAIN if self.was_trusted else Finding.SHOWS_NONE)
+        self._enter(Evidence.FAILS_AGAIN if self.was_trusted else Evidence.SHOWS_NONE)
 
     def _fail(self, why: str, now_ns: int, restarts: int) -> None:
         self._failures += 1
         self.why = why
         if self._failures > IN_A_ROW:
             self._pause(now_ns)
-            self._enter(Finding.FAILS_AGAIN)
+            self._enter(Evidence.FAILS_AGAIN)
         else:
-            self._enter(Finding.CONTRADICTS)
+            self._enter(Evidence.CONTRADICTS)
         self._begin(now_ns, restarts)
 
     def _pause(self, now_ns: int) -> None:

@@ -98,8 +98,8 @@ class DcUnit:
         self._memory, self._write_mask = memory, write_mask
         self._clock = clock
         self.present = True  # the controller has a distributed clock
-        self.way_ns = 0  # a frame's way from the first slave to it
-        self.behind_ns = 0  # a frame's way through the slaves behind it and back
+        self.propagation_delay_ns = 0  # from the first slave to this one
+        self.loop_delay_ns = 0  # through the slaves behind this one and back
         self.frame_start = clock()  # when the frame that is being processed reached the first slave
         self.time_mask = _U64  # the bits of the system time that it has
         self.local = CrystalClock(self.frame_start)
@@ -123,16 +123,18 @@ class DcUnit:
 
     def latch(self) -> None:
         """The master wrote to the receive times: keep when its frame came, and came back."""
-        arrival = self.frame_start + self.way_ns
+        arrival = self.frame_start + self.propagation_delay_ns
         out = self.local.at(arrival)
-        back = self.local.at(arrival + self.behind_ns) if self.behind_ns else 0
+        back = self.local.at(arrival + self.loop_delay_ns) if self.loop_delay_ns else 0
         struct.pack_into("<II", self._memory, reg.DC_RECEIVE_TIMES, out & _MASK, back & _MASK)
         _TIME.pack_into(self._memory, reg.DC_RECEIVE_TIME, out & self.time_mask)
 
     def show_system_time(self) -> None:
         """About to be read: the time when this frame passed the reference clock, as this clock has it."""
         offset, delay = _offset_and_delay(self._memory, _DC_OFFSET)
-        time = int(self.local.at(self.frame_start + self.way_ns) + offset - delay) & self.time_mask
+        time = (
+            int(self.local.at(self.frame_start + self.propagation_delay_ns) + offset - delay) & self.time_mask
+        )
         _TIME.pack_into(self._memory, reg.DC_SYSTEM_TIME, time)
 
     def settle(self) -> int:

@@ -294,7 +294,7 @@ class Esc:
 
     def set_line(self, before: int, behind: int) -> None:
         """So many slaves are before it and behind it. Port 0 is always open; port 1 if one is behind."""
-        self.clock.way_ns, self.clock.behind_ns = before * HOP_NS, 2 * behind * HOP_NS
+        self.clock.propagation_delay_ns, self.clock.loop_delay_ns = before * HOP_NS, 2 * behind * HOP_NS
         status = _LINE_GOES_ON if behind else _LINE_ENDS
         was = _U16.unpack_from(self.memory, reg.DL_STATUS)[0]
         if was == _LINE_GOES_ON and not behind:
@@ -381,7 +381,7 @@ class Esc:
             if start < _DC_RECEIVE_TIME:
                 clock.show_system_time()
             if end > _DC_CHANGE_EVENT:
-                clock.events.update(self._pdi.clock() + clock.way_ns)
+                clock.events.update(self._pdi.clock() + clock.propagation_delay_ns)
         if start > _DC_RECEIVE_TIMES:
             return self.memory[start:end]
         if start < reg.SII_DATA and end > reg.SII_CONTROL:

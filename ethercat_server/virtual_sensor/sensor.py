@@ -40,7 +40,7 @@ class Firmware(Application):
 
     def inputs(self) -> bytes:
         """The newest process data when its first byte passes."""
-        return self.sampler.newest(self.esc.clock.way_ns + self.esc.into_ns)
+        return self.sampler.newest(self.esc.clock.propagation_delay_ns + self.esc.into_ns)
 
     def prepare(self, expected: int) -> None:
         self.sampler.prepare(expected)

@@ -11,11 +11,11 @@ from ethercat_server.sampling.association import (
     Association,
     Expected,
     Read,
-    by_event,
-    by_polls,
-    count,
+    associate_by_event,
+    associate_by_polls,
+    count_steps,
 )
-from ethercat_server.sampling.trust import TRANSITIONS, Finding, Trust, TrustState
+from ethercat_server.sampling.trust import TRANSITIONS, Evidence, Trust, TrustState
 
 PERIOD_NS, LEAST_NS = 1_000_000, 50_000
 # The next sample is expected at 0; times below are in µs from then.
@@ -27,7 +27,7 @@ def brought(
 ) -> Association:  # fmt: skip
     expected = Expected(0.0, PERIOD_NS, doubt * 1e3, is_doubtful)
     read = Read(round(before * 1e3), round(sent * 1e3), round((sent + took) * 1e3), LEAST_NS)
-    return by_polls(expected, read, has_events=has_events, lost_track=lost_track)
+    return associate_by_polls(expected, read, has_events=has_events, lost_track=lost_track)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_which_sample_it_is_by_polls(given: dict[str, float], number: int, uncer
 
 @pytest.mark.parametrize(("late", "number"), [(0.0, 1), (0.4, 1), (-0.4, 1), (0.6, 2), (3.1, 4), (-0.9, 0)])
 def test_which_sample_it_is_by_its_event(late: float, number: int) -> None:
-    assert by_event(late, uncertain=False).number == number
+    assert associate_by_event(late, uncertain=False).number == number
 
 
 @pytest.mark.parametrize(
@@ -78,18 +78,18 @@ def test_how_many_samples_passed(
     number: int, late: float, is_doubtful: bool, absent: int, unchanged: float, expected: tuple[int, int]
 ) -> None:
     found = Association(number, late, False)
-    got = count(found, is_doubtful=is_doubtful, absent=absent, unchanged_periods=unchanged)
+    got = count_steps(found, is_doubtful=is_doubtful, absent=absent, unchanged_periods=unchanged)
     assert got == expected
 
 
-@pytest.mark.parametrize(("state", "finding"), [*itertools.product(TrustState, Finding)])
-def test_what_event_times_are_worth_changes_by_the_table_only(state: TrustState, finding: Finding) -> None:
+@pytest.mark.parametrize(("state", "evidence"), [*itertools.product(TrustState, Evidence)])
+def test_what_event_times_are_worth_changes_by_the_table_only(state: TrustState, evidence: Evidence) -> None:
     trust = Trust()
     trust.state = state
-    if (state, finding) in TRANSITIONS:
-        trust._enter(finding)
-        assert trust.state is TRANSITIONS[state, finding]
+    if (state, evidence) in TRANSITIONS:
+        trust._enter(evidence)
+        assert trust.state is TRANSITIONS[state, evidence]
     else:
         with pytest.raises(KeyError):
-            trust._enter(finding)
+            trust._enter(evidence)
         assert trust.state is state

@@ -14,7 +14,7 @@ import pytest
 from ethercat_server.daemon.traces import Traces
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.doctor.trace import find_losses
-from ethercat_server.sampling.trace import Kind, Trace, TraceError
+from ethercat_server.sampling.trace import RecordKind, Trace, TraceError
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.ended import run_here
@@ -42,7 +42,7 @@ def check_replay(simulation: Simulation, numbers: Sequence[int] = (0,)) -> Trace
         dated = [
             int(step.instant_ns)
             for step in steps
-            if step.record.kind is Kind.FRESH and step.record.sensor == number
+            if step.record.kind is RecordKind.FRESH and step.record.sensor == number
         ]
         handed_out = [
             frame.monotonic_ns

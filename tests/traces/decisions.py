@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Final
 
-from ethercat_server.sampling.trace import Kind, Trace
+from ethercat_server.sampling.trace import RecordKind, Trace
 
 FOLDER: Final = Path(__file__).parent
 NAMES: Final = ("quiet", "loops", "slow", "stalls", "lies", "unplugged")
@@ -23,14 +23,14 @@ def decisions(name: str) -> dict[str, int]:
     """Counts of samples and exchanges; ages of samples in µs."""
     steps = list(trace(name).replay(anew=True))
     kinds = Counter(step.record.kind for step in steps)
-    new = [step for step in steps if step.record.kind is Kind.FRESH]
+    new = [step for step in steps if step.record.kind is RecordKind.FRESH]
     ages = sorted(
         step.record.sent_ns + step.record.duration_ns - step.instant_ns for step in new if step.locked
     )
     return {
         "samples": len(new),
-        "early_polls": kinds[Kind.READ],
-        "invalid": kinds[Kind.INVALID],
+        "early_polls": kinds[RecordKind.READ],
+        "invalid": kinds[RecordKind.INVALID],
         "lost": sum(max(0, step.steps - 1) for step in new),
         "put_right": sum(step.steps < 1 for step in new),
         "uncertain": sum(step.uncertain for step in new),
