@@ -20,7 +20,7 @@ _NEVER_NS: Final = 1 << 62
 
 
 class Task:
-    """Steps under way."""
+    """Steps, and where they have got to."""
 
     def __init__(self, steps: Steps[None]) -> None:
         self.steps = steps

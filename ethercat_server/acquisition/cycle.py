@@ -27,9 +27,9 @@ from ethercat_server.sampling.sample_clock import SampleClock, learn, learn_shor
 from ethercat_server.sampling.trace import RecordKind, learn_note
 from ethercat_server.sensor.sensor import Sensor, SensorState
 
-# Sockets are served this often even if every deadline has passed,
+# Longest interval between two servings of the sockets, even if every deadline has passed.
 _SERVE_EVERY_NS: Final = 10_000_000
-_SERVE_IN_FLIGHT_NS: Final = 2_000_000  # and, without waiting, while an exchange is on its way
+_SERVE_IN_FLIGHT_NS: Final = 2_000_000  # the same while an exchange is in flight: then serving does not wait
 _CHORES_EVERY_NS: Final = 20_000_000  # interval between chores, such as whether CLOCK_REALTIME was set
 _RECOVERY_STEP_NS: Final = 500_000  # time between two exchanges while all sensors are lost
 # Interval between summaries of the distributions, which take some 100 µs each.
@@ -62,7 +62,7 @@ class Watchdog(Protocol):
         """The longest time between two calls of `feed`."""
 
     def feed(self) -> None:
-        """The loop runs."""
+        """Tell it that the loop runs."""
 
 
 class Cycle:
@@ -103,13 +103,13 @@ class Cycle:
             ]
             for each in bus.process_data.inputs
         ]
-        # The answer that the last step took, and whether all sensors that are not lost took part in it.
+        # The answer that arrived in the last step, and whether all sensors that are not lost took part in it.
         self._answer: Exchange | None = None
-        # When the last exchange was sent, whether it is not back, how many were sent since one was back, and
-        # when the first of them was if there are several.
+        # When the last exchange was sent; whether it is in flight; how many were sent since the last answer,
+        # and when the first of those was, if there are several.
         self._sent_ns = self._unanswered_since_ns = bus.clock.monotonic_ns()
         self._in_flight, self._unanswered = False, 0
-        # How late the loop woke when it first slept after it learned.
+        # Wake-up lateness of the first sleep since the clocks learned; None before it.
         self._woke_late_ns: float | None = None
         self._short_ns = 0.0  # an exchange that is back sooner is a short one, from which local clocks learn
         self._complete = False
@@ -120,7 +120,7 @@ class Cycle:
         self._started_ns = bus.clock.monotonic_ns()
         self._summarize_at_ns = 0
         self._chores_at_ns = self._roll_at_ns = 0
-        self._slept = False  # whether the loop, when it was stopped, had slept until the exchange that is due
+        self._slept = False  # whether the loop had slept until the due exchange when `stop` ended it
         self._summaries: list[tuple[dict[str, float], dict[str, float]]] = []
         self._plan()
 
@@ -129,7 +129,7 @@ class Cycle:
         self.stopping = True
 
     def run(self) -> None:
-        """The loop."""
+        """Run the loop until `stop`."""
         hub, acyclic, recovery = self._hub, self._acyclic, self._recovery
         monotonic_ns, serve_by, slept = self._bus.clock.monotonic_ns, 0, self._slept
         self._feed_at_ns = 0
@@ -205,7 +205,7 @@ class Cycle:
             slept = slept or wait > 0
         if now - due > self._shortest_ns:
             self._count_missed(due, now)
-            if slept:  # else the answer was held up, and what is due was past when it came
+            if slept:  # otherwise a late answer is why the exchange is overdue
                 self._recovery.causes.see_stall(now - due, now)
         if self._unanswered:
             if self._unanswered == 1:
@@ -228,7 +228,7 @@ class Cycle:
         if frame is None:
             return
         while (exchange := bus.process_data.match(frame, back)) is DUPLICATE:
-            # The answer may be behind duplicates of others: they must not pile up.
+            # Drain duplicates of earlier answers, which would delay this one.
             if back > self._sent_ns + _SERVE_EVERY_NS:
                 return
             frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
@@ -271,7 +271,7 @@ class Cycle:
             self._hub.publish(new, now)
 
     def _count_missed(self, due_ns: float, now_ns: int) -> None:
-        """What was due then is done now: count the sample periods in between that are not counted yet."""
+        """Count as missed the sample periods from `due_ns` until now that are not counted yet."""
         missed = max(0, int((now_ns - max(due_ns, self._missed_until_ns)) // self._shortest_ns))
         self._missed_deadlines += missed
         self._missed_until_ns = now_ns
@@ -285,7 +285,7 @@ class Cycle:
             arrived = back
         if back - sent - round_trip.usual_ns > self._shortest_ns:  # it was held up
             self._count_missed(sent + round_trip.usual_ns, back)
-            # By this computer, if it had arrived and was awaited already.
+            # By this computer, if the answer had arrived, and the loop was waiting for it.
             self._recovery.causes.see_stall(back - max(arrived, since_ns), back)
         arrived = max(sent, arrived - self._wire_ns[which])
         if learners:
@@ -313,16 +313,15 @@ class Cycle:
             self._watchdog.feed()
         if now >= self._roll_at_ns:
             self._roll_at_ns = now + SLOT_NS
-            self._roll()
+            self._each_second()
 
-    def _roll(self) -> None:
-        """Once a second."""
+    def _each_second(self) -> None:
         for distribution in self._everyone:
             distribution.roll()
         self._plan()
         self._round_trip_health.check()
         self._recovery.check()
-        self.tracing.second()
+        self.tracing.each_second()
         for stream in self._streams:
             stream.check()
             if stream.clock.events is None:

@@ -73,7 +73,7 @@ class RecentDistribution:
         del self._ring[:]
 
     def roll(self) -> None:
-        """A second has passed."""
+        """Begin the slot of another second; the oldest leaves the last ten."""
         self.count()
         self.slots.append(Distribution())
         if len(self.slots) > WINDOW_SLOTS:

@@ -36,15 +36,17 @@ _FIELDS: Final = LAYOUTS[min(LAYOUTS)]
 _SATURATED: Final = _FIELDS.index("force_torque_saturated")
 _ACCELERATION: Final = slice(_FIELDS.index("acceleration.x"), _FIELDS.index("acceleration.z") + 1)
 _TEMPERATURE: Final = _FIELDS.index("temperature")
-_UP: Final = slice(len(CHANNELS), len(CHANNELS) + 3)  # acceleration among the sums; temperature is the last
+_GRAVITY: Final = slice(
+    len(CHANNELS), len(CHANNELS) + 3
+)  # acceleration among the sums; temperature is the last
 _SUMS: Final = len(CHANNELS) + 4
 _CONE: Final = math.cos(math.radians(1.0))
-_LEAST_UP: Final = 0.5  # g, or m/s² of firmware that sends those: without an IMU it is 0
+_LEAST_GRAVITY: Final = 0.5  # g, or m/s² of firmware that sends those: without an IMU it is 0
 _SLOW_S: Final = 20.0  # in this time drift stays steady
 
 
 class Drift:
-    """Of one sensor."""
+    """Drift of the zero of one sensor since its tare, or what began a new count."""
 
     def __init__(self, sensor: Sensor, clock: Clock) -> None:
         self.history = History()
@@ -57,7 +59,7 @@ class Drift:
         self._part, self._parts = Part(_SUMS), list[Part]()
         self._full, self._found = list[Part](), list[Found]()  # a window, and what of it is known
         self._first: list[Found] | None = None
-        self._joined = False  # whether the last window was believed
+        self._was_plausible = False  # whether the window before was drift, by `_is_plausible`
         self._unusable = True  # until the next second, so that nothing is from before
 
     def _now_s(self) -> float:
@@ -73,9 +75,8 @@ class Drift:
         if self._full:
             self._examine()
 
-    def second(self) -> None:
-        """A second has passed."""
-        self.history.second()
+    def each_second(self) -> None:
+        self.history.each_second()
         sensor = self.sensor
         self._unusable = sensor.settling or sensor.settings.get("calibration_matrix") is False
         part, self._part = self._part, Part(_SUMS)
@@ -88,26 +89,28 @@ class Drift:
         self._found.append(found_in(self._full, len(self._found)))
         if len(self._found) == _SUMS:
             self._full = []
-            self._joined = self._believes(self._found)
-            if self._joined:
-                self._take(self._found)
+            self._was_plausible = self._is_plausible(self._found)
+            if self._was_plausible:
+                self._accept(self._found)
 
-    def _believes(self, window: Sequence[Found]) -> bool:
-        up = [found.mean for found in window[_UP]]
-        if why_moving(window[: len(CHANNELS)]) or math.hypot(*up) < _LEAST_UP:
+    def _is_plausible(self, window: Sequence[Found]) -> bool:
+        gravity = [found.mean for found in window[_GRAVITY]]
+        if why_moving(window[: len(CHANNELS)]) or math.hypot(*gravity) < _LEAST_GRAVITY:
             return False
         if self._first is None:
             return True
-        was = [found.mean for found in self._first[_UP]]
-        if sum(a * b for a, b in zip(up, was, strict=True)) < _CONE * math.hypot(*up) * math.hypot(*was):
+        was = [found.mean for found in self._first[_GRAVITY]]
+        if sum(a * b for a, b in zip(gravity, was, strict=True)) < _CONE * math.hypot(*gravity) * math.hypot(
+            *was
+        ):
             return False
-        share = (self._now_s() - self._last_s) / _SLOW_S if self._joined else 1.0
+        share = (self._now_s() - self._last_s) / _SLOW_S if self._was_plausible else 1.0
         return all(
             abs(new.mean - old.mean) <= share * channel.steady + math.hypot(new.by_chance, old.by_chance) / 2
             for channel, new, old in zip(CHANNELS[:6], window, self._last, strict=False)
         )
 
-    def _take(self, window: list[Found]) -> None:
+    def _accept(self, window: list[Found]) -> None:
         self._first = self._first or window
         self._last, self._last_s = window, self._now_s()
 

@@ -44,7 +44,6 @@ class RoundTripHealth:
         self._slow_s = 0
 
     def check(self) -> None:
-        """Check the last second."""
         usual_us = self._round_trip.usual_ns / 1000
         if self._slow_s < _SLOW_SECONDS:
             self._slow_s = self._slow_s + 1 if usual_us > SLOW_US else 0

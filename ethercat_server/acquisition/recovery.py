@@ -349,7 +349,7 @@ class SensorRecovery:
         yield from self._set_up()
 
     def _set_up(self) -> Steps[None]:
-        """From PREOP to OP."""
+        """Set up, map and take the sensor from PREOP to OP."""
         asked = self._change is not None and self._change.failed is None
         yield from set_up(self.sdo, self._sensor, asked=asked)
         yield from self._slave.map()

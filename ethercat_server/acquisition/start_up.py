@@ -71,13 +71,12 @@ class AsFound:
         self.force = force
 
     def wanted_settings(self, _number: int, _name: str, _serial: int) -> dict[str, SettingValue]:
-        """See `Wanted`."""
         return {}
 
     asked_settings = wanted_settings
 
     def check_sensors(self, found: Mapping[int, Identity]) -> None:
-        """See `Wanted`."""
+        """Accept all: nothing is asked of any."""
 
 
 class Started(NamedTuple):

@@ -3,7 +3,7 @@
 A frame exists for every new sample. While the sensor is silent there is one REPEATED (or INVALID)
 frame for each sample period that passes, so that its silence is visible; the polls in between samples, which
 find the same data again only because the bus is read more often than the sensor samples, make none. An answer
-that was overtaken by a later one is ignored.
+that arrives after that of a later exchange is ignored.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class SensorStream:
         self.health = SampleHealth(sensor.number, self.drift.add)
         self._discard = DISCARDED_AT_START
         self._gap = 0  # number of new samples to come that have GAP
-        self._silent = False  # whether REPEATED or INVALID frames were sent since the newest sample
+        self._silent = False  # whether REPEATED or INVALID frames were made since the newest sample
         # The last valid exchange, and whether it brought a new sample.
         self._exchange, self._fresh = DUPLICATE, False
         # The working counter of an exchange since then that was not valid; 0 for none.
@@ -188,7 +188,7 @@ class SensorStream:
     def check(self) -> None:
         """To be called once a second: log what the samples show of the sensor."""
         self.health.check(self.fresh, self.repeated, self.clock)
-        self.drift.second()
+        self.drift.each_second()
         events = self.clock.events
         if events is not None and events.trust.state is TrustState.ABSENT:
             self.clock.events = None

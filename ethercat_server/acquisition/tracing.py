@@ -42,8 +42,7 @@ class Tracing:
         self._ring.snapshot(Clocks(self._round_trip, [stream.clock for stream in self._streams]))
         self._snapshot_in_s = _SNAPSHOT_EVERY_S
 
-    def second(self) -> None:
-        """A second has passed."""
+    def each_second(self) -> None:
         self._snapshot_in_s -= 1
         if self._snapshot_in_s <= 0:
             self.snapshot()

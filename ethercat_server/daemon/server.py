@@ -91,7 +91,7 @@ def every_second(server: Server, notifier: Notifier, traces: Traces) -> None:
     """
     gc.collect(0)
     notifier.update(server)
-    traces.second()
+    traces.each_second()
 
 
 def _give_up_root(user: User | None, options: ServerOptions) -> None:

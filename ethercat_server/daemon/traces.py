@@ -38,7 +38,7 @@ class Traces:
         if not self._due_s and not self._pause_s:
             self._due_s, self._pause_s = _AFTER_S, _PAUSE_S
 
-    def second(self) -> None:
+    def each_second(self) -> None:
         """A second has passed."""
         self._pause_s = max(0, self._pause_s - 1)
         if self._due_s:

@@ -2,9 +2,9 @@
 and the frames in flight, matched with their answers by index and tag.
 
 Distributed clocks, by ETG.1000.4 and the data sheets of slave controllers: the local time counts ns from
-power-on; the system time is that and an offset, less a delay, which masters that synchronize slaves have
-written. Events are latched in local time, for the sync managers that are asked to; nothing else is written
-here, and only to sensors.
+power-on; the DC system time is the local time plus the system time offset less the propagation delay, both
+written by masters that synchronize slaves. Events are latched in local time, for the sync managers that are
+asked to; nothing else is written here, and only to sensors.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def read_clock(bus: Datagrams, number: int, at: int) -> Steps[DistributedClock |
 
 
 def _loop_delay_ns(bus: Datagrams, number: int) -> Steps[int]:
-    """A write to the receive times has the controller note when a frame arrives at each of its ports."""
+    """Have the controller latch when a frame arrives at each port: the last less port 0; 0 if unknown."""
     if not (yield from bus.write_register(number, reg.DC_RECEIVE_TIMES, bytes(4))):
         return 0
     data = yield from bus.read_register(number, reg.DC_RECEIVE_TIMES, _PORTS.size)
@@ -93,7 +93,7 @@ TAG_SIZE: Final = 4
 _AROUND_DATA: Final = DATAGRAM_HEADER + COUNTER_SIZE
 # Bytes of datagrams that fit one frame.
 _LONGEST: Final = 1498
-# Sent in place of the inputs. No sensor sends this: all its values would be NaN.
+# Sent where inputs are to be filled in. No sensor sends this: all its values would be NaN.
 _NEVER: Final = b"\xff"
 
 
@@ -350,12 +350,10 @@ class ProcessData:
 
     @property
     def sent(self) -> int:
-        """Number of exchanges sent."""
         return self._tag // max(1, len(self._frames))
 
     @property
     def lost(self) -> int:
-        """Number of frames lost."""
         self._expire(self._monotonic_ns())
         return self._lost
 

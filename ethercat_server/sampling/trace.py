@@ -210,7 +210,7 @@ class FrozenTrace(NamedTuple):
 
     @property
     def size(self) -> int:
-        """In bytes."""
+        """Bytes of the whole file."""
         return len(self.header) + self.end - self.begin
 
     def read(self, offset: int, length: int) -> bytes:

@@ -34,8 +34,8 @@ class History:
         self.changed |= self.peak != before
         self._saturated |= saturated
 
-    def second(self) -> None:
-        """A second has passed: seconds with saturated samples that follow each other are one saturation."""
+    def each_second(self) -> None:
+        """Seconds with saturated samples that follow each other are one saturation."""
         if self._saturated and not self._was_saturated:
             self.saturations, self.saturated_at, self.changed = self.saturations + 1, round(time.time()), True
         self._was_saturated, self._saturated = self._saturated, False

@@ -56,7 +56,7 @@ class Arm:
             self.clock.sleep(1.0)
             for half in (slice(2), slice(2, 4)):
                 self.drift.add([rows[name][half] for name in NAMES])
-            self.drift.second()
+            self.drift.each_second()
 
     @property
     def row(self) -> SensorStatus:

@@ -42,8 +42,8 @@ from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from ethercat_server.sensor.set_up import read_offset, read_settings, write_offset
 from ethercat_server.sensor.tare import tare
 
-# Names in Table III.1 and Listing III.6.
-IN_THE_NOTE = (
+# Names of objects in Bota's manual, and in the script that read them all.
+IN_THE_MANUAL = (
     (0x2000, 0, "Calibration"), (0x6000, 0, "Sensor Data"), (0x7000, 0, "Digital Output"),
     (0x8000, 0, "Force/Torque Offset"), (0x8001, 0, "Acceleration Offset"),
     (0x8002, 0, "Angular Velocities Offset"), (0x8003, 0, "Force/Torque Range"),
@@ -83,7 +83,7 @@ def test_no_setting_is_held_by_the_factory_calibration() -> None:
 
 
 def test_objects_have_every_name_that_people_know_them_by() -> None:
-    for index, subindex, name in IN_THE_NOTE:
+    for index, subindex, name in IN_THE_MANUAL:
         found = [row.address for row in find_objects(name)]
         assert (index, subindex) in found, name
         assert find_objects(name.upper().replace(" ", "_")) == find_objects(name)

@@ -175,7 +175,7 @@ def test_a_loss_that_nothing_explains_leaves_a_trace_and_few_of_them(
         if command:
             simulation.command(command)
         simulation.run(1.0)
-        traces.second()
+        traces.each_second()
         if traces.writing is not None:
             traces.writing.join()
             traces.writing = None
@@ -198,7 +198,7 @@ def test_a_loss_that_nothing_explains_leaves_a_trace_and_few_of_them(
     assert "invalid exchanges" in line
     for _ in range(4):
         for _ in range(610):
-            traces.second()
+            traces.each_second()
         for _ in range(4):
             second("power cycle 0.1")
     assert len(written) == 5

@@ -1,7 +1,8 @@
 """The sensor's object dictionary: one row per object entry, found by address or by name.
 
-Sources: Table III.1 and Listing III.6 of the design note, and the dump of a real Rokubi. The server
-configures the sensor by it and the virtual sensor answers by it; nothing else knows an index.
+Sources: the table of CoE objects in Bota's manual, the script that read them all (its name is still
+scripts/sensor_configuration_SDO_reader.py), and the dump of a real Rokubi. The server configures the sensor
+by it and the virtual sensor answers by it; nothing else knows an index.
 """
 
 from __future__ import annotations
@@ -247,7 +248,7 @@ def is_sensor(vendor: int, product: int) -> bool:
 
 
 def with_highest_subindices(rows: Sequence[ObjectEntry]) -> list[ObjectEntry]:
-    """By address, with sub-index 0 of each object that has parts, as Listing III.6 reads it."""
+    """By address, with sub-index 0 of each object that has parts, as that script listed them."""
     highest: dict[int, int] = {}
     for row in rows:
         if row.subindex:
@@ -259,7 +260,7 @@ def with_highest_subindices(rows: Sequence[ObjectEntry]) -> list[ObjectEntry]:
 # Every object in Bota's manual, also those that the firmware seen does not have.
 KNOWN_OBJECTS: Final[tuple[ObjectEntry, ...]] = tuple(
     with_highest_subindices(
-        # Table III.1 has the last one, without a type; the firmware seen has none.
+        # The last one is in the manual, without a type, but not in the firmware seen.
         (*OBJECTS, ObjectEntry(0x8003, 0, "Force/torque range", OCTETS, RO, ""))
     )
 )
@@ -279,8 +280,8 @@ TITLES: Final[Mapping[int, str]] = {
     0x8030: "Control",
 }
 
-# Other names that Table III.1 and Listing III.6 have; sub-index 0 of what has parts is all of it.
-NOTE_NAMES: Final[tuple[tuple[int, int, str], ...]] = (
+# Other names in the manual and in that script; sub-index 0 of what has parts is all of it.
+MANUAL_NAMES: Final[tuple[tuple[int, int, str], ...]] = (
     (0x2000, 0, "Calibration"),
     (0x6000, 0, "Sensor Data"),
     (0x8002, 0, "Angular Velocities Offset"),
@@ -349,7 +350,7 @@ def _names() -> Iterable[tuple[str, Sequence[ObjectEntry]]]:
             yield name, [row]
     for index, title in TITLES.items():
         yield title, _parts(index)
-    for index, subindex, name in NOTE_NAMES:
+    for index, subindex, name in MANUAL_NAMES:
         whole = index in TITLES and subindex == 0
         yield name, _parts(index) if whole else _entry(index, subindex)
 
