@@ -227,7 +227,7 @@ class ClockSimulation:
             due_ns = int(poll_ns - self.round_trip.late_ns)
             if flying and flying[0].back_ns <= max(due_ns, self.now_ns):
                 self.now_ns = max(self.now_ns, self._awake(flying[0].back_ns))
-                self._take(flying.popleft())
+                self._hand_over(flying.popleft())
                 self.now_ns += _HAND_OUT_NS
                 continue
             if due_ns > self.now_ns:
@@ -257,7 +257,7 @@ class ClockSimulation:
         latched = self.controller.latched(self.instants_ns, number, look_ns) if self.controller else None
         self._flying.append(Exchange(sent_ns, self._last_back_ns, number, latched))
 
-    def _take(self, exchange: Exchange) -> None:
+    def _hand_over(self, exchange: Exchange) -> None:
         clock, number = self.clock, exchange.number
         sent, arrived, back = int(exchange.sent_ns), int(exchange.back_ns), int(self.now_ns)
         fresh = number > (self.samples[-1].number if self.samples else -1)

@@ -30,7 +30,7 @@ from ethercat_server.errors import BusError, InterfaceError, SdoAbortError, Serv
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, Deadline
 from ethercat_server.ethercat.datagrams import Steps, finish
 from ethercat_server.sensor.guard import GuardedSdo
-from ethercat_server.sensor.sensor import Found, Identity, Sensor
+from ethercat_server.sensor.sensor import FoundSensor, Identity, Sensor
 from ethercat_server.sensor.set_up import NO_SETTINGS, read_in_force
 from ethercat_server.sensor.tare import LATER
 
@@ -62,7 +62,7 @@ class Sensors:
         self.client, self.used, self.private = client, used, private
         self._name = name
         self.sensors = [
-            Found(info.sensor, Identity(info.name, info.serial or 0, info.hardware, info.firmware))
+            FoundSensor(info.sensor, Identity(info.name, info.serial or 0, info.hardware, info.firmware))
             for info in Description.parse(client.description).sensors
         ]
 
@@ -123,7 +123,7 @@ class Sensors:
             return self.private.error
         return ServerError(f"{self._name} closed the connection ({error}): see its log")
 
-    def in_force(self, found: Found, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Sensor:
+    def in_force(self, found: FoundSensor, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Sensor:
         """The sensor with its present settings, also as the wanted ones; see `read_in_force` for `asked`."""
         sensor = Sensor(found.number, found.identity, {})
         finish(read_in_force(self.sdo(found.number), sensor, asked), clock=self.clock)
@@ -243,7 +243,7 @@ def find_server(ifname: str | None, server: str | None) -> Sensors | None:
     return Sensors.through(holder.address, used)
 
 
-def choose(sensors: Sequence[Found], wanted: str | None) -> Found:
+def choose(sensors: Sequence[FoundSensor], wanted: str | None) -> FoundSensor:
     """The sensor that `wanted` selects, the only one if None; UsageError if it is not unique.
 
     A number that no sensor has is taken as a serial number.

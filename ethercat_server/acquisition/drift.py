@@ -26,9 +26,9 @@ from ethercat_server.sensor.tare import (
     LOAD,
     PARTS,
     RATE,
-    Found,
+    ChannelStatistics,
     Part,
-    found_in,
+    channel_statistics,
     why_moving,
 )
 
@@ -57,8 +57,8 @@ class Drift:
         """All that was before is void: a `tare`, a `change` of settings, a `return`, the `start`."""
         self._cause, self._since_s = cause, self._now_s()
         self._part, self._parts = Part(_SUMS), list[Part]()
-        self._full, self._found = list[Part](), list[Found]()  # a window, and what of it is known
-        self._first: list[Found] | None = None
+        self._full, self._found = list[Part](), list[ChannelStatistics]()  # a window, and what of it is known
+        self._first: list[ChannelStatistics] | None = None
         self._was_plausible = False  # whether the window before was drift, by `_is_plausible`
         self._unusable = True  # until the next second, so that nothing is from before
 
@@ -86,14 +86,14 @@ class Drift:
 
     def _examine(self) -> None:
         """One channel of a full window: all at once would delay an exchange."""
-        self._found.append(found_in(self._full, len(self._found)))
+        self._found.append(channel_statistics(self._full, len(self._found)))
         if len(self._found) == _SUMS:
             self._full = []
             self._was_plausible = self._is_plausible(self._found)
             if self._was_plausible:
                 self._accept(self._found)
 
-    def _is_plausible(self, window: Sequence[Found]) -> bool:
+    def _is_plausible(self, window: Sequence[ChannelStatistics]) -> bool:
         gravity = [found.mean for found in window[_GRAVITY]]
         if why_moving(window[: len(CHANNELS)]) or math.hypot(*gravity) < _LEAST_GRAVITY:
             return False
@@ -110,7 +110,7 @@ class Drift:
             for channel, new, old in zip(CHANNELS[:6], window, self._last, strict=False)
         )
 
-    def _accept(self, window: list[Found]) -> None:
+    def _accept(self, window: list[ChannelStatistics]) -> None:
         self._first = self._first or window
         self._last, self._last_s = window, self._now_s()
 

@@ -33,7 +33,7 @@ class Identity(NamedTuple):
         return f"{self.name} with serial {self.serial}"
 
 
-class Found(NamedTuple):
+class FoundSensor(NamedTuple):
     """A sensor that was found."""
 
     number: int

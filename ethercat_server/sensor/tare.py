@@ -100,7 +100,7 @@ def tare(
     new = tuple(t - found.mean + o for t, found, o in zip(target, before[:6], old, strict=True))
     _check_fits(new, "the offset that the key 'target' asks for")
 
-    def write() -> Steps[tuple[tuple[float, ...], list[Found]]]:
+    def write() -> Steps[tuple[tuple[float, ...], list[ChannelStatistics]]]:
         written = sensor.offset = yield from write_offset(sdo, new)
         on_offset(sensor)
         yield from _wait(sdo.clock, sensor, stream, SETTLING_SAMPLES)
@@ -129,7 +129,7 @@ def _check_fits(offset: Sequence[float], what: str) -> None:
         raise RequestError(ErrorCode.BAD_REQUEST, f"{what} cannot be: {error}") from None
 
 
-class Found(NamedTuple):
+class ChannelStatistics(NamedTuple):
     """One channel over a window of samples."""
 
     mean: float
@@ -162,7 +162,7 @@ def _moments(parts: Sequence[Part], channel: int) -> tuple[float, float]:
     return mean, max(0.0, sum(part.squares[channel] for part in parts) / taken - mean * mean)
 
 
-def found_in(parts: Sequence[Part], channel: int, start: float = 0.0) -> Found:
+def channel_statistics(parts: Sequence[Part], channel: int, start: float = 0.0) -> ChannelStatistics:
     """One channel of a window of `PARTS` parts, in whose sums values are relative to `start`."""
     samples, first = sum(part.taken for part in parts), parts[: PARTS // 2]
     mean, variance = _moments(parts, channel)
@@ -171,10 +171,10 @@ def found_in(parts: Sequence[Part], channel: int, start: float = 0.0) -> Found:
     means = [part.sums[channel] / part.taken for part in parts]
     of_parts = math.dist(means, [sum(means) / PARTS] * PARTS) / math.sqrt(PARTS * (PARTS - 1))
     error = max(math.sqrt(variance / samples), of_parts)
-    return Found(start + mean, math.sqrt(variance), abs(other - one), by_chance, error)
+    return ChannelStatistics(start + mean, math.sqrt(variance), abs(other - one), by_chance, error)
 
 
-def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[list[Found]]:
+def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[list[ChannelStatistics]]:
     """Over the next samples."""
     unpack = layout_for(sensor.pdo_size).struct.unpack
     deadline = _patience(clock, sensor, samples)
@@ -200,7 +200,7 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
         # From the first on, so that a large load does not drown its small changes.
         parts[PARTS * taken // samples].add([(v - start,) for v, start in zip(row, first, strict=True)])
         taken += 1
-    return [found_in(parts, channel, start) for channel, start in enumerate(first)]
+    return [channel_statistics(parts, channel, start) for channel, start in enumerate(first)]
 
 
 def _wait(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[None]:
@@ -216,7 +216,7 @@ def _patience(clock: Clock, sensor: Sensor, samples: int) -> Deadline:
     return Deadline(clock, 1.0 + _PATIENCE * samples * sensor.period_ns * 1e-9)
 
 
-def why_moving(window: Sequence[Found]) -> str:
+def why_moving(window: Sequence[ChannelStatistics]) -> str:
     """Why a sensor was not at rest in a window of force, torque and angular rate; empty if it was."""
     turn = math.hypot(*(found.mean for found in window[6:]))
     if turn > _REST_TURN_DPS:
@@ -230,7 +230,11 @@ def why_moving(window: Sequence[Found]) -> str:
 
 
 def _check_better(
-    sensor: Sensor, before: Sequence[Found], after: Sequence[Found], samples: int, target: Sequence[float]
+    sensor: Sensor,
+    before: Sequence[ChannelStatistics],
+    after: Sequence[ChannelStatistics],
+    samples: int,
+    target: Sequence[float],
 ) -> None:
     """RequestError if an axis is off target or further from it than before, and noise does not explain it."""
     worst, text = 0.0, ""

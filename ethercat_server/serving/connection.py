@@ -29,7 +29,7 @@ _UNFINISHED_NS: Final = 10_000_000_000  # timeout for the rest of a message whos
 _LAST_REPLY_NS: Final = 1_000_000_000  # timeout for a connection that is being closed
 
 
-class State(Enum):
+class ConnectionState(Enum):
     """What a connection does now."""
 
     READING = "waits for the client's next request, if the client has not closed its side"
@@ -45,7 +45,7 @@ class State(Enum):
         self.ending = self.name in {"CLOSING", "LINGERING", "CLOSED"}
 
 
-_S = State
+_S = ConnectionState
 # Any other is a defect of this program.
 TRANSITIONS: Final = {
     _S.READING: {_S.READY, _S.CLOSING, _S.CLOSED},
@@ -53,7 +53,7 @@ TRANSITIONS: Final = {
     _S.ANSWERING: {_S.READY, _S.CLOSING, _S.CLOSED},
     _S.CLOSING: {_S.LINGERING, _S.CLOSED},
     _S.LINGERING: {_S.CLOSED},
-    _S.CLOSED: set[State](),
+    _S.CLOSED: set[ConnectionState](),
 }
 
 
@@ -236,7 +236,7 @@ class Connection:
         self.fd = stream.fileno()
         self.peer = stream.peer
         self.uid = uid
-        self.state = State.READING
+        self.state = ConnectionState.READING
         self.framed: FrameDecoder | None = None
         self.bare: BareJsonDecoder | None = None
         self.subscription: Subscription | None = None
@@ -254,10 +254,10 @@ class Connection:
         """For the log. The user by number: looking up a name can require a directory server."""
         return f"client {self.peer} (uid {'unknown' if self.uid is None else self.uid})"
 
-    def _become(self, state: State) -> None:
+    def _become(self, state: ConnectionState) -> None:
         assert state in TRANSITIONS[self.state], f"{self}: {self.state.name} -> {state.name}"
         self.state = state
-        if self._client_ended or state in (State.READY, State.ANSWERING, State.CLOSED):
+        if self._client_ended or state in (_S.READY, _S.ANSWERING, _S.CLOSED):
             self._watched.readers.discard(self.fd)
         else:
             self._watched.readers.add(self.fd)
@@ -265,7 +265,7 @@ class Connection:
     @property
     def is_idle(self) -> bool:
         """Whether it has no subscription, and no request that is not answered."""
-        return self.subscription is None and self.state is State.READING and not self.outbox.waiting
+        return self.subscription is None and self.state is ConnectionState.READING and not self.outbox.waiting
 
     def find_uid(self) -> int | None:
         """The user who owns the other end; asked again if that was not known."""
@@ -289,15 +289,15 @@ class Connection:
             # before the last reply is read.
             if not self.state.ending:
                 self._feed(data)
-                self._become(State.READY)
-        elif self.state is State.READING and self.bare is not None and self.bare.pending:
+                self._become(ConnectionState.READY)
+        elif self.state is ConnectionState.READING and self.bare is not None and self.bare.pending:
             self.bare.end_of_input()
-            self._become(State.READY)
+            self._become(ConnectionState.READY)
         else:
             self._client_ended = True
             self._watched.readers.discard(self.fd)
-            if self.state is State.LINGERING:
-                self._become(State.CLOSED)
+            if self.state is ConnectionState.LINGERING:
+                self._become(ConnectionState.CLOSED)
             elif self.subscription is None:
                 self.finish()
 
@@ -331,7 +331,7 @@ class Connection:
         if isinstance(message, dict):  # this decoder accepts no DATA
             self._heard_ns, self._begun_ns = self._monotonic_ns(), 0
             return message
-        self._become(State.READING)
+        self._become(ConnectionState.READING)
         if decoder.pending and not self._begun_ns:
             self._begun_ns = self._monotonic_ns()
         return None
@@ -339,12 +339,12 @@ class Connection:
     def answer_later(self) -> None:
         """The request that was taken is answered later: `answered` then. It may have ended the connection."""
         if not self.state.ending:
-            self._become(State.ANSWERING)
+            self._become(ConnectionState.ANSWERING)
 
     def answered(self) -> None:
         """Go on with what the client sent after the request; it is idle from now on."""
         self._heard_ns = self._monotonic_ns()
-        self._become(State.READY)
+        self._become(ConnectionState.READY)
 
     # -- ending
 
@@ -359,7 +359,7 @@ class Connection:
             return f"its message is still incomplete after {_UNFINISHED_NS / 1e9:g} s"
         elif (
             self.subscription is None
-            and self.state is not State.ANSWERING
+            and self.state is not ConnectionState.ANSWERING
             and now_ns - self._heard_ns > limits.idle_ns
         ):
             return f"it is not subscribed and has sent no request for {limits.idle_ns / 1e9:g} s"
@@ -372,8 +372,8 @@ class Connection:
 
     def fail(self) -> None:
         """Close at once: the connection is broken, or the client is beyond a limit."""
-        if self.state is not State.CLOSED:
-            self._become(State.CLOSED)
+        if self.state is not ConnectionState.CLOSED:
+            self._become(ConnectionState.CLOSED)
             self.subscription = None
 
     def settle(self, now_ns: int) -> None:
@@ -381,10 +381,10 @@ class Connection:
         too_long = self.state.ending and now_ns - self._ending_ns > _LAST_REPLY_NS
         if too_long or self.outbox.broken:
             self.fail()
-        elif self.state is State.CLOSING and not self.outbox.waiting:
+        elif self.state is ConnectionState.CLOSING and not self.outbox.waiting:
             if not self._client_ended:
                 self._stream.end_sending()
-            self._become(State.CLOSED if self._client_ended else State.LINGERING)
+            self._become(ConnectionState.CLOSED if self._client_ended else ConnectionState.LINGERING)
 
     def close(self) -> None:
         """Close the stream."""
@@ -393,7 +393,7 @@ class Connection:
         self._stream.close()
 
     def _end(self) -> None:
-        self._become(State.CLOSING)
+        self._become(ConnectionState.CLOSING)
         self.subscription = None
         self._ending_ns = self._monotonic_ns()
 
@@ -401,7 +401,7 @@ class Connection:
 
     def send_json(self, message: JsonObject) -> None:
         """Send a reply or an event in this connection's own form."""
-        if self.state in (State.LINGERING, State.CLOSED):
+        if self.state in (ConnectionState.LINGERING, ConnectionState.CLOSED):
             return
         if self.outbox.full:
             self.fail()

@@ -19,7 +19,7 @@ from bota_ethercat.control import ErrorCode, error_reply
 from bota_ethercat.errors import RequestError
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import OutgoingFrame
-from ethercat_server.serving.connection import Connection, Limits, State, Unreadable, Watched
+from ethercat_server.serving.connection import Connection, ConnectionState, Limits, Unreadable, Watched
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import Transport
 
@@ -50,7 +50,7 @@ class Hub:
         self._handler: Handler | None = None
         self._subscribers: list[Connection] = []
         self._watched = Watched(set(), set())
-        self._ready: deque[Connection] = deque()  # those in State.READY, in the order of their turns
+        self._ready: deque[Connection] = deque()  # those that are READY, in the order of their turns
         self._pause_ends_ns = 0
         self._sweep_at_ns = 0
 
@@ -75,7 +75,7 @@ class Hub:
         if self.connections.get(connection.fd) is not connection:
             return
         connection.send_json(reply)
-        if connection.state is State.ANSWERING:
+        if connection.state is ConnectionState.ANSWERING:
             connection.answered()
             self._ready.append(connection)
 
@@ -130,7 +130,7 @@ class Hub:
                 listening.append(fd)
                 continue
             connection.receive()
-            if connection.state is State.READY:
+            if connection.state is ConnectionState.READY:
                 self._ready.append(connection)
             elif connection.state.ending:
                 self._sweep_at_ns = 0
@@ -167,7 +167,7 @@ class Hub:
         """One request of each that has sent some, until the time is up; the others are first next time."""
         for _ in range(len(self._ready)):
             connection = self._ready.popleft()
-            if connection.state is State.READY:
+            if connection.state is ConnectionState.READY:
                 self._answer_one(connection)
             if self._monotonic_ns() >= until_ns:
                 return
@@ -182,7 +182,7 @@ class Hub:
                 connection.answer_later()
             else:
                 connection.send_json(answer)
-        if connection.state is State.READY:
+        if connection.state is ConnectionState.READY:
             self._ready.append(connection)
         elif connection.state.ending:
             self._sweep_at_ns = 0
@@ -210,7 +210,7 @@ class Hub:
                     connection.send_json(error_reply(None, ErrorCode.BAD_REQUEST, complaint))
                     connection.finish()
             connection.settle(now_ns)
-        gone = [connection for connection in self.connections.values() if connection.state is State.CLOSED]
+        gone = [each for each in self.connections.values() if each.state is ConnectionState.CLOSED]
         for connection in gone:
             del self.connections[connection.fd]
             connection.close()

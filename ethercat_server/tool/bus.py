@@ -17,7 +17,7 @@ from ethercat_server.ethercat.nic import network_trouble
 from ethercat_server.ethercat.slave import sii
 from ethercat_server.process.command_line import FAILED
 from ethercat_server.sensor.scan import NoSlaveError, look_safely, read_image
-from ethercat_server.sensor.sensor import Found, Identity
+from ethercat_server.sensor.sensor import FoundSensor, Identity
 from ethercat_server.tool.command import DONE, Subcommand, chosen, columns, say, say_json, sensor_arguments
 
 
@@ -102,7 +102,7 @@ def _eeprom(args: argparse.Namespace) -> int:
             identities = (
                 Identity(row.get("name", ""), row.get("serial", 0), "", "") for row in slaves.values()
             )
-            position = choose(list(map(Found, slaves, identities)), args.sensor).number
+            position = choose(list(map(FoundSensor, slaves, identities)), args.sensor).number
             slaves = {position: slaves[position]}
     errors = [row["error"] for row in slaves.values() if "error" in row]
     if len(errors) == len(slaves):

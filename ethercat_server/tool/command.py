@@ -14,7 +14,7 @@ from bota_ethercat.text.json_text import finite
 from ethercat_server.access.sensors import Sensors, choose, find_server
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
-from ethercat_server.sensor.sensor import Found
+from ethercat_server.sensor.sensor import FoundSensor
 
 DONE: Final = 0
 CHANGES: Final = 3  # exit code of `apply --dry-run` when there is something to change
@@ -73,13 +73,13 @@ def sensors_of(args: argparse.Namespace) -> Iterator[Sensors]:
 
 
 @contextlib.contextmanager
-def sensor_of(args: argparse.Namespace) -> Iterator[tuple[Sensors, Found]]:
+def sensor_of(args: argparse.Namespace) -> Iterator[tuple[Sensors, FoundSensor]]:
     """The same, and the one that is selected; UsageError if it is not unique."""
     with sensors_of(args) as opened:
         yield opened, choose(opened.sensors, args.sensor)
 
 
-def chosen(opened: Sensors, args: argparse.Namespace) -> list[Found]:
+def chosen(opened: Sensors, args: argparse.Namespace) -> list[FoundSensor]:
     """The selected sensor, or all."""
     return opened.sensors if args.sensor is None else [choose(opened.sensors, args.sensor)]
 
@@ -95,7 +95,7 @@ def say_json(value: dict[str, Any], *, indent: int | None = 2) -> None:
     say(json.dumps(finite(value), indent=indent, allow_nan=False))
 
 
-def report(as_json: bool, opened: Sensors, found: Found, values: dict[str, Any], *lines: str) -> None:
+def report(as_json: bool, opened: Sensors, found: FoundSensor, values: dict[str, Any], *lines: str) -> None:
     """The result for one sensor: a JSON object with `values`, or the sensor's name and `lines`."""
     if as_json:
         say_json({"through": opened.used, **found.as_json(), **values})

@@ -21,7 +21,7 @@ from ethercat_server.sensor.objects.dictionary import (
     find_objects,
     similar_names,
 )
-from ethercat_server.sensor.sensor import Found
+from ethercat_server.sensor.sensor import FoundSensor
 from ethercat_server.sensor.set_up import read_sinc
 from ethercat_server.tool.command import (
     DONE,
@@ -71,7 +71,7 @@ def _meaning(row: ObjectEntry, value: float | str) -> str:
     return row.allowed.get(int(value), "" if row.setting is None else "undefined value")
 
 
-def _read_objects(sdo: Sdo, found: Found, rows: Sequence[ObjectEntry]) -> dict[str, Any]:
+def _read_objects(sdo: Sdo, found: FoundSensor, rows: Sequence[ObjectEntry]) -> dict[str, Any]:
     """The objects of a sensor, ready for JSON, and the `error` that ended reading if one did."""
     objects: list[dict[str, Any]] = []
     silent = 0

@@ -30,7 +30,7 @@ from ethercat_server.ethercat.datagrams import Steps, finish
 from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.objects.dictionary import BY_ADDRESS, KNOWN_OBJECTS, OBJECTS, Access, ObjectEntry
-from ethercat_server.sensor.sensor import Found, Identity, Sensor
+from ethercat_server.sensor.sensor import FoundSensor, Identity, Sensor
 from ethercat_server.sensor.set_up import FORMER, Change, pack_offset, read_offset, save, write_offset
 from ethercat_server.sensor.tare import OLD
 from ethercat_server.sensor.undo import or_undone
@@ -139,7 +139,7 @@ def _apply(args: argparse.Namespace) -> int:
     return CHANGES if args.dry_run and changed else DONE
 
 
-def _save_now(opened: Sensors, found: Found) -> None:
+def _save_now(opened: Sensors, found: FoundSensor) -> None:
     """Store the sensor's parameters in its flash."""
     with signals_held_back():
         finish(save(opened.sdo(found.number), Sensor(found.number, found.identity, {})), clock=opened.clock)
@@ -185,7 +185,7 @@ def _tare(args: argparse.Namespace) -> int:
     return DONE
 
 
-def _taken_back(opened: Sensors, found: Found, *, undo: bool) -> dict[str, Sequence[float]]:
+def _taken_back(opened: Sensors, found: FoundSensor, *, undo: bool) -> dict[str, Sequence[float]]:
     """Write the offset of before the last tare, or zeros, and verify it.
 
     BusError unless what is in force is of that tare.
@@ -328,7 +328,7 @@ def _restore(args: argparse.Namespace) -> int:
 
 def _put_back(
     opened: Sensors,
-    found: Found,
+    found: FoundSensor,
     sensor: Sensor,
     settings: Mapping[str, SettingValue],
     objects: Mapping[Address, tuple[bytes, bytes]],

@@ -33,7 +33,7 @@ from bridge.process import StopSignals, Worker, prepare, refuse
 from bridge.publishing.messages import Stamps, TerminalTopics, make_measured
 from bridge.rclpy_internals import Spinner, is_about_arguments, make_executors, refuse_what_raises
 from bridge.services import create_services
-from bridge.stream.link import SYSTEM_CLOCK, Clock, RequestFailedError, RequestRefusedError
+from bridge.stream.link import SYSTEM_CLOCK, NodeClock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
 
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
@@ -90,7 +90,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
     With the parameter `lifecycle` it is a managed node, which its transitions configure and activate.
     """
 
-    clock: Clock = SYSTEM_CLOCK
+    clock: NodeClock = SYSTEM_CLOCK
     channel: TcpChannel | None = None  # tests have a clock and a channel of their own
     is_open = False
 

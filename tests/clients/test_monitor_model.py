@@ -9,7 +9,7 @@ from unittest import mock
 
 import pytest
 
-from bota_clients.monitor.model import Model, SensorState
+from bota_clients.monitor.model import Model, SensorView
 from bota_clients.monitor.reader import Reader
 from bota_clients.monitor.screen import ViewOptions, render
 from bota_ethercat.address import Address
@@ -31,14 +31,14 @@ def model() -> Model:
     return fresh
 
 
-def take(model: Model, *frames: DataMessage) -> SensorState:
+def take(model: Model, *frames: DataMessage) -> SensorView:
     """Its state when these have come together."""
     at_s = now(frames[-1].sequence)
     model.add_frames(frames, at_s)
     return only(model, at_s)
 
 
-def only(model: Model, at_s: float) -> SensorState:
+def only(model: Model, at_s: float) -> SensorView:
     (sensor,) = model.state(at_s).sensors
     return sensor
 
@@ -47,12 +47,12 @@ def run(first: int, count: int, **values: float) -> list[DataMessage]:
     return [frame(k, {**REST, **values}) for k in range(first, first + count)]
 
 
-def peaks(sensor: SensorState) -> list[tuple[float, ...]]:
+def peaks(sensor: SensorView) -> list[tuple[float, ...]]:
     assert sensor.peaks is not None
     return [tuple(peak) for peak in sensor.peaks]
 
 
-def texts(sensor: SensorState) -> list[str]:
+def texts(sensor: SensorView) -> list[str]:
     return [alert.text for alert in sensor.alerts]
 
 

@@ -22,8 +22,8 @@ from ethercat_server.serving.connection import (
     MAX_QUEUED_DATA,
     MAX_REQUEST_LENGTH,
     Connection,
+    ConnectionState,
     Limits,
-    State,
     Subscription,
 )
 from ethercat_server.serving.hub import Hub
@@ -238,7 +238,7 @@ def test_a_refused_client_that_still_sends_can_read_its_last_reply(served: Serve
 def test_a_refused_client_that_never_closes_is_closed_after_a_second(served: Served) -> None:
     served.connect(sent=struct.pack(">IB", 0, 2))
     served.serve(0.9)
-    assert served.only.state is State.LINGERING
+    assert served.only.state is ConnectionState.LINGERING
     served.serve(0.2)
     assert not served.connections
 
@@ -373,7 +373,7 @@ def test_a_subscriber_that_half_closes_continues_to_receive(served: Served) -> N
     client = served.subscribe()
     client.end_sending()
     served.serve(0.2)
-    assert served.only.state is State.READING
+    assert served.only.state is ConnectionState.READING
     served.publish()
     assert served.sequences(client) == [0]
     client.close()
@@ -689,4 +689,4 @@ def test_a_transition_that_is_not_in_the_table_is_an_error(served: Served) -> No
     connection.finish()
     with pytest.raises(AssertionError, match="CLOSING -> READY"):
         connection.answered()
-    assert connection.state is State.CLOSING
+    assert connection.state is ConnectionState.CLOSING

@@ -79,7 +79,7 @@ class Message(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SensorState:
+class SensorView:
     """One sensor. Counts are since connecting, rate, jitter and age are those of the last five seconds."""
 
     position: int
@@ -145,7 +145,7 @@ class State:
     """Everything, at one moment."""
 
     server: ServerState
-    sensors: tuple[SensorState, ...] = ()
+    sensors: tuple[SensorView, ...] = ()
     clients: tuple[ServerClient, ...] = ()
     message: Message | None = None
     events: tuple[str, ...] = ()  # in words, oldest first
@@ -211,7 +211,7 @@ class _Sensor:
             worst = max(finding, known, key=lambda one: (one.level, one.size))
             self._seen[finding.key] = worst, now_s
 
-    def state(self, now_s: float, *, server_speaks: bool) -> SensorState:
+    def state(self, now_s: float, *, server_speaks: bool) -> SensorView:
         """The current state. Silence is the sensor's fault only if the server is not silent."""
         if server_speaks:
             self._judge(now_s)
@@ -226,7 +226,7 @@ class _Sensor:
         ]
         info, status, lost = self.observer.info, self.observer.status, self.observer.lost
         sample = self._newest and SampleDecoder(len(self._newest), self._imu_units).decode(self._newest)
-        return SensorState(
+        return SensorView(
             position=self.position,
             info=info,
             status=status,

@@ -18,7 +18,7 @@ from rich.text import Text
 
 from bota_clients import numbers
 from bota_clients.monitor import words
-from bota_clients.monitor.model import Alert, Range, SensorState, State
+from bota_clients.monitor.model import Alert, Range, SensorView, State
 from bota_ethercat.pdo import AXES
 
 KEYS: Final = (
@@ -161,7 +161,7 @@ def _keys(look: ViewOptions, width: int) -> Text:
     return row
 
 
-def _panel(sensor: SensorState, width: int, *, bars: bool = True) -> list[Text]:
+def _panel(sensor: SensorView, width: int, *, bars: bool = True) -> list[Text]:
     stream = f"{words.rate(sensor)}   age {words.times(sensor.age_us)}   jitter {words.jitter(sensor)}"
     lost = _field("Lost", "")
     for number, (text, bad) in enumerate(words.losses(sensor)):
@@ -191,7 +191,7 @@ def _field(name: str, text: str, style: str = "") -> Text:
     return Text.assemble((name.ljust(9), LABEL), (text, style))
 
 
-def _alerts(sensor: SensorState, width: int) -> list[Text]:
+def _alerts(sensor: SensorView, width: int) -> list[Text]:
     none = _field("Warnings", "none" if sensor.sample is not None else "no sample yet")
     return [row for alert in sensor.alerts for row in _alert(alert, width)] or [none]
 
@@ -208,7 +208,7 @@ def _alert(alert: Alert, width: int) -> list[Text]:
     return [head, Text(f"  -> {alert.remedy}")]
 
 
-def _axes(sensor: SensorState, which: int, width: int, *, bars: bool) -> list[Text]:
+def _axes(sensor: SensorView, which: int, width: int, *, bars: bool) -> list[Text]:
     """Force, or torque if `which` is 1: a heading and a row an axis."""
     unit, axes = sensor.units[which], range(3 * which, 3 * which + 3)
     peaks = sensor.peaks or (None,) * len(AXES)
@@ -237,7 +237,7 @@ def _axes(sensor: SensorState, which: int, width: int, *, bars: bool) -> list[Te
     return rows
 
 
-def _imu(sensor: SensorState) -> list[Text]:
+def _imu(sensor: SensorView) -> list[Text]:
     sample = sensor.sample
     if sample is None:
         return [_field("IMU", "--")]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from bota_clients.monitor.model import Alert, Percentiles, SensorState, ServerClient, ServerState, State
+from bota_clients.monitor.model import Alert, Percentiles, SensorView, ServerClient, ServerState, State
 from bota_clients.numbers import duration, milliseconds
 from bota_ethercat.health.limits import Level
 from bota_ethercat.text.json_text import finite
@@ -69,7 +69,7 @@ def server_facts(server: ServerState) -> list[tuple[str, str]]:
     ]
 
 
-def identity(sensor: SensorState) -> str:
+def identity(sensor: SensorView) -> str:
     """Position, AL state, name, serial number and firmware."""
     info = sensor.info
     serial = "" if info.serial is None else f"serial {info.serial}"
@@ -78,25 +78,25 @@ def identity(sensor: SensorState) -> str:
     return "  ".join(part for part in parts if part)
 
 
-def delays(sensor: SensorState) -> str:
+def delays(sensor: SensorView) -> str:
     """By how much the sensor's filters delay its values."""
     force_torque, *imu = ("not known" if ms is None else f"{ms:g} ms" for ms in sensor.delay_ms.values())
     of_imu = "" if sensor.imu_off else f"   acceleration {imu[0]}   angular rate {imu[1]}"
     return f"force, torque {force_torque}{of_imu}"
 
 
-def rate(sensor: SensorState) -> str:
+def rate(sensor: SensorView) -> str:
     found = "no samples" if sensor.rate_hz is None else f"{sensor.rate_hz:.1f}"
     return f"{found} of {sensor.info.rate_hz:g} Hz" if sensor.info.rate_hz else f"{found} Hz"
 
 
-def jitter(sensor: SensorState) -> str:
+def jitter(sensor: SensorView) -> str:
     if sensor.jitter_us is None or sensor.jitter_worst_us is None:
         return "not known"
     return f"{sensor.jitter_us:.0f} µs, worst {sensor.jitter_worst_us:.0f}"
 
 
-def losses(sensor: SensorState) -> list[tuple[str, bool]]:
+def losses(sensor: SensorView) -> list[tuple[str, bool]]:
     """Each kind of loss in words, and whether there was any."""
     lost = sensor.status.lost_samples
     return [
@@ -107,7 +107,7 @@ def losses(sensor: SensorState) -> list[tuple[str, bool]]:
     ]
 
 
-def clock(sensor: SensorState) -> str:
+def clock(sensor: SensorView) -> str:
     """How the server follows the sensor's clock."""
     known = sensor.status.clock
     text = known.mode
@@ -169,7 +169,7 @@ def json_object(state: State, unix_s: float) -> dict[str, Any]:
     }
 
 
-def _sensor(sensor: SensorState) -> dict[str, Any]:
+def _sensor(sensor: SensorView) -> dict[str, Any]:
     sample, peaks, info, status = sensor.sample, sensor.peaks, sensor.info, sensor.status
     imu = None if sensor.imu_off else sample
     return {

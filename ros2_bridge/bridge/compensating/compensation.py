@@ -20,7 +20,7 @@ from bridge.compensating.sources import Source
 from bridge.parameters.table import Parameters
 from bridge.publishing.messages import Stamps
 from bridge.publishing.wrenches import FilteredTopic, TfFrames, WrenchTopic, make_frames
-from bridge.stream.link import Clock
+from bridge.stream.link import NodeClock
 from ft_compensation.bias import BiasRamp
 from ft_compensation.compensator import Compensator, Stages
 from ft_compensation.quantities import ZERO, CompensationError, StationaryLimits
@@ -75,7 +75,12 @@ class Compensation:
     fields = ("force", "torque")
 
     def __init__(
-        self, node: Node, parameters: Parameters, stamps: Stamps, rate_hz: Callable[[], float], clock: Clock
+        self,
+        node: Node,
+        parameters: Parameters,
+        stamps: Stamps,
+        rate_hz: Callable[[], float],
+        clock: NodeClock,
     ) -> None:
         frames = make_frames(node, parameters, stamps, clock)
         self.frames = TfFrames(node, frames)

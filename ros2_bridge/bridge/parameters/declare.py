@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 from bota_ethercat.errors import SettingError
 from bota_ethercat.settings import SETTINGS, Setting, SettingValue, check_settings, known_settings
 from bota_ethercat.text.did_you_mean import did_you_mean
-from bridge.parameters.table import PARAMETERS, ParameterError, Parameters, Row, gather
+from bridge.parameters.table import PARAMETERS, ParameterError, ParameterRow, Parameters, gather
 from bridge.rclpy_internals import given_parameters
 from bridge.stream.link import CONFIGURE_TIMEOUT_S, Link, RequestFailedError
 
@@ -27,7 +27,7 @@ _OF_OTHERS: Final = ("qos_overrides.", "use_sim_time", "start_type_description_s
 _ROWS: Final = {row.name: row for row in PARAMETERS}
 
 
-def descriptor(row: Row) -> ParameterDescriptor:
+def descriptor(row: ParameterRow) -> ParameterDescriptor:
     described = ParameterDescriptor(description=row.description, read_only=not row.live)
     if row.choices or isinstance(row.default, tuple):
         described.additional_constraints = row.allowed()

@@ -48,7 +48,7 @@ class ParameterError(Exception):
     """A parameter has a value that it cannot have; the text is one sentence."""
 
 
-class Row(NamedTuple):
+class ParameterRow(NamedTuple):
     """One parameter. The default's type is the parameter's; a tuple is texts, or as many numbers.
 
     `low` and `high` bound a number; of several, each from -`high` if `low` is 0. `live`: can be set while the
@@ -260,7 +260,7 @@ class Parameters:
 
 
 PARAMETERS: Final = tuple(
-    Row(_GROUPS.sub(r"\1.", each.name), *each.metadata["row"], **each.metadata["more"])
+    ParameterRow(_GROUPS.sub(r"\1.", each.name), *each.metadata["row"], **each.metadata["more"])
     for each in fields(Parameters)
 )
 

@@ -16,7 +16,7 @@ from bota_ethercat.pdo import Vector3
 from bridge.parameters.table import Parameters
 from bridge.publishing.messages import Stamps, Topic
 from bridge.rclpy_internals import packer
-from bridge.stream.link import Clock
+from bridge.stream.link import NodeClock
 from bridge.tf import TF_PERIOD_S, Tf, UnusableError, check_tf, stale_text
 from ft_compensation.compensator import Stages
 from ft_compensation.outputs import WrenchFilter, WrenchTransform
@@ -103,7 +103,9 @@ class FilteredTopic(WrenchTopic):
 class TfFrameTopic(WrenchTopic):
     """`wrench_compensated/NAME`: in a frame known to TF, by its latest pose, which `look_up` replaces."""
 
-    def __init__(self, node: Node, name: str, stamps: Stamps, parameters: Parameters, clock: Clock) -> None:
+    def __init__(
+        self, node: Node, name: str, stamps: Stamps, parameters: Parameters, clock: NodeClock
+    ) -> None:
         super().__init__(node, f"wrench_compensated/{name}", name, stamps)
         self._name, self._source, self._clock = name, parameters.frame_id, clock
         # The pose's stamp and what follows from it; None: TF has had none yet.
@@ -146,7 +148,7 @@ class TfFrameTopic(WrenchTopic):
         return stale and f"{what}TF's latest pose of {self._source} in {self._name} {stale}"
 
 
-def make_frames(node: Node, parameters: Parameters, stamps: Stamps, clock: Clock) -> list[WrenchTopic]:
+def make_frames(node: Node, parameters: Parameters, stamps: Stamps, clock: NodeClock) -> list[WrenchTopic]:
     """A topic for each of the parameter `wrench_frames`; ParameterError if one needs TF and there is none."""
     topics: list[WrenchTopic] = []
     for name, fixed in parameters.frames:

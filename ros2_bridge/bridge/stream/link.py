@@ -30,7 +30,7 @@ SHUTDOWN_TIMEOUT_S: Final = 3.0
 _NEWER_IN_DESCRIPTIONS: Final = ("name", "serial", "state", "hardware", "firmware", "rate_hz", "settling")
 
 
-class Clock:
+class NodeClock:
     """Time as the node's threads see it; tests have a clock of their own, and let it pass as they like."""
 
     monotonic = staticmethod(time.monotonic)
@@ -39,7 +39,7 @@ class Clock:
     wait = staticmethod(threading.Event.wait)  # until an event is set, so many seconds at most; whether it is
 
 
-SYSTEM_CLOCK: Final = Clock()
+SYSTEM_CLOCK: Final = NodeClock()
 
 
 class RequestFailedError(Exception):
@@ -53,7 +53,7 @@ class RequestRefusedError(RequestFailedError):
 class Link:
     """`on_change` is called, in the writer's thread, after each change of what is known."""
 
-    def __init__(self, client: Client, sensor: int, clock: Clock) -> None:
+    def __init__(self, client: Client, sensor: int, clock: NodeClock) -> None:
         self.client = client  # of the node's only connection
         self.clock = clock  # what everything is timed by
         self.address = printable(client.address)

@@ -26,7 +26,7 @@ from bota_ethercat.text.untrusted import rows
 from bridge.parameters.table import Parameters
 from bridge.process import Worker
 from bridge.stream.frame_selector import FrameCounts, FrameSelector
-from bridge.stream.link import SYSTEM_CLOCK, Clock, Link, sentence
+from bridge.stream.link import SYSTEM_CLOCK, Link, NodeClock, sentence
 
 _WAIT_S: Final = 0.1  # so that silence is known to be the server's
 # Times that a ROS message can carry, less the longest delay of a filter.
@@ -105,7 +105,7 @@ class Reader:
 
     def __init__(
         self, parameters: Parameters, outputs: Outputs, log: Any, on_failure: Callable[[str], object], *,
-        channel: TcpChannel | None = None, clock: Clock = SYSTEM_CLOCK,
+        channel: TcpChannel | None = None, clock: NodeClock = SYSTEM_CLOCK,
     ) -> None:  # fmt: skip
         self._sensor, self._outputs, self._log = parameters.sensor, outputs, log
         units = ImuUnits(parameters.imu_raw_units)
