@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # Linux: an alternative name of an interface works for sockets if it is short, and never for what reads /sys.
 #
-# One would guess: the names that `ip link` shows as `altname` (udev gives enx..., enp..., ens...) are good everywhere a
-# name is, or nowhere but in `ip`.
-# What happens: bind of a packet socket and if_nametoindex take one of up to 15 characters, as `ip` takes any; a longer one
-# "does not exist"; /sys/class/net has none of either. A socket that was bound by it tells the first name: a program
-# that compares the name of recvfrom with the one that it was given drops every frame. A user meets it with an
-# EtherCAT master that opens the name well and then finds neither carrier nor driver. Seen with Linux 6.18, CPython 3.11.
-# Needs root (a network namespace); 77 without.
+# One would guess: the names that `ip link` shows as `altname` (udev gives enx..., enp..., ens...) are good everywhere
+# a name is, or nowhere but in `ip`.
+# What happens: bind of a packet socket and if_nametoindex take one of up to 15 characters, as `ip` takes any; a
+# longer one "does not exist"; /sys/class/net has none of either. A socket that was bound by it tells the first name:
+# a program that compares the name of recvfrom with the one that it was given drops every frame. A user meets it with
+# an EtherCAT master that opens the name well and then finds neither carrier nor driver. Seen with Linux 6.18, CPython
+# 3.11. Needs root (a network namespace); 77 without.
 set -euo pipefail
 [ "$(id -u)" = 0 ] || { echo "needs root for a network namespace"; exit 77; }
 [ "${1-}" = inside ] || exec unshare --net --mount "$0" inside

@@ -1,12 +1,13 @@
 #!/usr/bin/env bash
-# Linux packet socket: its interface goes and comes back under the same name, and the socket stays deaf without an error.
+# Linux packet socket: its interface goes and comes back under the same name, and the socket stays deaf without an
+# error.
 #
-# One would guess: a socket that is bound to "ens5" either goes on when ens5 is there again, as it does after
-# `ip link set ens5 down` and `up`, or every call fails from then on.
+# One would guess: a socket that is bound to "ens5" either goes on when ens5 is there again, as it does after `ip link
+# set ens5 down` and `up`, or every call fails from then on.
 # What happens: one recv fails with ENETDOWN. After that, recv times out as on a quiet line and poll reports nothing;
 # only send (ENXIO) and getsockname (an empty name) tell. After down and up the first error is the very same and the
-# socket goes on: whoever takes ENETDOWN for "wait for the link" waits for ever. A user meets it with a USB adapter that
-# is plugged in again. Seen with Linux 6.18. Needs root (a network namespace); 77 without.
+# socket goes on: whoever takes ENETDOWN for "wait for the link" waits for ever. A user meets it with a USB adapter
+# that is plugged in again. Seen with Linux 6.18. Needs root (a network namespace); 77 without.
 set -euo pipefail
 [ "$(id -u)" = 0 ] || { echo "needs root for a network namespace"; exit 77; }
 [ "${1-}" = inside ] || exec unshare --net "$0" inside

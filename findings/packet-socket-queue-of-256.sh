@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # Linux packet socket: a receive buffer of 208 KiB holds 256 frames of 60 bytes.
 #
-# One would guess: 212,992 bytes hold some 3,500 of the shortest frames, 4 s of an EtherCAT bus of 800 Hz, and 140 of the
-# longest; so short frames are what is safe.
-# What happens: what counts is what the kernel allocated for a frame, 832 bytes for 60, and a longest one costs only 2.7
-# times as much: 256 against 93. What does not fit is dropped without an error; only PACKET_STATISTICS counts it. A
-# monitor or a master that stands still for 0.16 s at 1600 Hz begins to lose frames. The same rule holds for UDP and Unix
-# datagrams. Seen with Linux 6.18 on veth; with a card, its driver decides what a frame costs. Needs root (a network
-# namespace); 77 without.
+# One would guess: 212,992 bytes hold some 3,500 of the shortest frames, 4 s of an EtherCAT bus of 800 Hz, and 140 of
+# the longest; so short frames are what is safe.
+# What happens: what counts is what the kernel allocated for a frame, 832 bytes for 60, and a longest one costs only
+# 2.7 times as much: 256 against 93. What does not fit is dropped without an error; only PACKET_STATISTICS counts it.
+# A monitor or a master that stands still for 0.16 s at 1600 Hz begins to lose frames. The same rule holds for UDP and
+# Unix datagrams. Seen with Linux 6.18 on veth; with a card, its driver decides what a frame costs. Needs root (a
+# network namespace); 77 without.
 set -euo pipefail
 [ "$(id -u)" = 0 ] || { echo "needs root for a network namespace"; exit 77; }
 [ "${1-}" = inside ] || exec unshare --net "$0" inside

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
 # pysoem 1.1.13: a second Master.close() closes a descriptor that belongs to something else by then.
 #
-# One would guess: close() may be called again, as with Python's files and sockets, so `finally: master.close()` beside a
-# close() in the program's own way out does no harm.
-# What happens: the master keeps the number of its socket, and the second call closes whatever has that number by then: a
-# log, a socket, a recording. The call raises nothing; the next write to that file fails with EBADF. A user meets it in a
-# program that closes the bus after a fault and again when it ends. Seen with Linux 6.18, CPython 3.11. Needs root (a
-# network namespace); 77 without.
+# One would guess: close() may be called again, as with Python's files and sockets, so `finally: master.close()`
+# beside a close() in the program's own way out does no harm.
+# What happens: the master keeps the number of its socket, and the second call closes whatever has that number by
+# then: a log, a socket, a recording. The call raises nothing; the next write to that file fails with EBADF. A user
+# meets it in a program that closes the bus after a fault and again when it ends. Seen with Linux 6.18, CPython 3.11.
+# Needs root (a network namespace); 77 without.
 set -euo pipefail
 [ "$(id -u)" = 0 ] || { echo "needs root for a network namespace"; exit 77; }
 folder=$(mktemp -d)

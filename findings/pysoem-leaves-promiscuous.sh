@@ -3,10 +3,10 @@
 #
 # One would guess: what a program sets on a socket ends with it, as tcpdump's and Wireshark's promiscuous mode does.
 # What happens: the flag is set on the interface, as `ip link set ens5 promisc on` does, and nobody takes it off. From
-# then on the card hands up every frame of its segment. A user meets it in a security audit, or on an interface that was
-# tried once, by mistake (the office network's), and that costs processor time until the next boot.
-# `ip link set ens5 promisc off` ends it. A capturing program's own mode (PACKET_ADD_MEMBERSHIP) is shown in `promiscuity`
-# and is gone with its socket. Seen with Linux 6.18. Needs root (a network namespace); 77 without.
+# then on the card hands up every frame of its segment. A user meets it in a security audit, or on an interface that
+# was tried once, by mistake (the office network's), and that costs processor time until the next boot. `ip link set
+# ens5 promisc off` ends it. A capturing program's own mode (PACKET_ADD_MEMBERSHIP) is shown in `promiscuity` and is
+# gone with its socket. Seen with Linux 6.18. Needs root (a network namespace); 77 without.
 set -euo pipefail
 [ "$(id -u)" = 0 ] || { echo "needs root for a network namespace"; exit 77; }
 folder=$(mktemp -d)

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # Linux: a Unix datagram socket in a new network namespace queues 11 datagrams, whatever the machine is set to.
 #
-# One would guess: Unix sockets are files and have nothing to do with network namespaces; as much fits as SO_RCVBUF and
-# SO_SNDBUF allow, and where systemd has raised net.unix.max_dgram_qlen to 512, that holds for the machine.
-# What happens: the limit counts datagrams, not bytes, is each namespace's own, begins with 10 in every new one (a new one
-# copies nothing from its parent) and is read when the receiver's socket is made. A receiver that pauses for 12 ms loses
-# datagrams of a sender of 1 kHz that does not wait, in a container or namespace only. A user meets it when a simulator or
-# logger that has always kept up sends to a program in `ip netns exec` or a container. Seen with Linux 6.18. Needs root
-# (network namespaces); 77 without.
+# One would guess: Unix sockets are files and have nothing to do with network namespaces; as much fits as SO_RCVBUF
+# and SO_SNDBUF allow, and where systemd has raised net.unix.max_dgram_qlen to 512, that holds for the machine.
+# What happens: the limit counts datagrams, not bytes, is each namespace's own, begins with 10 in every new one (a new
+# one copies nothing from its parent) and is read when the receiver's socket is made. A receiver that pauses for 12 ms
+# loses datagrams of a sender of 1 kHz that does not wait, in a container or namespace only. A user meets it when a
+# simulator or logger that has always kept up sends to a program in `ip netns exec` or a container. Seen with Linux
+# 6.18. Needs root (network namespaces); 77 without.
 set -euo pipefail
 [ "$(id -u)" = 0 ] || { echo "needs root for a network namespace"; exit 77; }
 folder=$(mktemp -d)
