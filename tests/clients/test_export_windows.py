@@ -229,6 +229,18 @@ def test_every_format_has_the_same(tmp_path: Path) -> None:
             assert table.schema.field(name).type.list_size == array[0].size
 
 
+def test_a_chunk_of_zarr_that_was_not_copied_is_not_a_force_of_zero(tmp_path: Path) -> None:
+    zarr = pytest.importorskip("zarr")
+    path, made = tmp_path / "run.mcap", tmp_path / "run.zarr"
+    record(path, (frame(number) for number in range(1000)), **SETTINGS)
+    assert run_here(main, path, made, "--fps", 30, "--window", 8).code == 0
+    chunks = [each for each in (made / "force_torque" / "c").rglob("*") if each.is_file()]
+    assert chunks
+    for chunk in chunks:
+        chunk.unlink()
+    assert np.isnan(zarr.open_group(made, mode="r")["force_torque"][:]).all()
+
+
 PAGE = Path(__file__).parents[2] / "docs" / "datasets.md"
 
 

@@ -413,7 +413,9 @@ def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
         for name, array in block.items():
             if name not in group:
                 shape, chunks = (0, *array.shape[1:]), (_CHUNK, *array.shape[1:])
-                group.create_array(name, shape=shape, chunks=chunks, dtype=array.dtype)
+                # Zarr reads a chunk that is missing, of an incomplete copy, as this; its default is 0.
+                missing = np.nan if array.dtype.kind == "f" else 0
+                group.create_array(name, shape=shape, chunks=chunks, dtype=array.dtype, fill_value=missing)
             group[name].append(array)
 
 
