@@ -259,6 +259,7 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
             if not chosen:
                 there = ", ".join(sorted({each.topic for each in bag.connections}))
                 raise RecordingError(f"{path} has no topic {topic}, but {there}")
+            _refuse_two_definitions(path, chosen[0], bag.connections)
             for connection, _, data in bag.messages(chosen):
                 message: Any = bag.deserialize(data, connection.msgtype)
                 stamp = message.header.stamp
@@ -270,6 +271,24 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
         if paths != [path]:
             what = "; its folder has no metadata.yaml, so its recorder was killed: try 'mcap recover'"
         raise RecordingError(f"{which} cannot be read as a bag: {error}{what}") from None
+
+
+def _refuse_two_definitions(path: Path, chosen: Any, connections: Iterable[Any]) -> None:
+    """RecordingError if the bag has two definitions of a type of the topic: rosbags decodes all with one."""
+    from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415 - of the extra `dataset`
+    from rosbags.typesys import get_types_from_msg  # noqa: PLC0415
+
+    if chosen.msgdef.format is not MessageDefinitionFormat.MSG:
+        return
+    own = get_types_from_msg(chosen.msgdef.data, chosen.msgtype)
+    for each in connections:
+        if each.msgdef.format is MessageDefinitionFormat.MSG and each.msgdef.data != chosen.msgdef.data:
+            for name, definition in get_types_from_msg(each.msgdef.data, each.msgtype).items():
+                if own.get(name, definition) != definition:
+                    raise RecordingError(
+                        f"{path} defines {name} in two ways, for {chosen.topic} and {each.topic}: "
+                        f"make a bag of {chosen.topic} alone"
+                    )
 
 
 def windows_of(
