@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from bota_ethercat.health.sentences import STOOD_STILL
+from bota_ethercat.health.advice import STOOD_STILL
 from bota_ethercat.pdo import is_finite, layout_for
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import FIRST_INDEX

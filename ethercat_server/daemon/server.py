@@ -25,7 +25,6 @@ from ethercat_server.serving.connection import Limits
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import SocketTransport
-from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 
 _NEVER_NS: Final = 1 << 62
 
@@ -48,6 +47,8 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         cleanup.callback(hub.close)
         ifname, priority = options.ifname, options.server["rt_priority"]
         if options.ifname == VIRTUAL_INTERFACE:
+            from ethercat_server.virtual_sensor.virtual_bus import VirtualBus  # noqa: PLC0415 - not as root
+
             # By the port two such servers have different sensors, each the same every time.
             virtual = VirtualBus(options.virtual_arguments, priority, options.server["user"], options.port)
             ifname = cleanup.enter_context(virtual).ifname

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, TextIO
 
+from bota_ethercat.health.advice import CHECK_IT, IT_TELLS
 from bota_ethercat.health.limits import Level
-from bota_ethercat.health.sentences import CHECK_IT, IT_TELLS
 from bota_ethercat.text.untrusted import visible
 from ethercat_server.errors import ServerError
 

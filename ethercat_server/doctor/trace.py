@@ -18,7 +18,8 @@ from bota_ethercat.errors import ConnectionFailedError, ProtocolError
 from bota_ethercat.program.server_choice import default_server
 from bota_ethercat.text.untrusted import printable
 from ethercat_server.errors import ServerError
-from ethercat_server.sampling.trace import Decision, RecordKind, Trace, TraceError
+from ethercat_server.sampling.replay import Decision, Trace, TraceError
+from ethercat_server.sampling.trace import RecordKind
 
 SUFFIX: Final = ".trace"
 _LATE: Final = 1.5  # periods between two exchanges beyond which samples pass

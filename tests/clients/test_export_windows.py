@@ -7,6 +7,7 @@ import json
 import math
 import random
 import re
+import struct
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -18,7 +19,7 @@ import pytest
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import main
-from bota_clients.export.dataset import Periodic, Stamped, read_stamps, windows_of
+from bota_clients.export.dataset import Periodic, Stamped, messages, read_stamps, windows_of
 from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
@@ -229,6 +230,18 @@ def test_every_format_has_the_same(tmp_path: Path) -> None:
             assert table.schema.field(name).type.list_size == array[0].size
 
 
+def test_a_chunk_of_zarr_that_was_not_copied_is_not_a_force_of_zero(tmp_path: Path) -> None:
+    zarr = pytest.importorskip("zarr")
+    path, made = tmp_path / "run.mcap", tmp_path / "run.zarr"
+    record(path, (frame(number) for number in range(1000)), **SETTINGS)
+    assert run_here(main, path, made, "--fps", 30, "--window", 8).code == 0
+    chunks = [each for each in (made / "force_torque" / "c").rglob("*") if each.is_file()]
+    assert chunks
+    for chunk in chunks:
+        chunk.unlink()
+    assert np.isnan(zarr.open_group(made, mode="r")["force_torque"][:]).all()
+
+
 PAGE = Path(__file__).parents[2] / "docs" / "datasets.md"
 
 
@@ -260,6 +273,34 @@ def test_the_code_of_the_page_runs(code: str, tmp_path: Path, monkeypatch: pytes
 
 
 STAMPS = [START_NS + 123_456_789, START_NS + 223_456_000]
+
+
+def test_a_bag_that_defines_a_type_in_two_ways_is_refused(tmp_path: Path) -> None:
+    writing = pytest.importorskip("mcap.writer")
+    header = "builtin_interfaces/Time stamp\nstring frame_id"
+    nested = f"{'=' * 80}\nMSG: std_msgs/Header\n{header}\n{'=' * 80}\nMSG: builtin_interfaces/Time\n"
+    fields = "std_msgs/Header header\nfloat64 force\nfloat64 torque\n"
+    swapped = "std_msgs/Header header\nfloat64 torque\nfloat64 force\n"
+    for other, refused in ((fields + "# newtons\n", False), (swapped, True)):
+        bag = tmp_path / "bag.mcap"
+        with bag.open("wb") as file:
+            writer = writing.Writer(file)
+            writer.start("ros2", "")
+            for topic, text in (("/left", fields), ("/right", other)):
+                definition = text + nested + "int32 sec\nuint32 nanosec\n"
+                schema = writer.register_schema("a_msgs/msg/Load", "ros2msg", definition.encode())
+                channel = writer.register_channel(topic, "cdr", schema)
+                body = struct.pack("<4BiIIB3xdd", 0, 1, 0, 0, 5, 7, 1, 0, 1.0, 2.0)
+                writer.add_message(channel, 1, body, 1)
+            writer.finish()
+        if refused:
+            with pytest.raises(
+                RecordingError, match="defines a_msgs/msg/Load in two ways, for /left and /right"
+            ):
+                list(messages(bag, "/left"))
+        else:
+            ((stamp_ns, message),) = messages(bag, "/left")
+            assert (stamp_ns, message.force, message.torque) == (5_000_000_007, 1.0, 2.0)
 
 
 def test_stamps_are_read_from_tables_and_bags(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ import pytest
 from ethercat_server.daemon.traces import Traces
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.doctor.trace import find_losses
-from ethercat_server.sampling.trace import RecordKind, Trace, TraceError
+from ethercat_server.sampling.replay import Trace, TraceError
+from ethercat_server.sampling.trace import RecordKind
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.ended import run_here

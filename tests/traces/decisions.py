@@ -8,7 +8,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Final
 
-from ethercat_server.sampling.trace import RecordKind, Trace
+from ethercat_server.sampling.replay import Trace
+from ethercat_server.sampling.trace import RecordKind
 
 FOLDER: Final = Path(__file__).parent
 NAMES: Final = ("quiet", "loops", "slow", "stalls", "lies", "unplugged")

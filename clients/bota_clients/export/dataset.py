@@ -259,6 +259,7 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
             if not chosen:
                 there = ", ".join(sorted({each.topic for each in bag.connections}))
                 raise RecordingError(f"{path} has no topic {topic}, but {there}")
+            _refuse_two_definitions(path, chosen[0], bag.connections)
             for connection, _, data in bag.messages(chosen):
                 message: Any = bag.deserialize(data, connection.msgtype)
                 stamp = message.header.stamp
@@ -270,6 +271,24 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
         if paths != [path]:
             what = "; its folder has no metadata.yaml, so its recorder was killed: try 'mcap recover'"
         raise RecordingError(f"{which} cannot be read as a bag: {error}{what}") from None
+
+
+def _refuse_two_definitions(path: Path, chosen: Any, connections: Iterable[Any]) -> None:
+    """RecordingError if the bag has two definitions of a type of the topic: rosbags decodes all with one."""
+    from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415 - of the extra `dataset`
+    from rosbags.typesys import get_types_from_msg  # noqa: PLC0415
+
+    if chosen.msgdef.format is not MessageDefinitionFormat.MSG:
+        return
+    own = get_types_from_msg(chosen.msgdef.data, chosen.msgtype)
+    for each in connections:
+        if each.msgdef.format is MessageDefinitionFormat.MSG and each.msgdef.data != chosen.msgdef.data:
+            for name, definition in get_types_from_msg(each.msgdef.data, each.msgtype).items():
+                if own.get(name, definition) != definition:
+                    raise RecordingError(
+                        f"{path} defines {name} in two ways, for {chosen.topic} and {each.topic}: "
+                        f"make a bag of {chosen.topic} alone"
+                    )
 
 
 def windows_of(
@@ -413,7 +432,9 @@ def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
         for name, array in block.items():
             if name not in group:
                 shape, chunks = (0, *array.shape[1:]), (_CHUNK, *array.shape[1:])
-                group.create_array(name, shape=shape, chunks=chunks, dtype=array.dtype)
+                # Zarr reads a chunk that is missing, of an incomplete copy, as this; its default is 0.
+                missing = np.nan if array.dtype.kind == "f" else 0
+                group.create_array(name, shape=shape, chunks=chunks, dtype=array.dtype, fill_value=missing)
             group[name].append(array)
 
 

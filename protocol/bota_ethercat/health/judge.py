@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
+from bota_ethercat.health.advice import IT_TELLS, STOOD_STILL
 from bota_ethercat.health.limits import LIMITS, About, Finding, Level, StreamLimits, Verdict, verdict
-from bota_ethercat.health.sentences import IT_TELLS, STOOD_STILL, did_not_read
+from bota_ethercat.health.sentences import did_not_read
 from bota_ethercat.pdo import AXES
 from bota_ethercat.replies import EmergencyStatus
 from bota_ethercat.sensor.warnings_register import Severity, WarningFlag, explain

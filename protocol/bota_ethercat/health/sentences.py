@@ -16,10 +16,6 @@ from bota_ethercat.pdo import AXES
 from bota_ethercat.replies import SensorStatus
 from bota_ethercat.text.untrusted import number, printable, text, whole
 
-# What others than the doctor advise.
-CHECK_IT: Final = "check it with ethercat-doctor"
-IT_TELLS: Final = "ethercat-doctor tells which"
-STOOD_STILL: Final = f"computer stood still{{}}, {CHECK_IT}"
 _EVENTS: Final[Mapping[str, str]] = {
     Event.SENSOR_LOST: "{} is lost",
     Event.SENSOR_BACK: "{} is back",
