@@ -12,7 +12,7 @@ ONE_SAMPLE_PERIODS: Final = 0.9  # time without a PDI read, in periods, in which
 class Expected(NamedTuple):
     """The sampling clock as estimated before an exchange. Times in ns."""
 
-    phase_ns: float  # when the next sample comes to be, less the outward part of the shortest round trip
+    phase_ns: float  # instant of the next sample, less the outward part of the shortest round trip
     period_ns: float
     doubt_ns: float  # uncertainty of the phase
     is_doubtful: bool  # whether the sample before may have been another one

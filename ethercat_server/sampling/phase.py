@@ -113,7 +113,7 @@ class SensorPhase(Phase):
         return not self.log_noise and self.period_variance < (KNOWN_ERROR * self.period_ns) ** 2
 
     def begin(self, low_ns: float, high_ns: float) -> None:
-        """The first sample came to be between these two; the next one is expected."""
+        """The first sample was made between these two; the next one is expected."""
         self.phase_ns = (low_ns + high_ns) / 2
         self.variance = (high_ns - low_ns) ** 2 / 12
         self._covariance = 0.0
@@ -130,7 +130,7 @@ class SensorPhase(Phase):
             self.period_variance = most
 
     def learn_bracket(self, low_ns: float, high_ns: float, variance: float) -> None:
-        """While little is known: the sample came to be between these two, anywhere."""
+        """While little is known: the sample was made between these two, uniformly distributed."""
         variance += (high_ns - low_ns) ** 2 / 12 + RESOLUTION_NS**2
         error_ns = (low_ns + high_ns) / 2 - self.phase_ns
         if error_ns * error_ns > CONTRADICTS * CONTRADICTS * (self.variance + variance):
@@ -142,7 +142,7 @@ class SensorPhase(Phase):
         self.correct(error_ns, variance)
 
     def learn_bit(self, read_ns: float, variance: float, sign: int) -> None:
-        """The sample had come to be at the PDI read (`sign` 1), or had not (-1)."""
+        """The sample was there at the PDI read (`sign` 1), or was not (-1)."""
         deviation_ns = math.sqrt(self.variance + variance + RESOLUTION_NS**2)
         late = (read_ns - self.phase_ns) / deviation_ns
         if sign * late > CERTAIN:
@@ -167,7 +167,7 @@ class SensorPhase(Phase):
         self._adapt_noise((1 - chance) * (surprise + math.log(1 - chance)))
 
     def learn_instant(self, instant_ns: float, variance: float) -> None:
-        """The sample came to be then."""
+        """An event says when the sample was made."""
         error_ns = instant_ns - self.phase_ns
         surprise = error_ns * error_ns / (self.variance + variance)
         if surprise > CONTRADICTS * CONTRADICTS:

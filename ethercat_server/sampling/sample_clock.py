@@ -1,8 +1,8 @@
-"""The sampling clock of one sensor: which sample an exchange brought, and when that came to be.
+"""The sampling clock of one sensor: which sample an exchange brought, and its instant.
 
 The sensor samples freely; an exchange tells whether its process data changed since the one before, and a
-slave controller with a distributed clock when it did. What is not known well, because a frame was lost or the
-machine stood still, leaves the estimate as it is: it holds over, and its uncertainty grows as crystals drift.
+slave controller with a distributed clock when it did. After a lost frame or a stall of the machine the
+estimate is in holdover: it advances by the model, and its variance grows.
 """
 
 from __future__ import annotations
@@ -45,10 +45,9 @@ class SampleClock:
         phase: its phase is the next sample's instant less the outward part of the shortest round trip.
         locked: whether the phase is known well enough to follow it.
         instant_ns: estimated instant of the newest sample, from those before it.
-        steps: how many samples the newest one is after the one handed out before it: more than 1, some were
-            lost; 0, one was counted as lost that was not.
-        uncertain: whether more may have been lost than `steps` says. The samples after it tell, and their
-            `steps` put it right.
+        steps: number of the newest sample less that of the one handed out before it: more than 1 if some were
+            lost, 0 to correct a loss that was counted and was none.
+        uncertain: whether more may have been lost than `steps` says; the `steps` of later samples correct it.
         learns: whether `learn` must follow: a steady clock learns from some samples only, which are chosen
             before they arrive: otherwise the selection would bias the estimate.
         before_ns: an exchange that is back by more than this before the phase cannot bring a new sample.
@@ -90,17 +89,17 @@ class SampleClock:
         self._read_at_ns = 0
         self._moved_ns = round_trip.moved_ns
         self._bias_ns = 0.0  # by how much events are later than polls show, while polls are followed
-        self._number = 1  # of the newest sample, counted from the one before it by the phase alone
-        # When the sensor had certainly been read in the exchange that brought the newest sample.
+        self._number = 1  # of the newest sample after the one before it, by the phase alone
+        # Latest possible time of the PDI read in the exchange that brought the newest sample.
         self._seen_by_ns = 0.0
         self._absent = 0  # consecutive samples that were polled for and did not come
-        # Whether an instant is known; whether the sample before was `uncertain`; whether the next is overdue.
+        # Whether any instant is known; the sample before was `uncertain`; the next one is overdue.
         self._begun = self._doubtful = self._overdue = False
         # Whether the next sample is certainly the expected one if its exchange is back less than `_sure_ns`
         # after its phase; its event is then within `_doubt_ns` of it, and it is overdue after `_late_ns`.
         self._steady = False
         self._sure_ns = self._doubt_ns = self._late_ns = self._outward_ns = 0.0
-        # Samples since something was learned, and how many at most.
+        # Samples that were not learned from since the last that was, and their limit.
         self._skipped = self._skips = 0
         self._derive()
 

@@ -1,4 +1,4 @@
-"""When a sensor's samples came to be, by what its slave controller latches.
+"""The instants of a sensor's samples by the event times that its slave controller latches.
 
 A controller with distributed clocks keeps its local time of the moment when the sensor's processor had
 written a sample (PDI buffer change event). The frame that reads the sample reads that, too. `LocalClock`

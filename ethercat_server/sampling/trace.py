@@ -65,7 +65,10 @@ def learn_note(
 
 
 def state_of(value: Any, seen: set[int] | None = None) -> Any:
-    """All numbers of an object of this package, for `set_state`; what was seen already is left out."""
+    """All numbers of an object of this package, for `set_state`; what was seen already is left out.
+
+    Its attributes are keys in trace files: who renames one has to count up `VERSION`.
+    """
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Enum):
