@@ -7,21 +7,17 @@ as they are set, and go to INIT at the end.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import gc
 import os
 import signal
 import socket
-import struct
 import threading
 from collections.abc import Iterator
 from typing import Final
 
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
 from ethercat_server.acquisition.start_up import AsFound
-from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.nic import look_up
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.server import Server
@@ -31,36 +27,15 @@ from ethercat_server.virtual_sensor.virtual_bus import VIRTUAL_INTERFACE, Virtua
 
 STOPPED: Final = "stopped before it was done"
 _END_S: Final = 5.0
-_SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_PROMISC = 0x8913, 0x8914, 0x100
-_IFREQ: Final = struct.Struct("16sH14x")
 
 
 @contextlib.contextmanager
 def open_interface(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
-    """The open bus on `ifname`, or on a virtual bus for `virtual`.
-
-    Promiscuous mode, which SOEM switches on and leaves on, is switched off again unless it was on before.
-    """
+    """The open bus on `ifname`, or on a virtual bus for `virtual`."""
     with contextlib.ExitStack() as cleanup:
         if ifname == VIRTUAL_INTERFACE:
             ifname = cleanup.enter_context(VirtualBus()).ifname
-        with contextlib.suppress(InterfaceError):  # said when it is to be opened
-            index = look_up(ifname).ifindex
-            if not change_flags(index) & _IFF_PROMISC:
-                cleanup.callback(change_flags, index, off=_IFF_PROMISC)
         yield cleanup.enter_context(open_bus(ifname, allow_ip=allow_ip))
-
-
-def change_flags(index: int, *, on: int = 0, off: int = 0) -> int:
-    """Change the flags of an interface (linux/if.h), if it is there and that is allowed; what they were."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket, contextlib.suppress(OSError):
-        name = socket.if_indextoname(index).encode()
-        answer = fcntl.ioctl(any_socket, _SIOCGIFFLAGS, _IFREQ.pack(name, 0))
-        flags: int = _IFREQ.unpack(answer)[1]
-        if (wanted := (flags | on) & ~off) != flags:
-            fcntl.ioctl(any_socket, _SIOCSIFFLAGS, _IFREQ.pack(name, wanted))
-        return flags
-    return 0
 
 
 class PrivateServer:

@@ -130,6 +130,9 @@ _IFLA_ADDRESS, _IFLA_NAME, _IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_INFO, _IFL
 _IFLA_CARRIER, _IFLA_LINK_NAMESPACE, _IFLA_NAMESPACE, _IFLA_ALTERNATIVE_NAME = 33, 37, 46, 53
 _INFO_KIND: Final = 1
 _IFF_UP, _IFF_LOOPBACK, _IFF_RUNNING = 0x1, 0x8, 0x40
+IFF_PROMISC: Final = 0x100
+_SIOCGIFFLAGS, _SIOCSIFFLAGS = 0x8913, 0x8914
+_FLAGS: Final = struct.Struct("16sH14x")
 _ADDRESS: Final = struct.Struct("=BBBBI")  # family, length of the prefix, flags, scope, interface
 _IFA_ADDRESS, _IFA_LOCAL = 1, 2
 _IFA_F_PERMANENT: Final = 0x80
@@ -558,3 +561,15 @@ def missing_capabilities(
     lines = (Path("/proc/self/status").read_text() if status is None else status).splitlines()
     effective = next((int(line.split()[1], 16) for line in lines if line.startswith("CapEff:")), 0)
     return [name for bit, name in needed.items() if not effective >> bit & 1]
+
+
+def change_flags(index: int, *, on: int = 0, off: int = 0) -> int:
+    """Change the flags of an interface (linux/if.h), if it is there and that is allowed; what they were."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket, contextlib.suppress(OSError):
+        name = socket.if_indextoname(index).encode()
+        answer = fcntl.ioctl(any_socket, _SIOCGIFFLAGS, _FLAGS.pack(name, 0))
+        flags: int = _FLAGS.unpack(answer)[1]
+        if (wanted := (flags | on) & ~off) != flags:
+            fcntl.ioctl(any_socket, _SIOCSIFFLAGS, _FLAGS.pack(name, wanted))
+        return flags
+    return 0

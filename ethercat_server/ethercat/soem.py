@@ -67,7 +67,9 @@ class SoemBackend:
 
     def open(self) -> None:
         """See `Backend`."""
-        before = packet_sockets()
+        before, flags = packet_sockets(), nic.IFF_PROMISC
+        with contextlib.suppress(InterfaceError):  # it cannot be opened either
+            flags = nic.change_flags(nic.look_up(self._ifname).ifindex)
         try:
             self._master.open(nic.own_name(self._ifname))
         except ConnectionError:
@@ -84,6 +86,8 @@ class SoemBackend:
             self._ifindex = nic.look_up(self._ifname).ifindex
         except InterfaceError:
             raise BusError(f"the interface {self.ifname} went away: connect it and start again") from None
+        if not flags & nic.IFF_PROMISC:  # SOEM would leave it so, and all that is for us is broadcast
+            nic.change_flags(self._ifindex, off=nic.IFF_PROMISC)
         # Until SOEM had bound it to the interface, it received the EtherCAT frames of all others.
         while self.receive(0) is not None:
             pass

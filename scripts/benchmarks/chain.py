@@ -19,8 +19,8 @@ from typing import Any, Final
 
 from bota_ethercat.client import Client
 from bota_ethercat.errors import ProtocolError
-from ethercat_server.access.private_server import change_flags
 from ethercat_server.errors import ServerError
+from ethercat_server.ethercat.nic import change_flags
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 from scripts.benchmarks import statistics
 from scripts.benchmarks.records import PORT, began

@@ -63,7 +63,7 @@ def test_the_whole_doctor(bench: Bench) -> None:
     for position in range(2):
         now = sensor.stats(position)
         assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
-    assert not promiscuous(veth), "SOEM leaves it so"
+    assert not promiscuous(veth), "SOEM makes it so, and leaves it"
 
 
 @contextlib.contextmanager

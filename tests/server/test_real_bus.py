@@ -118,6 +118,12 @@ def test_samples_flow_again_on_the_same_connection(
     assert bench.sensor.stats()["calibration_writes"] == 0
 
 
+def test_the_interface_is_not_left_promiscuous(bench: Bench, client: Client) -> None:
+    """SOEM makes it so; whoever had it so before finds it as it was."""
+    assert client.fresh(10)
+    assert "promiscuity 0" in bench.veth.ip("-d", "link", "show", bench.veth.near)
+
+
 def test_settings_change_by_way_of_preop(bench: Bench, client: Client) -> None:
     """The mailbox by single datagrams over the raw socket, while pysoem's own are not used any more."""
     for settings in ({"chop": True, "imu_active": 3}, {"chop": False, "imu_active": 1}):
