@@ -16,6 +16,7 @@ import pytest
 from bota_ethercat.control import ACTIONS, Parameter
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.daemon.server import Notifier, every_second
+from ethercat_server.daemon.traces import Traces
 from ethercat_server.serving.connection import Connection
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import Client, Simulation, more_if_long
@@ -111,7 +112,8 @@ def test_what_a_defect_leaves_in_cycles_is_freed_within_a_second() -> None:
         return {}
 
     simulation.hub.start(defective)
-    simulation.cycle.every_second = partial(every_second, simulation.server, Notifier())
+    traces = Traces(simulation.server)
+    simulation.cycle.every_second = partial(every_second, simulation.server, Notifier(), traces)
     client = simulation.connect()
     for _ in range(5):
         for _ in range(10):
