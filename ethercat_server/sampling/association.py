@@ -45,13 +45,15 @@ def associate_by_polls(expected: Expected, read: Read, *, has_events: bool, lost
     excess_ns = max(0.0, read.back_ns - read.sent_ns - read.least_ns)
     read_ns = read.sent_ns + read_delay_ns(excess_ns, period_ns)
     most = math.floor((read.sent_ns + excess_ns - phase_ns + doubt_ns) / period_ns)
+    least = math.floor((read.sent_ns - phase_ns - doubt_ns) / period_ns)
     unread_ns = read.back_ns - read.before_ns
     if unread_ns - read.least_ns < ONE_SAMPLE_PERIODS * period_ns:
         # It came between two reads: it is the one expected nearest to them.
         late = ((read.before_ns + read_ns) / 2 - phase_ns) / period_ns
-        return Association(1 + (min(round(late), most) if has_events else round(late)), late, False)
+        passed = min(round(late), most) if has_events else round(late)
+        # Read just when a later one came to be, it may still be the one before: nothing tells which.
+        return Association(1 + passed, late, has_events and 0 < passed > least)
     late = (read_ns - phase_ns) / period_ns
-    least = math.floor((read.sent_ns - phase_ns - doubt_ns) / period_ns)
     lost_track = lost_track and unread_ns > period_ns
     return Association(1 + math.floor(late), late, is_doubtful or lost_track or (most > 0 and least < most))
 

@@ -298,11 +298,10 @@ class SampleClock:
         elif read_ns - before_ns < phase.period_ns:
             phase.learn_bracket(before_ns, read_ns, variance)
         phase.advance(1)
-        self._doubtful = self.uncertain
         if not self._by_event:
             self._schedule.count_polled_hit()
         self._schedule.count_hit()
-        self._absent, self._overdue = 0, False
+        self._doubtful, self._absent, self._overdue = self.uncertain, 0, False
 
     def _learn_absence(self, sent_ns: int, read_ns: float, variance: float) -> None:
         """No sample was there at the read, with this variance, in the exchange that was sent then."""
