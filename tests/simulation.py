@@ -442,6 +442,8 @@ class MemoryChannel(TcpChannel):
 
 def more_if_long(usual: Collection[Any], every: Iterable[Any]) -> list[Any]:
     """Values of parameters: all of `every`, those that are not in `usual` in long runs only."""
+    every = [*every]
+    assert all(value in every for value in usual), "a usual one would never be run"
     return [
         pytest.param(
             *(value if isinstance(value, tuple) else (value,)),

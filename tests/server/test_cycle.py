@@ -292,7 +292,8 @@ def test_a_run_is_repeated_by_its_seed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "dc"), more_if_long([(4, ""), (4, "none"), (23, "")], [(n, "") for n in range(1, 25)])
+    ("seed", "dc"),
+    more_if_long([(4, ""), (4, "none"), (23, "")], [(4, "none"), *((n, "") for n in range(1, 25))]),
 )
 def test_what_a_stuck_sensor_leaves_out_is_flagged(seed: int, dc: str) -> None:
     running, draw = simulation(Machine(seed=seed), dc=dc), random.Random(seed)
