@@ -35,10 +35,13 @@ class Association(NamedTuple):
     uncertain: bool  # whether more samples may have passed than `number` says
 
 
-def associate_by_polls(expected: Expected, read: Read, *, has_events: bool, lost_track: bool) -> Association:
+def associate_by_polls(
+    expected: Expected, read: Read, *, has_events: bool, lost_track: bool, was_silent: bool = False
+) -> Association:
     """Which sample it is by when the process data was read with and without it.
 
     `has_events`: the phase is so exact that no sample can have come before it: it was held back.
+    `was_silent`: a sensor that gave nothing for some periods gives something again.
     `lost_track`: samples may have been lost before it that nobody knows of.
     """
     phase_ns, period_ns, doubt_ns, is_doubtful = expected
@@ -52,7 +55,7 @@ def associate_by_polls(expected: Expected, read: Read, *, has_events: bool, lost
         late = ((read.before_ns + read_ns) / 2 - phase_ns) / period_ns
         passed = min(round(late), most) if has_events else round(late)
         # Read just when a later one came to be, it may still be the one before: nothing tells which.
-        return Association(1 + passed, late, has_events and 0 < passed > least)
+        return Association(1 + passed, late, was_silent and 0 < passed > least)
     late = (read_ns - phase_ns) / period_ns
     lost_track = lost_track and unread_ns > period_ns
     return Association(1 + math.floor(late), late, is_doubtful or lost_track or (most > 0 and least < most))

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable
 
 from ethercat_server.sampling.association import (
+    SILENT_PERIODS,
     Association,
     Expected,
     Read,
@@ -229,6 +230,7 @@ class SampleClock:
             Read(self._read_at_ns, sent_ns, back_ns, least_ns),
             has_events=events is not None,
             lost_track=events is not None and events.is_doubtful,
+            was_silent=self._absent >= SILENT_PERIODS,
         )
         self._count(found, unchanged_ns)
         instant_ns = max(phase_ns + (self._number - 1) * period_ns, self._read_at_ns) + outward_ns
