@@ -47,7 +47,7 @@ def serve(argv: Sequence[str] | None, signals: Signals) -> None:
         cleanup.callback(hub.close)
         ifname, priority = options.ifname, options.server["rt_priority"]
         if options.ifname == VIRTUAL_INTERFACE:
-            from ethercat_server.virtual_sensor.virtual_bus import VirtualBus  # noqa: PLC0415 - not as root
+            from ethercat_server.virtual_sensor.virtual_bus import VirtualBus  # noqa: PLC0415 - for this only
 
             # By the port two such servers have different sensors, each the same every time.
             virtual = VirtualBus(options.virtual_arguments, priority, options.server["user"], options.port)

@@ -25,38 +25,32 @@ log = logging.getLogger(__name__)
 
 
 class Traces:
-    """Those of a server. `second` is to be called once a second, in the loop."""
+    """Those of a server. `each_second` is to be called in the loop."""
 
     def __init__(self, server: Server) -> None:
         self._tracing, folder = server.cycle.tracing, state.folder()
         self._paths = cycle(folder / f"loss-{server.bus.ifname}-{n}.trace" for n in range(1, _FILES + 1))
-        self._due_s, self._pause_s = 0, 0
+        self._pause_s = 0  # until a loss leaves a trace again
         server.recovery.on_unexplained_loss = self._ask
         self.writing: threading.Thread | None = None
 
     def _ask(self) -> None:
-        if not self._due_s and not self._pause_s:
-            self._due_s, self._pause_s = _AFTER_S, _PAUSE_S
+        self._pause_s = self._pause_s or _PAUSE_S
 
     def each_second(self) -> None:
         """A second has passed."""
         self._pause_s = max(0, self._pause_s - 1)
-        if self._due_s:
-            self._due_s -= 1
-            if not self._due_s:
-                # The loop freezes it, which takes a fraction of a ms; a file may take long.
-                work = self._tracing.freeze(), next(self._paths)
-                self.writing = threading.Thread(target=_write, args=work, name="trace", daemon=True)
-                self.writing.start()
+        if self._pause_s == _PAUSE_S - _AFTER_S:
+            # The loop freezes it, which takes a fraction of a ms; a file may take long.
+            work = self._tracing.freeze(), next(self._paths)
+            self.writing = threading.Thread(target=_write, args=work, name="trace", daemon=True)
+            self.writing.start()
 
 
 def _write(trace: FrozenTrace, path: Path) -> None:
     realtime.leave()
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb") as file:
-            for offset in range(0, trace.size, _PART):
-                file.write(trace.read(offset, _PART))
+        state.replace(path, (trace.read(offset, _PART) for offset in range(0, trace.size, _PART)))
     except OSError as error:
         log.warning("the trace of the loss is not kept: %s", error)
     else:

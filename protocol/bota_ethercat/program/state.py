@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,12 +36,17 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def write(path: Path, kept: dict[str, Any]) -> None:
+    """See `replace`."""
+    replace(path, [json.dumps(kept).encode()])
+
+
+def replace(path: Path, parts: Iterable[bytes]) -> None:
     """Replace the file as a whole, also if power is cut; OSError if it cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(f".{os.getpid()}")
     try:
-        with unfinished.open("w", encoding="utf-8") as file:
-            file.write(json.dumps(kept))
+        with unfinished.open("wb") as file:
+            file.writelines(parts)
             file.flush()
             os.fsync(file.fileno())
         unfinished.replace(path)
