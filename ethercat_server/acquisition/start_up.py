@@ -12,7 +12,8 @@ from typing import Final, NamedTuple, Protocol, TypeVar
 from bota_ethercat.errors import PdoSizeError, SettingError
 from bota_ethercat.pdo import layout_for
 from bota_ethercat.settings import SETTINGS, SettingValue, check_combination, start_up_defaults
-from ethercat_server.acquisition.terminals import Terminal, find_terminals, named_positions
+from ethercat_server.acquisition.terminal_choice import named_positions
+from ethercat_server.acquisition.terminals import Terminal, find_terminals
 from ethercat_server.errors import BusError, SdoAbortError, SetUpError, UsageError
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus

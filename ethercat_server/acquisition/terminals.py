@@ -8,7 +8,6 @@ nothing in here runs.
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -16,6 +15,7 @@ from bota_ethercat.framing import MessageType, encode_data
 from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.acquisition.recovery import restore_station
 from ethercat_server.acquisition.stream import INVALID, REPEATED, OutgoingFrame
+from ethercat_server.acquisition.terminal_choice import parsed
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import Steps, repeat
@@ -23,10 +23,8 @@ from ethercat_server.ethercat.exchange import Exchange
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.controller import SlaveController
-from ethercat_server.sensor.scan import Kind, Slave
+from ethercat_server.sensor.scan import Slave
 
-# A choice of slaves: vendor and product, position on the wire.
-CHOICE: Final = re.compile(r"(?!$)(?:(0x[0-9a-fA-F]+):(0x[0-9a-fA-F]+)(?:@(?=[0-9])|$))?([0-9]{1,5})?")
 _UNASSIGNED: Final = 0xFF  # sync manager of a PDO that is not assigned by default
 # By the number of a data type in the SII (ETG.1020); others are unsigned.
 _LETTERS: Final = {**dict.fromkeys((0x02, 0x03, 0x04, 0x10, *range(0x12, 0x16)), "i"), 0x08: "f", 0x11: "f"}
@@ -165,19 +163,9 @@ def find_terminals(slaves: Sequence[Slave], choices: Sequence[str]) -> list[Term
     return found
 
 
-def named_positions(choices: Sequence[str]) -> dict[int, Kind | None]:
-    """The positions on the wire that are named, and the vendor and product that each must have, if any."""
-    return {int(position): kind for kind, position in map(_parsed, choices) if position}
-
-
 def _matches(slave: Slave, choice: str) -> bool:
-    (kind, position), row = _parsed(choice), slave.as_json()
+    (kind, position), row = parsed(choice), slave.as_json()
     return kind in (None, (row["vendor"], row["product"])) and position in ("", str(slave.position))
-
-
-def _parsed(choice: str) -> tuple[Kind | None, str]:
-    vendor, product, position = CHOICE.findall(choice)[0]
-    return (int(vendor, 0), int(product, 0)) if vendor else None, position
 
 
 class CycleWithTerminals(Cycle):

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.signals import Signals
+from ethercat_server.daemon.options import parse_options
 from ethercat_server.errors import ServerError, StopRequestedError
 from ethercat_server.process.logs import set_up_logging
 
@@ -20,11 +21,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the server; returns its exit code."""
     signals = Signals()
     set_up_logging()
-    # Loading it takes a moment, in which Ctrl-C must work already.
-    from ethercat_server.daemon.server import serve  # noqa: PLC0415
-
     try:
-        serve(argv, signals)
+        options = parse_options(argv)
+        # Loading it takes a moment, in which Ctrl-C must work already, and for which --help need not wait.
+        from ethercat_server.daemon.server import serve  # noqa: PLC0415
+
+        serve(options, signals)
     except StopRequestedError:
         log.info("stopped during start-up")
     except ServerError as error:

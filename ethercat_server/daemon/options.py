@@ -7,11 +7,10 @@ import argparse
 import functools
 import ipaddress
 import shlex
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from bota_ethercat.errors import SettingError
 from bota_ethercat.program.arguments import Parser, number, typed, whole
@@ -24,11 +23,13 @@ from bota_ethercat.settings import (
     start_up_defaults,
 )
 from bota_ethercat.text.did_you_mean import did_you_mean
-from ethercat_server.acquisition.terminals import CHOICE
+from ethercat_server.acquisition.terminal_choice import CHOICE
 from ethercat_server.errors import UsageError
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import realtime
-from ethercat_server.sensor.sensor import Identity
+
+if TYPE_CHECKING:
+    from ethercat_server.sensor.sensor import Identity
 
 DEFAULTS: Final = "defaults"
 KEEP: Final = "keep"
@@ -136,6 +137,8 @@ EMPTY: Final = ConfigFile({}, {}, {})
 
 def read_config(path: Path) -> ConfigFile:
     """Read a configuration file; UsageError names file and key."""
+    import tomllib  # noqa: PLC0415 - for this only
+
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # Windows' editors put a mark first
     except OSError as error:

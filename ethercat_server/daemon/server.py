@@ -8,13 +8,12 @@ import ipaddress
 import logging
 import os
 import socket
-from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
 from bota_ethercat.program.signals import Signals
 from ethercat_server.daemon.histories import kept
-from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions, parse_options
+from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions
 from ethercat_server.daemon.traces import Traces
 from ethercat_server.errors import StopRequestedError
 from ethercat_server.ethercat.soem import open_bus
@@ -31,9 +30,8 @@ _NEVER_NS: Final = 1 << 62
 log = logging.getLogger(__name__)
 
 
-def serve(argv: Sequence[str] | None, signals: Signals) -> None:
+def serve(options: ServerOptions, signals: Signals) -> None:
     """Start up, stream until asked to stop, shut down; ServerError says what failed."""
-    options = parse_options(argv)
     user = user_to_become(options.server["user"])
     if user is not None:
         forbid_new_privileges()  # before the log's thread starts

@@ -152,10 +152,10 @@ def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 COMMANDS = (
-    Subcommand("adapters", "list the network adapters of this machine", (), _adapters),
-    Subcommand("find", "look for sensors on all interfaces, without disturbing others", (), _find),
+    Subcommand("adapters", (), _adapters),
+    Subcommand("find", (), _find),
     Subcommand(
-        "eeprom", "read the slaves' SII (EEPROM): decoded, and raw words",
+        "eeprom",
         sensor_arguments(all_if_none=True), _eeprom,
     ),
 )  # fmt: skip

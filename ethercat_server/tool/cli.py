@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Any, Final, NoReturn
+from collections.abc import Sequence
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from bota_ethercat.program.arguments import Parser
 from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server.process import command_line
-from ethercat_server.tool import bus, filters, objects, settings
-from ethercat_server.tool.command import Subcommand, say_json
+
+if TYPE_CHECKING:
+    from ethercat_server.tool.command import Subcommand
 
 _PROGRAM: Final = "ethercat-sensor"
 _EXIT_CODES: Final = "exit codes: 0 done, 1 failed, 2 wrong arguments, 3 apply --dry-run: there are changes"
 
-COMMANDS: Final[Mapping[str, Subcommand]] = {
-    command.name: command for module in (bus, objects, settings, filters) for command in module.COMMANDS
+# Subcommands: the module of each, which is loaded for it only, and what it does.
+COMMANDS: Final = {
+    "adapters": ("bus", "list the network adapters of this machine"),
+    "find": ("bus", "look for sensors on all interfaces, without disturbing others"),
+    "eeprom": ("bus", "read the slaves' SII (EEPROM): decoded, and raw words"),
+    "objects": ("objects", "read and decode every object of the dictionary"),
+    "read": ("objects", "read and decode some objects by name"),
+    "apply": ("settings", "change settings, all or none, and verify them"),
+    "save": ("settings", "store the sensor's parameters in its flash"),
+    "tare": ("settings", "set the force/torque offset so that the mean reading becomes zero"),
+    "snapshot": ("settings", "write all readable objects to a file"),
+    "restore": ("settings", "write back what differs from a snapshot"),
+    "filters": ("filters", "filters for a control loop: noise, delay, phase margin; needs no sensor"),
 }
 
 
@@ -37,14 +51,21 @@ class _Parser(Parser):
 
     def error(self, message: str) -> NoReturn:
         if self.as_json:
-            say_json({"error": message}, indent=None)
+            sys.stdout.write(json.dumps({"error": message}) + "\n")
         super().error(message)
+
+
+def subcommand(name: str) -> Subcommand:
+    """The one of `COMMANDS` with this name."""
+    module = import_module(f"ethercat_server.tool.{COMMANDS[name][0]}")
+    command: Subcommand = next(each for each in module.COMMANDS if each.name == name)
+    return command
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line up to the subcommand's name."""
     width = max(map(len, COMMANDS))
-    summaries = "\n".join(f"  {name:{width}}  {command.summary}" for name, command in COMMANDS.items())
+    summaries = "\n".join(f"  {name:{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
     parser = _Parser(
         _PROGRAM,
         "Inspects and configures Bota EtherCAT sensors, on the interface or through a server.",
@@ -68,8 +89,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if named and arguments[0] not in COMMANDS:
         guess = did_you_mean(arguments[0], COMMANDS)
         parser.error(f"no command {arguments[0]!r}: there are {', '.join(COMMANDS)}{guess}")
-    command = COMMANDS[parser.parse_args(arguments[:1] if named else arguments).command]
-    description = f"{command.summary[0].upper()}{command.summary[1:]}."
+    command = subcommand(parser.parse_args(arguments[:1] if named else arguments).command)
+    summary = COMMANDS[command.name][1]
+    description = f"{summary[0].upper()}{summary[1:]}."
     parser = _Parser(f"{_PROGRAM} {command.name}", description, _EXIT_CODES)
     for add in command.arguments:
         add(parser)

@@ -34,7 +34,6 @@ class Subcommand(NamedTuple):
     """One subcommand."""
 
     name: str
-    summary: str
     arguments: Sequence[Argument]
     run: Callable[[argparse.Namespace], int]  # returns the exit code; raises ServerError
 

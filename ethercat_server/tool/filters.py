@@ -116,7 +116,7 @@ def _filters(args: argparse.Namespace) -> int:
 
 COMMANDS = (
     Subcommand(
-        "filters", "filters for a control loop: noise, delay, phase margin; needs no sensor",
+        "filters",
         (
             argument("--loop", "rate of the control loop", metavar="HZ", type=_HERTZ, required=True),
             argument("--bandwidth", "its bandwidth (default: loop / 10)", metavar="HZ", type=_HERTZ),

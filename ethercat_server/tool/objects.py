@@ -157,9 +157,9 @@ def _line(row: dict[str, Any]) -> tuple[str, ...]:
 _SENSORS: Final = sensor_arguments(all_if_none=True)
 _NAME: Final = "object: a name such as 'Sampling rate' or 'Force/Torque Offset', a setting, or 0x8006:1"
 COMMANDS: Final = (
-    Subcommand("objects", "read and decode every object of the dictionary", _SENSORS, _objects),
+    Subcommand("objects", _SENSORS, _objects),
     Subcommand(
-        "read", "read and decode some objects by name",
+        "read",
         (*_SENSORS, argument("names", _NAME, nargs="+", metavar="NAME")), _read,
     ),
 )  # fmt: skip

@@ -389,10 +389,10 @@ _TARGET: Final = "wrench the sensor is to read, in N and Nm (default: zeros)"
 
 
 COMMANDS: Final = (
-    Subcommand("apply", "change settings, all or none, and verify them", _SETTINGS, _apply),
-    Subcommand("save", "store the sensor's parameters in its flash", _SENSOR, _save),
+    Subcommand("apply", _SETTINGS, _apply),
+    Subcommand("save", _SENSOR, _save),
     Subcommand(
-        "tare", "set the force/torque offset so that the mean reading becomes zero",
+        "tare",
         (
             *_SENSOR,
             argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
@@ -403,11 +403,11 @@ COMMANDS: Final = (
         _tare,
     ),
     Subcommand(
-        "snapshot", "write all readable objects to a file",
+        "snapshot",
         (*_FILE, argument("--force", "replace an existing file")), _snapshot,
     ),
     Subcommand(
-        "restore", "write back what differs from a snapshot",
+        "restore",
         (*_FILE, _SAVE, argument("--force", "accept a file of another sensor")), _restore,
     ),
 )  # fmt: skip

@@ -19,7 +19,7 @@ from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import look_up
 from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from ethercat_server.sensor.objects.dictionary import MODELS
-from ethercat_server.virtual_sensor import link
+from ethercat_server.virtual_sensor import control
 from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_clock
 from ethercat_server.virtual_sensor.faults import COMMANDS, PPM_LIMIT
 from ethercat_server.virtual_sensor.foreign import KINDS, MOST_SLAVES, SENSOR, parse_chain, slaves_in
@@ -97,7 +97,7 @@ def build_parser() -> argparse.ArgumentParser:
         "none: not even that, so where nothing changes no sample is new",
     )  # fmt: skip
     parser.add_argument(
-        "--control", metavar="PATH", help=f"Unix socket for commands (default {link.own_socket()})"
+        "--control", metavar="PATH", help=f"Unix socket for commands (default {control.own_socket()})"
     )
     parser.add_argument("--send", metavar="COMMAND", help="have the one that listens there obey, and end")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
@@ -167,13 +167,15 @@ def main(
     parser = build_parser()
     args = parser.parse_args(argv)
     if args.send is not None:
-        return _send(args.control or link.own_socket(), args.send)
+        return _send(args.control or control.own_socket(), args.send)
     if args.iface is None:
         parser.error("name an interface, or a command with --send")
     try:
         slaves = options_from(args, _SERIAL_NUMBERS * (number or _number_of(args.iface)) or 1)
     except UsageError as error:
         parser.error(str(error))
+    from ethercat_server.virtual_sensor import link  # noqa: PLC0415 - loading it takes a moment
+
     stopped = threading.Event()
     models = [slave.model for slave in slaves if isinstance(slave, SensorOptions)]
     foreign = [slave.kind for slave in slaves if isinstance(slave, ForeignOptions)]
@@ -210,7 +212,7 @@ def _say(sentence: object) -> None:
 def _send(path: str, command: str) -> int:
     """Exit code 0 if the virtual sensor that listens there has obeyed."""
     try:
-        answer = link.send(path, command)
+        answer = control.send(path, command)
     except OSError as error:
         why = error.strerror or error
         _say(f"no virtual sensor of yours answers at {path} ({why}): start one, or give --control")

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from bota_clients.monitor import cli
+from bota_clients.monitor import cli, program
 from bota_clients.monitor.cli import parse
 from bota_clients.monitor.model import Model, State
 from bota_clients.monitor.reader import Reader
@@ -70,9 +70,11 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
         code = cli.main(arguments)
         return code, *capsys.readouterr()
 
-    monkeypatch.setattr(cli, "Model", model)
-    monkeypatch.setattr(cli, "time", SimpleNamespace(sleep=sleep, monotonic=time.monotonic, time=time.time))
-    monkeypatch.setattr(cli, "_ANSWER_S", PATIENCE_S)
+    monkeypatch.setattr(program, "Model", model)
+    monkeypatch.setattr(
+        program, "time", SimpleNamespace(sleep=sleep, monotonic=time.monotonic, time=time.time)
+    )
+    monkeypatch.setattr(program, "_ANSWER_S", PATIENCE_S)
     yield running
     signal.signal(signal.SIGTERM, handler)
 

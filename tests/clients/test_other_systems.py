@@ -47,7 +47,7 @@ for name, entry in CLIENTS.items():
 
 import bota_clients.identify.program
 from bota_clients.export import cli as export
-from bota_clients.monitor import cli
+from bota_clients.monitor import cli, program as monitoring
 from bota_clients.program import Signals, call_on
 from bota_clients.record import cli as record, program as recording
 from bota_clients.replay import cli as replay, program as replaying
@@ -67,8 +67,8 @@ while True:
     except Exception as error:
         assert "refused" in str(error), error
 assert recording.run(record.parse_options([recorded, *where, "--seconds", "0.2"]), recorder) == 0
-cli._ONCE_S = 0.1
-assert cli.run(cli.parse(["--once", *where])) in (0, 1)
+monitoring._ONCE_S = 0.1
+assert monitoring.run(cli.parse(["--once", *where])) in (0, 1)
 stop._on_signal(0, None)
 thread.join()
 assert export.main([recorded, table]) == 0

@@ -14,6 +14,7 @@ import pytest
 from catkin_pkg.package import parse_package
 from catkin_pkg.packages import find_packages
 
+from bota_ethercat.program.version import VERSION
 from tests.ros_package.package_files import PACKAGE, PACKAGES, ROOT, SHARED_FOLDERS, shared_files
 from tests.test_architecture import imports
 
@@ -31,7 +32,7 @@ def test_the_manifests_and_one_version() -> None:
     folders |= {str(folder.relative_to(ROOT)): name for name, folder in PACKAGES.items()}
     assert {path: package.name for path, package in found.items()} == folders
     version = PROJECT["project"]["version"]
-    assert CLIENTS["project"]["version"] == version
+    assert CLIENTS["project"]["version"] == version == VERSION
     for package in found.values():
         assert (package.version, package.licenses, package.package_format) == (version, ["Apache-2.0"], 3)
         # colcon takes a package with an invalid address for plain Python.

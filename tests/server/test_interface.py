@@ -20,6 +20,7 @@ import pytest
 
 from bota_ethercat.program.signals import Signals
 from ethercat_server.access.adapters import Adapter, adapters
+from ethercat_server.daemon.options import parse_options
 from ethercat_server.daemon.server import serve
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat import nic
@@ -242,7 +243,7 @@ def test_an_address_for_some_time_is_refused_by_server_tool_and_doctor_and_marke
         assert f"'sudo ip address flush dev {veth.near}'" in refusal(veth.near)
         assert why in tool_here("eeprom", veth.near, code=1).err
         with pytest.raises(InterfaceError, match="has the IP address"):
-            serve([veth.near, "14999", "--user", "root"], Signals())
+            serve(parse_options([veth.near, "14999", "--user", "root"]), Signals())
         found = doctor_here(veth.near, "--seconds", 0, "--json")
         assert why in found.findings("bus")["slaves"]["found"]
         assert (found.code, found.findings("other software")["addresses"]["level"]) == (1, "bad")

@@ -23,6 +23,7 @@ import pytest
 from bota_ethercat.program.signals import Signals
 from ethercat_server import server as assembly
 from ethercat_server.daemon import server as daemon
+from ethercat_server.daemon.options import parse_options
 from ethercat_server.errors import ServerError, StopRequestedError, UsageError
 from ethercat_server.process import privileges, realtime
 from ethercat_server.process.privileges import User, user_to_become
@@ -107,7 +108,7 @@ def test_what_needs_root_is_done_before_a_frame_is_read(monkeypatch: pytest.Monk
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         with pytest.raises(StopRequestedError):
-            daemon.serve(["ens5", str(free_port()), "--user", "nobody"], Signals())
+            daemon.serve(parse_options(["ens5", str(free_port()), "--user", "nobody"]), Signals())
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
