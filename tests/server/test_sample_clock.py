@@ -326,6 +326,12 @@ def test_no_lie_costs_a_sample_on_a_slow_card(late_ns: float, since_s: float) ->
         assert outcome.exchanges < 1.05
 
 
+def test_event_times_stay_trusted_that_differ_from_polls_by_a_part_of_a_long_round_trip() -> None:
+    card = Card(2.2e6, spread=0, jitter_ns=5e4)
+    simulation = run(Controller(late_ns=-200e3), Sensor(800.0, ppm=150.0), card, seconds=5.0)
+    assert state(simulation) is TrustState.TRUSTED
+
+
 @pytest.mark.parametrize(
     "controller",
     [
