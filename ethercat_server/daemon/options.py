@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from bota_ethercat.address import DEFAULT_PORT
 from bota_ethercat.errors import SettingError
 from bota_ethercat.program.arguments import Parser, number, typed, whole
 from bota_ethercat.sensor_choice import SensorChoice
@@ -31,6 +32,7 @@ from ethercat_server.process import realtime
 if TYPE_CHECKING:
     from ethercat_server.sensor.sensor import Identity
 
+_PORT: Final = whole(1, 65535)
 DEFAULTS: Final = "defaults"
 KEEP: Final = "keep"
 
@@ -277,12 +279,14 @@ def build_parser() -> argparse.ArgumentParser:
         "ethercat-server",
         "EtherCAT master for Bota force/torque sensors: streams their samples over TCP.",
         "settings: " + "; ".join(f"{row.name} ({row.meaning})" for row in SETTINGS.values()),
-        usage="%(prog)s [options] IFACE [SENSOR_NAME] PORT",
+        usage="%(prog)s [options] IFACE [SENSOR_NAME] [PORT]",
     )
     interface = f"network interface ('{VIRTUAL_INTERFACE}' for a simulated sensor)"
     parser.add_argument("ifname", metavar="IFACE", help=interface)
     parser.add_argument("sensor_name", metavar="SENSOR_NAME", nargs="?", help="model of the first sensor")
-    parser.add_argument("port", metavar="PORT", type=whole(1, 65535), help="TCP port")
+    parser.add_argument(
+        "port", metavar="PORT", nargs="?", type=_PORT, help=f"TCP port (default {DEFAULT_PORT})"
+    )
     parser.add_argument(
         "--force", action="store_true",
         help="take over a bus in use: slaves of others in SAFEOP or OP are taken to PREOP, machines stop",
@@ -316,7 +320,13 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
 
     argparse itself exits with code 2 for the errors it finds.
     """
-    parsed = build_parser().parse_intermixed_args(argv)
+    parser = build_parser()
+    parsed = parser.parse_intermixed_args(argv)
+    if parsed.port is None and (parsed.sensor_name or "")[:1].isdigit():  # no model's name
+        try:
+            parsed.sensor_name, parsed.port = None, _PORT(parsed.sensor_name)
+        except argparse.ArgumentTypeError as error:
+            parser.error(f"argument PORT: {error}")
     file = read_config(parsed.config) if parsed.config else EMPTY
     given = {
         name: tuple(value) if setting.many else value
@@ -324,7 +334,7 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
         if (value := getattr(parsed, name)) is not None
     }
     options = ServerOptions(
-        parsed.ifname, parsed.port, parsed.sensor_name, parsed.virtual, file,
+        parsed.ifname, parsed.port or DEFAULT_PORT, parsed.sensor_name, parsed.virtual, file,
         force=parsed.force,
         allow_ip=parsed.allow_ip,
         server=_defaults() | file.server | given,

@@ -27,10 +27,19 @@ def configured(tmp_path: Path) -> Configured:
     return parse
 
 
-def test_both_forms_of_the_command() -> None:
-    for arguments, name in (([], None), ([NAME], NAME)):
-        options = parse_options(["ens5", *arguments, "12001"])
-        assert (options.ifname, options.sensor_name, options.port) == ("ens5", name, 12001)
+@pytest.mark.parametrize(
+    ("arguments", "name", "port"),
+    [
+        ([], None, 12001),
+        (["12005"], None, 12005),
+        ([NAME], NAME, 12001),
+        ([NAME, "12005"], NAME, 12005),
+        (["--force", "12005"], None, 12005),
+    ],
+)
+def test_the_forms_of_the_command(arguments: list[str], name: str | None, port: int) -> None:
+    options = parse_options(["ens5", *arguments])
+    assert (options.ifname, options.sensor_name, options.port) == ("ens5", name, port)
 
 
 def test_options_may_stand_anywhere() -> None:
@@ -64,9 +73,10 @@ def test_wrong_arguments_are_refused_by_name(arguments: list[str], complaint: st
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["ens5"], "required: PORT"),
+        ([], "required: IFACE"),
         (["a", "b", "1", "d"], "unrecognized arguments: d"),
-        (["ens5", "port"], "PORT: 'port': it must be a whole number from 1 to 65535"),
+        (["ens5", "1200l"], "PORT: '1200l': it must be a whole number from 1 to 65535"),
+        (["ens5", NAME, "port"], "PORT: 'port': it must be a whole number from 1 to 65535"),
         (["ens5", "0"], "'0': it must be"),
         (
             ["ens5", "1", "--rt-priority", "100"],
