@@ -11,6 +11,8 @@ from typing import Final
 
 import pytest
 
+from tests.rights import NOBODY, needs_another_user
+
 ROOT: Final = Path(__file__).parent.parent
 PIP: Final = """
 echo 'Collecting numpy<3,>=1.26 (from bota)'; echo '  Downloading https://example.org/numpy-2.4.whl (6.6 kB)'
@@ -18,11 +20,12 @@ until [ -e "$1/seen" ]; do sleep 0.02; done
 """
 
 
-def run(script: str, folder: Path) -> tuple[int, str]:
+def run(script: str, folder: Path, *before: str) -> tuple[int, str]:
     source = f'source "{ROOT}/scripts/environment"; filling={folder} every=0.05\n'
     done = subprocess.run(
-        ["bash", "-c", source + script, "demo", folder], capture_output=True, text=True, check=False
-    )
+        [*before, "bash", "-c", source + script, "demo", folder],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
     return done.returncode, done.stderr
 
 
@@ -72,6 +75,31 @@ def test_a_checkout_that_cannot_be_written_to_is_one_sentence(function: str, tmp
     code, said = run(f"SUDO_USER= lock=/proc/.venv.lock; {function} demo", tmp_path)
     sentence = f"demo: {ROOT} cannot be written to, where .venv is to be: make it yours, or copy it\n"
     assert (code, said) == (1, sentence)
+
+
+@needs_another_user
+@pytest.mark.parametrize("restricted", ["1", "0"])
+def test_without_a_namespace_nothing_is_downloaded(restricted: str, tmp_path: Path) -> None:
+    (tmp_path / "restricted").write_text(restricted)
+    script = "restricted=$1/restricted; unshare() { return 1; }; quietly() { say downloads; }; "
+    user, reads = NOBODY.pw_uid, "+dac_read_search"
+    nobody = "setpriv", f"--reuid={user}", f"--inh-caps={reads}", f"--ambient-caps={reads}"
+    code, said = run(script + "make_owners_environment ros", tmp_path, *nobody)
+    assert code == 1
+    assert said.startswith("demo: this kernel lets only root make namespaces: run it as root (sudo demo)")
+    assert ("AppArmor" in said) == (restricted == "1")
+    assert "downloads" not in said
+
+
+def test_a_full_disk_is_told_before_anything_is_downloaded(tmp_path: Path) -> None:
+    script = (
+        "df() { printf '%s\\n' header 'disk 1000 500 120 80% /'; }; new_environment() { mkdir -p $venv; }\n"
+    )
+    code, said = run(script + f"venv={tmp_path}/.venv lock={tmp_path}/lock; make_environment ros", tmp_path)
+    assert (code, said.splitlines()[-1]) == (
+        1, f"demo: {tmp_path}/.venv needs up to 600 MB, and 120 MB are free there: "
+        "free some, or clone to another disk",
+    )  # fmt: skip
 
 
 def test_the_demo_needs_no_tools_of_developers() -> None:
