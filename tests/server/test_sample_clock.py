@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from ethercat_server.sampling.phase import SensorPhase
 from ethercat_server.sampling.trust import Trust, TrustState
 from tests.clock_simulation import SECOND, Card, ClockSimulation, Controller, Machine, Outcome, Sensor
 from tests.simulation import more_if_long
@@ -132,6 +133,18 @@ def test_a_clock_that_restarts_is_found_again(rate_hz: float, card: Card, bound:
         for sample in shown.samples[bound:]:
             assert sample.locked
             assert abs(sample.error_ns) < 100e3
+
+
+def test_after_four_contradictions_in_a_row_the_phase_is_unknown() -> None:
+    """Not before: a stall is no restart."""
+    phase, deviations = SensorPhase(1e6), []
+    phase.begin(0.0, 1e3)
+    for _ in range(4):
+        phase.learn_instant(phase.phase_ns + 3e5, 1e6)
+        deviations.append(math.sqrt(phase.variance) / phase.period_ns)
+        phase.advance(1)
+    assert max(deviations[:3]) < 0.01
+    assert deviations[3] > 0.25
 
 
 def draw(seed: int, stolen: float) -> tuple[Sensor, Card, Machine]:
