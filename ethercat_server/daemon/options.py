@@ -8,7 +8,6 @@ import functools
 import ipaddress
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -196,8 +195,7 @@ def _defaults() -> dict[str, Any]:
     return {name: setting.default for name, setting in SERVER_SETTINGS.items()}
 
 
-@dataclass(frozen=True, slots=True)
-class ServerOptions:
+class ServerOptions(NamedTuple):
     """Everything the server needs to know to start."""
 
     ifname: str
@@ -207,8 +205,8 @@ class ServerOptions:
     file: ConfigFile = EMPTY  # the configuration file's content
     force: bool = False  # whether to take over a bus that is in use
     allow_ip: bool = False  # whether to use an interface of the machine's network
-    server: Mapping[str, Any] = field(default_factory=_defaults)  # by the names of SERVER_SETTINGS
-    assigned: Mapping[str, SettingValue] = field(default_factory=dict)  # settings from the command line
+    server: Mapping[str, Any] = _defaults()  # by the names of SERVER_SETTINGS
+    assigned: Mapping[str, SettingValue] = {}  # settings from the command line
 
     @property
     def terminals(self) -> Sequence[str]:
