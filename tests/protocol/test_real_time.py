@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import resource
 import subprocess
 import sys
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
+from bota_ethercat.program import real_time
 from tests.rights import IPC_LOCK, SYS_RESOURCE, limited, needs_limits, needs_root, skip_if_forbidden
 
 PROBE = """
@@ -65,6 +70,22 @@ def test_refused_with_what_would_grant_it() -> None:
         f"ordinary scheduling; not granted: CPU {missing} (there are {usable}); not granted: SCHED_FIFO 40 "
         "('rtprio 40' in a file in /etc/security/limits.d, LimitRTPRIO=40 in a service's unit)"
     )
+
+
+@pytest.mark.parametrize("may_lock_all", [True, False])
+def test_memory_is_not_locked_where_the_limit_suffices_only_now(
+    may_lock_all: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel would lock it; what the process allocates later would fail."""
+
+    def refuse(*_: object) -> None:
+        raise ValueError("not allowed to raise maximum limit")
+
+    monkeypatch.setattr(resource, "setrlimit", refuse)
+    monkeypatch.setattr(real_time, "_may_lock_all", lambda: may_lock_all)
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: SimpleNamespace(mlockall=lambda _: 0))
+    assert real_time._lock_memory(keeps_rights=True) == may_lock_all
+    assert not real_time._lock_memory(keeps_rights=False)
 
 
 @needs_root
