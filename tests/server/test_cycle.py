@@ -306,6 +306,19 @@ def test_what_a_stuck_sensor_leaves_out_is_flagged(seed: int, dc: str) -> None:
     assert running.status()["sensors"][0]["lost_samples"] == 0, "what was not there cannot be lost"
 
 
+def test_without_an_event_gap_follows_the_sample_that_ends_a_silence_and_the_next() -> None:
+    """The slave may have held back either: one may be missing after it."""
+    running = simulation(dc="none")
+    running.run(2.0)
+    running.frames.clear()
+    running.at(0.0, "stick")
+    running.at(0.02, "unstick")
+    running.run(0.1)
+    flags = [frame.flags for frame in running.frames]
+    silent_until = max(at for at, flag in enumerate(flags) if flag & DataFlag.REPEATED)
+    assert flags[silent_until + 2 : silent_until + 5] == [DataFlag.GAP, DataFlag.GAP, 0]
+
+
 # -- slow network cards, and many sensors with clocks of their own: nothing is lost by it
 
 SETTLED_S = 3.0

@@ -72,7 +72,8 @@ def check_replay(simulation: Simulation, numbers: Sequence[int] = (0,)) -> Trace
 def test_a_replay_makes_the_same_decisions(machine: Machine, dc: str) -> None:
     simulation = Simulation(SensorOptions(signal="clock", ppm=150.0, dc=dc), machine=machine)
     simulation.run(3.0)
-    check_replay(simulation)
+    trace = check_replay(simulation)
+    assert any(record.latched for record in trace.records) == (dc == "")
 
 
 def test_a_replay_begins_anew_where_a_sensor_came_back_and_where_event_times_are_given_up() -> None:
