@@ -306,6 +306,17 @@ def test_what_a_stuck_sensor_leaves_out_is_flagged(seed: int, dc: str) -> None:
     assert running.status()["sensors"][0]["lost_samples"] == 0, "what was not there cannot be lost"
 
 
+def test_a_stall_during_a_silence_makes_one_frame_and_no_burst() -> None:
+    running = simulation()
+    running.run(2.0)
+    running.frames.clear()
+    running.at(0.0, "stick")
+    running.at(0.05, lambda: running.clock.stall(50e6))
+    running.run(0.2)
+    silent = sum(bool(frame.flags & (DataFlag.REPEATED | DataFlag.INVALID)) for frame in running.frames)
+    assert abs(silent - 0.15 / (PERIOD_NS / 1e9)) < 6, silent
+
+
 def test_without_an_event_gap_follows_the_sample_that_ends_a_silence_and_the_next() -> None:
     """The slave may have held back either: one may be missing after it."""
     running = simulation(dc="none")
