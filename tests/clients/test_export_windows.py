@@ -203,6 +203,43 @@ def test_a_bias_is_not_guessed(tmp_path: Path) -> None:
         assert "out.npz: windows" in said(*fine)
 
 
+@pytest.mark.parametrize("way", ["stamps", "latency", "clock", "clock set back"])
+def test_frames_outside_of_the_recording_have_windows_that_are_not_valid(tmp_path: Path, way: str) -> None:
+    """One before the first sample, two within, one after the last, one before this was measured."""
+    run, path, out = tmp_path / "run.mcap", tmp_path / "frames.csv", tmp_path / "out.npz"
+    frames = [frame(number) for number in range(100, 2000)]
+    if way == "clock set back":  # to before the first sample
+        frames[900:] = [each._replace(stamp_ns=each.stamp_ns - 10**9) for each in frames[900:]]
+    record(run, frames, **SETTINGS)
+    at, more = np.array([-50, 500, 1200, 1998.5, 2010]), list[Any]()
+    wanted = stamps(*at)
+    if way == "latency":
+        wanted, more = wanted + 10**8, ["--latency", 0.1]
+    elif way == "clock":
+        clock = tmp_path / "clock.json"
+        clock.write_text(f'{{"stamp_ns": {START_NS}, "monotonic_ns": 0, "drift_ppm": 0}}')
+        more = ["--clock", clock]
+    elif way == "clock set back":
+        wanted[2:] -= 10**9
+        wanted[0] -= 10**9
+    path.write_text("\n".join(["timestamp", *map(str, wanted)]))
+    said = run_here(main, run, out, "--at", path, "--window", 4, *more).err
+    assert (
+        "windows of 4 samples; those of 3 of 5 frames are not valid: the frames are before or after" in said
+    )
+    assert said.count("\n") == 1
+    made = dict(np.load(out))
+    valid = made["force_torque_valid"]
+    assert valid.tolist() == [[each] * 4 for each in (False, True, True, False, False)]
+    assert (np.isnan(made["force_torque"]).all(axis=2) == ~valid).all()
+    assert newest(made)[1:3] == [[498, 499, 500, 501], [1198, 1199, 1200, 1201]]
+    if way != "clock set back":
+        assert made["monotonic_ns"] == pytest.approx(at * PERIOD_NS, abs=1)
+    assert made["stamp_ns"].tolist() == wanted.tolist()
+    refused = run_here(main, run, out, "--at", path, "--force", "--strict", *more)
+    assert (refused.code, "row 0 of" in refused.err) == (1, True)
+
+
 def test_every_format_has_the_same(tmp_path: Path) -> None:
     zarr, parquet = pytest.importorskip("zarr"), pytest.importorskip("pyarrow.parquet")
     path = tmp_path / "run.mcap"
@@ -403,8 +440,13 @@ def test_every_type_that_a_table_can_hold(tmp_path: Path, empty: int | None) -> 
     ("rows", "arguments", "said"),
     [
         ([1.0, 0.9], (), "row 1 of {} (counted from 0) is before the row above it"),
-        ([-0.5, 1.0], (), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:19.500"),
-        ([1.0, 2.0, 2.6, 2.7], (), "row 2 of {} (counted from 0) is of 2023-11-14T22:13:22.600"),
+        ([-0.5, 1.0], ("--strict",), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:19.500"),
+        ([1.0, 2.0, 2.6, 2.7], ("--strict",), "row 2 of {} (counted from 0) is of 2023-11-14T22:13:22.600"),
+        ([-0.5, -0.1], (), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:19.500"),
+        ([2.6, 2.7], (), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:22.600"),
+        ([1.0, 2.6, 2.55], (), "row 1 of {} (counted from 0) is of 2023-11-14T22:13:22.600"),
+        ([-0.1, -0.2, 1.0], (), "row 1 of {} (counted from 0) is before the row above it"),
+        ([0.5, 1.5], ("--latency", 1, "--strict"), "row 0 of {} (counted from 0) is of 2023-11-14T22"),
         ([0.5], ("--latency", 1), "row 0 of {} (counted from 0) is of 2023-11-14T22:13:20.500"),
         ([-1.7e9], (), "is of 1970-01-01T00:00:00.000000000Z, and the first sample was measured at 2023-11-"),
         (["0.1", "soon"], (), "{} has no times in a column timestamp (choose one with --column"),
@@ -438,7 +480,15 @@ def test_what_cannot_be_done_is_said_and_leaves_nothing(
 
 
 @pytest.mark.parametrize(
-    "arguments", ["out.csv --fps 30", "out.npz", "out.npz --fps 30 --at x", "out.npz --fps 30 --window 0"]
+    "arguments",
+    [
+        "out.csv --fps 30",
+        "out.zarr",
+        "out.npz --all",
+        "out.csv --tool x",
+        "out.npz --fps 30 --at x",
+        "out.npz --fps 30 --window 0",
+    ],
 )
 def test_wrong_usage(arguments: str) -> None:
     assert run_here(main, "run.mcap", *arguments.split()).code == 2

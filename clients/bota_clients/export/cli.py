@@ -24,8 +24,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; argparse exits with 2 if it is wrong."""
     made = Parser(
         PROGRAM,
-        "Writes the samples of a recording as CSV, one a line, or for each camera frame the last samples "
-        "that were measured before it, as .parquet, .zarr or .npz.",
+        "Writes the samples of a recording, one a row, as CSV, .parquet or .npz, or for each camera frame "
+        "the last samples that were measured before it, as .parquet, .zarr or .npz.",
         "CSV is for pandas.read_csv(FILE, parse_dates=['stamp_utc']), MATLAB's readtable, or a spreadsheet. "
         "'ethercat-export align' finds the offset of another computer's clock.",
     )
@@ -34,6 +34,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     add("output", type=Path, nargs="?", metavar="OUT",
         help="file to write (default: RECORDING.csv, with --at or --fps RECORDING.parquet)")  # fmt: skip
     add("--all", action="store_true", help="CSV: also frames that are no new sample: repeated, invalid")
+    add("--tool", type=Path, metavar="YAML",
+        help="not CSV: also the compensated wrench, with these parameters of the ROS 2 node")  # fmt: skip
     add_force(made)
     group = made.add_argument_group("for each camera frame")
     add = group.add_mutually_exclusive_group().add_argument
@@ -48,15 +50,24 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="seconds from a frame's exposure to its stamp (default 0)")  # fmt: skip
     add("--clock", type=Path, metavar="JSON",
         help="clock of the stamps, by 'ethercat-export align' (default: the server's)")  # fmt: skip
-    add("--tool", type=Path, metavar="YAML",
-        help="also the compensated wrench, with these parameters of the ROS 2 node")  # fmt: skip
+    add("--strict", action="store_true",
+        help="refuse frames outside of the recording (default: their windows are not valid)")  # fmt: skip
     options = made.parse_args(argv)
     has_frames = options.at is not None or options.fps is not None
     options.output = options.output or options.recording.with_suffix(DATASETS[0] if has_frames else ".csv")
     if options.output.absolute() == options.recording.absolute():
         made.error("the output would overwrite the recording: give another name")
-    if (options.output.suffix in DATASETS) != has_frames:
+    suffix = options.output.suffix
+    if has_frames and suffix not in DATASETS:
         made.error(f"windows of samples, with --at or --fps, are written as {', '.join(DATASETS)} only")
+    if suffix == ".zarr" and not has_frames:
+        made.error(
+            "all samples are written as CSV, .parquet or .npz: choose one of these, or use --at or --fps"
+        )
+    if options.tool and suffix not in DATASETS:
+        made.error("CSV has no compensated wrench: omit --tool, or write .parquet or .npz")
+    if options.all and suffix in DATASETS:
+        made.error("--all is for CSV only: omit it")
     return options
 
 

@@ -1,5 +1,7 @@
 """What `ethercat-export --at` does: windows of samples for each frame, from a recording into a file.
 
+Without frames the file has all samples (`samples.py`).
+
 Frames are stamped by a wall clock, which may be set meanwhile. Every DATA frame has the stamps of both clocks
 of the server, so a recording has the history of their offset: by this the frames' stamps are put on
 CLOCK_MONOTONIC, which is never set.
@@ -27,11 +29,13 @@ import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import DATASETS, PROGRAM
-from bota_clients.export.windows import Arrays, Windows, offset_of, read_tool
+from bota_clients.export.samples import MOST_LOST, samples_of
+from bota_clients.export.windows import Array, Arrays, Windows, interpolated, offset_of, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
 from bota_clients.recording.reader import Offset, Recording
+from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
@@ -40,6 +44,7 @@ from bota_ethercat.text.json_text import parse_json_object
 
 _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
 _CHUNK: Final = 1024  # frames, in a file
+_GROUP: Final = 131_072  # samples, in a file
 _UNITS: Final = {"force": "N", "torque": "Nm", "acceleration": "m/s^2", "angular_rate": "rad/s", "age": "s"}
 _SECOND: Final = 1_000_000_000
 _PER_SECOND: Final = {"s": _SECOND, "ms": 1_000_000, "us": 1000, "ns": 1}
@@ -84,11 +89,15 @@ class Periodic:
             self._begin_ns = int(instants[0])
         begin, self._made = self._made, math.ceil((instants[-1] - self._begin_ns) / self._period_ns)
         made = self._begin_ns + np.rint(np.arange(begin, self._made) * self._period_ns).astype(np.int64)
-        return np.stack([_interpolated(made, instants, stamps), made])
+        return np.stack([interpolated(made, instants, stamps), made])
 
 
 class Stamped:
-    """Frames in the order of their instants, stamped so long after the exposure."""
+    """Frames in the order of their instants, stamped so long after the exposure.
+
+    Attributes:
+        outside: how many so far were before or after the recording, so that their windows are not valid.
+    """
 
     def __init__(
         self,
@@ -96,8 +105,14 @@ class Stamped:
         source: str = "the frames",
         latency_s: float = 0.0,
         clock: ForeignClock | None = None,
+        *,
+        strict: bool = False,
     ) -> None:
-        """`source` is for errors; `clock` made the stamps, if not the server's CLOCK_REALTIME."""
+        """`source` is for errors; `clock` made the stamps, if not the server's CLOCK_REALTIME.
+
+        `strict`: RecordingError for a frame outside of the recording.
+        """
+        self.outside, self.strict, self._early = 0, strict, 0
         self.count, self._stamps, self._source, self._clock = len(stamps_ns), stamps_ns, source, clock
         self._left, self._latency_ns = stamps_ns, round(latency_s * _SECOND)
 
@@ -106,7 +121,10 @@ class Stamped:
 
         From both stamps (n,) of the samples, the last of the call before first.
         """
-        found = np.zeros(0, np.int64) if self._clock is None else self._clock.instants(self._left)
+        if self._clock is None:
+            found, self._early = self._left[: self._early] - stamps[0] + instants[0], 0
+        else:
+            found = self._clock.instants(self._left)
         ends = [0, *(np.flatnonzero(np.diff(stamps) < 0) + 1).tolist(), len(stamps)]
         for begin, end in itertools.pairwise(ends):
             here, there = stamps[begin:end], instants[begin:end]
@@ -121,9 +139,24 @@ class Stamped:
             rest = rest[: int(np.append(np.flatnonzero(np.diff(rest) < 0), len(rest))[0]) + 1]
             if len(rest) and rest[0] >= here[0]:
                 reached = rest[: np.searchsorted(rest, here[-1], "right")]
-                found = np.append(found, _interpolated(reached, here, there))
+                found = np.append(found, interpolated(reached, here, there))
         made, self._left = self._left[: len(found)], self._left[len(found) :]
         return np.stack([made, found - self._latency_ns])
+
+    def begin(self, recording: Recording, sensor: int) -> None:
+        """Find the frames before its lowest stamp, which is not its first if the clock was set."""
+        new = (each.stamp_ns for each in recording.frames(sensor) if not each.flags & NOT_NEW)
+        first_ns, stamps = next(new, 0), self._stamps
+        if not self.strict and self._clock is None and first_ns - _NEAR_NS < stamps[0] < first_ns:
+            ascending = stamps[: int(np.append(np.flatnonzero(np.diff(stamps) < 0), len(stamps))[0]) + 1]
+            self._early = int(np.searchsorted(ascending, min(first_ns, min(new, default=first_ns))))
+
+    def end(self, stamp_ns: int, instant_ns: int) -> Ints:
+        """As `exposed`, of the frames after the recording's last sample, if the others are."""
+        left = self._left
+        if self.strict or (np.diff(left, prepend=stamp_ns) < 0).any() or (left > stamp_ns + _NEAR_NS).any():
+            left = left[:0]
+        return np.stack([left, left - stamp_ns + instant_ns - self._latency_ns])
 
     def refusal(self, row: int, begin_ns: int, end_ns: int) -> RecordingError:
         """Of this row, which was not exposed between these two stamps, or is not in its place."""
@@ -143,12 +176,6 @@ class Stamped:
         return RecordingError(
             f"{source} is of {taken}Z, and the {which} sample was measured at {limit}Z: {what}"
         )
-
-
-def _interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
-    """One clock by another, in ns, without loss of digits."""
-    passed = np.interp(at - here[0], here - here[0], there - there[0])
-    return np.asarray(there[0] + np.rint(passed).astype(np.int64))
 
 
 def read_stamps(path: Path, name: str = "timestamp") -> Ints:
@@ -299,9 +326,12 @@ def windows_of(
 ) -> Iterator[Arrays]:
     """Blocks of f frames: `stamp_ns` as given, `monotonic_ns` of the exposure, and their `Windows.at`.
 
-    RecordingError for the first frame without a window.
+    RecordingError for a frame that has no place among the samples and is not merely before or after them.
     """
-    done, clocks, waiting = 0, np.zeros((2, 0), np.int64), np.zeros((2, 0), np.int64)
+    stamped, outside = frames if isinstance(frames, Stamped) else None, 0
+    if stamped is not None:
+        stamped.begin(recording, sensor)
+    done, first, clocks, waiting = 0, *(np.zeros((2, 0), np.int64) for _ in range(3))
     for info, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
         until_ns = windows.until_ns
         if info is not None:
@@ -313,35 +343,46 @@ def windows_of(
             # What comes next may put the latest samples in doubt.
             until_ns = windows.until_ns - windows.doubt_ns
         ready = waiting[:, : np.searchsorted(waiting[1], until_ns, "right")]
-        if (ready[1, :1] < windows.begin_ns).any():
-            break
+        first = first if done else ready[:, :1]
+        if (is_early := ready[1] < windows.begin_ns)[:1].any():
+            if stamped is None or stamped.strict or done > outside:
+                break
+            outside += int(is_early.sum())
         if ready.size:
             yield {"stamp_ns": ready[0], "monotonic_ns": ready[1], **windows.at(ready[1])}
         done, waiting = done + len(ready[0]), waiting[:, len(ready[0]) :]
         windows.forget(min([until_ns, *waiting[1, :1].tolist()]))
     if not clocks.size:
         raise RecordingError(f"{recording.path} has no new and valid samples")
-    if isinstance(frames, Stamped) and done < frames.count:
-        stamp_ns, instant_ns = np.hstack([waiting, clocks[:, -1:]])[:, 0].tolist()
-        bounds = (bound + stamp_ns - instant_ns for bound in (windows.begin_ns, windows.until_ns))
-        raise frames.refusal(done, *bounds)
+    if stamped is not None:
+        late = np.hstack([waiting, stamped.end(*clocks[:, -1].tolist())])
+        has_all = done + len(late[0]) == stamped.count and (late[1] > windows.until_ns).all()
+        if done == outside or (late.size and stamped.strict) or not has_all:
+            row = 0 if done == stamped.count else done
+            pairs = [waiting, clocks[:, -1:]] if row or not first.size else [first]
+            stamp_ns, instant_ns = np.hstack(pairs)[:, 0].tolist()
+            bounds = (bound + stamp_ns - instant_ns for bound in (windows.begin_ns, windows.until_ns))
+            raise stamped.refusal(row, *bounds)
+        stamped.outside = outside + len(late[0])
+        if late.size:
+            empty = windows.at(np.full(len(late[0]), _FIRST >> 1))
+            yield {"stamp_ns": late[0], "monotonic_ns": late[1], **empty}
     if not done:
         raise RecordingError("the recording is too short for a frame")
 
 
 def write(options: argparse.Namespace, recording: Recording) -> str:
-    """Windows for the frames that are asked for, into a file; says of how many samples."""
+    """All samples, or windows for the frames that are asked for, into a file; says what it has."""
     clock = options.clock and ForeignClock.read(options.clock)
     tool = options.tool and read_tool(options.tool)
     length, sensor, path = int(options.window), choose(recording, options.sensor), options.output
-    frames: Periodic | Stamped
-    if options.at is None:
-        frames = Periodic(options.fps)
-    else:
-        frames = Stamped(read_stamps(options.at, options.column), str(options.at), options.latency, clock)
+    frames: Periodic | Stamped | None = Periodic(options.fps) if options.fps else None
+    if options.at is not None:
+        stamps = read_stamps(options.at, options.column)
+        frames = Stamped(stamps, str(options.at), options.latency, clock, strict=options.strict)
     if tool and any(tool.get("bias", ())):
         _check_offsets(options.tool, tool, recording, sensor.offsets)
-    windows = Windows(length, tool=tool, imu_units=options.imu_units)
+    windows = Windows(length if frames else MOST_LOST, tool=tool, imu_units=options.imu_units)
     about = {
         "program": f"{PROGRAM} {VERSION}",
         "options": vars(options),
@@ -363,12 +404,33 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
         raise FileError(f"{path} {EXISTS}")
     with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
-        made, blocks = Path(folder, path.name), windows_of(recording, frames, windows, sensor.sensor)
-        _WRITERS[path.suffix](made, json.dumps(about, default=str), _in_chunks(blocks))
+        made, valid = Path(folder, path.name), list[Array]()
+        if frames:
+            blocks = _in_chunks(windows_of(recording, frames, windows, sensor.sensor), _CHUNK)
+        else:
+            blocks = _in_chunks(samples_of(recording, windows, sensor.sensor), _GROUP)
+            blocks = _tallied(blocks, valid)
+        _WRITERS[path.suffix](made, json.dumps(about, default=str), blocks)
         if path.is_dir():
             shutil.rmtree(path)
         made.replace(path)
-    return f"windows of {count(length, 'sample')}"
+    if not frames:
+        rows = np.concatenate(valid)
+        return f"{count(len(rows), 'sample')}, {len(rows) - rows.sum()} of them not valid"
+    outside = ""
+    if isinstance(frames, Stamped) and frames.outside:
+        outside = (
+            f"; those of {frames.outside} of {count(frames.count, 'frame')} are not valid: the frames are "
+            "before or after the recording (--strict refuses them)"
+        )
+    return f"windows of {count(length, 'sample')}{outside}"
+
+
+def _tallied(blocks: Iterable[Arrays], valid: list[Array]) -> Iterator[Arrays]:
+    """The same, and which of the rows are valid."""
+    for block in blocks:
+        valid.append(block["valid"])
+        yield block
 
 
 def _check_offsets(
@@ -387,20 +449,20 @@ def _check_offsets(
         )
 
 
-def _in_chunks(blocks: Iterable[Arrays]) -> Iterator[Arrays]:
+def _in_chunks(blocks: Iterable[Arrays], size: int) -> Iterator[Arrays]:
     """The same in larger blocks: for each small one Zarr rewrites a chunk, and Parquet has a row group."""
     held = Arrays()
     for block in blocks:
         held = {name: np.concatenate([held[name], block[name]]) for name in block} if held else block
-        while len(held["stamp_ns"]) >= _CHUNK:
-            yield {name: array[:_CHUNK] for name, array in held.items()}
-            held = {name: array[_CHUNK:] for name, array in held.items()}
-    if len(held.get("stamp_ns", ())):
+        while len(held["monotonic_ns"]) >= size:
+            yield {name: array[:size] for name, array in held.items()}
+            held = {name: array[size:] for name, array in held.items()}
+    if len(held.get("monotonic_ns", ())):
         yield held
 
 
 def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
-    """One row for each frame; a window is a fixed-size list, sample by sample."""
+    """One row for each frame or sample; a window is a fixed-size list, sample by sample."""
     import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
     from pyarrow import parquet  # noqa: PLC0415
 
@@ -409,9 +471,15 @@ def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
         columns: dict[str, Any] = {}
         for name, array in block.items():
             flat, size = pa.array(array.reshape(-1)), array[0].size
+            if name == "sequence":
+                flat = pa.array(array, mask=array < 0)
+            elif array.dtype.kind == "M":
+                flat = flat.cast(pa.timestamp("ns", "UTC"))
             columns[name] = flat if array.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
         table = pa.table(columns, metadata={_ATTRIBUTES: about})
-        writer = writer or parquet.ParquetWriter(path, table.schema, compression="zstd")
+        if writer is None:  # of numbers, for every reader
+            compression = "snappy" if "valid" in columns else "zstd"
+            writer = parquet.ParquetWriter(path, table.schema, compression=compression)
         writer.write_table(table)
     writer.close()
 

@@ -46,7 +46,16 @@ _SLOT: Final = np.dtype([
     ("values", "f4", 12),  # force, torque, acceleration, angular rate: N, Nm, m/s², rad/s; NaN: empty
     ("valid", "?", 3),  # by channel
     ("compensated", "f4", 6),  # N, Nm; NaN: not known
+    ("monotonic_ns", "i8"),  # stamp; of an empty slot by its place
+    ("sequence", "i8"),  # -1: there was no such frame, or it is not known which
+    ("number", "i8"),  # of the sample, from 0 on; -1: empty
 ])  # fmt: skip
+
+
+def interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
+    """One clock by another, in ns, without loss of digits."""
+    passed = np.interp(at - here[0], here - here[0], there - there[0])
+    return np.asarray(there[0] + np.rint(passed).astype(np.int64))
 
 
 def offset_of(tool: Mapping[str, Any]) -> Wrench | None:
@@ -89,6 +98,7 @@ class Windows:
         self._length, self._units, self._compensator = length, imu_units, None
         self._slots = np.zeros(0, _SLOT)
         self._newest = (0, 0)  # stamp and sequence of the newest sample
+        self._taken = 0  # samples
         self._in_force: tuple[Mapping[str, object], float] | None = None
         self._doubted_until_ns = -1
         if tool is None:
@@ -148,6 +158,11 @@ class Windows:
             self._doubted_until_ns = newest_ns + round(DOUBT_AFTER * 1e9 / (rate_hz or self._rate_hz))
 
     @property
+    def has_tool(self) -> bool:
+        """Whether there is a compensated wrench."""
+        return self._compensator is not None
+
+    @property
     def doubt_ns(self) -> int:
         """How long before an offset was reported samples may have part of it; 0 without a tool."""
         if self._compensator is None or self._in_force is None:
@@ -170,7 +185,8 @@ class Windows:
         passed = np.diff(stamps, prepend=self._newest[0])
         if (passed <= 0).any():
             raise RecordingError("the server's machine was restarted meanwhile: record again")
-        is_gap = (samples.flags & int(DataFlag.GAP) != 0) | (np.diff(sequence, prepend=self._newest[1]) != 1)
+        further = np.diff(sequence, prepend=self._newest[1])
+        is_gap = (samples.flags & int(DataFlag.GAP) != 0) | (further != 1)
         self._newest = int(stamps[-1]), int(sequence[-1])
         lost = np.maximum(np.rint(passed * (self._rate_hz * 1e-9)).astype(np.int64) - 1, 0) * is_gap
         # Of the slots of lost samples the first ones do: a window is not longer.
@@ -181,7 +197,13 @@ class Windows:
         since_ns = np.rint(passed[of] * (after / (lost[of] + 1))).astype(np.int64)
         since_ns[end] = passed
         slots = np.zeros(len(of), _SLOT)
-        slots["measured_ns"] = ((stamps - passed)[of] + since_ns)[:, np.newaxis] - self._delay_ns
+        slots["monotonic_ns"] = (stamps - passed)[of] + since_ns
+        slots["measured_ns"] = slots["monotonic_ns"][:, np.newaxis] - self._delay_ns
+        # A frame that was not read in time has a number, a sample that the server never had does not.
+        slots["sequence"] = np.where((further == lost + 1)[of], (sequence - further)[of] + after, -1)
+        slots["sequence"][end], slots["number"] = sequence, -1
+        slots["number"][end] = np.arange(self._taken, self._taken + len(end))
+        self._taken += len(end)
         values = np.hstack([samples.force, samples.torque, samples.acceleration, samples.angular_rate])
         slots["values"] = math.nan
         slots["values"][end] = np.where(np.isfinite(values), values, math.nan)
@@ -238,7 +260,7 @@ class Windows:
             values, wrench = slots["values"][index, part], slots["compensated"][index]
             age_s[~valid] = values[~valid] = wrench[~valid] = math.nan
             found |= {name: values, f"{name}_age": age_s.astype(np.float32), f"{name}_valid": valid}
-            if self._compensator is not None and not channel:
+            if self.has_tool and not channel:
                 found[f"{name}_compensated"] = wrench
                 found[f"{name}_compensated_valid"] = valid & np.isfinite(wrench).all(axis=2)
         found["imu"] = np.concatenate([found.pop("acceleration"), found.pop("angular_rate")], axis=2)
@@ -249,6 +271,13 @@ class Windows:
         ends = [int(self._ends(np.array([before_ns]), channel)[0]) for channel in range(3)]
         begin = max(min(ends) - self._length, 0)
         self._slots = self._slots[begin:].copy()
+
+    def take(self, *, rest: bool) -> Array:
+        """The slots that nothing that comes later can change, or the rest; they are in no window then."""
+        settled = np.array([self.until_ns - self.doubt_ns - 1])
+        end = len(self._slots) if rest else int(self._ends(settled, 0)[0])
+        taken, self._slots = self._slots[:end], self._slots[end:].copy()
+        return taken
 
     def _ends(self, instants_ns: Ints, channel: int) -> Ints:
         """The slot behind the newest one that was measured before or at each of these instants."""

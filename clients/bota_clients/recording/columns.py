@@ -20,7 +20,7 @@ Ints = npt.NDArray[np.int64]
 
 # The largest process data as a NumPy record, from the table. The smaller begins alike.
 _SIZE: Final = max(LAYOUTS)
-_RECORD: Final = np.dtype([(field.name, "<" + field.type.value) for field in LAYOUTS[_SIZE].fields])
+RECORD: Final = np.dtype([(field.name, "<" + field.type.value) for field in LAYOUTS[_SIZE].fields])
 _MAX: Final = (1 << 63) - 1
 
 
@@ -74,7 +74,7 @@ def columns(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS)
     # 64-bit values that do not fit an int64 are no valid times.
     whole_numbers = np.minimum(np.array(heads, np.uint64), _MAX).astype(np.int64)
     sequence, stamp_ns, monotonic_ns, _, flags, wkc = whole_numbers.reshape(-1, 6).T
-    table = np.frombuffer(data, _RECORD)
+    table = np.frombuffer(data, RECORD)
 
     def whole(name: str) -> Ints:
         return table[name].astype(np.int64)

@@ -1,0 +1,84 @@
+"""What `ethercat-export RECORDING run.parquet` does: all samples as columns of numbers, one row a sample.
+
+Names and units are those of the CSV, places of lost samples and the compensated wrench those of `Windows`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+
+from bota_clients.errors import RecordingError
+from bota_clients.export.table import REGISTERS, VECTORS, new_samples
+from bota_clients.export.windows import Array, Arrays, Windows, interpolated
+from bota_clients.recording.columns import RECORD, Columns, joined
+from bota_clients.recording.reader import Recording
+from bota_ethercat.framing import DataFlag
+
+MOST_LOST: Final = 100_000  # rows of one gap
+# By how much the wall clock goes otherwise than CLOCK_MONOTONIC between two samples unless it was set.
+_STEP_NS: Final = 1_000_000
+_SLEW: Final = 0.001
+
+
+def samples_of(recording: Recording, windows: Windows, sensor: int = 0) -> Iterator[Arrays]:
+    """Blocks of rows, with the places and the compensated wrench of `windows`, of a length of `MOST_LOST`.
+
+    RecordingError.
+    """
+    held, first_ns, gaps = list[Columns](), 0, dict[int, int]()
+    begin, taken = 0, 0  # samples: number of the first that is held, and how many were taken
+    for info, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
+        if info is not None:
+            windows.configure(info.settings, info.rate_hz, info.name, info.offset)
+            samples = windows.add([*new_samples(batch, gaps)])
+            held = [joined([*held, samples])]
+        slots = windows.take(rest=info is None)
+        if not len(slots):
+            continue
+        first_ns = first_ns if taken else windows.begin_ns
+        yield _rows(slots, held[0], slots["number"] - begin, first_ns, tool=windows.has_tool)
+        taken = int(slots["number"].max(initial=taken - 1)) + 1
+        keep = max(taken - 1, 0)  # lost samples that follow are between this one and the next
+        held, begin = [held[0].where(np.arange(begin, begin + len(held[0])) >= keep)], keep
+    if not taken:
+        raise RecordingError(f"{recording.path} has no new and valid samples")
+
+
+def _rows(slots: Array, samples: Columns, index: Array, first_ns: int, *, tool: bool) -> Arrays:
+    """Of each slot, by the index of its sample; negative: it was lost."""
+    is_lost = slots["number"] < 0
+    index = np.where(is_lost, 0, index)
+
+    def column(name: str, lost: Any = np.nan) -> Array:
+        values = getattr(samples, name)[index]
+        values[is_lost] = lost
+        return np.asarray(values)
+
+    monotonic_ns = slots["monotonic_ns"]
+    stamp_ns = interpolated(monotonic_ns, samples.monotonic_ns, samples.stamp_ns)
+    passed, stamped = np.diff(samples.monotonic_ns), np.diff(samples.stamp_ns)
+    is_set = np.append(False, abs(stamped - passed) > _STEP_NS + _SLEW * passed)
+    behind = np.minimum(np.searchsorted(samples.monotonic_ns, monotonic_ns), len(samples) - 1)
+    stamp = np.where(is_lost, stamp_ns, samples.stamp_ns[index]).astype("datetime64[ns]")
+    stamp[is_lost & is_set[behind]] = np.datetime64("NaT")
+    found: Arrays = {
+        "time_s": (monotonic_ns - first_ns) * 1e-9, "stamp_utc": stamp, "monotonic_ns": monotonic_ns,
+        "sequence": slots["sequence"], "valid": slots["valid"][:, 0],
+    }  # fmt: skip
+    axes = {
+        f"{name}_{axis}_{unit}": (name, place) for name, unit in VECTORS for place, axis in enumerate("xyz")
+    }
+    found |= {name: column(of)[:, place].astype(np.float32) for name, (of, place) in axes.items()}
+    if tool:
+        wrench = np.where(found["valid"][:, np.newaxis], slots["compensated"], np.nan)
+        found["compensated_valid"] = np.asarray(np.isfinite(wrench).all(axis=1))
+        found |= {f"compensated_{name}": part for name, part in zip(axes, wrench.T, strict=False)}
+    found["temperature_degC"] = column("temperature").astype(np.float32)
+    turned = column("orientation").astype(np.float32)
+    found |= {f"orientation_{axis}": part for axis, part in zip("xyzw", turned.T, strict=True)}
+    found["gap"] = np.asarray(column("flags", 0) & int(DataFlag.GAP), bool)
+    return found | {name: column(name, 0).astype(RECORD[name]) for name in REGISTERS}
