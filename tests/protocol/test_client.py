@@ -32,9 +32,14 @@ from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
-from tests.bridge.scripted_server import ScriptedServer, description, process_data
+from tests.bridge.scripted_server import (
+    MemoryServer,
+    ScriptedChannel,
+    ScriptedServer,
+    description,
+    process_data,
+)
 from tests.golden_vectors import odd_messages
-from tests.protocol.scripted_channel import MemoryServer, ScriptedChannel
 from tests.server.running import PATIENCE_S, free_port, full_listener
 from tests.simulation import MemoryChannel, Simulation
 
