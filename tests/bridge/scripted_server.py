@@ -16,21 +16,15 @@ from collections.abc import Callable
 from typing import Any, Protocol, Self
 
 from bota_ethercat.client.channel import TcpChannel
-from bota_ethercat.control import PROTOCOL_VERSION
+from bota_ethercat.control import Event, event
 from bota_ethercat.errors import ConnectionFailedError, ProtocolError, UnreachableError
 from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data, encode_json
 from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
+from tests.descriptions import description, sensor_row
+from tests.server.running import wait_until
 
 Answer = Callable[[JsonObject], JsonObject | None]
-
-
-def description(sensor: int = 0, **changes: Any) -> JsonObject:
-    row = {
-        "sensor": sensor, "name": "BFT-SENS-ECAT-M8", "serial": 1, "pdo_size": 61, "rate_hz": 800,
-        "state": "OP", "hardware": "h", "firmware": "f", "settings": {},
-    }  # fmt: skip
-    return {"protocol": PROTOCOL_VERSION, "version": "0.1.0", "sensors": [row], **changes}
 
 
 def process_data(number: float, size: int = 61) -> bytes:
@@ -54,7 +48,8 @@ class Script:
         self.requests: list[JsonObject] = []
         self.connections = 0
         self.description = description()
-        self.answers: dict[str, Answer] = {}
+        zeros = dict.fromkeys(("old_offset", "new_offset", "residual", "deviation"), [0] * 6)
+        self.answers: dict[str, Answer] = {"tare": lambda _: {"ok": True, **zeros}}
         self.on_subscribe: Callable[[], None] = lambda: None
         self.subscribed = threading.Event()
         self.sequence = 0
@@ -193,8 +188,9 @@ class ScriptedChannel(TcpChannel):
 class ScriptedServer(Script):
     """Listens on a port of the loopback, by default a free one; samples go to the newest subscriber."""
 
-    def __init__(self, port: int = 0) -> None:
+    def __init__(self, port: int = 0, **sensor: Any) -> None:
         super().__init__()
+        self.description = description(sensor_row(**sensor))
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
         self.disconnected = threading.Event()
@@ -230,6 +226,16 @@ class ScriptedServer(Script):
         peer = self._asking if answers else self.streams[-1]
         assert peer is not None
         peer.sendall(data)
+
+    def send(self, *messages: bytes | JsonObject) -> None:
+        wait_until(lambda: bool(self.streams), "a subscriber")
+        for message in messages:
+            self.send_raw(message if isinstance(message, bytes) else encode_json(message))
+
+    def reconfigure(self, **sensor: Any) -> None:
+        row = sensor_row(**sensor)
+        self.description["sensors"] = [row]
+        self.send(event(Event.RECONFIGURED, sensor=0, settings=row["settings"], rate_hz=row["rate_hz"]))
 
     def _answer(self, message: JsonObject) -> None:
         if message["action"] == "subscribe" and self._asking is not None:

@@ -35,8 +35,9 @@ from bridge.diagnostics import TICK_S
 from bridge.parameters.table import PARAMETERS, gather
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from tests.bridge.real_node import PATIENCE_S, Asking, LoggedNode, retire
-from tests.bridge.scripted_server import MemoryServer, ScriptedChannel, description
+from tests.bridge.scripted_server import MemoryServer, ScriptedChannel
 from tests.compensation.making import TOOL, load
+from tests.descriptions import description, sensor_row
 
 HEALTHY = dict.fromkeys(("link", "stream", "sensor", "clock", "compensation"), "ok")
 RATE_HZ = 100
@@ -47,12 +48,6 @@ QUICK: dict[str, object] = {"rest.duration": 0.3, "bias_ramp_time": 0.0}
 DEFAULTS = gather({row.name: row.default for row in PARAMETERS})
 TURNS = itertools.count()
 STEP_S = 0.01  # time passes in steps of this length: a sample each
-
-
-def streaming_description() -> JsonObject:
-    content = description()
-    content["sensors"][0].update(rate_hz=RATE_HZ, settings=dict(SETTINGS))
-    return content
 
 
 def status(lost_samples: int = 0, mode: str = "locked") -> JsonObject:
@@ -75,7 +70,7 @@ class Server(MemoryServer):
         super().__init__()
         self.now_ns, self.clock_step_ns = 5 * 10**9, 0  # the step: by how much the wall clock has been set
         self.pass_step = self.step  # what who waits does, until the time has come
-        self.description = streaming_description()
+        self.description = description(sensor_row(rate_hz=RATE_HZ, settings=dict(SETTINGS)))
         self.answers["status"] = lambda _: status()
         self.changes: dict[str, Any] = {}
         self.paused = False
