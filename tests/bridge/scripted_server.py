@@ -1,12 +1,13 @@
 """A server that does as a test tells it: speaks the wire protocol from `protocol`, knows no sensor.
 
-`ScriptedServer` answers describe, subscribe and shutdown by itself and sends what `send_sample` and
-`send_raw` are given.
+It answers describe, subscribe and shutdown by itself and sends what `send_sample` and `send_raw` are given:
+`MemoryServer` in memory and in simulated time, without sockets and threads, `ScriptedServer` over TCP.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import selectors
 import socket
 import threading
@@ -14,21 +15,16 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol, Self
 
-from bota_ethercat.control import PROTOCOL_VERSION
-from bota_ethercat.errors import ProtocolError
+from bota_ethercat.client.channel import TcpChannel
+from bota_ethercat.control import Event, event
+from bota_ethercat.errors import ConnectionFailedError, ProtocolError, UnreachableError
 from bota_ethercat.framing import DataMessage, FrameDecoder, encode_data, encode_json
 from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
+from tests.descriptions import description, sensor_row
+from tests.server.running import wait_until
 
 Answer = Callable[[JsonObject], JsonObject | None]
-
-
-def description(sensor: int = 0, **changes: Any) -> JsonObject:
-    row = {
-        "sensor": sensor, "name": "BFT-SENS-ECAT-M8", "serial": 1, "pdo_size": 61, "rate_hz": 800,
-        "state": "OP", "hardware": "h", "firmware": "f", "settings": {},
-    }  # fmt: skip
-    return {"protocol": PROTOCOL_VERSION, "version": "0.1.0", "sensors": [row], **changes}
 
 
 def process_data(number: float, size: int = 61) -> bytes:
@@ -52,7 +48,8 @@ class Script:
         self.requests: list[JsonObject] = []
         self.connections = 0
         self.description = description()
-        self.answers: dict[str, Answer] = {}
+        zeros = dict.fromkeys(("old_offset", "new_offset", "residual", "deviation"), [0] * 6)
+        self.answers: dict[str, Answer] = {"tare": lambda _: {"ok": True, **zeros}}
         self.on_subscribe: Callable[[], None] = lambda: None
         self.subscribed = threading.Event()
         self.sequence = 0
@@ -95,11 +92,105 @@ class Script:
             self.subscribed.set()
 
 
+class MemoryServer(Script):
+    """What it sends has arrived at once; `Client(1, channel=ScriptedChannel(server))` is its client."""
+
+    def __init__(self) -> None:
+        super().__init__(self)
+        self.now_ns = 10**15
+        self.listens = self.is_connected = True
+        self.is_there = True  # its computer answers; else connecting is pending for ever
+        self.attempted_s: list[float] = []
+        self.arrived = bytearray()
+        self._agenda: list[tuple[int, Callable[[], object]]] = []
+
+    def at(self, now_ns: int, action: Callable[[], object]) -> None:
+        self._agenda.append((now_ns, action))
+
+    def go_on(self, seconds: float) -> None:
+        until_ns = self.now_ns + math.ceil(seconds * 1e9)
+        while not self.arrived and self._agenda and self._agenda[0][0] <= until_ns:
+            self.now_ns, action = self._agenda.pop(0)
+            action()
+        if not self.arrived:
+            self.now_ns = until_ns
+
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        self.now_ns += math.ceil(max(seconds, 0.0) * 1e9)
+        return event.is_set()
+
+    def monotonic(self) -> float:
+        return self.now_ns / 1e9
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    def time_ns(self) -> int:
+        return self.now_ns
+
+    def send_raw(self, data: bytes) -> None:
+        self.arrived += data
+
+    def drop(self) -> None:
+        self.subscribed.clear()
+        self.is_connected = False
+
+
+class ScriptedChannel(TcpChannel):
+    """The channel to it. Time passes while the client waits."""
+
+    def __init__(self, server: MemoryServer) -> None:
+        super().__init__("memory", 0)
+        self.same_address, self.monotonic_ns = True, server.monotonic_ns
+        self._server = server
+        self._requests = FrameDecoder()
+
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        return self._server.wait(event, seconds)
+
+    def connect(self, timeout_s: float) -> bool:
+        self._server.attempted_s.append(self._server.monotonic())
+        if not self._server.is_there:
+            self.wait(threading.Event(), timeout_s)
+            return False
+        if not self._server.listens:
+            raise UnreachableError("Connection refused")
+        self._server.connections += 1
+        self._server.is_connected, self._requests = True, FrameDecoder()
+        return True
+
+    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+        arrived = self._server.arrived
+        if not arrived and not self._server.is_connected:
+            raise ConnectionFailedError("the server closed it")
+        self._server.go_on(timeout_s)
+        count = min(len(buffer), len(arrived))
+        buffer[:count] = arrived[:count]
+        del arrived[:count]
+        return count
+
+    def send(self, data: bytes) -> None:
+        if not self._server.is_connected:
+            raise ConnectionFailedError("cannot send: Broken pipe")
+        self._server.receive(self._requests, data)
+
+    def shutdown(self) -> None:
+        self._server.drop()
+
+    def close(self) -> None:
+        self._server.drop()
+        self._server.arrived.clear()
+
+    def fileno(self) -> int:
+        return -1
+
+
 class ScriptedServer(Script):
     """Listens on a port of the loopback, by default a free one; samples go to the newest subscriber."""
 
-    def __init__(self, port: int = 0) -> None:
+    def __init__(self, port: int = 0, **sensor: Any) -> None:
         super().__init__()
+        self.description = description(sensor_row(**sensor))
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
         self.disconnected = threading.Event()
@@ -135,6 +226,16 @@ class ScriptedServer(Script):
         peer = self._asking if answers else self.streams[-1]
         assert peer is not None
         peer.sendall(data)
+
+    def send(self, *messages: bytes | JsonObject) -> None:
+        wait_until(lambda: bool(self.streams), "a subscriber")
+        for message in messages:
+            self.send_raw(message if isinstance(message, bytes) else encode_json(message))
+
+    def reconfigure(self, **sensor: Any) -> None:
+        row = sensor_row(**sensor)
+        self.description["sensors"] = [row]
+        self.send(event(Event.RECONFIGURED, sensor=0, settings=row["settings"], rate_hz=row["rate_hz"]))
 
     def _answer(self, message: JsonObject) -> None:
         if message["action"] == "subscribe" and self._asking is not None:

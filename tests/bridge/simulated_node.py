@@ -27,18 +27,17 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.serialization import deserialize_message
 
-from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.control import Event, event
-from bota_ethercat.errors import ConnectionFailedError, UnreachableError
-from bota_ethercat.framing import FrameDecoder
+from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
 from bridge.diagnostics import TICK_S
 from bridge.parameters.table import PARAMETERS, gather
 from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from tests.bridge.real_node import PATIENCE_S, Asking, LoggedNode, retire
-from tests.bridge.scripted_server import Script, description
+from tests.bridge.scripted_server import MemoryServer, ScriptedChannel
 from tests.compensation.making import TOOL, load
+from tests.descriptions import description, sensor_row
 
 HEALTHY = dict.fromkeys(("link", "stream", "sensor", "clock", "compensation"), "ok")
 RATE_HZ = 100
@@ -49,12 +48,6 @@ QUICK: dict[str, object] = {"rest.duration": 0.3, "bias_ramp_time": 0.0}
 DEFAULTS = gather({row.name: row.default for row in PARAMETERS})
 TURNS = itertools.count()
 STEP_S = 0.01  # time passes in steps of this length: a sample each
-
-
-def streaming_description() -> JsonObject:
-    content = description()
-    content["sensors"][0].update(rate_hz=RATE_HZ, settings=dict(SETTINGS))
-    return content
 
 
 def status(lost_samples: int = 0, mode: str = "locked") -> JsonObject:
@@ -70,101 +63,34 @@ def status(lost_samples: int = 0, mode: str = "locked") -> JsonObject:
     }  # fmt: skip
 
 
-class Wire(TcpChannel):
-    """A channel in memory; `feed` and `end` are for its other end."""
-
-    def __init__(self, world: Any, clock: SimulatedClock) -> None:
-        super().__init__("memory", 0)
-        self.monotonic_ns, self.same_address, self._clock, self._world = (
-            clock.monotonic_ns,
-            True,
-            clock,
-            world,
-        )
-        self.arrived, self._ended = bytearray(), True
-        self._send: Callable[[bytes], object] = lambda _: None
-
-    def connect(self, timeout_s: float) -> bool:
-        self._send = self._world.accept(self)
-        self._ended = False
-        return True
-
-    def feed(self, data: bytes) -> None:
-        self.arrived += data
-
-    def end(self) -> None:
-        self._ended = True
-
-    def wait(self, event: threading.Event, seconds: float) -> bool:
-        return self._clock.wait(event, seconds)
-
-    def shutdown(self) -> None:
-        self.end()
-
-    def close(self) -> None:
-        self.end()
-        self.arrived.clear()
-
-    def fileno(self) -> int:
-        return -1
-
-    def send(self, data: bytes) -> None:
-        if self._ended:
-            raise ConnectionFailedError("cannot send: Broken pipe")
-        self._send(data)
-
-    def receive(self, buffer: memoryview, timeout_s: float) -> int:
-        if not self.arrived and self._ended:
-            raise ConnectionFailedError("the server closed it")
-        data = self.arrived[: len(buffer)]
-        buffer[: len(data)] = data
-        del self.arrived[: len(data)]
-        return len(data)
-
-
-class Server(Script):
+class Server(MemoryServer):
     """Samples once a step, as long as it is not `paused`: with `changes`, but for what comes `once`."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.now_ns, self.clock_step_ns = 5 * 10**9, 0  # the step: by how much the wall clock has been set
-        super().__init__(self)
-        self.description = streaming_description()
+        self.pass_step = self.step  # what who waits does, until the time has come
+        self.description = description(sensor_row(rate_hz=RATE_HZ, settings=dict(SETTINGS)))
         self.answers["status"] = lambda _: status()
         self.changes: dict[str, Any] = {}
         self.paused = False
-        self.listens, self.attempted_s = True, list[float]()
         self.sent = 0
         self._once: deque[dict[str, Any]] = deque()
-        self._wire: Wire | None = None
-
-    def monotonic_ns(self) -> int:
-        return self.now_ns
 
     def time_ns(self) -> int:
         return 10**18 + self.now_ns + self.clock_step_ns
 
-    def accept(self, wire: Wire) -> Callable[[bytes], object]:
-        self.attempted_s.append(self.now_ns / 1e9)
-        if not self.listens:
-            raise UnreachableError("Connection refused")
-        self.connections += 1
-        self._wire, decoder = wire, FrameDecoder()
-        return lambda data: self.receive(decoder, data)
-
-    def send_raw(self, data: bytes) -> None:
-        assert self._wire is not None
-        self._wire.feed(data)
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        due_ns = self.now_ns + round(seconds * 1e9)
+        while not event.is_set() and self.now_ns < due_ns:
+            self.pass_step()
+        return event.is_set()
 
     def once(self, **changes: Any) -> None:
         self._once.append(changes)
 
     def forget_once(self) -> None:
         self._once.clear()
-
-    def drop(self) -> None:
-        self.subscribed.clear()
-        assert self._wire is not None
-        self._wire.end()
 
     def reconfigure(self, **changed: Any) -> None:
         values = {name: changed.pop(name) for name in ("rate_hz", "delay_ms") if name in changed}
@@ -178,22 +104,6 @@ class Server(Script):
         if self.subscribed.is_set() and not self.paused:
             self.send_sample(float(self.sent), **(self._once.popleft() if self._once else self.changes))
             self.sent += 1
-
-
-class SimulatedClock:
-    """The node's clock: who waits lets time pass."""
-
-    def __init__(self, world: Any, step: Callable[[], None]) -> None:
-        self.monotonic_ns, self.time_ns, self._step = world.monotonic_ns, world.time_ns, step
-
-    def monotonic(self) -> float:
-        return float(self.monotonic_ns() / 1e9)
-
-    def wait(self, event: threading.Event, seconds: float, /) -> bool:
-        due_s = self.monotonic() + seconds
-        while not event.is_set() and self.monotonic() < due_s:
-            self._step()
-        return event.is_set()
 
 
 class Topic:
@@ -232,25 +142,20 @@ class Guard:
 
 
 class Node(Asking):
-    """A node that is connected to `server` as soon as time passes. StartError if it cannot start.
+    """A node that is connected to `server` as soon as time passes. StartError if it cannot start."""
 
-    `server` has the time, takes connections with `accept` (UnreachableError if nobody listens) and lets
-    STEP_S pass with `step`.
-    """
-
-    def __init__(self, server: Any, *arguments: str, **parameters: object) -> None:
+    def __init__(self, server: Server, *arguments: str, **parameters: object) -> None:
         self.name = f"/test_{uuid.uuid4().hex}/bridge"
         self.topics: dict[str, Topic] = {}
         self._triggered = list[Callable[[], object]]()
         self.stand_ins: list[Any] = []
         self.server, self._tick_ns, self._is_busy = server, 0, False
         self._agenda: list[tuple[int, Callable[[], object]]] = []
-        self._clock = SimulatedClock(server, self.step)
-        bench, self._wire = self, Wire(server, self._clock)
+        server.pass_step, bench = self.step, self
 
         class Bridge(LoggedNode):
-            clock: Any = self._clock
-            channel = self._wire
+            clock: Any = server
+            channel = ScriptedChannel(server)
 
             def create_publisher(self, *arguments: Any, **options: Any) -> Any:
                 topic = Topic(super().create_publisher(*arguments, **options))
@@ -295,33 +200,33 @@ class Node(Asking):
     # -- time
 
     def at(self, seconds: float, action: Callable[[], object]) -> None:
-        self._agenda.append((self.server.monotonic_ns() + round(seconds * 1e9), action))
+        self._agenda.append((self.server.now_ns + round(seconds * 1e9), action))
 
     def step(self) -> None:
-        for due in [due for due in self._agenda if due[0] <= self.server.monotonic_ns()]:
+        for due in [due for due in self._agenda if due[0] <= self.server.now_ns]:
             self._agenda.remove(due)
             due[1]()
         self.server.step()
         for timer in list(self.node.timers):
             timer.callback()  # as an executor would call it
         self.settle()
-        if self.server.monotonic_ns() >= self._tick_ns:
-            self._tick_ns = self.server.monotonic_ns() + round(TICK_S * 1e9)
+        if self.server.now_ns >= self._tick_ns:
+            self._tick_ns = self.server.now_ns + round(TICK_S * 1e9)
             self.node.monitor.tick()
 
     def settle(self) -> None:
         reader = self.node.reader
         with contextlib.suppress(ConnectionFailedError):  # the node has been told to end
             reader.read(0.0)
-            while self._wire.arrived:
+            while self.server.arrived:
                 reader.read(0.0)
         reader.client._reader = None  # who asks the server waits as another thread does
         while self._triggered and not self._is_busy:
             self._triggered.pop(0)()
 
     def run(self, seconds: float) -> None:
-        end_s = self._clock.monotonic() + seconds - STEP_S / 2
-        while self._clock.monotonic() < end_s:
+        end_s = self.server.monotonic() + seconds - STEP_S / 2
+        while self.server.monotonic() < end_s:
             self.step()
 
     def fresh(self, messages: list[Any], seconds: float) -> list[Any]:
@@ -330,9 +235,9 @@ class Node(Asking):
         return messages
 
     def run_until(self, condition: Callable[[], object], what: Callable[[], str] | str) -> None:
-        end_s = self._clock.monotonic() + PATIENCE_S
+        end_s = self.server.monotonic() + PATIENCE_S
         while not condition():
-            if self._clock.monotonic() > end_s:
+            if self.server.monotonic() > end_s:
                 raise AssertionError(f"waited in vain for: {what if isinstance(what, str) else what()}")
             self.step()
 

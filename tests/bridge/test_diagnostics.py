@@ -32,7 +32,7 @@ def test_a_healthy_stream(node: Node) -> None:
     array = node.statuses()
     assert [level(item) for item in array.values()] == ["ok"] * 5
     assert set(array) == set(HEALTHY)
-    assert {item.hardware_id for item in array.values()} == {"BFT-SENS-ECAT-M8 1"}
+    assert {item.hardware_id for item in array.values()} == {"BFT-SENS-ECAT-M8 100"}
     link, stream, sensor, clock, compensation = (values(array[name]) for name in HEALTHY)
     assert (link["connected"], link["reconnects"]) == ("true", "0")
     assert link["address"] == "localhost:12001"
@@ -40,7 +40,7 @@ def test_a_healthy_stream(node: Node) -> None:
     assert (stream["age_p50_us"], stream["age_p99_us"]) == ("0", "0")
     for key in ("lost", "skipped", "repeated", "invalid", "server_lost", "server_late_p99_us"):
         assert stream[key].replace(".", "").isdigit(), key
-    assert (sensor["serial"], sensor["al_state"]) == ("1", "OP")
+    assert (sensor["serial"], sensor["al_state"]) == ("100", "OP")
     assert (clock["mode"], clock["uncertainty_us"]) == ("locked", "5.0")
     assert [text_of(value) for value in (True, 1.5, "a\x1bb", "")] == ["true", "1.5", "a?b", ""]
     assert array["compensation"].message == (

@@ -27,9 +27,9 @@ from bota_ethercat.address import Address
 from bota_ethercat.framing import DataMessage, encode_data
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.signals import MOVE_LENGTH, POSE_LENGTH
+from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import QUICK, STEP_S, Node, Server, Stages, six, stamp_ns
 from tests.clients.cpp_programs import end_driver, needs_gxx, patient
-from tests.clients.played_sensor import PlayedSensor
 from tests.clients.test_sensor_loop import Loop, Seen, program
 from tests.ended import run_here
 from tests.server.running import wait_until
@@ -211,7 +211,7 @@ def test_the_plugins_wrench_is_the_exported_one(heard: Recorded, tool: Path) -> 
     wanted = dict(zip(stamps, wrench.tolist(), strict=True))
     with open_recording(heard.run) as recording:
         items = [*recording.everything(0)]
-    loop, played = Reading(program()), PlayedSensor()
+    loop, played = Reading(program()), ScriptedServer()
     played.description = described(items) | {"boot_id": "another"}
     try:
         loop.opened(played.port, payload_file=tool)

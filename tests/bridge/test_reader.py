@@ -17,8 +17,8 @@ from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
 from bridge.stream.frame_selector import BACKLOG_NS, FRESH_NS, FrameCounts, FrameSelector, RateLimit
 from bridge.stream.link import sentence
-from tests.bridge.scripted_server import description
 from tests.bridge.simulated_node import Node, Server, stamp_ns
+from tests.descriptions import description
 
 PERIOD_NS = 1_250_000
 
@@ -52,7 +52,7 @@ def test_every_fresh_sample_once_with_its_stamp(node: Node, quiet: Server) -> No
     chunks = stream[0] + stream[1], stream[1], stream[2][:30], stream[2][30:]
     assert feed(node, quiet, *chunks) == [0.0, 1.0, 2.0]
     assert [stamp_ns(message) - begin for message in node.hear("wrench")] == [0, 1, 2]
-    assert "connected to localhost:12001: sensor 0 (BFT-SENS-ECAT-M8, serial 1, 100 Hz, OP)" in node.log
+    assert "connected to localhost:12001: sensor 0 (BFT-SENS-ECAT-M8, serial 100, 100 Hz, OP)" in node.log
 
 
 def test_attempts_to_connect_back_off_and_one_line_says_so(quiet: Server) -> None:

@@ -18,6 +18,8 @@ from typing import Any, Final
 
 import pytest
 
+from bota_ethercat.framing import encode_data
+from bota_ethercat.pdo import encode
 from tests.server.running import PATIENCE_S
 
 ROOT: Final = Path(__file__).parents[2]
@@ -171,3 +173,14 @@ def driver(port: int, /, **options: object) -> Iterator[Driver]:
 def assert_no_faults() -> None:
     while _idle:
         assert end_driver(_idle.pop()) == 0
+
+
+def frame(
+    sequence: int, flags: int = 0, *, sensor: int = 0, age_s: float = 0.0, size: int = 61, **values: float
+) -> bytes:
+    """A DATA message; its force along x is its number. `values` by name, with `__` for the dot."""
+    # A machine that has been up for less than `age_s` has no such instant yet.
+    time.sleep(max(0.0, age_s - time.monotonic()))
+    instant = time.monotonic_ns() - int(age_s * 1e9)
+    data = encode(size, {"force.x": sequence, **{k.replace("__", "."): v for k, v in values.items()}})
+    return encode_data(sequence, 5, instant, sensor, flags, 3, data)

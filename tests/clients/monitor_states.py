@@ -12,7 +12,9 @@ from bota_clients.monitor.model import Model, State
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import encode
-from bota_ethercat.settings import start_up_defaults
+from bota_ethercat.text.json_text import JsonObject
+from tests import descriptions
+from tests.descriptions import sensor_row
 
 ADDRESS = "localhost:12001"
 OWN_PEER = "127.0.0.1:40000"
@@ -24,17 +26,14 @@ SECONDS = 8.0
 Values = Mapping[str, float]
 
 
-def description(names: Sequence[str] = ("BFT-SENS-ECAT-M8",), **settings: Any) -> dict[str, Any]:
+def description(names: Sequence[str] = ("BFT-SENS-ECAT-M8",), **settings: Any) -> JsonObject:
     """A reply to `describe`."""
-    rows = [
-        {
-            "sensor": position, "name": name, "serial": 1234 + position, "hardware": "RM200V4_6adc",
-            "firmware": "1.3.8", "pdo_size": 77, "rate_hz": RATE_HZ, "state": "OP",
-            "settings": {**start_up_defaults(), **settings},
-        }
-        for position, name in enumerate(names)
-    ]  # fmt: skip
-    return {"protocol": 1, "version": "1.0.0", "sensors": rows}
+    return descriptions.description(
+        *(
+            sensor_row(sensor, name=name, serial=1234 + sensor, pdo_size=77, **settings)
+            for sensor, name in enumerate(names)
+        )
+    )
 
 
 def status(sensors: int = 1, mode: str = "locked", sent: int = 0) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from bota_clients.recording.writer import DiskFile, RecordingWriter
 from bota_ethercat import pdo
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.text.json_text import JsonObject
+from tests.descriptions import description, sensor_row
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 1_250_000
@@ -16,15 +17,8 @@ PERIOD_NS = 1_250_000
 
 def describe(*sensors: int, **settings: object) -> JsonObject:
     """A reply to `describe` with these sensors."""
-    rows = [
-        {
-            "sensor": sensor, "name": "BFT-SENS-ECAT-M8", "serial": 100 + sensor, "hardware": "H",
-            "firmware": "1.3.8", "pdo_size": 61, "rate_hz": 800, "state": "OP",
-            "settings": {"sinc_length": 64, **settings},
-        }
-        for sensor in sensors
-    ]  # fmt: skip
-    return {"reply": "describe", "ok": True, "protocol": 1, "version": "0.1.0", "sensors": rows}
+    rows = [sensor_row(sensor, settings={"sinc_length": 64, **settings}) for sensor in sensors]
+    return description(*rows, reply="describe", ok=True)
 
 
 def frame(number: int, sensor: int = 0, flags: int = 0, size: int = 61, **values: float) -> DataMessage:

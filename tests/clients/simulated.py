@@ -16,9 +16,9 @@ from bota_clients.report.series import Subject
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import SensorInfo
-from bota_ethercat.settings import sampling_rate_hz, start_up_defaults
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
+from tests.descriptions import sensor_row
 from tests.simulation import Simulation
 
 STARTED_AT_NS = 1_767_225_600 * 10**9
@@ -60,26 +60,13 @@ def decoded(frames: Sequence[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS)
     return columns([frame for frame in frames if frame.sensor == 0], imu_units)
 
 
-def described(sinc_length: int = 64, **settings: Any) -> dict[str, Any]:
-    """A row of a reply to `describe`."""
-    return {
-        "sensor": 0, "name": "BFT-SENS-ECAT-M8", "serial": 4711, "hardware": "RM200V4_6adc", "firmware":
-        "1.3.8",
-        "pdo_size": 61, "rate_hz": sampling_rate_hz(sinc_length), "state": "OP",
-        "settings": {
-            **start_up_defaults(), "coordinate_system": False, "inertia_compensation": False,
-            "orientation_estimation": False, "sinc_length": sinc_length, **settings,
-        },
-    }  # fmt: skip
-
-
 def subject_of(
     frames: Sequence[DataMessage],
     row: Mapping[str, Any] | None = None,
     source: str = "simulated.mcap",
     **kind: Any,
 ) -> Subject:
-    info = SensorInfo.parse(described() if row is None else row)
+    info = SensorInfo.parse(sensor_row() if row is None else row)
     assert info is not None
     return Subject(info, decoded(frames, **kind), source)
 
@@ -87,4 +74,4 @@ def subject_of(
 def sensor(seconds: float, *commands: str, **options: Any) -> Subject:
     """A simulated sensor as a report's subject."""
     frames = simulate(seconds, *commands, **options)
-    return subject_of(frames, described(options.get("sinc_length", 64)))
+    return subject_of(frames, sensor_row(sinc_length=options.get("sinc_length", 64)))

@@ -32,11 +32,12 @@ from tests.clients.cpp_programs import (
     assert_no_faults,
     driver,
     end_driver,
+    frame,
     needs_gxx,
     patient,
     start_driver,
 )
-from tests.clients.played_sensor import PlayedSensor, described, frame
+from tests.descriptions import description, sensor_row
 from tests.golden_vectors import READ, ReadStream, odd_messages
 from tests.server.running import PATIENCE_S, free_port, full_listener, wait_until
 
@@ -48,8 +49,7 @@ MAX_AGE = 2**63 - 1
 TCP_FIN_WAIT2 = b"\x05"  # the state in TCP_INFO of who has closed its side, and the other end knows
 PATIENT = {"max_age_ms": 60_000}
 """For what must not depend on how fast this machine is."""
-SENSOR = {"sensor": 0, "name": "BFT-SENS-ECAT-M8", "serial": 7, "pdo_size": 61, "rate_hz": 800, "state": "OP"}
-GRANTED = {"reply": "subscribe", "ok": True, "protocol": 1, "version": "1.2.3", "sensors": [SENSOR]}
+GRANTED = {"reply": "subscribe", "ok": True, **description()}
 REFUSED = {"reply": "subscribe", "ok": False, "error": {"code": "busy", "message": "no 9"}}
 OURS = boot_id() or pytest.fail("this machine has no boot id")
 
@@ -476,16 +476,13 @@ def test_describe_tare_and_refusals() -> None:
         name: [at + n / 8 for n in range(6)]
         for at, name in enumerate(("old_offset", "new_offset", "residual", "deviation"))
     }
-    row: dict[str, Any] = {"hardware": "h", "firmware": "f", "state": "OP"}
-    with PlayedSensor(**row) as sensor, driver(sensor.port) as running:
+    with ScriptedServer() as sensor, driver(sensor.port) as running:
         sensor.answers |= {
             "tare": lambda _: {"ok": True, **results},
             "sdo_read": lambda asked: {"ok": True, "value": 1} if asked.get("subindex") else refused,
         }
         told = running.do("describe")
-        wanted = {
-            name: described(**row)[name] for name in (*row, "sensor", "name", "serial", "pdo_size", "rate_hz")
-        }
+        wanted = {name: value for name, value in sensor_row().items() if name != "settings"}
         assert (told["ok"], told["version"], told["sensors"]) == (True, "0.1.0", [wanted])
         told = running.do("tare", 20, 1.5, -2, 0, 0.25, 0, 0)
         assert sensor.requests[-1] == request(

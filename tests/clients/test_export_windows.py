@@ -25,7 +25,8 @@ from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.bags import imu, write_bag
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
-from tests.clients.simulated import Script, described, simulate
+from tests.clients.simulated import Script, simulate
+from tests.descriptions import sensor_row
 from tests.ended import run_here
 
 SETTINGS: dict[str, Any] = {"fir": False, "acceleration_filter": 1, "angular_rate_filter": 3}
@@ -113,7 +114,7 @@ def test_a_step_of_the_wall_clock_in_the_middle_bends_nothing(tmp_path: Path, st
 def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> None:
     """The stream is without REPEATED frames, comes in other batches, and is asked as it comes."""
     frames = simulate(3.0, script=Script(((1.0, "stick"), (1.2, "unstick")), lost_frames=0.02))
-    path, row, chance = tmp_path / "run.mcap", described(), random.Random(1)
+    path, row, chance = tmp_path / "run.mcap", sensor_row(), random.Random(1)
     record(path, frames, sensors=(0,), **row["settings"])
     with open_recording(path) as recording:
         recorded = joined(windows_of(recording, Periodic(30.0), Windows(32, tool=TOOL)))
@@ -145,7 +146,7 @@ def test_the_compensated_wrench_is_the_nodes() -> None:
     frames[50:] = [frame(number, flags=4, **turning) for number in range(130, 136)]
     parts = "tool_mass", "tool_center_of_gravity", "bias"
     windows = Windows(1, tool={name: TOOL[name] for name in parts})
-    windows.configure({**described()["settings"], **SETTINGS}, RATE_HZ, "BFT-SENS-ECAT-M8")
+    windows.configure({**sensor_row()["settings"], **SETTINGS}, RATE_HZ, "BFT-SENS-ECAT-M8")
     windows.add(frames)
     made = windows.at(np.array([8, 130, 131]) * PERIOD_NS - 1_880_000)
     assert made["force_torque_compensated"][0, 0] == pytest.approx([5, 0, 0, 0, 0.6, 0], abs=1e-3)

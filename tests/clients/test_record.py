@@ -28,9 +28,10 @@ from bota_clients.recording.file_format import frame_topic
 from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.bridge.scripted_server import ScriptedServer, description
+from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.recordings import frame, record
 from tests.clients.running import Recorder, Replay, frames_in, signalled
+from tests.descriptions import description
 from tests.ended import run_here
 from tests.golden_vectors import odd_messages
 from tests.served_simulation import served

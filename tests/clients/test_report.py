@@ -19,12 +19,13 @@ from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.limits import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from ethercat_server.virtual_sensor.signals import poses
-from tests.clients.simulated import Script, described, sensor, simulate, subject_of
+from tests.clients.simulated import Script, sensor, simulate, subject_of
+from tests.descriptions import sensor_row
 from tests.virtual_sensor.motions import measured, turning
 
 SLOW = 512  # SINC length for what does not depend on the rate: 100 Hz
 SINC, SECONDS = 128, 7  # of `healthy`: 400 Hz
-ROW = described(SINC)
+ROW = sensor_row(sinc_length=SINC)
 GOOD, NOT_POSSIBLE, LOOK, TROUBLE = Level.GOOD, Level.NOT_POSSIBLE, Level.LOOK, Level.TROUBLE
 FORCE_TORQUE, IMU = "Noise of force and torque", "Noise of the IMU"
 SILENT = "Silent or stuck sensor"

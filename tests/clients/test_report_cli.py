@@ -13,13 +13,10 @@ import pytest
 from bota_clients.report import cli, page, plots
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import writer
-from tests.clients.simulated import STARTED_AT_NS, described, simulate
+from tests.clients.simulated import STARTED_AT_NS, simulate
+from tests.descriptions import description, sensor_row
 
 SINC, SPLIT = 128, 600
-
-
-def describe(*rows: object) -> dict[str, object]:
-    return {"reply": "describe", "ok": True, "protocol": 1, "sensors": list(rows)}
 
 
 Frames = Sequence[DataMessage]
@@ -52,7 +49,7 @@ def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plots, "draw", lambda *_: None)
 
 
-SENSOR: Final = describe(described(SINC))
+SENSOR: Final = description(sensor_row(sinc_length=SINC))
 
 
 class Report:
@@ -103,16 +100,16 @@ def test_a_recording_becomes_a_page_beside_it(report: Report) -> None:
     record(report.path, SENSOR, frames())
     code, out, err = report.run(report.path, "--note", "cell 3 <b>")
     assert (code, err) == (0, f"ethercat-report: the report is in {report.out}\n")
-    assert out == "Sensor 0 (BFT-SENS-ECAT-M8, serial 4711): Good. All checks passed.\n"
+    assert out == "Sensor 0 (BFT-SENS-ECAT-M8, serial 100): Good. All checks passed.\n"
     assert "`" not in report.out.read_text()
-    words = "cell.mcap", "4711", "1.3.8", "2026-01-01 00:00:00 UTC", "cell 3 &lt;b&gt;", "✓ Good"
+    words = "cell.mcap", "100", "1.3.8", "2026-01-01 00:00:00 UTC", "cell 3 &lt;b&gt;", "✓ Good"
     assert report.lacks(*words) == []
     assert not list(report.folder.glob(".*")), "nothing is left behind"
 
 
 @pytest.mark.parametrize(("command", "code", "word"), [("warn 0x20", 0, "look"), ("warn 0x40", 1, "trouble")])
 def test_the_exit_code_is_the_verdict(report: Report, command: str, code: int, word: str) -> None:
-    report.of(describe(described(256)), simulate(6, command, seed=3, sinc_length=256))
+    report.of(description(sensor_row(sinc_length=256)), simulate(6, command, seed=3, sinc_length=256))
     found, said, _ = report.again("--json")
     [sensor] = json.loads(said)
     assert (found, sensor["verdict"]) == (code, word)
@@ -126,8 +123,10 @@ def test_too_short_a_recording_is_not_conclusive(report: Report) -> None:
 
 def test_the_longest_stretch_of_the_same_settings_counts(report: Report) -> None:
     # When it was received says nothing about when a sample was taken: the clocks differ, and it came late.
-    before = describe(described(256, fir=True))
-    code, _ = report.of(before, frames()[:SPLIT], reconfigured(described(SINC)), frames()[SPLIT:], SENSOR)
+    before = description(sensor_row(sinc_length=256, fir=True))
+    code, _ = report.of(
+        before, frames()[:SPLIT], reconfigured(SENSOR["sensors"][0]), frames()[SPLIT:], SENSOR
+    )
     assert code == 0, "the settings are those that were in force"
     words = "The settings were changed 1 time while", "reconfigured (1)", number(frames()[SPLIT:])
     assert report.lacks(*words) == []
@@ -142,21 +141,21 @@ def test_a_change_of_settings_is_no_fault_of_the_sensor(report: Report) -> None:
         for frame in simulate(3, sinc_length=256, seed=4)
     ]
     after[0] = after[0]._replace(flags=DataFlag.GAP)
-    other = described(256)
+    other = sensor_row(sinc_length=256)
     code, out = report.of(
-        SENSOR, frames()[:changing], lost, reconfigured(other), after[:10], describe(other), after[10:]
+        SENSOR, frames()[:changing], lost, reconfigured(other), after[:10], description(other), after[10:]
     )
     assert (code, "Good" in out) == (0, True)
     assert report.lacks("The settings were changed 1 time while", number(frames()[:changing])) == []
 
 
 def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(report: Report) -> None:
-    new = describe({**described(SINC), "serial": 99, "firmware": "2.0.0"})
+    new = description({**sensor_row(sinc_length=SINC), "serial": 99, "firmware": "2.0.0"})
     code, out = report.of(SENSOR, frames()[:SPLIT], new, frames()[SPLIT:])
     assert (code, "serial 99): Good" in out) == (0, True)
     words = (
         "The sensor was exchanged while",
-        "serial 4711, firmware 1.3.8;",
+        "serial 100, firmware 1.3.8;",
         "2.0.0",
         number(frames()[SPLIT:]),
     )
@@ -164,8 +163,8 @@ def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(report: Report) 
 
 
 def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(report: Report) -> None:
-    rows = [{**described(SINC), "sensor": position, "serial": 100 + position} for position in (0, 1, 2)]
-    code, out = report.of(describe(*rows), frames(), sensors="0 4")
+    rows = [sensor_row(position, sinc_length=SINC) for position in (0, 1, 2)]
+    code, out = report.of(description(*rows), frames(), sensors="0 4")
     assert (code, out.count("serial")) == (0, 1)
     assert report.lacks("Not recorded, because others were chosen: sensor 1 and 2.") == []
 

@@ -20,7 +20,8 @@ from bota_clients.report.page import as_json, render
 from bota_clients.report.plots import envelope, stretches
 from bota_clients.report.series import GROUPS
 from bota_ethercat.framing import DataFlag
-from tests.clients.simulated import decoded, described, sensor, simulate, subject_of
+from tests.clients.simulated import decoded, sensor, simulate, subject_of
+from tests.descriptions import sensor_row
 from tests.simulation import more_if_long
 
 MADE = "2026-01-01 00:01 UTC"
@@ -119,8 +120,8 @@ EVIL = "</title><script>alert(1)</script>\"'&$x^2$<img src=x onerror=y>"
 def two() -> tuple[str, str]:
     """A sensor that describes itself with markup, and one that sent nothing: the page, and the JSON."""
     row = {
-        **described(), "name": EVIL, "serial": EVIL, "hardware": EVIL, "firmware": "\u202eevil\x07",
-        "settings": {**described()["settings"], EVIL: 1, "sinc_length": EVIL},
+        **sensor_row(), "name": EVIL, "serial": EVIL, "hardware": EVIL, "firmware": "\u202eevil\x07",
+        "settings": {**sensor_row()["settings"], EVIL: 1, "sinc_length": EVIL},
     }  # fmt: skip
     first = subject_of(simulate(1), row, source=EVIL)
     examined = [
@@ -164,7 +165,7 @@ def test_nonsense_is_examined_and_drawn_without_an_error(
     spoil: Callable[[Columns], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike
-    given = subject_of(simulate(3, sinc_length=128), described(128))
+    given = subject_of(simulate(3, sinc_length=128), sensor_row(sinc_length=128))
     examination = Examination(replace(given, columns=replace(given.columns, **spoil(given.columns))))
     assert examination.headline != "Good"
     assert all(check.found.endswith(".") for check in examination.checks)

@@ -20,6 +20,7 @@ from bota_clients.identify.cli import main as identify
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
+from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.cpp_programs import (
     FAST,
     ROOT,
@@ -28,12 +29,13 @@ from tests.clients.cpp_programs import (
     Commanded,
     build,
     end_driver,
+    frame,
     needs_gxx,
     patient,
 )
-from tests.clients.played_sensor import PlayedSensor, described, frame
 from tests.clients.recordings import record
 from tests.clients.test_identify import posed
+from tests.descriptions import sensor_row
 from tests.ended import run_here
 from tests.server.running import PATIENCE_S, free_port, wait_until
 
@@ -108,8 +110,8 @@ def running(request: pytest.FixtureRequest) -> Iterator[Loop]:
 
 
 @pytest.fixture
-def server(running: Loop) -> Iterator[PlayedSensor]:
-    with PlayedSensor() as sensor:
+def server(running: Loop) -> Iterator[ScriptedServer]:
+    with ScriptedServer() as sensor:
         yield sensor
         running.do("stop")
 
@@ -289,7 +291,7 @@ def test_the_payload_from_the_file_of_an_identification(running: Loop, tmp_path:
 @pytest.mark.parametrize(
     ("flags", "parameters", "sensor", "said"),
     [
-        ("", {"serial": 8}, {}, "is BFT-SENS-ECAT-M8, serial 7, but the parameter serial is 8"),
+        ("", {"serial": 8}, {}, "is BFT-SENS-ECAT-M8, serial 100, but the parameter serial is 8"),
         ("", {}, {"calibration_matrix": False}, "sends ADC counts instead of N and Nm"),
         (
             "",
@@ -305,10 +307,10 @@ def test_the_payload_from_the_file_of_an_identification(running: Loop, tmp_path:
     ],
 )
 def test_sensors_that_cannot_give_what_the_urdf_asks_for(
-    running: Loop, flags: str, parameters: dict[str, object], sensor: dict[str, object], said: str
+    running: Loop, flags: str, parameters: dict[str, object], sensor: dict[str, Any], said: str
 ) -> None:
     running.new(*flags.split(), **parameters)
-    told = running.do("check", json.dumps({"protocol": 1, "sensors": [described(**sensor)]}))
+    told = running.do("check", json.dumps({"protocol": 1, "sensors": [sensor_row(**sensor)]}))
     assert told["why"].startswith(said)
     assert bool(told["why"]) == bool(said)
 
@@ -316,7 +318,7 @@ def test_sensors_that_cannot_give_what_the_urdf_asks_for(
 # -- connections
 
 
-def test_a_sample_is_fresh_for_four_periods_but_at_least_10_ms(running: Loop, server: PlayedSensor) -> None:
+def test_a_sample_is_fresh_for_four_periods_but_at_least_10_ms(running: Loop, server: ScriptedServer) -> None:
     assert running.new(host="127.0.0.1", port=server.port, receive_priority=0, error_after="inf") == ""
     assert running.do("open")["ok"]
     assert running.do("max_age") == 0.01
@@ -325,7 +327,7 @@ def test_a_sample_is_fresh_for_four_periods_but_at_least_10_ms(running: Loop, se
     wait_until(lambda: bool(running.do("max_age") == 0.04), "the new rate to count")
 
 
-def test_wrong_ports_positions_and_versions(running: Loop, server: PlayedSensor) -> None:
+def test_wrong_ports_positions_and_versions(running: Loop, server: ScriptedServer) -> None:
     assert "nobody listens there" in running.refused(free_port())
     assert "sensor 3 is not on the bus" in running.refused(server.port, sensor=3)
     server.description["protocol"] = 2
@@ -336,12 +338,12 @@ def test_the_server_may_come_later(running: Loop) -> None:
     port = free_port()
     running.new(host="127.0.0.1", port=port, connect_timeout=60)
     running.begin("open")
-    with PlayedSensor(port):
+    with ScriptedServer(port):
         assert running.answer()["ok"]
         running.do("stop")
 
 
-def test_it_becomes_usable_with_the_first_sample(running: Loop, server: PlayedSensor) -> None:
+def test_it_becomes_usable_with_the_first_sample(running: Loop, server: ScriptedServer) -> None:
     loop = running.opened(server.port)
     seen = loop.read()
     assert (seen["force.x"], seen["condition"], seen["age"]) == (None, SILENT, math.inf)
@@ -354,7 +356,7 @@ def test_it_becomes_usable_with_the_first_sample(running: Loop, server: PlayedSe
     assert loop.read()["force.x"] > 1
 
 
-def test_stale_samples_and_a_lost_sensor(running: Loop, server: PlayedSensor) -> None:
+def test_stale_samples_and_a_lost_sensor(running: Loop, server: ScriptedServer) -> None:
     loop = running.opened(server.port, max_age=0.05, on_stale="hold", error_after=0.2)
     server.send(frame(1))
     loop.until(FRESH)
@@ -373,7 +375,7 @@ def test_stale_samples_and_a_lost_sensor(running: Loop, server: PlayedSensor) ->
     assert loop.until(FRESH)["force.x"] == 3
 
 
-def test_settings_that_changed_are_checked(running: Loop, server: PlayedSensor) -> None:
+def test_settings_that_changed_are_checked(running: Loop, server: ScriptedServer) -> None:
     loop = running.opened(server.port)
     server.send(frame(1))
     loop.until(FRESH)
@@ -402,7 +404,7 @@ def test_settings_that_changed_are_checked(running: Loop, server: PlayedSensor) 
     loop.until(UNCHECKED)
 
 
-def test_a_tare_in_any_pose_is_right_in_every_pose(running: Loop, server: PlayedSensor) -> None:
+def test_a_tare_in_any_pose_is_right_in_every_pose(running: Loop, server: ScriptedServer) -> None:
     """The sensor's offset becomes what makes it read the load of the tool, which is then subtracted."""
     loop = running.opened(server.port, bias="9,0,0,0,0,0", tool_mass=2, tool_center_of_gravity="0,0,0.1")
     loop.begin("tare")
@@ -423,7 +425,7 @@ def test_a_tare_in_any_pose_is_right_in_every_pose(running: Loop, server: Played
 
 def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> None:
     """Two sample periods: the newest force is that of the acceleration two samples before."""
-    with PlayedSensor(rate_hz=100, delay_ms={"force_torque": 25.0, "acceleration": 5.0}) as server:
+    with ScriptedServer(rate_hz=100, delay_ms={"force_torque": 25.0, "acceleration": 5.0}) as server:
         loop = running.opened(server.port, tool_mass=1)
         begin_ns = time.monotonic_ns() - 50_000_000
         for number in range(1, 5):
@@ -434,7 +436,7 @@ def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> Non
         loop.do("stop")
 
 
-def test_the_first_sample_while_the_sensor_turns(running: Loop, server: PlayedSensor) -> None:
+def test_the_first_sample_while_the_sensor_turns(running: Loop, server: ScriptedServer) -> None:
     """How fast it spins up, and so the inertia of the tool, is not known yet."""
     loop = running.opened(server.port, "compensated", tool_mass=1, on_invalid="hold")
     begin_ns = time.monotonic_ns()
@@ -446,7 +448,7 @@ def test_the_first_sample_while_the_sensor_turns(running: Loop, server: PlayedSe
     assert seen["compensated.force.x"] == pytest.approx(2)
 
 
-def test_a_tare_without_a_payload_and_one_that_is_refused(running: Loop, server: PlayedSensor) -> None:
+def test_a_tare_without_a_payload_and_one_that_is_refused(running: Loop, server: ScriptedServer) -> None:
     loop = running.opened(server.port)
     assert loop.do("tare")["ok"]
     loop.logged("info: tared to zero in this pose, the weight of a tool included")
@@ -459,17 +461,17 @@ def test_a_tare_without_a_payload_and_one_that_is_refused(running: Loop, server:
 
 
 def test_another_sensor_in_its_place_is_refused(running: Loop) -> None:
-    with PlayedSensor() as first:
+    with ScriptedServer() as first:
         loop = running.opened(first.port, max_age=0.3)
         first.send(frame(1))
         loop.until(FRESH)
-    with PlayedSensor(first.port, serial=8) as other:
+    with ScriptedServer(first.port, serial=8) as other:
         loop.logged(
-            "sensor 0 is BFT-SENS-ECAT-M8, serial 8, and was BFT-SENS-ECAT-M8, serial 7, when configured"
+            "sensor 0 is BFT-SENS-ECAT-M8, serial 8, and was BFT-SENS-ECAT-M8, serial 100, when configured"
         )
         other.send(frame(2))
         loop.until(UNCHECKED, lambda seen: seen["force.x"] is None)
-    with PlayedSensor(first.port) as same:
+    with ScriptedServer(first.port) as same:
         loop.logged("connected again")
         loop.until(SILENT)
         same.send(frame(2))
@@ -477,7 +479,7 @@ def test_another_sensor_in_its_place_is_refused(running: Loop) -> None:
         loop.do("stop")
 
 
-def test_a_cycle_makes_no_system_call(running: Loop, server: PlayedSensor) -> None:
+def test_a_cycle_makes_no_system_call(running: Loop, server: ScriptedServer) -> None:
     """The kernel kills the program for any other system call, also while the connection is made anew."""
     loop = running.opened(server.port)
     server.send(frame(1))
@@ -491,7 +493,7 @@ def test_a_cycle_makes_no_system_call(running: Loop, server: PlayedSensor) -> No
 def test_the_two_threads_under_the_thread_sanitizer() -> None:
     """Real seconds: a server that comes and goes while a loop runs at 1 kHz."""
     loop = Loop(program(THREADS))
-    with PlayedSensor() as first:
+    with ScriptedServer() as first:
         port = first.port
         loop.opened(port)
         loop.begin("run", 8, 1000)
@@ -501,7 +503,7 @@ def test_the_two_threads_under_the_thread_sanitizer() -> None:
                 first.send(frame(int(time.monotonic() * 1e6)))
                 first.reconfigure(rate_hz=400)
     for _ in range(20):
-        with PlayedSensor(port) as again:
+        with ScriptedServer(port) as again:
             wait_until(lambda: bool(again.streams), "the next connection")
             again.send(frame(int(time.monotonic() * 1e6)))
     told = loop.answer()

@@ -32,9 +32,9 @@ from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
-from tests.bridge.scripted_server import ScriptedServer, description, process_data
+from tests.bridge.scripted_server import MemoryServer, ScriptedChannel, ScriptedServer, process_data
+from tests.descriptions import description, sensor_row
 from tests.golden_vectors import odd_messages
-from tests.protocol.scripted_channel import MemoryServer, ScriptedChannel
 from tests.server.running import PATIENCE_S, free_port, full_listener
 from tests.simulation import MemoryChannel, Simulation
 
@@ -664,7 +664,7 @@ BEGINNINGS: dict[str, tuple[Callable[[MemoryServer], object], str]] = {
     "computer off": (lambda server: setattr(server, "is_there", False), "no force: disconnected"),
     "server hangs": (lambda server: server.answers.update(describe=lambda _: None), "no force: disconnected"),
     "refused": (lambda server: server.answers.update(subscribe=lambda _: {"ok": False}), "no force: disconn"),
-    "no sensor": (lambda server: setattr(server, "description", description(1)), "no force: disconnected"),
+    "no sensor": (lambda server: server.description.update(sensors=[sensor_row(1)]), "no force: disconn"),
     "another program": (
         lambda server: setattr(server, "receive", lambda *_: server.send_raw(b"HTTP/1.1 400 Bad\r\n")),
         "no force: disconnected",

@@ -13,6 +13,7 @@ from bota_ethercat.client import Client
 from bota_ethercat.framing import DataMessage, encode_data
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
 from bota_ethercat.text.json_text import JsonObject
+from tests.bridge.scripted_server import MemoryServer, ScriptedChannel
 from tests.golden_vectors import (
     ACCOUNTED,
     BEGIN_NS,
@@ -28,7 +29,6 @@ from tests.golden_vectors import (
     outcomes,
     same_sample,
 )
-from tests.protocol.scripted_channel import MemoryServer, ScriptedChannel
 
 
 def test_samples() -> None:

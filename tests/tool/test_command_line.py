@@ -24,7 +24,8 @@ from ethercat_server.tool.cli import COMMANDS
 from ethercat_server.tool.settings import RESTORABLE
 from ethercat_server.virtual_sensor.device import build_image
 from ethercat_server.virtual_sensor.dictionary import sensor_device
-from tests.bridge.scripted_server import ScriptedServer, description
+from tests.bridge.scripted_server import ScriptedServer
+from tests.descriptions import description
 from tests.server.running import needs_bus
 from tests.tool.running import one_sentence, refused, tool_here
 
