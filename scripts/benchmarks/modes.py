@@ -1,9 +1,9 @@
 """What `scripts/benchmark` measures, as rows, and how a row is shown.
 
-The comparison is of this project with a bare C program and Bota's driver, on virtual sensors. This project
-and the C program alternate in short turns, so that the machine's noise meets both. Bota's closed Python
-driver (package bota-driver) is no dependency of the project: scripts/benchmark installs it into .venv-vendor
-before the program enters its network namespace.
+The comparison is of this project with a bare C program, a loop of pysoem and Bota's driver, on virtual
+sensors. This project and the C program alternate in short turns, so that the machine's noise meets both.
+Bota's closed Python driver (package bota-driver) is no dependency of the project: scripts/benchmark installs
+it into .venv-vendor before the program enters its network namespace.
 """
 
 from __future__ import annotations
@@ -18,7 +18,17 @@ from typing import Final
 import numpy as np
 
 from scripts.benchmarks import statistics
-from scripts.benchmarks.chain import PROCESSES, WARM_UP_S, Chain, Child, Figures, ScriptError, Setup, Turn
+from scripts.benchmarks.chain import (
+    PROCESSES,
+    WARM_UP_S,
+    Chain,
+    Child,
+    Figures,
+    ScriptError,
+    Setup,
+    Turn,
+    own_cpus,
+)
 from scripts.benchmarks.processes.masters import build
 from scripts.benchmarks.records import REAL_TIME
 
@@ -31,7 +41,7 @@ _OTHER: Final = (
     f"PYTHONPATH={VENDOR.with_name('protocol')}",
 )  # fmt: skip
 THIS, C_CLIENT, BARE_C = "this", "this, C client", "bare C"
-DRIVER, ROS = "Bota's driver", "this, ROS"
+PYSOEM, DRIVER, ROS = "pysoem", "Bota's driver", "this, ROS"
 RATIOS: Final = {
     "age_p50": ("age_us", "p50"),
     "age_p99": ("age_us", "p99"),
@@ -49,10 +59,16 @@ def _start(name: str, chain: Chain) -> Child:
             chain.directory / "server", WARM_UP_S, setup.seconds, chain.bus(), setup.sinc, setup.rate_hz,
             setup.priority,
         )  # fmt: skip
+    if name == PYSOEM:
+        return chain.python(
+            "server", f"{PROCESSES}.pysoem_loop", chain.directory / "server", WARM_UP_S, setup.seconds,
+            chain.bus(), setup.rate_hz, setup.priority, own_cpus()[1],
+        )  # fmt: skip
     if name == BARE_C:
         chain.master(yardstick)
     else:
         chain.server()
+        chain.settle()
     if name == ROS:
         for position in range(setup.sensors):
             chain.node(REAL_TIME, position)
@@ -63,7 +79,15 @@ def _start(name: str, chain: Chain) -> Child:
 def turn(setup: Setup, name: str) -> Turn:
     """One run of what is compared."""
     with Chain(setup, name) as chain:
-        return chain.measure(_start(name, chain))
+        recorder = _start(name, chain)
+        return chain.measure(recorder, (lambda: _client(chain)) if name == ROS else None)
+
+
+def _client(chain: Chain) -> Child:
+    """The recorder of a client beside the subscriber: in C if that can be built, for less CPU time."""
+    yardstick = Path(os.environ["DEMO_DIRECTORY"]) / "yardstick"
+    how = ("c", yardstick, "client") if yardstick.exists() else ("tcp",)
+    return chain.recorder(*how, warm_up_s=0.0)
 
 
 def find_missing(with_driver: bool) -> dict[str, str]:
@@ -89,6 +113,7 @@ def compare(setup: Setup, with_driver: bool) -> list[Figures]:
     taken = {name: together([each[name] for each in rounds]) for name in alternating}
     if with_driver and DRIVER not in missing:
         taken[DRIVER] = turn(setup, DRIVER)
+    taken[PYSOEM] = turn(setup, PYSOEM)
     if setup.ros:
         taken[ROS] = turn(setup, ROS)
     if BARE_C in taken:
@@ -140,6 +165,7 @@ def load(setup: Setup, loops: int) -> list[Figures]:
         for how, priority in (("ordinary", 0), ("real-time", REAL_TIME))[: 1 + bool(setup.priority)]:
             with Chain(setup, f"{client}, {how}, beside {loops} loops") as chain:
                 chain.server()
+                chain.settle()
                 if client == "wrench":
                     chain.node(priority)
                 kind = ("ros", 1) if client == "wrench" else ("tcp",)
@@ -161,6 +187,13 @@ def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
     return show
 
 
+def _lost(row: Figures) -> str:
+    if "made" not in row:
+        return str(row.get("missing", ""))
+    after = f" ({row['lost_after_server']} after the server)" if "lost_after_server" in row else ""
+    return f"{row['lost']} of {row['made']}{after}"
+
+
 def _points(row: Figures, name: str) -> str:
     return " / ".join(f"{row[name][point]:.0f}" for point in ("p50", "p99", "p999"))
 
@@ -169,12 +202,16 @@ def _points(row: Figures, name: str) -> str:
 TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
     "comparison": {
         "sensors: program": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}: {row['program']}",
-        "lost": lambda row: f"{row['lost']} of {row['made']}" if "made" in row else row.get("missing", ""),
+        "lost": _lost,
+        "repeated": lambda row: str(row.get("repeated", _NONE)),
         "age p50, µs": _shown("age_us", "p50", "age_p50"),
         "p99": _shown("age_us", "p99", "age_p99"),
         "p99.9": _shown("age_us", "p999", "age_p999"),
         "stamp error p99, µs": _shown("stamp_error_us", "p99"),
         "CPU, %": _shown("cpu_percent", "server", "cpu"),
+        "settled after": lambda row: (
+            f"{row['settled']['seconds']:.1f} s, {row['lost_settling']} lost" if "settled" in row else _NONE
+        ),
     },
     "load": {
         "beside loops": lambda row: f"{row['rate_hz']} Hz, {row['loops']} loops: {row['chain']}",
