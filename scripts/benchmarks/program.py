@@ -81,7 +81,7 @@ def run(options: argparse.Namespace, *, idle_states: bool) -> None:
 
 def measure(name: str, options: argparse.Namespace, priority: int, *, ros: bool) -> list[Figures]:
     """The rows of a table, of all configurations."""
-    seconds = options.seconds or (3.0 if options.quick else 6.0)
+    seconds = options.seconds or (3.0 if options.quick else 4.5)
     if name == "path":
         return path.measure()
     whole = name == "comparison" and not options.quick
@@ -139,7 +139,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         description="Measure this project beside a bare C program.",
     )
     parser.add_argument("--quick", action="store_true", help="one configuration only, in half a minute")
-    parser.add_argument("--seconds", type=number(0.5, 3600), help="how long each chain is measured (6)")
+    parser.add_argument("--seconds", type=number(0.5, 3600), help="how long each chain is measured (4.5)")
     parser.add_argument("--json", type=Path, default="benchmark-results/benchmark.json", metavar="FILE",
                         help="where the figures go (%(default)s)")  # fmt: skip
     parser.add_argument("--page", type=Path, metavar="FILE.md",
