@@ -144,7 +144,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
                         help="where the figures go (%(default)s)")  # fmt: skip
     parser.add_argument("--page", type=Path, metavar="FILE.md",
                         help="measure all that this page has (docs/benchmark.md), and renew it")  # fmt: skip
-    parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver, too")
+    parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver and KickCAT, too")
     parser.add_argument("--rates", type=int, nargs="+", choices=_RATES_HZ, metavar="HZ",
                         help="sample rates (800 1600)")  # fmt: skip
     only = parser.add_mutually_exclusive_group()
