@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -19,17 +19,21 @@ from typing import Any, Final
 
 from bota_ethercat.client import Client
 from bota_ethercat.errors import ProtocolError
+from bota_ethercat.framing import DataFlag
+from bota_ethercat.pdo import SampleDecoder
 from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.nic import change_flags
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 from scripts.benchmarks import statistics
-from scripts.benchmarks.records import PORT, began
+from scripts.benchmarks.records import INPUT_BYTES, PORT, began, decode_clock
 from scripts.benchmarks.statistics import Floats
 
 OVERSAMPLING_HZ: Final = 51200  # the sensor's rate is this over its SINC length
 PROCESSES: Final = "scripts.benchmarks.processes"
 PPM: Final = 150.0  # error of the sensors' clocks, with alternating sign, so that samples pass each other
-WARM_UP_S: Final = 1.0
+WARM_UP_S: Final = 1.0  # from the first sample that a recorder has; the server's clocks are steady before
+_TRIALS_S: Final = 3.0  # the server decides on event times, in up to five trials of half a second
+_SETTLE_LIMIT_S: Final = 10.0  # measured is then, steady or not
 _START_TIMEOUT_S: Final = 30.0
 _STOP_TIMEOUT_S: Final = 8.0
 Figures = dict[str, Any]
@@ -107,6 +111,7 @@ class Chain(contextlib.ExitStack):
         self.setup = setup
         self.children: list[Child] = []
         self._link: Client | None = None
+        self._settling: Figures = {}
         self.directory = Path(tempfile.mkdtemp(dir=os.environ.get("DEMO_DIRECTORY")))
         self.callback(shutil.rmtree, self.directory, ignore_errors=True)
         self.callback(self.stop)
@@ -142,6 +147,28 @@ class Chain(contextlib.ExitStack):
         )  # fmt: skip
         return self.connect(self.setup.sensors)
 
+    def settle(self) -> None:
+        """Wait until the server's clocks are steady; `measure` tells when, and what was lost until then."""
+        assert self._link is not None
+        decode, old = SampleDecoder(INPUT_BYTES).decode, DataFlag.REPEATED | DataFlag.INVALID
+        numbers: list[list[int]] = [[] for _ in range(self.setup.sensors)]
+        locked_since_s, uptime_s, is_steady = 0.0, 0.0, False
+        with Client(PORT, raw=True, reconnect=False) as stream:
+            while not is_steady and uptime_s < _SETTLE_LIMIT_S:
+                self.sleep(0.05)
+                while frames := stream.poll():
+                    for frame in frames:
+                        if not frame.flags & old:
+                            clock = decode_clock(decode(frame.process_data).array)
+                            numbers[frame.sensor].append(clock.number)
+                status = self._link.ask("status")
+                uptime_s, clocks = status["uptime_s"], [each["clock"] for each in status["sensors"]]
+                if any(clock["mode"] != "locked" for clock in clocks):
+                    locked_since_s = uptime_s
+                is_steady = clocks_steady(clocks, uptime_s - locked_since_s)
+        lost = sum(statistics.span(statistics.unwrap(each))[1] for each in numbers)
+        self._settling = {"settled": {"seconds": round(uptime_s, 1)}, "lost_settling": lost}
+
     def master(self, c_program: Path) -> None:
         """Start the C program in place of the server, on its CPU."""
         setup = self.setup
@@ -170,9 +197,11 @@ class Chain(contextlib.ExitStack):
         words = [*(word for each in renamed for word in ("-r", each)), *(w for p in given for w in ("-p", p))]
         self.python(f"node {position}", "bridge.client", "--ros-args", *words)
 
-    def recorder(self, kind: str, *arguments: object, priority: int = 0) -> Child:
+    def recorder(
+        self, kind: str, *arguments: object, priority: int = 0, warm_up_s: float = WARM_UP_S
+    ) -> Child:
         """Start a recorder (processes/recorder.py, or of kind `c` the program given) that ends by itself."""
-        times = (self.directory / kind, WARM_UP_S, self.setup.seconds)
+        times = (self.directory / kind, warm_up_s, self.setup.seconds)
         if kind == "c":
             return self.start(kind, *arguments, PORT, *times)
         return self.python(kind, f"{PROCESSES}.recorder", kind, *times, priority, *arguments)
@@ -192,27 +221,45 @@ class Chain(contextlib.ExitStack):
         end = time.monotonic() + seconds
         self.wait(lambda: time.monotonic() > end, seconds=seconds + 5)
 
-    def measure(self, recorder: Child) -> Turn:
-        """Wait for a recording to be complete and end everything; what was recorded, and what it took."""
+    def measure(self, recorder: Child, beside: Callable[[], Child] | None = None) -> Turn:
+        """Wait for a recording to be complete and end everything; what was recorded, and what it took.
+
+        `beside` starts the recorder of a client at the same server when the recording begins.
+        """
         path, seconds = recorder.result, self.setup.seconds
         self.wait(began(path).exists, "nothing was received")
+        client = beside() if beside else None
         pid = next(child.pid for child in self.children if child.name == "server")
         start, before_s = time.monotonic(), used_s(pid)
         self.wait(lambda: time.monotonic() > start + seconds - 0.1 or path.exists(), seconds=seconds + 5)
         percent = 100 * (used_s(pid) - before_s) / (time.monotonic() - start)
         usage: Figures = {"cpu_percent": {"server": round(percent, 1)}}
         self.wait(path.exists, "the recording did not end")
+        if client:
+            self.wait(client.result.exists, "the client's recording did not end")
         if self._link:
             usage["hand_out_us"] = self._link.ask("status")["sensors"][0]["age_us"]
         self.stop()
-        result, ages = statistics.summary(statistics.read_arrivals(path))
-        return {**result, **usage}, ages
+        arrivals = statistics.read_arrivals(path)
+        if client:
+            usage |= statistics.lost_by_end(arrivals, statistics.read_arrivals(client.result))
+        result, ages = statistics.summary(arrivals)
+        return {**result, **usage, **self._settling}, ages
 
     def stop(self) -> list[str]:
         """End everything, the last first; what was wrong about how they ended."""
         troubles = [child.stop() for child in reversed(self.children)]
         self.children.clear()
         return [trouble for trouble in troubles if trouble]
+
+
+def clocks_steady(clocks: Sequence[Figures], locked_s: float) -> bool:
+    """Whether the sensors' clocks in `status`, locked for this time, are steady.
+
+    Event times on trial look like refused ones, so that polled stamps are decided only after all trials.
+    """
+    is_locked = all(clock["mode"] == "locked" for clock in clocks)
+    return is_locked and (all(clock["stamps"] == "hardware" for clock in clocks) or locked_s >= _TRIALS_S)
 
 
 def own_cpus() -> tuple[int, int]:

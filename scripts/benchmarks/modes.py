@@ -1,9 +1,10 @@
 """What `scripts/benchmark` measures, as rows, and how a row is shown.
 
-The comparison is of this project with a bare C program and Bota's driver, on virtual sensors. This project
-and the C program alternate in short turns, so that the machine's noise meets both. Bota's closed Python
-driver (package bota-driver) is no dependency of the project: scripts/benchmark installs it into .venv-vendor
-before the program enters its network namespace.
+The comparison is of this project with a bare C program, with loops of pysoem and KickCAT and with Bota's
+driver, on virtual sensors. This project and the C program alternate in short turns, so that the machine's
+noise meets both. KickCAT's bindings and Bota's closed Python driver (packages kickcat and bota-driver) are no
+dependencies of the project: scripts/benchmark installs them into .venv-vendor before the program enters its
+network namespace.
 """
 
 from __future__ import annotations
@@ -18,7 +19,16 @@ from typing import Final
 import numpy as np
 
 from scripts.benchmarks import statistics
-from scripts.benchmarks.chain import PROCESSES, WARM_UP_S, Chain, Child, Figures, ScriptError, Setup, Turn
+from scripts.benchmarks.chain import (
+    PROCESSES,
+    WARM_UP_S,
+    Chain,
+    Child,
+    Figures,
+    ScriptError,
+    Setup,
+    Turn,
+)
 from scripts.benchmarks.processes.masters import build
 from scripts.benchmarks.records import REAL_TIME
 
@@ -28,10 +38,16 @@ VENDOR: Final = Path(__file__).parents[2] / ".venv-vendor"
 # What the ROS packages set is not for another environment's Python, which has no package of this project.
 _OTHER: Final = (
     "env", "-u", "LD_LIBRARY_PATH", "-u", "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
-    f"PYTHONPATH={VENDOR.with_name('protocol')}",
+    f"PYTHONPATH={VENDOR.with_name('protocol')}", VENDOR / "bin" / "python", "-m",
 )  # fmt: skip
 THIS, C_CLIENT, BARE_C = "this", "this, C client", "bare C"
-DRIVER, ROS = "Bota's driver", "this, ROS"
+PYSOEM, KICKCAT, DRIVER, ROS = "pysoem", "KickCAT", "Bota's driver", "this, ROS"
+_POLLERS: Final[Mapping[str, Sequence[object]]] = {
+    PYSOEM: (sys.executable, "-m", f"{PROCESSES}.poller", "pysoem"),
+    KICKCAT: (*_OTHER, f"{PROCESSES}.poller", "kickcat"),
+    DRIVER: (*_OTHER, f"{PROCESSES}.vendor_driver"),
+}
+_PACKAGES: Final = {KICKCAT: "kickcat", DRIVER: "bota-driver"}  # of scripts/benchmark --vendor
 RATIOS: Final = {
     "age_p50": ("age_us", "p50"),
     "age_p99": ("age_us", "p99"),
@@ -43,16 +59,14 @@ RATIOS: Final = {
 def _start(name: str, chain: Chain) -> Child:
     """Start what is compared; the recorder of what arrives."""
     setup, yardstick = chain.setup, Path(os.environ["DEMO_DIRECTORY"]) / "yardstick"
-    if name == DRIVER:  # with the server's priority, for which it does not ask
-        return chain.start(
-            "server", *_OTHER, VENDOR / "bin" / "python", "-m", f"{PROCESSES}.vendor_driver",
-            chain.directory / "server", WARM_UP_S, setup.seconds, chain.bus(), setup.sinc, setup.rate_hz,
-            setup.priority,
-        )  # fmt: skip
+    if name in _POLLERS:  # with the server's priority, for which they do not ask
+        how = (WARM_UP_S, setup.seconds, chain.bus(), setup.sinc, setup.rate_hz, setup.priority)
+        return chain.start("server", *_POLLERS[name], chain.directory / "server", *how)
     if name == BARE_C:
         chain.master(yardstick)
     else:
         chain.server()
+        chain.settle()
     if name == ROS:
         for position in range(setup.sensors):
             chain.node(REAL_TIME, position)
@@ -63,34 +77,41 @@ def _start(name: str, chain: Chain) -> Child:
 def turn(setup: Setup, name: str) -> Turn:
     """One run of what is compared."""
     with Chain(setup, name) as chain:
-        return chain.measure(_start(name, chain))
+        recorder = _start(name, chain)
+        return chain.measure(recorder, (lambda: _client(chain)) if name == ROS else None)
 
 
-def find_missing(with_driver: bool) -> dict[str, str]:
+def _client(chain: Chain) -> Child:
+    """The recorder of a client beside the subscriber: in C if that can be built, for less CPU time."""
+    yardstick = Path(os.environ["DEMO_DIRECTORY"]) / "yardstick"
+    how = ("c", yardstick, "client") if yardstick.exists() else ("tcp",)
+    return chain.recorder(*how, warm_up_s=0.0)
+
+
+def find_missing(others: Sequence[str]) -> dict[str, str]:
     """Build the C program; which of the others cannot be compared here, and why."""
     missing = {}
     try:
         build(Path(os.environ["DEMO_DIRECTORY"]))
     except ScriptError as error:
         missing[BARE_C] = str(error)
-    if with_driver and not [*VENDOR.glob("has-bota-driver*")]:
-        missing[DRIVER] = "bota-driver could not be installed by scripts/benchmark"
+    for name in others:
+        if not [*VENDOR.glob(f"has-{_PACKAGES[name]}*")]:
+            missing[name] = f"{_PACKAGES[name]} could not be installed by scripts/benchmark"
     return missing
 
 
-def compare(setup: Setup, with_driver: bool) -> list[Figures]:
+def compare(setup: Setup, with_others: bool) -> list[Figures]:
     """A row for each program."""
-    with_driver = with_driver and setup.sensors == 1  # it knows one sensor only
-    missing = find_missing(with_driver)
+    others = [*_PACKAGES] if with_others and setup.sensors == 1 else []  # the driver knows one sensor only
+    missing = find_missing(others)
     alternating = [THIS] if BARE_C in missing else [THIS, C_CLIENT, BARE_C]
     count = max(1, min(_MAX_TURNS, int(setup.seconds)))
     short = replace(setup, seconds=setup.seconds / count)
     rounds = [{name: turn(short, name) for name in alternating} for _ in range(count)]
     taken = {name: together([each[name] for each in rounds]) for name in alternating}
-    if with_driver and DRIVER not in missing:
-        taken[DRIVER] = turn(setup, DRIVER)
-    if setup.ros:
-        taken[ROS] = turn(setup, ROS)
+    last = [PYSOEM, *(name for name in others if name not in missing), *[ROS] * setup.ros]
+    taken |= {name: turn(setup, name) for name in last}
     if BARE_C in taken:
         taken[C_CLIENT][0]["ratio"] = ratios(*([each[by] for each in rounds] for by in (C_CLIENT, BARE_C)))
     rows: list[Figures] = [{"program": name, **figures} for name, (figures, _) in taken.items()]
@@ -140,6 +161,7 @@ def load(setup: Setup, loops: int) -> list[Figures]:
         for how, priority in (("ordinary", 0), ("real-time", REAL_TIME))[: 1 + bool(setup.priority)]:
             with Chain(setup, f"{client}, {how}, beside {loops} loops") as chain:
                 chain.server()
+                chain.settle()
                 if client == "wrench":
                     chain.node(priority)
                 kind = ("ros", 1) if client == "wrench" else ("tcp",)
@@ -161,6 +183,13 @@ def _shown(table: str, key: str, ratio: str = "") -> Callable[[Figures], str]:
     return show
 
 
+def _lost(row: Figures) -> str:
+    if "made" not in row:
+        return str(row.get("missing", ""))
+    after = f" ({row['lost_after_server']} after the server)" if "lost_after_server" in row else ""
+    return f"{row['lost']} of {row['made']}{after}"
+
+
 def _points(row: Figures, name: str) -> str:
     return " / ".join(f"{row[name][point]:.0f}" for point in ("p50", "p99", "p999"))
 
@@ -169,12 +198,16 @@ def _points(row: Figures, name: str) -> str:
 TABLES: Final[Mapping[str, Mapping[str, Callable[[Figures], str]]]] = {
     "comparison": {
         "sensors: program": lambda row: f"{row['rate_hz']} Hz, {row['sensors']}: {row['program']}",
-        "lost": lambda row: f"{row['lost']} of {row['made']}" if "made" in row else row.get("missing", ""),
+        "lost": _lost,
+        "repeated": lambda row: str(row.get("repeated", _NONE)),
         "age p50, µs": _shown("age_us", "p50", "age_p50"),
         "p99": _shown("age_us", "p99", "age_p99"),
         "p99.9": _shown("age_us", "p999", "age_p999"),
         "stamp error p99, µs": _shown("stamp_error_us", "p99"),
         "CPU, %": _shown("cpu_percent", "server", "cpu"),
+        "settled after": lambda row: (
+            f"{row['settled']['seconds']:.1f} s, {row['lost_settling']} lost" if "settled" in row else _NONE
+        ),
     },
     "load": {
         "beside loops": lambda row: f"{row['rate_hz']} Hz, {row['loops']} loops: {row['chain']}",

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from bota_ethercat.program.arguments import number
-from scripts.benchmarks import path
+from scripts.benchmarks import machine, path
 from scripts.benchmarks.chain import (
     OVERSAMPLING_HZ,
     Figures,
@@ -52,9 +52,14 @@ def run(options: argparse.Namespace, *, idle_states: bool) -> None:
         print("no ROS 2 here (rclpy): only up to a TCP client")
     wanted = dict.fromkeys((*_ON_PAGE, options.mode) if options.page else (options.mode,))
     began = time.monotonic()
+    is_timed = list(wanted) != ["path"]
+    before = machine.wake_us(priority) if is_timed else {}
     results = {name: measure(name, options, priority, ros=ros) for name in wanted}
+    wake_us = {"before": before, "after": machine.wake_us(priority)} if is_timed else None
     for name, rows in results.items():
         print(f"\n{markdown(name, rows)}")
+    if wake_us:
+        print(f"\n{machine.sentence(wake_us)}")
     content = {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "kernel": platform.release(),
@@ -62,6 +67,7 @@ def run(options: argparse.Namespace, *, idle_states: bool) -> None:
         "python": platform.python_version(),
         "idle_states": idle_states,
         "rt_priority": priority,
+        "wake_us": wake_us,
         **results,
     }
     options.json.parent.mkdir(parents=True, exist_ok=True)
@@ -75,7 +81,7 @@ def run(options: argparse.Namespace, *, idle_states: bool) -> None:
 
 def measure(name: str, options: argparse.Namespace, priority: int, *, ros: bool) -> list[Figures]:
     """The rows of a table, of all configurations."""
-    seconds = options.seconds or (3.0 if options.quick else 6.0)
+    seconds = options.seconds or (3.0 if options.quick else 4.5)
     if name == "path":
         return path.measure()
     whole = name == "comparison" and not options.quick
@@ -112,7 +118,8 @@ def renew(path: Path, content: Mapping[str, Any]) -> None:
     where = (
         f"All figures on this page but those with another date are of one run: {content['date'][:10]}, "
         f"{content['cpus']} CPUs, Linux {content['kernel'].split('-')[0]}, Python {content['python']}, "
-        f"{'with' if content['idle_states'] else 'without'} idle states."
+        f"{'with' if content['idle_states'] else 'without'} idle states. "
+        f"{machine.sentence(content['wake_us'])}"
     )
 
     def measured(match: re.Match[str]) -> str:
@@ -132,12 +139,12 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         description="Measure this project beside a bare C program.",
     )
     parser.add_argument("--quick", action="store_true", help="one configuration only, in half a minute")
-    parser.add_argument("--seconds", type=number(0.5, 3600), help="how long each chain is measured (6)")
+    parser.add_argument("--seconds", type=number(0.5, 3600), help="how long each chain is measured (4.5)")
     parser.add_argument("--json", type=Path, default="benchmark-results/benchmark.json", metavar="FILE",
                         help="where the figures go (%(default)s)")  # fmt: skip
     parser.add_argument("--page", type=Path, metavar="FILE.md",
                         help="measure all that this page has (docs/benchmark.md), and renew it")  # fmt: skip
-    parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver, too")
+    parser.add_argument("--vendor", action="store_true", help="Bota's own Python driver and KickCAT, too")
     parser.add_argument("--rates", type=int, nargs="+", choices=_RATES_HZ, metavar="HZ",
                         help="sample rates (800 1600)")  # fmt: skip
     only = parser.add_mutually_exclusive_group()

@@ -7,14 +7,16 @@ as it says itself, the same as the server says (0: it does not), CLOCK_MONOTONIC
 from __future__ import annotations
 
 import os
+import time
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 PORT: Final = 12001  # of the server and what is compared with it
 REAL_TIME: Final = 40  # SCHED_FIFO of clients, the node among them, as the launch file's `realtime:=true`
 COLUMNS: Final = 5
+INPUT_BYTES: Final = 61  # process data of a virtual sensor
 _NS: Final = 1_000_000_000
 
 
@@ -61,6 +63,15 @@ class ArrivalRecorder:
         unfinished = self._path.with_suffix(".unfinished")
         unfinished.write_bytes(self._values.tobytes())
         unfinished.replace(self._path)
+
+
+def deadlines(period_ns: int) -> Iterator[None]:
+    """Once a period at absolute instants, for a program that polls; those that have passed are left out."""
+    due = time.monotonic_ns()
+    while True:
+        time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
+        yield
+        due += period_ns * (1 + max(0, time.monotonic_ns() - due) // period_ns)
 
 
 def began(path: Path) -> Path:

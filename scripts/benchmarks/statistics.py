@@ -46,16 +46,46 @@ def read_arrivals(path: Path) -> list[Arrivals]:
         _, number, instant, stamp, received = records[records[:, 0] == position].T
         # Of the instants that it may be, the latest before the arrival, or just after it.
         wraps = (received - instant + _INSTANT_WRAP_NS // 2) // _INSTANT_WRAP_NS
-        number, instant = np.unwrap(number, period=_NUMBER_WRAP), instant + wraps * _INSTANT_WRAP_NS
+        number, instant = unwrap(number), instant + wraps * _INSTANT_WRAP_NS
         found.append(Arrivals(number, instant, stamp, received))
     return found
 
 
 def count(arrivals: Arrivals) -> dict[str, int]:
-    """Of one sensor: samples from the first to the last that arrived, and how many of them did not."""
-    numbers = np.unique(arrivals.number)
-    made = int(numbers[-1] - numbers[0]) + 1
-    return {"made": made, "lost": made - len(numbers)}
+    """Of one sensor: samples from the first to the last that arrived; those that did not, or came again."""
+    made, lost = span(arrivals.number)
+    return {"made": made, "lost": lost, "repeated": len(arrivals.number) - (made - lost)}
+
+
+def span(numbers: Ints) -> tuple[int, int]:
+    """How many samples there are from the first number to the last, and how many of them are missing."""
+    if not len(numbers):
+        return 0, 0
+    present = np.unique(numbers)
+    made = int(present[-1] - present[0]) + 1
+    return made, made - len(present)
+
+
+def unwrap(numbers: Sequence[int] | Ints) -> Ints:
+    """Numbers of samples, made continuous where those of the signal begin anew."""
+    return np.unwrap(np.array(numbers, dtype=np.int64), period=_NUMBER_WRAP).astype(np.int64)
+
+
+def lost_by_end(subscribers: Sequence[Arrivals], clients: Sequence[Arrivals]) -> dict[str, int]:
+    """What a subscriber lost while a client recorded at the same server, too, of each sensor.
+
+    Lost at the server, or before it, is what neither has; lost after it what the client alone has.
+    """
+    lost = {"lost_at_server": 0, "lost_after_server": 0}
+    for ours, theirs in zip(
+        (each.number for each in subscribers), (each.number for each in clients), strict=True
+    ):
+        begin, end = max(ours.min(), theirs.min()), min(ours.max(), theirs.max())
+        here, there = (np.unique(each[(begin <= each) & (each <= end)]) for each in (ours, theirs))
+        either = np.union1d(here, there)
+        lost["lost_at_server"] += max(0, int(end - begin) + 1) - len(either)
+        lost["lost_after_server"] += len(either) - len(here)
+    return lost
 
 
 def spread_us(values_ns: Floats) -> dict[str, float]:

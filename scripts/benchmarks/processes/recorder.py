@@ -19,14 +19,13 @@ from bota_ethercat.client import make_real_time
 from bota_ethercat.control import request
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_json
 from bota_ethercat.pdo import SampleDecoder
-from scripts.benchmarks.records import PORT, ArrivalRecorder, decode_clock
+from scripts.benchmarks.records import INPUT_BYTES, PORT, ArrivalRecorder, decode_clock
 
-SIZE: Final = 61
 _DEPTH: Final = 50
 
 
 def tcp(recording: ArrivalRecorder, port: int = PORT) -> None:
-    frames, decode = FrameDecoder(), SampleDecoder(SIZE).decode
+    frames, decode = FrameDecoder(), SampleDecoder(INPUT_BYTES).decode
     old = DataFlag.REPEATED | DataFlag.INVALID
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.sendall(encode_json(request("subscribe")))

@@ -20,7 +20,7 @@ from typing import Final
 import bota_driver  # type: ignore[import-not-found]
 
 from bota_ethercat.program.real_time import make_real_time
-from scripts.benchmarks.records import ArrivalRecorder, decode_clock
+from scripts.benchmarks.records import ArrivalRecorder, deadlines, decode_clock
 
 _ATTEMPTS: Final = 5
 
@@ -72,16 +72,13 @@ def configuration(ifname: str, sinc: int) -> bota_driver.BotaDriverConfig:
 
 def record(driver: bota_driver.BotaDriver, recording: ArrivalRecorder, period_ns: int) -> None:
     """Note everything that is returned until the time is over; when, before anything is decoded."""
-    due = time.monotonic_ns()
-    while True:
-        time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
+    for _ in deadlines(period_ns):
         frame = driver.read_frame()
         now = time.monotonic_ns()
         if not frame.status.invalid:
             clock = decode_clock((*frame.force, *frame.torque))
             if not recording.add(0, *clock, 0, now):
                 return
-        due += period_ns * (1 + max(0, now - due) // period_ns)
 
 
 if __name__ == "__main__":
