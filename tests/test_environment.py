@@ -97,7 +97,7 @@ def test_a_full_disk_is_told_before_anything_is_downloaded(tmp_path: Path) -> No
     )
     code, said = run(script + f"venv={tmp_path}/.venv lock={tmp_path}/lock; make_environment ros", tmp_path)
     assert (code, said.splitlines()[-1]) == (
-        1, f"demo: {tmp_path}/.venv needs up to 600 MB, and 120 MB are free there: "
+        1, f"demo: {tmp_path}/.venv needs up to 400 MB, and 120 MB are free there: "
         "free some, or clone to another disk",
     )  # fmt: skip
 
