@@ -291,6 +291,7 @@ def test_the_code_of_the_page_runs(code: str, tmp_path: Path, monkeypatch: pytes
     record(Path("run.mcap"), (frame(number) for number in range(1000)), **SETTINGS)
     for suffix in ("npz", "parquet"):
         run_here(main, "run.mcap", f"run.{suffix}", "--fps", 30)
+    run_here(main, "run.mcap", "samples.parquet")
     if "lerobot" in code:
         lerobot, state = (
             importlib.import_module("lerobot.datasets.lerobot_dataset"),
@@ -304,6 +305,7 @@ def test_the_code_of_the_page_runs(code: str, tmp_path: Path, monkeypatch: pytes
         made.finalize()
     found: dict[str, Any] = {}
     exec(code, found)
+    assert len(found.get("force", range(1000))) == 1000
     assert np.shape(found.get("force_torque", np.zeros((38, 32, 6)))) == (38, 32, 6)
     if "lerobot" in code:
         merged = found["LeRobotDataset"]("me/with_force", root="with_force")[20]

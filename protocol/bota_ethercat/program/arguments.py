@@ -34,7 +34,7 @@ ethercat-replay run.mcap                                   # as recorded, in pla
 ethercat-replay run.mcap --loop                            # again and again
 ethercat-replay run.mcap --speed max --server 12002        # as fast as clients read, on another port
 ethercat-export run.mcap                                   # writes run.csv
-ethercat-export run.mcap /dev/stdout                       # into a pipe
+ethercat-export run.mcap run.parquet                       # for pandas, polars, DuckDB, MATLAB
 ethercat-export run.mcap --at frames.csv                   # what was measured before each camera frame
 ethercat-report run.mcap                                   # write run.html
 ethercat-report run.mcap -o cell3.html --note 'cell 3'     # into another file, with a remark
