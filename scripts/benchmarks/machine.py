@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -21,30 +20,22 @@ _SLACK: Final = Path("/proc/self/timerslack_ns")
 
 def wake_us(priority: int) -> dict[str, float]:
     """Lateness of a bare timer on the server's CPU with its scheduling: p50, p99, p999, us."""
-    late = []
-    with _scheduled_as_server(priority):
-        due = time.monotonic_ns()
-        for _ in range(int(_SECONDS * 1e9 / _PERIOD_NS)):
-            due = max(due + _PERIOD_NS, time.monotonic_ns())
-            time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
-            late.append(time.monotonic_ns() - due)
-    return statistics.spread_us(np.array(late, dtype=np.float64))
-
-
-@contextmanager
-def _scheduled_as_server(priority: int) -> Iterator[None]:
-    """This process, whose children are not to inherit it."""
-    cpus = os.sched_getaffinity(0)
+    cpus, late = os.sched_getaffinity(0), []
     _SLACK.write_text("1000", encoding="ascii")
     try:
         os.sched_setaffinity(0, own_cpus()[1:])
         if priority:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        yield
-    finally:
+        due = time.monotonic_ns()
+        for _ in range(int(_SECONDS * 1e9 / _PERIOD_NS)):
+            due = max(due + _PERIOD_NS, time.monotonic_ns())
+            time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
+            late.append(time.monotonic_ns() - due)
+    finally:  # the processes that are measured do not inherit it
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         os.sched_setaffinity(0, cpus)
         _SLACK.write_text("0", encoding="ascii")  # the default
+    return statistics.spread_us(np.array(late, dtype=np.float64))
 
 
 def sentence(wakes: Mapping[str, Mapping[str, float]]) -> str:

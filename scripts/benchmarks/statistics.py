@@ -77,9 +77,8 @@ def lost_by_end(subscribers: Sequence[Arrivals], clients: Sequence[Arrivals]) ->
     Lost at the server, or before it, is what neither has; lost after it what the client alone has.
     """
     lost = {"lost_at_server": 0, "lost_after_server": 0}
-    for ours, theirs in zip(
-        (each.number for each in subscribers), (each.number for each in clients), strict=True
-    ):
+    for subscriber, client in zip(subscribers, clients, strict=True):
+        ours, theirs = subscriber.number, client.number
         begin, end = max(ours.min(), theirs.min()), min(ours.max(), theirs.max())
         here, there = (np.unique(each[(begin <= each) & (each <= end)]) for each in (ours, theirs))
         either = np.union1d(here, there)

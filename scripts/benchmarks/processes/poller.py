@@ -61,16 +61,8 @@ def with_kickcat(ifname: str) -> Exchange:
 LIBRARIES: Final = {"pysoem": with_pysoem, "kickcat": with_kickcat}
 
 
-def main(
-    library: str,
-    path: str,
-    warm_up_s: str,
-    seconds: str,
-    ifname: str,
-    _sinc: str,
-    rate_hz: str,
-    priority: str,
-) -> None:
+def main() -> None:
+    library, path, warm_up_s, seconds, ifname, _, rate_hz, priority = sys.argv[1:]
     recording = ArrivalRecorder(Path(path), float(warm_up_s), float(seconds))
     gc.disable()
     Path("/proc/self/timerslack_ns").write_text("1000", encoding="ascii")  # as the server's
@@ -90,4 +82,4 @@ def record(exchange: Exchange, recording: ArrivalRecorder, period_ns: int) -> No
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()
