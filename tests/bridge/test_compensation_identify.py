@@ -52,7 +52,7 @@ def test_from_poses_to_the_contact_force(started: Node, take: Take, server: Serv
     text = take(*AXES)
     assert "pose 6 taken (up is -1.00, 0.00, 0.00 in the sensor's frame)" in text
     assert "the poses suffice" in text
-    path = tmp_path / "bota-ethercat-bridge" / "sensor-1-payload.yaml"
+    path = tmp_path / "bota-ethercat-bridge" / "sensor-100-payload.yaml"
     started.do(
         "identify/solve", "mass 0.8000 ± ", "center of gravity (4.0", "Bias Fx 3.0000 Fy -1.5000 Fz 7.2500",
         "95 % confidence", "Residuals by pose, 1: ",
@@ -83,7 +83,7 @@ def test_the_accelerometers_offset_is_found_and_subtracted(
         started.do("identify/add_pose")
     started.do("identify/solve", "Accelerometer: offset x 0.196 ± ")
     offset = [0.02 * STANDARD_GRAVITY, -0.015 * STANDARD_GRAVITY, 0.0]
-    written = written_parameters(tmp_path / "bota-ethercat-bridge" / "sensor-1-payload.yaml")
+    written = written_parameters(tmp_path / "bota-ethercat-bridge" / "sensor-100-payload.yaml")
     assert written["accelerometer.offset"] == pytest.approx(offset, abs=2e-3)
     started.do("identify/apply")
     found, scale = started.parameters("accelerometer.offset", "accelerometer.scale")
@@ -111,7 +111,7 @@ def test_the_file_is_one_that_the_node_starts_with(
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_STATE_HOME", "relative")  # which does not count
     started.set("identify.file", "auto")
-    default = tmp_path / ".local" / "state" / "bota-ethercat-bridge" / "sensor-1-payload.yaml"
+    default = tmp_path / ".local" / "state" / "bota-ethercat-bridge" / "sensor-100-payload.yaml"
     started.do("identify/solve", f"Written to {default}")
     path = tmp_path / "mine.yaml"
     started.set("identify.file", str(path))
