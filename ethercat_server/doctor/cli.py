@@ -16,7 +16,7 @@ from ethercat_server.daemon.options import SERVER_SETTINGS
 from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import command_line
 
-PROGRAM: Final = "ethercat-doctor"
+_PROGRAM: Final = "ethercat-doctor"
 _EXIT_CODES: Final = "exit codes: 0 good or worth a look, 1 trouble, failed or stopped, 2 wrong arguments"
 _LONGEST_S: Final = 3600.0
 
@@ -24,7 +24,7 @@ _LONGEST_S: Final = 3600.0
 def build_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = Parser(
-        PROGRAM,
+        _PROGRAM,
         "Diagnoses latency and lost samples: kernel, processors, network card, other software, "
         "bus; then measures. Read-only. Run as root for a complete report.",
         _EXIT_CODES,
@@ -56,13 +56,13 @@ def build_parser() -> argparse.ArgumentParser:
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the doctor; returns the exit code. argparse exits with 2."""
-    command_line.begin(PROGRAM)
+    command_line.begin(_PROGRAM)
     # Missing privileges are a finding.
     logging.getLogger("ethercat_server.process.realtime").setLevel(logging.ERROR)
     args = build_parser().parse_args(argv)
     from ethercat_server.doctor.program import run  # noqa: PLC0415 - --help need not wait for it
 
-    return command_line.run(PROGRAM, lambda: run(args), as_json=args.json)
+    return command_line.run(_PROGRAM, lambda: run(args), as_json=args.json)
 
 
 if __name__ == "__main__":
