@@ -36,6 +36,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--all", action="store_true", help="CSV: also frames that are no new sample: repeated, invalid")
     add("--tool", type=Path, metavar="YAML",
         help="not CSV: also the compensated wrench, with these parameters of the ROS 2 node")  # fmt: skip
+    add("--mcap", type=Path, metavar="OUT",
+        help="write the recording into a complete MCAP file, also if it was cut off")  # fmt: skip
     add_force(made)
     group = made.add_argument_group("for each camera frame")
     add = group.add_mutually_exclusive_group().add_argument
@@ -54,10 +56,18 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="refuse frames outside of the recording (default: their windows are not valid)")  # fmt: skip
     options = made.parse_args(argv)
     has_frames = options.at is not None or options.fps is not None
-    options.output = options.output or options.recording.with_suffix(DATASETS[0] if has_frames else ".csv")
+    if options.output and options.output.suffix == ".mcap" and not options.mcap:
+        options.mcap, options.output = options.output, None
+    if options.mcap and (options.output or options.all or options.tool or has_frames):
+        made.error(
+            "--mcap writes the messages as they are: omit the other output, --all, --tool, --at, --fps"
+        )
+    options.output = (
+        options.mcap or options.output or options.recording.with_suffix(DATASETS[0] if has_frames else ".csv")
+    )
     if options.output.absolute() == options.recording.absolute():
         made.error("the output would overwrite the recording: give another name")
-    suffix = options.output.suffix
+    suffix = "" if options.mcap else options.output.suffix
     if has_frames and suffix not in DATASETS:
         made.error(f"windows of samples, with --at or --fps, are written as {', '.join(DATASETS)} only")
     if suffix == ".zarr" and not has_frames:
@@ -102,9 +112,8 @@ def run(options: argparse.Namespace) -> int:
     """
     from bota_clients.recording.reader import open_recording  # noqa: PLC0415 - needs the extra
 
-    write = import_module(
-        f"bota_clients.export.{'dataset' if options.output.suffix in DATASETS else 'table'}"
-    ).write
+    module = "whole" if options.mcap else "dataset" if options.output.suffix in DATASETS else "table"
+    write = import_module(f"bota_clients.export.{module}").write
     interrupt_on_signals()
     try:
         with open_recording(options.recording) as recording:

@@ -158,10 +158,11 @@ class RecordingWriter:
         """End the chunk and write it to disk; RecordingError if it cannot be written."""
         self._mcap.flush()  # type: ignore[no-untyped-call]
 
-    def finish(self, notes: Mapping[str, str]) -> None:
-        """Write what is buffered, index and footer, synchronize the disk and close; RecordingError."""
+    def finish(self, notes: Mapping[str, str] | None) -> None:
+        """Write what is buffered, `notes`, index and footer, synchronize the disk, close; RecordingError."""
         self.flush()
-        self._mcap.add_metadata(file_format.END_METADATA, dict(notes))
+        if notes is not None:
+            self._mcap.add_metadata(file_format.END_METADATA, dict(notes))
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._disk.flush()
         self._disk.sync()

@@ -1,0 +1,54 @@
+"""What `ethercat-export RECORDING --mcap OUT` does: all messages of a recording in a complete file.
+
+Readers other than `recording.reader` open no file without the index at its end, which a recorder that was
+killed does not write.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import tempfile
+from pathlib import Path
+from typing import Final
+
+from bota_clients.errors import RecordingError
+from bota_clients.export.cli import PROGRAM
+from bota_clients.numbers import count
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording
+from bota_clients.recording.writer import DiskFile, RecordingWriter
+from bota_ethercat.program.new_file import refuse_existing
+from bota_ethercat.program.version import VERSION
+
+_CHUNK: Final = 1024  # messages
+
+
+def write(options: argparse.Namespace, recording: Recording) -> str:
+    """Frames, descriptions and events, in file order, into a file; says how many frames. RecordingError.
+
+    A recording that was cut off has no notes at its end here either; `repaired` at its start says why.
+    """
+    path, sensor, notes = options.output, options.sensor, dict(recording.metadata)
+    if sensor is not None:
+        if sensor not in {each.sensor for each in recording.sensors if each.frames}:
+            raise RecordingError(f"{recording.path} has no samples of sensor {sensor}")
+        notes["sensors"] = str(sensor)
+    if recording.cut_off is not None:
+        notes["repaired"] = recording.cut_off
+    refuse_existing(path, force=options.force)
+    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
+        made = Path(folder, path.name)
+        with contextlib.closing(DiskFile(made, overwrite=False)) as disk:
+            writer = RecordingWriter(disk, f"{PROGRAM} {VERSION}", notes)
+            for number, item in enumerate(recording.everything(sensor)):
+                if isinstance(item, RecordedDescription):
+                    writer.describe(item.stamp_ns, item.reply)
+                elif isinstance(item, RecordedEvent):
+                    writer.event(item.stamp_ns, item.event)
+                else:
+                    writer.frame(item)
+                if number % _CHUNK == _CHUNK - 1:
+                    writer.flush()
+            writer.finish(recording.end)
+        made.replace(path)
+    return count(writer.frames, "frame")
