@@ -69,6 +69,7 @@ class Adapter(NamedTuple):
     ethernet: bool = True  # wired Ethernet, or a virtual interface like it
     master: str = ""  # bridge or bond that it is a part of
     upper: tuple[str, ...] = ()  # interfaces that stand on it, such as VLANs
+    xdp: tuple[str, ...] = ()  # where XDP programs are attached, see `nic.Interface`
     counters: Mapping[str, int] = {}
     routes: Routes = Routes()
     holder: Holder | None = None  # the EtherCAT master that uses it
@@ -120,6 +121,7 @@ def links() -> list[Adapter]:
                 each.name for each in rows
                 if each.link == row.ifindex != each.ifindex and not each.namespace and each.kind != "veth"
             ),
+            xdp=row.xdp,
             counters=dict(zip(_COUNTERS, array("Q", row.stats[: 8 * len(_COUNTERS)]), strict=False)),
         )
         for row in rows

@@ -22,7 +22,7 @@ from typing import Any, Final
 from ethercat_server.access.adapters import Adapter, links
 from ethercat_server.doctor.report import CannotLookError
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic import ethtool, find_routes, link_settings, look_up
+from ethercat_server.ethercat.nic import ethtool, find_routes, in_between, link_settings, look_up, receivers
 
 NOT_SUPPORTED: Final = "the driver does not support it"
 _DUPLEX: Final = {0: "half", 1: "full"}
@@ -52,6 +52,9 @@ FACTS: Final[Mapping[str, Callable[[str], Any]]] = {
     "settings": _settings,  # speed in Mbit/s and duplex
     "driver": _driver,  # its name, and the bus the card is on
     "coalescing": lambda ifname: dict(zip(_COALESCING, ethtool(ifname, *_GET_COALESCING), strict=True)),
+    # Processes with a copy of all frames, None for one of another user, and whether of this interface alone.
+    "receivers": lambda ifname: list(receivers(look_up(ifname).ifindex)),
+    "between": lambda ifname: (in_between(ifname) or "").split(": ", 1),  # what is there; what to do
     "EEE": lambda ifname: tuple(map(bool, ethtool(ifname, *_GET_EEE)))[::-1],  # switched on, in use
 }
 

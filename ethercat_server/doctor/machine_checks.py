@@ -30,9 +30,11 @@ from ethercat_server.doctor.report import (
 from ethercat_server.ethercat.nic import (
     ALLOW_IP,
     NEEDED_CAPABILITIES,
+    XDP,
     Routes,
     missing_capabilities,
     network_trouble,
+    xdp_removal,
 )
 
 Look = Callable[[Host], CheckResult | Iterable[CheckResult]]
@@ -342,8 +344,34 @@ def _membership(machine: Host) -> Iterator[CheckResult]:
         yield warning(
             f"below {upper}", "it (a VLAN, for instance) sends through it", f"sudo ip link delete {upper}"
         )
-    if not link.master and not link.upper:
+    between = machine.fact("between") if link.kind else [""]  # of a card `_speed` says it
+    if between[0]:
+        yield bad(*between)
+    if not (link.master or link.upper or between[0]):
         yield ok("no bridge, bond or VLAN")
+
+
+def _xdp(machine: Host) -> CheckResult:
+    found = machine.link.xdp
+    return graded(
+        f"a program is attached ({', '.join(found)})" if found else "no program",
+        (found, warning,
+         f"{XDP}; if the command says that it is busy, end that program", *xdp_removal(machine.shown, found)),
+        modes=list(found),
+    )  # fmt: skip
+
+
+def _receivers(machine: Host) -> Iterator[CheckResult]:
+    for process, only_this in machine.fact("receivers"):
+        yield (warning if only_this else note)(
+            f"process {process.pid} ({process.name})"
+            if process
+            else "a process of another user, or container",
+            "it has a packet socket that gets a copy of each frame: a capture program, or another master",
+            f"sudo kill {process.pid}" if process else "sudo ss --packet --processes",
+        )
+    if not machine.fact("receivers"):
+        yield ok("no other program gets the frames")
 
 
 CHECKS: Final[Mapping[tuple[str, str], Look]] = {
@@ -359,4 +387,6 @@ CHECKS: Final[Mapping[tuple[str, str], Look]] = {
     ("other software", "managers"): _managers,
     ("other software", "addresses"): _addresses,
     ("other software", "membership"): _membership,
+    ("other software", "XDP"): _xdp,
+    ("other software", "packet sockets"): _receivers,
 }  # by subject and name, in the order of the report

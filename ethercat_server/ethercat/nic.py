@@ -19,7 +19,7 @@ import struct
 import sys
 import time
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -118,6 +118,7 @@ _TYPE: Final = 0x3FFF
 _BUFFER: Final = 65536
 _LINK: Final = struct.Struct("=BxHiII")  # family, type, index, flags, change mask
 _ETHERNET: Final = 1
+_ALL_PROTOCOLS: Final = 3
 _IFLA_ADDRESS, _IFLA_NAME, _IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_INFO, _IFLA_STATS = (
     1,
     3,
@@ -127,7 +128,8 @@ _IFLA_ADDRESS, _IFLA_NAME, _IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_INFO, _IFL
     18,
     23,
 )
-_IFLA_CARRIER, _IFLA_LINK_NAMESPACE, _IFLA_NAMESPACE, _IFLA_ALTERNATIVE_NAME = 33, 37, 46, 53
+_IFLA_CARRIER, _IFLA_LINK_NAMESPACE, _IFLA_XDP, _IFLA_NAMESPACE, _IFLA_ALTERNATIVE_NAME = 33, 37, 43, 46, 53
+_XDP_MODES: Final = {5: "xdpdrv", 6: "xdpgeneric", 7: "xdpoffload"}  # attributes of a program, and ip's words
 _INFO_KIND: Final = 1
 _IFF_UP, _IFF_LOOPBACK, _IFF_RUNNING = 0x1, 0x8, 0x40
 IFF_PROMISC: Final = 0x100
@@ -169,6 +171,7 @@ class Interface(NamedTuple):
     namespace: bytes  # of that, as the kernel numbers namespaces; empty if it is this one
     is_ethernet: bool
     stats: bytes  # struct rtnl_link_stats64
+    xdp: tuple[str, ...]  # where XDP programs are attached, as ip calls it: xdpdrv, xdpgeneric, xdpoffload
 
 
 def look_up(interface: str | int) -> Interface:
@@ -219,6 +222,9 @@ def _interface(fixed: tuple[int, ...], found: dict[int, bytes], namespace: bytes
         namespace=found.get(_IFLA_LINK_NAMESPACE, namespace),
         is_ethernet=kind == _ETHERNET,
         stats=found.get(_IFLA_STATS, b""),
+        xdp=tuple(
+            mode for kind, mode in _XDP_MODES.items() if kind in _attributes(found.get(_IFLA_XDP, b""))
+        ),
     )
 
 
@@ -281,13 +287,14 @@ def in_between(interface: str | int) -> str | None:
     found = look_up(interface)
     if found.link and (found.namespace or found.link != found.ifindex):
         with contextlib.suppress(OSError, struct.error):  # it may not look into the other's namespace
-            other = _look_up(found.link, found.namespace)
+            port = other = _look_up(found.link, found.namespace)
             if other.kind != _BRIDGE and other.master:
                 other = _look_up(other.master, found.namespace)
             if other.kind == _BRIDGE:
+                removed = f", or 'sudo ip link set {port.name} nomaster'" if port.name != other.name else ""
                 return (
                     f"{found.name} is connected to {other.name}, {_DROPS}: connect the sensor to "
-                    f"{found.name} itself"
+                    f"{found.name} itself{removed}"
                 )
     elif not found.kind and (mbits := _link_mbits(found.name)) > _ETHERCAT_MBITS:
         return (
@@ -321,10 +328,42 @@ def _link_mbits(name: str) -> int:
         return 0
 
 
+XDP: Final = "an XDP program, which may drop its frames and stays when the program that loaded it has ended"
+
+
+def xdp_removal(name: str, modes: Iterable[str]) -> tuple[str, ...]:
+    """The commands that remove the XDP programs from the interface `name`; `modes` are `Interface.xdp`."""
+    return tuple(f"sudo ip link set dev {name} {mode} off" for mode in modes)
+
+
+def receivers(index: int) -> Iterator[tuple[Process | None, bool]]:
+    """Those that get a copy of all frames of an interface, and whether it is the only one they listen on.
+
+    None for processes that this user cannot see.
+    """
+    bound = {
+        row.inode: row.ifindex == index
+        for row in packet_sockets()
+        if row.protocol == _ALL_PROTOCOLS and row.ifindex in {0, index}
+    }
+    unknown = {*bound}
+    for process in users_of({*bound}) if bound else ():
+        own = process.sockets & bound.keys()
+        unknown -= own
+        yield process, any(bound[inode] for inode in own)
+    if unknown:
+        yield None, any(bound[inode] for inode in unknown)
+
+
 def why_silent(interface: str | int) -> str:
     """The interface's part in frames not coming back, and what to do."""
     try:
-        return trouble(interface) or in_between(interface) or CHECK_CABLE
+        found = look_up(interface)
+        if problem := trouble(interface) or in_between(interface):
+            return problem
+        if found.xdp:
+            return f"{found.name} has {XDP}: '{xdp_removal(found.name, found.xdp)[0]}'"
+        return CHECK_CABLE
     except InterfaceError as error:
         return str(error)
 

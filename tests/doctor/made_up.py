@@ -22,6 +22,8 @@ FACTS: Facts = {
     "driver": ("e1000e", "0000:00:1f.6"),
     "coalescing": {"rx_coalesce_usecs": 0, "tx_coalesce_usecs": 0, "use_adaptive_rx_coalesce": 0},
     "EEE": (False, False),
+    "between": [""],
+    "receivers": [],
 }
 Files = Mapping[str, str | bytes | None]
 GOOD: Files = {

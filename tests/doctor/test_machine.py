@@ -15,7 +15,7 @@ from ethercat_server.doctor.machine import FACTS, Host, processor_list
 from ethercat_server.doctor.machine_checks import CHECKS, examine_machine, rising
 from ethercat_server.doctor.report import CannotLookError, CheckResult, bad, examine, ok
 from ethercat_server.errors import BusError
-from ethercat_server.ethercat.nic import Routes
+from ethercat_server.ethercat.nic import Process, Routes
 from tests.doctor.made_up import CPUS, GOOD, Facts, Files, but, machine
 
 SKIP, FINE, NOTE, LOOK, BAD = Level.NOT_POSSIBLE, Level.GOOD, Level.NOTE, Level.LOOK, Level.TROUBLE
@@ -170,6 +170,13 @@ SOFTWARE = [
     Case("membership", BAD, facts=but(link={"master": "br0"}), commands=["sudo ip link set ens5 nomaster"]),
     Case("membership", LOOK, facts=but(link={"upper": ("ens5.10",)}),
          commands=["sudo ip link delete ens5.10"]),
+    Case("membership", BAD, facts=but(link={"kind": "veth"}, between=["connected to br0", "remove it"]),
+         said="connected to br0\nremove it"),
+    Case("XDP", LOOK, facts=but(link={"xdp": ("xdpdrv", "xdpgeneric")}), said="xdpdrv, xdpgeneric",
+         commands=[f"sudo ip link set dev ens5 {mode} off" for mode in ("xdpdrv", "xdpgeneric")]),
+    Case("packet sockets", LOOK, facts=but(receivers=[(Process(70, "tcpdump", set()), True)]),
+         said="process 70 (tcpdump)", commands=["sudo kill 70"]),
+    Case("packet sockets", NOTE, facts=but(receivers=[(None, False)]), said="of another user"),
 ]  # fmt: skip
 
 

@@ -6,13 +6,21 @@ What it makes of the answers is tested on made-up machines and simulated buses.
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import errno
+import os
+import platform
+import shlex
 import signal
+import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
 
 import pytest
 
+from ethercat_server.ethercat.nic import look_up, why_silent
 from tests import rights
 from tests.doctor.running import MODULE, STARVED, doctor, doctor_here, doctor_of_nobody, levels
 from tests.rights import NOBODY
@@ -137,3 +145,90 @@ def test_virtual_brings_a_bus_of_its_own_and_takes_it_away() -> None:
     assert "ecat" not in str([row["commands"] for row in ended.json["findings"]]), (
         "what is gone needs no mending"
     )
+
+
+ETH_P_ALL = 3
+BPF = {"x86_64": 321, "aarch64": 280}  # the system call's number
+BPF_PROG_LOAD, PROG_TYPE_XDP, XDP_DROP = 5, 6, 1
+NEWLINK, REQUEST_ACK, NESTED, IFLA_XDP, XDP_FD, XDP_FLAGS = 16, 0x5, 0x8000, 43, 1, 3
+
+
+def attach_xdp(ifname: str, mode: int) -> None:
+    """Attach a program that drops every frame, and forget it, as a master does that ends."""
+    code = ctypes.create_string_buffer(struct.pack("=BBhiBBhi", 0xB7, 0, 0, XDP_DROP, 0x95, 0, 0, 0))
+    name = ctypes.create_string_buffer(b"GPL")
+    asked = struct.pack("=IIQQ", PROG_TYPE_XDP, 2, ctypes.addressof(code), ctypes.addressof(name))
+    libc = ctypes.CDLL(None, use_errno=True)
+    program = libc.syscall(BPF[platform.machine()], BPF_PROG_LOAD, asked.ljust(128, b"\0"), 128)
+    if program < 0 and ctypes.get_errno() in {errno.EPERM, errno.ENOSYS}:
+        pytest.skip("no BPF programs may be loaded here")
+    assert program >= 0, os.strerror(ctypes.get_errno())
+    xdp = struct.pack("=HHiHHI", 8, XDP_FD, program, 8, XDP_FLAGS, mode)
+    body = (
+        struct.pack("=BxHiIIHH", 0, 0, look_up(ifname).ifindex, 0, 0, 4 + len(xdp), IFLA_XDP | 0x8000) + xdp
+    )
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as kernel:
+        kernel.send(struct.pack("=IHHII", 16 + len(body), NEWLINK, REQUEST_ACK, 1, 0) + body)
+        (error,) = struct.unpack_from("=i", kernel.recv(4096), 16)
+    os.close(program)
+    assert error == 0, os.strerror(-error)
+
+
+def obey(commands: list[str]) -> None:
+    """Run what the doctor advises, as root."""
+    for command in commands:
+        sudo, *words = shlex.split(command)
+        assert sudo == "sudo"
+        subprocess.run(words, check=True)
+
+
+@pytest.mark.parametrize(("mode", "name"), [(1 << 1, "xdpgeneric"), (1 << 2, "xdpdrv")])
+def test_an_xdp_program_that_was_left_is_why_nothing_answers_until_its_command_removes_it(
+    bench: Bench, mode: int, name: str
+) -> None:
+    near = bench[0].near
+    attach_xdp(near, mode)
+    ended = doctor_here(near, *LOOK)
+    found, silent = ended.findings("other software")["XDP"], ended.findings("bus")["slaves"]
+    command = f"sudo ip link set dev {near} {name} off"
+    assert (found["level"], found["commands"]) == ("warning", [command])
+    assert silent["found"] == "no EtherCAT slave answers"
+    assert f"'{command}'" in silent["why"]
+    obey(found["commands"])
+    assert (look_up(near).xdp, why_silent(near)) == ((), "check cable and power")
+    ended = doctor_here(near, *LOOK)
+    assert ended.findings("other software")["XDP"]["level"] == "ok"
+    assert ended.findings("bus")["slaves"]["values"] == {"slaves": 2}
+
+
+def test_who_has_a_packet_socket_with_a_copy_of_each_frame_is_named_until_it_is_ended(bench: Bench) -> None:
+    """On this interface, on all; not those on another interface or of another protocol."""
+    near, far = bench[0].near, bench[0].far
+    script = (
+        "import socket, sys; name, protocol = sys.argv[1], int(sys.argv[2])\n"
+        "s = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(0 if name else protocol))\n"
+        "if name: s.bind((name, protocol))\n"
+        "print(flush=True); input()"
+    )
+    programs, pipe = [], subprocess.PIPE
+    with contextlib.ExitStack() as stack:
+        for name, protocol in ((near, ETH_P_ALL), ("", ETH_P_ALL), (far, ETH_P_ALL), (near, 0x88CC)):
+            words = [sys.executable, "-c", script, name, str(protocol)]
+            program = stack.enter_context(subprocess.Popen(words, stdin=pipe, stdout=pipe))
+            stack.callback(program.kill)
+            assert program.stdout is not None
+            assert program.stdout.readline() == b"\n"
+            programs.append(program)
+        rows = [
+            row for row in doctor_here(near, *LOOK).json["findings"]
+            if row["check"] == "packet sockets" and row["commands"] and row["commands"][0].split()[-1]
+            in {str(program.pid) for program in programs}
+        ]  # fmt: skip
+        first, second = programs[:2]
+        assert {row["commands"][0]: row["level"] for row in rows} == {
+            f"sudo kill {first.pid}": "warning",
+            f"sudo kill {second.pid}": "note",
+        }
+        obey([command for row in rows for command in row["commands"]])
+        assert [first.wait(PATIENCE_S), second.wait(PATIENCE_S)] == [-signal.SIGTERM] * 2
+    assert doctor_here(near, *LOOK).findings("other software")["packet sockets"]["level"] in {"ok", "note"}

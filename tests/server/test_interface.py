@@ -165,10 +165,13 @@ def test_a_bridge_on_the_way_is_why_no_slave_answers(elsewhere: bool) -> None:
         assert (
             f"no EtherCAT slave answers on {veth.near}: {why}" in tool_here("eeprom", veth.near, code=1).err
         )
-        found = doctor_here(veth.near, "--seconds", 0, "--json").findings("bus")["slaves"]
+        ended = doctor_here(veth.near, "--seconds", 0, "--json")
+        found, member = ended.findings("bus")["slaves"], ended.findings("other software")["membership"]
         assert found["found"] == "no EtherCAT slave answers"
         assert found["why"].startswith(why)
+        assert (member["level"], f"{member['found']}: {member['why']}") == ("bad", found["why"])
         if not elsewhere:
+            assert found["why"].endswith(f", or 'sudo ip link set {veth.far} nomaster'")
             assert f"{bridge} is a bridge, which drops EtherCAT frames" in refusal(bridge)
             veth.ip("link", "add", "link", bridge, "name", f"m{bridge}", "up", "type", "macvlan")
             assert f"m{bridge} is connected to {bridge}, a bridge" in why_silent(f"m{bridge}")
