@@ -244,16 +244,16 @@ def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
                 continue  # no IPv6, or no address ::1, on this machine
             for other in listeners:
                 other.close()
-            raise ServerError(f"port {port} on {host} {_reason(error)}") from None
+            raise ServerError(f"port {port} on {host} {_reason(error, port)}") from None
         listener.setblocking(False)
         listeners.append(listener)
     return listeners
 
 
-def _reason(error: OSError) -> str:
+def _reason(error: OSError, port: int) -> str:
     """Why an address cannot be used, and what to do."""
     if error.errno == errno.EADDRINUSE:
-        return "is in use by another program; stop that program or choose another port"
+        return f"is in use by another program ('ss -ltnp'): stop that one, or choose port {port % 65535 + 1}"
     if error.errno == errno.EADDRNOTAVAIL:
         return "cannot be used: no interface of this machine has this address; 'ip address' lists them"
     return f"cannot be used: {os.strerror(error.errno or 0)}; choose another"
