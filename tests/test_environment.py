@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from typing import Final
 import pytest
 
 from tests.rights import NOBODY, needs_another_user
+from tests.server.running import needs_bus
 
 ROOT: Final = Path(__file__).parent.parent
 PIP: Final = """
@@ -104,6 +106,30 @@ def test_a_full_disk_is_told_before_anything_is_downloaded(tmp_path: Path) -> No
 
 def test_the_demo_needs_no_tools_of_developers() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    (asked,) = re.findall(r"^make_owners_environment (\S+)", (ROOT / "scripts/demo").read_text(), re.M)
-    names = {re.split(r"[\[=<>]", line)[0] for extra in asked.split(",") for line in extras[extra]}
-    assert names == {"ros-rclpy", "ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "numpy"}
+    asked = re.findall(r"\bextra=(\w+)", (ROOT / "scripts/demo").read_text())
+    with_ros, without = ({re.split(r"[\[=<>]", line)[0] for line in extras[extra]} for extra in asked)
+    assert with_ros == {"ros-rclpy", "ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "numpy"}
+    assert without == {"mcap", "rich", "textual", "zstandard"}
+    assert {*extras["monitor"]} < {*extras["client"]}
+
+
+@needs_bus
+@pytest.mark.bus
+def test_the_demo_without_ros_ends_with_what_the_monitor_knows_and_leaves_nothing(tmp_path: Path) -> None:
+    """Where matplotlib, numpy and rclpy cannot be imported."""
+    blocked = tmp_path / "blocked"
+    for name in ("matplotlib", "numpy", "rclpy"):
+        (blocked / name).mkdir(parents=True)
+        (blocked / name / "__init__.py").write_text("raise ImportError(__name__)")
+    own = tmp_path / "own"
+    own.mkdir()
+    paths = os.pathsep.join(map(str, (blocked, *sys.path[1:])))
+    command = ["unshare", "--net", sys.executable, "-m", "scripts.demonstration.monitor"]
+    ended = subprocess.run(
+        [*command, "--seconds", "0.5"], check=False, cwd=ROOT, capture_output=True, text=True, timeout=100,
+        env={**os.environ, "PYTHONPATH": paths, "DEMO_DIRECTORY": str(own)},
+    )  # fmt: skip
+    assert "of 800 Hz" in ended.stdout, ended
+    assert "BFT-SENS-ECAT-M8" in ended.stdout
+    assert ended.returncode == ("\nTrouble: " in ended.stdout)
+    assert not own.exists()
