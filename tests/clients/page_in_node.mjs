@@ -49,6 +49,7 @@ await import(pathToFileURL(process.argv[2]));
 socket.onopen();
 for (const data of fs.readFileSync(0, "utf8").trim().split("\n")) socket.onmessage({ data });
 frame(performance.now() + 1e6);
+ids.record.click();
 ids.tare.click();
 ids.ask.click({ target: { value: "tare" } });
 console.log(JSON.stringify({ sent, ...Object.fromEntries(Object.entries(ids).map(([id, each]) => [id, each.text])) }));

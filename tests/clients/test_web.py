@@ -199,7 +199,7 @@ def test_a_message_that_no_page_sends_ends_the_connection(web: Harness, text: st
 # Who may.
 
 
-@pytest.mark.parametrize("action", ["tare", "clear", "reset"])
+@pytest.mark.parametrize("action", ["tare", "clear", "reset", "record"])
 def test_without_the_token_which_no_one_guesses_nothing_is_done(web: Harness, action: str) -> None:
     token = web.pages.token
     assert re.fullmatch(r"[\w-]{32,}", token)
@@ -214,7 +214,7 @@ def test_without_the_token_which_no_one_guesses_nothing_is_done(web: Harness, ac
         "control": False,
         "refused": "Only a page opened by the link that ethercat-monitor printed may do this",
     }
-    assert (web.tared, web.message()) == ([], "")
+    assert (web.tared, web.message(), web.recorder.running) == ([], "", False)
 
 
 def test_with_the_token_the_sensor_is_tared_once_at_a_time(web: Harness) -> None:
@@ -349,7 +349,8 @@ def test_the_page_shows_what_it_is_sent_as_text_and_tares(web: Harness, tmp_path
         "two in ten milliseconds"
     )
     assert shown["sent"][0] == "address /", "the token does not stay in it"
-    assert shown["sent"][-1] == '{"do":"tare","sensor":0}'
+    assert shown["record"] == "Record"
+    assert shown["sent"][-2:] == ['{"do":"record"}', '{"do":"tare","sensor":0}']
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import re
 import signal
 import socket
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,10 +20,12 @@ from websockets.typing import Origin
 from bota_clients.monitor import cli
 from bota_clients.monitor.web.pages import MOST_PAGES, TOO_MANY
 from bota_clients.monitor.web.server import HEADERS
+from bota_clients.recording.reader import open_recording
 from ethercat_server.virtual_sensor.options import SensorOptions
+from tests.clients.running import frames_in
 from tests.clients.web_pages import Web
 from tests.served_simulation import served
-from tests.server.running import PATIENCE_S, Program, free_port, has_ipv6
+from tests.server.running import PATIENCE_S, Program, free_port, has_ipv6, wait_until
 
 
 @pytest.fixture(scope="module")
@@ -97,13 +100,14 @@ def test_a_port_in_use_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> No
     assert capsys.readouterr() == ("", sentence)
 
 
-def test_the_program_shows_tares_and_ends_with_ctrl_c() -> None:
-    """With a real server: the link that it prints is enough to tare."""
+def test_the_program_shows_tares_records_and_ends_with_ctrl_c(tmp_path: Path) -> None:
+    """With a real server: the link that it prints is enough to tare, and to record into its folder."""
     port = free_port()
     with served(SensorOptions(signal="rest")) as server:
         program = Program(
-            "bota_clients.monitor.cli", ["--server", f"localhost:{server.port}", "--web", str(port)]
-        )
+            "bota_clients.monitor.cli", ["--server", f"localhost:{server.port}", "--web", str(port)],
+            under=["env", "--chdir", str(tmp_path)],
+        )  # fmt: skip
         try:
             program.wait_for("Ctrl-C ends it")
             link = re.search(rf"http://localhost:{port}/#token=(\S+)", program.said())
@@ -117,10 +121,26 @@ def test_the_program_shows_tares_and_ends_with_ctrl_c() -> None:
                     said := str(message(stream, "state")["state"]["message"])
                 ):
                     assert "not tared" not in said
+                stream.send('{"do":"record"}')
+                while not message(stream, "state")["state"]["recording"]:
+                    pass
+                wait_until(lambda: sum(map(frames_in, tmp_path.glob("*.mcap"))) > 0, "frames")
+                stream.send('{"do":"record"}')
+                while message(stream, "state")["state"]["recording"]:
+                    pass
+                assert "nothing was lost" in str(message(stream, "state")["state"]["message"])
+                with open_recording(next(tmp_path.glob("*.mcap"))) as stopped:
+                    assert (stopped.cut_off, stopped.end and stopped.end["reason"]) == (None, "asked to stop")
+                    stopped.path.unlink()
+                stream.send('{"do":"record"}')
+                wait_until(lambda: sum(map(frames_in, tmp_path.glob("*.mcap"))) > 0, "frames")
                 program.signal(signal.SIGINT)
                 with pytest.raises(ConnectionClosed):
                     message(stream, "never")
             assert program.wait() == 0
-            assert len(program.said().splitlines()) == 2, program.said()
+            *_, ended = said_lines = program.said().splitlines()
+            assert (len(said_lines), ended.startswith("Recorded recording-")) == (3, True), said_lines
+            with open_recording(next(tmp_path.glob("*.mcap"))) as whole:
+                assert whole.cut_off is None
         finally:
             program.close()

@@ -8,9 +8,11 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
 
+from bota_clients.monitor.recording import MonitorRecording
 from bota_clients.monitor.tare import Say
 from bota_clients.monitor.web.pages import Pages, WebModel
 from bota_clients.monitor.web.server import serving
+from bota_ethercat.address import Address
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S
 from tests.server.running import PATIENCE_S
@@ -22,7 +24,8 @@ class Web:
     def __init__(self, *names: str) -> None:
         self.model = WebModel(made.ADDRESS)
         self.model.connected(made.description(*[names] * bool(names)), made.OWN_PEER, START_S)
-        self.pages = Pages(self.model, self.tare)
+        self.recorder = MonitorRecording(Address("localhost", 1))
+        self.pages = Pages(self.model, self.tare, self.recorder)
         self.port = 0
         self.tared: list[tuple[int, str]] = []  # the positions that were to be tared, and the way
 

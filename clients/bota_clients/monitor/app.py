@@ -137,7 +137,7 @@ class Monitor(App[None]):
         elif key == "t":
             self._ask_tare()
         elif key == "r":
-            self._record()
+            self._model.say(self.recorder.toggle(self._clock()))
         elif key in {"p", " "}:
             self._view = replace(look, paused="" if look.paused else clock_text())
         elif key == "0":
@@ -166,13 +166,6 @@ class Monitor(App[None]):
             start_tare(self._address, self._to_tare, self._model.say, _ANSWERS[key])
         else:
             self._model.say("Not tared")
-
-    def _record(self) -> None:
-        if self.recorder.running:
-            self.recorder.stop()
-            self._model.say("Stopping the recording")
-        else:
-            self._model.say(self.recorder.start(self._clock()))
 
     def _next(self) -> None:
         count = len(self._state.sensors) if self._state else 0

@@ -36,6 +36,13 @@ class MonitorRecording:
         self.since_s = now_s
         return f"Recording to {path}"
 
+    def toggle(self, now_s: float) -> str:
+        """Start a recording, or request the end of that which runs; what to say."""
+        if not self.running:
+            return self.start(now_s)
+        self.stop()
+        return "Stopping the recording"
+
     def stop(self) -> None:
         """Request the end; `ended` reports it."""
         self._asked.set()

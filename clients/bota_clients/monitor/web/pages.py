@@ -26,6 +26,7 @@ import numpy as np
 
 from bota_clients.monitor import words
 from bota_clients.monitor.model import Model, State
+from bota_clients.monitor.recording import MonitorRecording
 from bota_clients.monitor.screen import table
 from bota_clients.monitor.tare import WAYS, Say
 from bota_clients.numbers import duration
@@ -142,14 +143,19 @@ class Page:
 
 
 class Pages:
-    """The connected pages, the model that they show, and the token with which one may tare."""
+    """The connected pages, the model that they show, and the token with which one may tare and record."""
 
-    def __init__(self, model: WebModel, tare: Callable[[int, Say, str], threading.Thread]) -> None:
+    def __init__(
+        self,
+        model: WebModel,
+        tare: Callable[[int, Say, str], threading.Thread],
+        recorder: MonitorRecording,
+    ) -> None:
         """`tare` starts one of WAYS with the sensor at a position."""
         self.token: Final = secrets.token_urlsafe(24)
         self.connected: set[Page] = set()
         self._model = model
-        self._tare = tare
+        self._tare, self._recorder = tare, recorder
         self._taring: threading.Thread | None = None
         self._points_s = 0.0
         self._number = 0
@@ -165,7 +171,9 @@ class Pages:
         return page
 
     def state(self, now_s: float) -> str:
-        return state_text(self._model.state(now_s))
+        if ended := self._recorder.ended():
+            self._model.say(*ended)
+        return state_text(self._model.state(now_s), recording=self._recorder.running)
 
     def collect(self, now_s: float) -> None:
         """Keep the points that have come since the last call."""
@@ -209,7 +217,7 @@ class Pages:
             return "The token in this link is not that of this run: open the link that it printed"
         if action is None:
             return None
-        if action not in ("reset", *WAYS):
+        if action not in ("reset", "record", *WAYS):
             page.end = "Not a message of this page"
             return None
         if not page.control:
@@ -217,6 +225,8 @@ class Pages:
         if action == "reset":
             self._model.reset()
             self._model.say("Peaks and past warnings are reset")
+        elif action == "record":
+            self._model.say(self._recorder.toggle(time.monotonic()))
         elif self._taring is not None and self._taring.is_alive():
             self._model.say("A tare is running already", True)
         else:
@@ -230,7 +240,7 @@ class Pages:
         return page.control
 
 
-def state_text(state: State) -> str:
+def state_text(state: State, *, recording: bool = False) -> str:
     """The state as JSON: what `--json` prints, and words for the page."""
     found = words.json_object(state, time.time())
     for row, sensor in zip(found["sensors"], state.sensors, strict=True):
@@ -241,6 +251,7 @@ def state_text(state: State) -> str:
         ]  # fmt: skip
         row["old"] = None if sensor.old_s is None else duration(sensor.old_s)
     found["link"], found["trouble"] = words.link(state.server), words.trouble(state.server)
+    found["recording"] = recording
     found["message"], found["table"] = state.message and state.message._asdict(), table(state)
     return _json({"state": finite(found)})
 

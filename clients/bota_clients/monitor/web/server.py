@@ -28,6 +28,7 @@ from websockets.http11 import Request, Response
 
 from bota_clients.arguments import is_loopback
 from bota_clients.monitor.reader import Reader
+from bota_clients.monitor.recording import MonitorRecording
 from bota_clients.monitor.tare import start_tare
 from bota_clients.monitor.web.pages import MOST_BYTES, TOO_MANY, Page, Pages, WebModel
 from bota_clients.program import call_on, say
@@ -68,26 +69,32 @@ _QUIET: Final = logging.Logger(__name__, logging.CRITICAL)
 
 def run_web(address: Address, where: Address, imu_units: ImuUnits, seconds: float | None) -> int:
     """Serve the page of the server at `address` until a signal or for `seconds`; returns the exit code."""
+    recorder = MonitorRecording(address)
     try:
-        asyncio.run(_run(address, where, imu_units, seconds))
+        asyncio.run(_run(address, where, imu_units, seconds, recorder))
     except OSError as error:
         if error.errno not in _WHY:
             raise
         say("ethercat-monitor", f"{where} {_WHY[error.errno]}: choose another port with --web PORT")
         return 1
+    finally:
+        if ended := recorder.close():
+            sys.stdout.write(f"{ended}\n")
     return 0
 
 
-async def _run(address: Address, where: Address, imu_units: ImuUnits, seconds: float | None) -> None:
+async def _run(
+    address: Address, where: Address, imu_units: ImuUnits, seconds: float | None, recorder: MonitorRecording
+) -> None:
     stop = asyncio.Event()
     call_on(asyncio.get_running_loop(), stop.set, "SIGINT", "SIGTERM", "SIGHUP")
     model = WebModel(str(address), imu_units)
-    pages = Pages(model, partial(start_tare, address))
+    pages = Pages(model, partial(start_tare, address), recorder)
     reader = Reader(address, model, POINTS_S)
     async with serving(pages, *where) as port:
         sys.stdout.write(
             f"Open http://{Address(where.host, port)}/#token={pages.token}\n"
-            "With this link the page can tare the sensor; without #token=... it only shows. Ctrl-C ends it.\n"
+            "With this link the page can tare and record; without #token=... it only shows. Ctrl-C ends it.\n"
         )
         sys.stdout.flush()
         reader.start()

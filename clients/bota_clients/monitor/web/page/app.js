@@ -1,4 +1,4 @@
-// Puts the page together: what comes over the link goes into traces, readings and cards.
+// Puts the page together: from the link into traces, readings and cards.
 
 import { byId, element, fill, setText } from "./dom.js";
 import { Link } from "./link.js";
@@ -12,13 +12,9 @@ const history = new History();
 const traces = GROUPS.map((group) => new Trace(group));
 let paused = null;
 let span = 10;
-let newest = null;
-let sensor = null;
-let control = false;
-let refused = null;
+let newest = null, sensor = null, refused = null, control = false;
 let troubles = { link: "not connected yet", server: null };
-let drawn = 0;
-let read = 0;
+let drawn = 0, read = 0;
 
 byId("traces").append(...traces.map((trace) => trace.card));
 traces.forEach((trace) => trace.start());
@@ -45,8 +41,6 @@ const link = new Link({
   },
 });
 
-// What is known, in the words of the terminal.
-
 function showState(state) {
   troubles.server = state.trouble;
   sensor = state.sensors.find((each) => each.sensor === link.sensor) ?? null;
@@ -62,6 +56,7 @@ function showState(state) {
     }));
   byId("sensors").hidden = state.sensors.length < 2;
   setText(byId("table"), state.table.join("\n"));
+  setText(byId("record"), state.recording ? "Stop recording" : "Record");
   showMessage(state.message);
   showControl();
   showTrouble();
@@ -105,15 +100,13 @@ function showTrouble() {
   byId("link").className = text ? "bad" : old ? "warn" : "good";
 }
 
-/** What the monitor last said; a token that it refused stays. */
+/** What the monitor last said, or why it refused the token. */
 function showMessage(message) {
   const said = refused ? { text: refused, bad: true } : message;
   byId("message").hidden = !said;
   byId("message").classList.toggle("bad", Boolean(said?.bad));
   setText(byId("message"), said?.text ?? "");
 }
-
-// What people do.
 
 function choose(position) {
   history.clear();
@@ -122,9 +115,9 @@ function choose(position) {
 }
 
 function showControl() {
-  for (const button of [byId("tare"), byId("reset")]) {
-    button.disabled = !(control && sensor && !troubles.link && !troubles.server);
-    button.title = control ? "" : "Only in a page opened by the link that ethercat-monitor printed";
+  for (const id of ["tare", "reset", "record"]) {
+    byId(id).disabled = !(control && !troubles.link && (id === "record" || (sensor && !troubles.server)));
+    byId(id).title = control ? "" : "Only by the link that ethercat-monitor printed";
   }
 }
 
@@ -146,7 +139,7 @@ byId("pause").addEventListener("click", () => {
   byId("pause").setAttribute("aria-pressed", Boolean(paused));
 });
 
-byId("reset").addEventListener("click", () => link.send({ do: "reset" }));
+for (const id of ["reset", "record"]) byId(id).addEventListener("click", () => link.send({ do: id }));
 byId("tare").addEventListener("click", () => {
   byId("ask").dataset.sensor = link.sensor;
   byId("ask").firstElementChild.textContent = `Tare sensor ${link.sensor}? Its reading becomes zero. Keep it stationary.`;
@@ -158,7 +151,7 @@ byId("ask").addEventListener("click", ({ target }) => {
   byId("ask").close();
 });
 
-// The token comes behind the # of the link, which no request carries, and does not stay in the address.
+// The token is behind the #, which no request carries, and leaves the address.
 function takeToken() {
   const given = new URLSearchParams(location.hash.slice(1)).get("token");
   let token = given;
@@ -174,7 +167,7 @@ addEventListener("hashchange", takeToken);
 takeToken();
 showControl();
 
-// Drawing: as often as a trace moves by a pixel, at most 25 times a second.
+// Drawing: for each pixel of movement, at most 25 times a second.
 
 function frame(now) {
   requestAnimationFrame(frame);
