@@ -7,6 +7,7 @@ import json
 import math
 import random
 import re
+import shutil
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
@@ -280,18 +281,21 @@ def test_a_chunk_of_zarr_that_was_not_copied_is_not_a_force_of_zero(tmp_path: Pa
     assert np.isnan(zarr.open_group(made, mode="r")["force_torque"][:]).all()
 
 
-PAGE = Path(__file__).parents[2] / "docs" / "datasets.md"
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = (DOCS / "datasets.md").read_text() + (DOCS / "recording.md").read_text()
 
 
-@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL))
-def test_the_code_of_the_page_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", PAGES, re.DOTALL))
+def test_the_code_of_the_pages_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for package in re.findall(r"^(?:import|from) (\w+)", code, re.MULTILINE):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     record(Path("run.mcap"), (frame(number) for number in range(1000)), **SETTINGS)
-    for suffix in ("npz", "parquet"):
+    for suffix in ("npz", "parquet", "zarr"):
         run_here(main, "run.mcap", f"run.{suffix}", "--fps", 30)
-    run_here(main, "run.mcap", "samples.parquet")
+    for made in ("samples.parquet", "whole.mcap"):
+        run_here(main, "run.mcap", made)
+    shutil.make_archive("run", "zip", "run.zarr")
     if "lerobot" in code:
         lerobot, state = (
             importlib.import_module("lerobot.datasets.lerobot_dataset"),
@@ -305,6 +309,9 @@ def test_the_code_of_the_page_runs(code: str, tmp_path: Path, monkeypatch: pytes
         made.finalize()
     found: dict[str, Any] = {}
     exec(code, found)
+    if zipped := re.search(r"# zipped: (.*)$", code, re.MULTILINE):
+        other = found["zarr"].open_group(eval(zipped[1], found), mode="r")
+        np.testing.assert_array_equal(other["force_torque"][:], found["force_torque"])
     assert len(found.get("force", range(1000))) == 1000
     assert np.shape(found.get("force_torque", np.zeros((38, 32, 6)))) == (38, 32, 6)
     if "lerobot" in code:
