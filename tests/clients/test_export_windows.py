@@ -315,8 +315,31 @@ def test_the_code_of_the_pages_runs(code: str, tmp_path: Path, monkeypatch: pyte
     assert len(found.get("force", range(1000))) == 1000
     assert np.shape(found.get("force_torque", np.zeros((38, 32, 6)))) == (38, 32, 6)
     if "lerobot" in code:
-        merged = found["LeRobotDataset"]("me/with_force", root="with_force")[20]
-        assert merged["observation.force_torque"].reshape(32, 6)[-1, 0] == 20 * 800 // 30 + 1
+        dataset = found["LeRobotDataset"]("me/with_force", root="with_force")
+        _check_lerobot(dataset, np.load("run.npz"))
+
+
+def _check_lerobot(dataset: Any, arrays: Any) -> None:
+    """A frame, the statistics without empty slots, and a batch as LeRobot normalizes it with them."""
+    key = "observation.force_torque"
+    frame_20 = dataset[20]
+    assert frame_20[key].reshape(32, 6)[-1, 0] == 20 * 800 // 30 + 1
+    written = json.loads(Path("with_force/meta/stats.json").read_text())
+    empty = np.isnan(arrays["force_torque"]).any(axis=2)
+    assert empty.any(), "or there is nothing to leave out"
+    measured = arrays["force_torque"][~empty]
+    assert {*written[key]} == {*written["state"]}
+    for name, wanted in (("min", measured.min(axis=0)), ("mean", measured.mean(axis=0)),
+                         ("q90", np.quantile(measured, 0.9, axis=0))):  # fmt: skip
+        np.testing.assert_allclose(written[key][name], np.tile(wanted, 32), rtol=1e-6)
+    types = importlib.import_module("lerobot.configs.types")
+    step = importlib.import_module("lerobot.processor.normalize_processor").NormalizerProcessorStep
+    state, mode = types.FeatureType.STATE, types.NormalizationMode.MEAN_STD
+    features = {key: types.PolicyFeature(state, (192,))}
+    normalize = step.from_lerobot_dataset(dataset, features, {state: mode})
+    observation = normalize({"observation": {key: frame_20[key]}})["observation"][key].reshape(32, 6)
+    wanted = (20 * 800 // 30 + 1 - measured[:, 0].mean()) / measured[:, 0].std()
+    assert observation[-1, 0] == pytest.approx(wanted, rel=1e-4)
 
 
 STAMPS = [START_NS + 123_456_789, START_NS + 223_456_000]

@@ -280,5 +280,5 @@ def test_the_bytes_of_a_frame_are_as_described() -> None:
 
 def test_the_example_reads_a_recording(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(path.parent)
-    (example,) = re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL)
+    (example,) = re.findall(r"```python\n([^`]*open_recording.*?)```", DOCS, re.DOTALL)
     exec(compile(example, "docs/recording.md", "exec"), {})
