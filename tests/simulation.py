@@ -404,7 +404,7 @@ class MemoryChannel(TcpChannel):
         self._stream = self.server.transport.connect(0, buffer_size=1 << 20)
         return True
 
-    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+    def receive(self, buffer: bytearray | memoryview, timeout_s: float) -> int:
         stream = self._stream
         if stream is None:
             raise ConnectionFailedError("Bad file descriptor")

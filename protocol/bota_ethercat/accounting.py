@@ -91,6 +91,13 @@ class StreamAccounting:
         self.counts.new += 1
         return True
 
+    def count_run(self, last: int) -> int:
+        """Count the frames before the one of this number, all without flags and next; how many."""
+        frames = last - 1 - self._sequence
+        self._sequence += frames
+        self.counts.new += frames
+        return frames
+
     def count(self, sequence: int, monotonic_ns: int, flags: int) -> FrameKind:
         """Count the next frame; what it is."""
         counts, jump = self.counts, 0

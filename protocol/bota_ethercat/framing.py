@@ -12,9 +12,9 @@ The rules it keeps:
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from enum import IntEnum, IntFlag
-from typing import Final, NamedTuple, NoReturn
+from typing import Any, Final, NamedTuple, NoReturn
 
 from bota_ethercat.errors import RemoteProtocolError
 from bota_ethercat.pdo import LAYOUTS
@@ -111,6 +111,14 @@ class FrameDecoder:
         else:
             self._make_room(4096)
         return memoryview(self._buffer)[self._end :]
+
+    def single(self, size: int) -> tuple[bytearray, bytes, Callable[..., tuple[Any, ...]]]:
+        """For DATA messages with `size` bytes of process data that come alone: where to read into, how one
+        begins, and what gives its fields. While nothing is buffered; what is none goes to `received`.
+        """
+        self._start = self._end = 0
+        length = _DATA_OVERHEAD + size
+        return self._buffer, _PREFIX.pack(length, _DATA), _UNPACK_DATA[length]
 
     def received(self, count: int) -> None:
         """`count` bytes were written to the start of `get_buffer()`."""

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Callable
 from enum import Enum
-from typing import Final, NamedTuple
+from operator import itemgetter
+from typing import Any, Final, NamedTuple
 
 from bota_ethercat.errors import PdoSizeError
 
@@ -136,6 +138,19 @@ def is_finite(process_data: bytes) -> bool:
 
 
 Vector3 = tuple[float, float, float]
+Values = tuple[Any, ...]  # the fields of process data in their order, as unpacked
+
+
+def part(first: str, last: str) -> slice:
+    """Where the fields from `first` to `last` are in `Values`."""
+    index = LAYOUTS[max(LAYOUTS)].index
+    return slice(index(first), index(last) + 1)
+
+
+WRENCH: Final = part("force.x", "torque.z")
+MOTION: Final = part("acceleration.x", "angular_rate.z")  # with the flag between the two
+TEMPERATURE: Final = part("temperature", "temperature")
+ORIENTATION: Final = part("orientation.x", "orientation.w")  # () if it is not mapped
 
 
 class Sample(NamedTuple):
@@ -174,6 +189,16 @@ class Sample(NamedTuple):
         return math.isfinite(total + fx + fy + fz + mx + my + mz + ax + ay + az + rx + ry + rz)
 
 
+flags_of: Callable[[Values], tuple[int, ...]] = itemgetter(
+    *(
+        PDO_FIELDS.index(field)
+        for field in PDO_FIELDS
+        if field.name in Sample._fields and field.type is not PdoType.REAL
+    )
+)
+"""The fields of `Sample` that say how the sensor is, `status` and those after it."""
+
+
 class SampleDecoder:
     """Decodes process data of one size into `Sample`."""
 
@@ -191,20 +216,26 @@ class SampleDecoder:
         ValueError if the buffer holds too few bytes.
         """
         try:
-            values = self._unpack_from(buffer, offset)
+            return self.sample(self._unpack_from(buffer, offset))
         except struct.error as error:
             raise ValueError(f"process data cut short: {error}") from None
-        (
-            status, warnings, fx, fy, fz, mx, my, mz, ft_saturated,
-            ax, ay, az, a_saturated, rx, ry, rz, r_saturated, temperature,
-        ) = values[:_BASE_FIELD_COUNT]  # fmt: skip
-        quaternion = values[_BASE_FIELD_COUNT:]
-        a, r = self._acceleration_scale, self._angular_rate_scale
+
+    def sample(self, values: Values) -> Sample:
+        """The sample whose fields were unpacked by the layout's `struct`."""
+        acceleration, angular_rate = self.motion(values)
+        fx, fy, fz, mx, my, mz = values[WRENCH]
+        quaternion = values[ORIENTATION]
+        (temperature,) = values[TEMPERATURE]
         return Sample(
-            (fx, fy, fz), (mx, my, mz), (ax * a, ay * a, az * a), (rx * r, ry * r, rz * r), temperature,
-            quaternion if any(quaternion) else None,
-            status, warnings, ft_saturated, a_saturated, r_saturated,
+            (fx, fy, fz), (mx, my, mz), acceleration, angular_rate, temperature,
+            quaternion if any(quaternion) else None, *flags_of(values),
         )  # fmt: skip
+
+    def motion(self, values: Values) -> tuple[Vector3, Vector3]:
+        """Acceleration (m/s²) and angular rate (rad/s) of such fields."""
+        ax, ay, az, _, rx, ry, rz = values[MOTION]
+        a, r = self._acceleration_scale, self._angular_rate_scale
+        return (ax * a, ay * a, az * a), (rx * r, ry * r, rz * r)
 
 
 def encode(size: int, values: dict[str, float]) -> bytes:

@@ -21,6 +21,7 @@ from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.health.judge import SATURATIONS, Observation, judge
 from bota_ethercat.health.limits import About, Level, StreamLimits
 from bota_ethercat.health.observer import SensorObserver, p99
+from bota_ethercat.pdo import TEMPERATURE
 from bota_ethercat.replies import Status
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable
@@ -39,6 +40,7 @@ _LEVELS: Final = {
     Level.NOT_POSSIBLE: DiagnosticStatus.STALE,
 }
 Problems = list[tuple[Level, str]]  # how bad, and a sentence
+Judged = tuple[Level, Callable[[], DiagnosticStatus]]  # how bad, and what makes the status of it
 _NO_CONNECTION: Final = "there is no connection to the server, see link"
 _NO_SAMPLES: Final = "there are no new samples, see stream"
 
@@ -105,11 +107,11 @@ class Monitor:
         self._collect()
         compensation = self._compensation()
         self._observe(now_s, compensation.withheld)
-        statuses = self._judge(now_s, compensation)
-        levels = [status.level for status in statuses]
+        judged = self._judge(now_s, compensation)
+        levels = [level for level, _ in judged]
         if regular or levels != self._levels:
             self._levels, self._published_s = levels, now_s
-            message = DiagnosticArray(status=statuses)
+            message = DiagnosticArray(status=[make() for _, make in judged])
             stamp = message.header.stamp
             stamp.sec, stamp.nanosec = divmod(self._clock.time_ns(), 1_000_000_000)
             self._publisher.publish(message)
@@ -188,13 +190,13 @@ class Monitor:
 
     # -- the statuses
 
-    def _judge(self, now_s: float, compensation: CompensationState) -> list[DiagnosticStatus]:
+    def _judge(self, now_s: float, compensation: CompensationState) -> list[Judged]:
         """The five statuses, in the order in which one would look for a cause."""
         link, new, said, now_ns = self._link, self._new, self._said, self._clock.monotonic_ns()
         silent_s = max(now_s - max(self._fresh_s, link.since_s), 0.0)
         # How long the server has owed an answer that this node would have seen.
         answer_s = max(now_s - self._asked_s - self._unread[0], 0.0) if self._waiting else 0.0
-        sample = self._reader.sample
+        values = self._reader.values
         said.note_unread(self._unread, now_ns)
         seen = Observation(
             seconds=1.0,
@@ -209,7 +211,7 @@ class Monitor:
             age_p99_us=None if self._age_us is None else self._age_us[1],
             not_finite=new["not_finite"],  # of those that it publishes; the server checks all
             **{name: bits for name, bits in self._flags._asdict().items() if name != "status"},
-            temperature=None if sample is None else sample.temperature,
+            temperature=None if values is None else values[TEMPERATURE][0],
             server_silent=answer_s > _SLOW_ANSWER_S / 2,
         )
         findings = judge(said.complete(seen, now_ns, limits=self.limits), self.limits).findings
@@ -229,20 +231,19 @@ class Monitor:
             self._judge_compensation(compensation, has_samples=has_samples),
         ]
 
-    def _status(
-        self, name: str, problems: Problems, good: str, values: Mapping[str, object]
-    ) -> DiagnosticStatus:
+    def _status(self, name: str, problems: Problems, good: str, values: Mapping[str, object]) -> Judged:
         """The worst level, and all sentences, the worst first; `good` if there is none."""
         problems, info = sorted(problems, key=lambda problem: -problem[0]), self._link.info
-        return DiagnosticStatus(
+        level = problems[0][0] if problems else Level.GOOD
+        return level, lambda: DiagnosticStatus(
             name=self._prefix + name,
-            level=_LEVELS[problems[0][0] if problems else Level.GOOD],
+            level=_LEVELS[level],
             message="; ".join(sentence for _, sentence in problems) or good,
             hardware_id=f"{info.name} {text_of(info.serial)}".strip(),
             values=[KeyValue(key=key, value=text_of(value)) for key, value in values.items()],
         )
 
-    def _judge_link(self, problems: Problems, now_s: float, answer_s: float) -> DiagnosticStatus:
+    def _judge_link(self, problems: Problems, now_s: float, answer_s: float) -> Judged:
         link = self._link
         if not link.is_connected:
             problems = [(Level.TROUBLE, f"{link.absence} (the node keeps trying)")]
@@ -259,7 +260,7 @@ class Monitor:
         }
         return self._status("link", problems, f"connected to {link.address}", values)
 
-    def _judge_stream(self, problems: Problems) -> DiagnosticStatus:
+    def _judge_stream(self, problems: Problems) -> Judged:
         link, counts, server = self._link, self._counts, self._server
         if not link.is_connected:
             problems = [(Level.NOT_POSSIBLE, f"no samples: {_NO_CONNECTION}")]
@@ -285,7 +286,7 @@ class Monitor:
         good = "samples arrive" if self._rate_hz is None else f"{self._rate_hz:.0f} samples a second"
         return self._status("stream", problems, good, values)
 
-    def _judge_sensor(self, problems: Problems, temperature: float | None) -> DiagnosticStatus:
+    def _judge_sensor(self, problems: Problems, temperature: float | None) -> Judged:
         link, info, flags, status = self._link, self._link.info, self._flags, self._said.status
         if not link.is_connected:
             problems = [(Level.NOT_POSSIBLE, f"unknown: {_NO_CONNECTION}")]
@@ -309,7 +310,7 @@ class Monitor:
         }
         return self._status("sensor", problems, "as it should be", values)
 
-    def _judge_clock(self, problems: Problems, *, has_samples: bool) -> DiagnosticStatus:
+    def _judge_clock(self, problems: Problems, *, has_samples: bool) -> Judged:
         clock, delays = self._said.status.clock, self._link.info.delay_ns
         if not has_samples:
             problems = [(Level.NOT_POSSIBLE, f"unknown: {_NO_SAMPLES}")]
@@ -322,7 +323,7 @@ class Monitor:
             values[f"delay_{name}_ms"] = None if delay_ns is None else delay_ns / 1e6
         return self._status("clock", problems, "locked to the sensor's clock", values)
 
-    def _judge_compensation(self, c: CompensationState, *, has_samples: bool) -> DiagnosticStatus:
+    def _judge_compensation(self, c: CompensationState, *, has_samples: bool) -> Judged:
         problems, flags = Problems(), self._flags
         if not has_samples:
             problems.append((Level.NOT_POSSIBLE, _NO_SAMPLES))

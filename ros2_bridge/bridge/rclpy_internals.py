@@ -37,11 +37,20 @@ def is_about_arguments(error: Exception) -> bool:
     return type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
 
 
-def packer(message: Any, count: int) -> Callable[..., Any]:
-    """Makes what `publish` takes from `count` float64, after a stamp (ns since 1970) if there is a header.
+def packing(publisher: Any, message: Any, count: int) -> tuple[Callable[..., Any], Callable[[Any], None]]:
+    """What makes a message of `count` float64, after a stamp (ns since 1970) if there is a header; and what
+    publishes it.
 
-    The result is serialized here if rclpy reads it as `message`, but for padding; else it is `message`.
+    It is serialized here if rclpy reads it as `message`, but for padding; else it is `message`.
     """
+    pack = _packer(message, count)
+    is_serialized = isinstance(pack(*[0] * hasattr(message, "header"), *[0.0] * count), bytes)
+    # What `publish` calls after checks that take longer. It keeps Python's lock, so the publisher stays.
+    is_direct = is_serialized and is_known()
+    return pack, publisher.handle.publish_raw if is_direct else publisher.publish
+
+
+def _packer(message: Any, count: int) -> Callable[..., Any]:
     fill, numbers = filling(message), [*map(float, range(count))]
     if not hasattr(message, "header"):
         layout, pack = serialize_message(message)[: -8 * count], Struct(f"<{count}d").pack

@@ -159,7 +159,7 @@ class ScriptedChannel(TcpChannel):
         self._server.is_connected, self._requests = True, FrameDecoder()
         return True
 
-    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+    def receive(self, buffer: bytearray | memoryview, timeout_s: float) -> int:
         arrived = self._server.arrived
         if not arrived and not self._server.is_connected:
             raise ConnectionFailedError("the server closed it")

@@ -111,6 +111,7 @@ class Topic:
 
     def __init__(self, publisher: Any) -> None:
         self._publisher = publisher
+        self.handle = SimpleNamespace(publish_raw=self.publish)
         self.is_heard = False
         self.messages: list[Any] = []
         self.turn = 0  # of the latest message, counted over all topics

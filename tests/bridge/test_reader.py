@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import random
 from collections.abc import Iterable, Iterator
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bota_ethercat.framing import DataMessage
-from bota_ethercat.pdo import encode
+from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.pdo import WRENCH, Values, encode
 from bota_ethercat.text.json_text import JsonObject
+from bridge.parameters.table import Parameters
 from bridge.stream.frame_selector import BACKLOG_NS, FRESH_NS, FrameCounts, FrameSelector, RateLimit
-from bridge.stream.link import sentence
-from tests.bridge.simulated_node import Node, Server, stamp_ns
+from bridge.stream.link import NodeClock, sentence
+from bridge.stream.reader import NO_FLAGS, Outputs, Reader
+from tests.bridge.scripted_server import MemoryServer, ScriptedChannel
+from tests.bridge.simulated_node import DEFAULTS, Node, Server, stamp_ns
 from tests.descriptions import description
 
 PERIOD_NS = 1_250_000
@@ -163,6 +168,119 @@ def test_a_server_that_does_not_fit_is_named_once(quiet: Server, changes: dict[s
     assert words in line
     assert line.isprintable()
     assert len(line) < 400
+
+
+# The steady way and the general one.
+
+_COMMON = 12
+_RARE: tuple[dict[str, Any], ...] = (
+    {"flags": DataFlag.GAP}, {"flags": DataFlag.REPEATED}, {"flags": DataFlag.INVALID},
+    {"skip": 2}, {"skip": -3}, {"skip": -10**6}, {"sensor": 1}, {"stamp_ns": 0}, {"late_ns": 70_000_000},
+    {"late_ns": -3_000_000}, {"values": {"warnings": 8}}, {"values": {"status": 1}}, {"size": 77},
+    {"values": {"force.x": math.nan}}, {"values": {"acceleration.x": math.inf}},
+    {"values": {"force_torque_saturated": 4}}, {"event": {"event": "sensor_lost", "sensor": 0}},
+    {"event": {"event": "sensor_back", "sensor": 0}}, {"pause_ns": 80_000_000}, {"pause_ns": 300_000_000},
+    {"cut": 40}, {"stuck": True}, {"drop": True},
+)  # fmt: skip
+
+
+class Collector:
+    """An output that keeps what it gets."""
+
+    parts = (WRENCH,)
+
+    def __init__(self) -> None:
+        self.got: list[object] = []
+
+    def is_wanted(self) -> bool:
+        return True
+
+    def publish(self, values: Values, frame: DataMessage) -> None:
+        self.got.append((tuple(map(str, values)), frame))
+
+    def observe(self, values: Values, frame: DataMessage) -> None:
+        self.got.append((tuple(map(str, values)), frame, "observed"))
+
+    def configure(self, parameters: Parameters) -> None:
+        raise AssertionError
+
+
+def play(script: list[int], *, steady: bool, limit_hz: float, same_clock: bool) -> list[object]:
+    """What a reader publishes and knows of a stream in which these come: common samples and rare things."""
+    server, output, said = MemoryServer(), Collector(), list[str]()
+    parameters = dataclasses.replace(DEFAULTS, publishing_frequency=limit_hz)
+    outputs, channel = Outputs([output]), ScriptedChannel(server)
+    channel.same_address = same_clock
+    log = SimpleNamespace(info=said.append, warning=lambda text, **_: said.append(text))
+    clock = cast("NodeClock", server)
+    reader = Reader(parameters, outputs, log, said.append, channel=channel, clock=clock)
+    outputs.refresh()
+    if not steady:
+        reader._read_steady = lambda timeout_s: None  # type: ignore[method-assign]
+    reader.read(0.0)
+    reader.read(0.0)
+    held = bytearray()
+    now_ns = server.now_ns
+    for number, kind in enumerate(script):
+        rare = _RARE[kind - _COMMON] if kind >= _COMMON else {}
+        now_ns += PERIOD_NS + rare.get("pause_ns", 0)
+
+        def arrive(number: int = number, rare: dict[str, Any] = rare) -> None:
+            if "event" in rare:
+                server.send_json(rare["event"])
+            if rare.get("drop"):
+                server.drop()
+                return
+            server.sequence += rare.get("skip", 0)
+            sent = encode(rare.get("size", 61), {"force.x": float(number), **rare.get("values", {})})
+            changes = {key: rare[key] for key in ("flags", "sensor", "stamp_ns") if key in rare}
+            monotonic_ns = server.now_ns - 200_000 - rare.get("late_ns", 0)
+            server.sequence = max(server.sequence, 1)
+            whole = server.frame(0, process_data=sent, monotonic_ns=monotonic_ns, **changes)
+            at = rare.get("cut", len(whole))
+            held.extend(whole[:at])
+            if not rare.get("stuck"):  # else it comes with the next
+                server.send_raw(bytes(held))
+                held.clear()
+            held.extend(whole[at:])
+
+        server.at(now_ns, arrive)
+    while server.now_ns < now_ns + 10**9:
+        reader.read(0.1)
+    state = reader.client.session.state(0)
+    reading = state.read(10**9, now_ns + 2 * 10**9, connected=True)
+    return [
+        *output.got, reader.counts, reader.saturated, reader.not_finite, reader.stamp_ns, reader.pop_ages(),
+        reader.pop_flags(NO_FLAGS), reader.link.lost, repr(reading), state.accounting.new_ns, state.unread,
+        reader.client._unread_ns > 0, server.connections,
+    ]  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(st.integers(0, _COMMON + len(_RARE) - 1), min_size=5, max_size=80),
+    st.sampled_from([0.0, 0.0, 300.0]),
+    st.booleans(),
+)
+def test_the_steady_way_publishes_and_counts_what_the_general_one_does(
+    script: list[int], limit_hz: float, same_clock: bool
+) -> None:
+    ways = [play(script, steady=way, limit_hz=limit_hz, same_clock=same_clock) for way in (False, True)]
+    assert ways[0] == ways[1]
+
+
+def test_nearly_all_samples_of_a_quiet_stream_go_the_steady_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    general = list[int]()
+    select = Reader._select
+
+    def note(reader: Reader, frames: list[DataMessage]) -> None:
+        general.append(len(frames))
+        select(reader, frames)
+
+    monkeypatch.setattr(Reader, "_select", note)
+    played = play([0] * 400, steady=True, limit_hz=0.0, same_clock=True)
+    assert len(played) > 400
+    assert sum(general) < 40
 
 
 # Which frames are news.

@@ -407,7 +407,7 @@ class HeldUp(ScriptedChannel):
 
     held_s = 0.0
 
-    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+    def receive(self, buffer: bytearray | memoryview, timeout_s: float) -> int:
         count = super().receive(buffer, timeout_s)
         self._server.now_ns, self.held_s = self._server.now_ns + round(self.held_s * 1e9), 0.0
         return count

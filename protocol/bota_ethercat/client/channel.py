@@ -153,24 +153,17 @@ class TcpChannel:
         if _DONT_WAIT:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _timeval(_SEND_TIMEOUT_S))
 
-    def receive(self, buffer: memoryview, timeout_s: float) -> int:
+    def receive(self, buffer: bytearray | memoryview, timeout_s: float) -> int:
         """Receive what fits, waiting at most `timeout_s` for the first byte; 0: nothing came.
 
         ConnectionFailedError at its end. The kernel's own timeout costs no system call while it is the same.
         """
         sock = self._sock
         try:
-            if sock is None:
-                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-            if timeout_s > 0 and timeout_s != self._timeout_s:
-                if _DONT_WAIT:
-                    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(timeout_s))
-                self._timeout_s = timeout_s
-            if _DONT_WAIT:
-                count = sock.recv_into(buffer, 0, 0 if timeout_s > 0 else _DONT_WAIT)
-            else:
-                sock.settimeout(max(timeout_s, 0.0))
+            if sock is not None and timeout_s == self._timeout_s:
                 count = sock.recv_into(buffer)
+            else:
+                count = self._receive(sock, buffer, timeout_s)
         except (BlockingIOError, TimeoutError):
             return 0
         except OSError as error:
@@ -178,6 +171,18 @@ class TcpChannel:
         if count == 0:
             raise ConnectionFailedError("the server closed it")
         return count
+
+    def _receive(self, sock: socket.socket | None, buffer: bytearray | memoryview, timeout_s: float) -> int:
+        if sock is None:
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        if not _DONT_WAIT:
+            sock.settimeout(max(timeout_s, 0.0))
+        elif timeout_s <= 0:
+            return sock.recv_into(buffer, 0, _DONT_WAIT)
+        else:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(timeout_s))
+            self._timeout_s = timeout_s
+        return sock.recv_into(buffer)
 
     def send(self, data: bytes) -> None:
         """Send all of it; ConnectionFailedError."""

@@ -25,7 +25,7 @@ from typing import Final
 
 from bota_ethercat.address import Address
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
-from bota_ethercat.client.reading import Condition, Reading
+from bota_ethercat.client.reading import WARNINGS, Condition, Reading
 from bota_ethercat.client.session import ClientEvent, Session, check_granted
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, ProtocolError, UnreachableError
 from bota_ethercat.framing import DataMessage, TerminalMessage
@@ -41,6 +41,7 @@ _MAX_EVENTS: Final = 1000
 _MAX_READS: Final = 64  # reads in one call, so that it returns whatever arrives
 _BACKLOG: Final = 2048  # bytes received at once that are more than any steady stream: more may be waiting
 _AGAIN_S: Final = 0.5
+_STEADY_NS: Final = 50_000_000
 _CLOSED: Final = "this client has been closed"
 
 
@@ -257,6 +258,52 @@ class Client:
         self._gather(timeout_s)
         return self.session.pop_items()
 
+    def steady(self, sensor: int, timeout_s: float) -> Iterator[list[DataMessage]]:
+        """What arrives at once, at the least cost, while it is a sensor's next samples and nothing unusual.
+
+        Ends when anything else comes, which `poll_all` has then, or nothing for `timeout_s`, and every 50 ms:
+        only then counts and readings know of these samples.
+        """
+        session, receive, monotonic_ns = self.session, self.channel.receive, self.channel.monotonic_ns
+        state = session.state(sensor)
+        frame = begin = state.steady
+        single = None if frame is None else session.single(frame)
+        if frame is None or begin is None or single is None or not self._open:
+            return
+        buffer, prefix, unpack = single
+        size, warnings, sequence = len(prefix) + 28 + len(frame[6]), frame[6][WARNINGS], frame[0]
+        looked_ns, timeout_ns, count = self._looked_ns, round(timeout_s * 1e9), 0
+        until_ns = looked_ns + _STEADY_NS
+        self._watched_ns = until_ns + timeout_ns
+        self._reader, self._stepping = threading.get_ident(), True
+        try:
+            try:
+                while True:
+                    count = receive(buffer, timeout_s)
+                    now_ns = monotonic_ns()
+                    at, frames = 0, []
+                    while at + size <= count and buffer.startswith(prefix, at):
+                        message = tuple.__new__(DataMessage, unpack(buffer, at))
+                        number, _, _, position, flags, _, data = message
+                        sequence += 1
+                        if number != sequence or position != sensor or flags or data[WARNINGS] != warnings:
+                            break
+                        frames.append(message)
+                        at += size
+                    if at != count or not frames or now_ns > until_ns:
+                        break
+                    frame, looked_ns = message, now_ns
+                    yield frames
+            finally:
+                self._looked_ns, self._watched_ns = looked_ns, looked_ns + timeout_ns
+                if frame is not begin:
+                    state.add_run(frame, looked_ns, session.same_machine)
+            self._received(count, now_ns)
+        except ProtocolError as error:
+            self._fail(error)
+        finally:
+            self._stepping = False
+
     def frames(self) -> Iterator[DataMessage]:
         """The frames as they come; without end, or with `reconnect` False until the connection ends."""
         with contextlib.suppress(ConnectionFailedError):
@@ -374,12 +421,7 @@ class Client:
                 self._watched_ns = self._looked_ns + round(timeout_s * 1e9)
                 with session.get_buffer() as buffer:
                     count = channel.receive(buffer, timeout_s)
-                now_ns = channel.monotonic_ns()
-                self._unread_ns = max(self._unread_ns, now_ns - self._watched_ns)
-                self._looked_ns = self._watched_ns = now_ns
-                answer = session.received(count, now_ns)
-                if answer:
-                    self._send(answer)
+                self._received(count, channel.monotonic_ns())
                 return count
             if self._failed and not self._reconnect:
                 raise self._failed
@@ -391,14 +433,25 @@ class Client:
                 self._looked_ns = self._watched_ns = channel.monotonic_ns()
                 self._send(session.opened(channel.monotonic_ns(), same_address=channel.same_address))
         except ProtocolError as error:
-            if self._failed is error:
-                raise
-            self._end(error)
-            if self._closing.is_set():
-                raise
+            self._fail(error)
         finally:
             self._stepping = False
         return 0
+
+    def _received(self, count: int, now_ns: int) -> None:
+        self._unread_ns = max(self._unread_ns, now_ns - self._watched_ns)
+        self._looked_ns = self._watched_ns = now_ns
+        answer = self.session.received(count, now_ns)
+        if answer:
+            self._send(answer)
+
+    def _fail(self, error: ProtocolError) -> None:
+        """The connection has failed; raises it where no other is to be made."""
+        if self._failed is error:
+            raise error
+        self._end(error)
+        if self._closing.is_set():
+            raise error
 
     def _end(self, error: ProtocolError) -> None:
         reachable = not isinstance(error, UnreachableError)

@@ -21,7 +21,7 @@ _CLOCK_TOLERANCE_NS: Final = 1_000_000
 _MIN_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
 _SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
 _WARNINGS_AT: Final = LAYOUTS[min(LAYOUTS)].offsets["warnings"]
-_WARNINGS: Final = slice(_WARNINGS_AT, _WARNINGS_AT + 4)
+WARNINGS: Final = slice(_WARNINGS_AT, _WARNINGS_AT + 4)
 _NO_WARNINGS: Final = bytes(4)
 
 
@@ -139,9 +139,21 @@ class ReceivedSensor:
         self._sampled, self._received_ns, self._sampled_received_ns = frame, received_ns, received_ns
         self._sampled_delay_ns = self.info.delay_ns
         self.unread += 1
-        if (warnings := process_data[_WARNINGS]) != _NO_WARNINGS:
+        if (warnings := process_data[WARNINGS]) != _NO_WARNINGS:
             self._warnings |= int.from_bytes(warnings, "little")
         return frame
+
+    @property
+    def steady(self) -> DataMessage | None:
+        """The newest frame if the one after it would be nothing unusual but for what is in it; else None."""
+        unusual = self._flags or self._reconnected or self._carried or self.lost
+        return None if unusual or not self.accounting.has_begun else self._sampled
+
+    def add_run(self, last: DataMessage, received_ns: int, same_clock: bool) -> None:
+        """As `add` for each frame after `steady`, all with its warnings and without flags, up to this one."""
+        before = self.accounting.count_run(last.sequence)
+        self.unread += before
+        self.add(last, received_ns, same_clock)
 
     def decode(self, frame: DataMessage) -> Sample:
         """The sample in a frame."""

@@ -171,6 +171,12 @@ class Session:
         """Where to read into; then call `received`."""
         return self._decoder.get_buffer()
 
+    def single(self, frame: DataMessage) -> tuple[bytearray, bytes, Callable[..., tuple[Any, ...]]] | None:
+        """`FrameDecoder.single` for messages like this one; None while anything else is to be done first."""
+        if self.items or self._raw or self._decoder.pending or not self.connected:
+            return None
+        return self._decoder.single(len(frame.process_data))
+
     def received(self, count: int, now_ns: int) -> bytes:
         """`count` bytes were read into `get_buffer()`; what to send, almost always nothing.
 

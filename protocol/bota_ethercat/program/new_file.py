@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -39,7 +38,7 @@ class NewFile:
                 self._target = self._beside = path
             else:
                 self._target = Path(os.path.realpath(path))  # a symbolic link stays one
-                self._beside = self._target.with_name(f".unfinished-{secrets.token_hex(4)}")
+                self._beside = self._target.with_name(f".unfinished-{os.urandom(4).hex()}")
             self._in_place = self._beside == self._target
             self._file = self._beside.open("w" if self._in_place else "x", encoding="utf-8", newline="\n")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 def visible(text: str) -> str:
     """The same length of text on one line: `?` for each character that is none or that a terminal obeys."""
-    return "".join(c if c.isprintable() else "?" for c in text)
+    return text if text.isprintable() else "".join(c if c.isprintable() else "?" for c in text)
 
 
 def printable(value: object, limit: int = 200) -> str:

@@ -15,10 +15,10 @@ import numpy as np
 from rclpy.node import Node
 
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.pdo import Sample, Vector3
+from bota_ethercat.pdo import WRENCH, Sample, Values, Vector3
 from bridge.compensating.sources import Source
 from bridge.parameters.table import Parameters
-from bridge.publishing.messages import Stamps
+from bridge.publishing.messages import Stamps, decoder
 from bridge.publishing.wrenches import FilteredTopic, TfFrames, WrenchTopic, make_frames
 from bridge.stream.link import NodeClock
 from ft_compensation.bias import BiasRamp
@@ -72,7 +72,7 @@ class Compensation:
         sample, time_s, stamp_s: the latest, its time by the server's monotonic clock and since 1970.
     """
 
-    fields = ("force", "torque")
+    parts = (WRENCH,)
 
     def __init__(
         self,
@@ -98,6 +98,7 @@ class Compensation:
         self.has_subscribers = self.is_stopped = False
         self.published = self.withheld = 0
         self.why_withheld = ""
+        self.decode = decoder(parameters).sample
         self.sample: Sample | None = None
         self.time_s = self.stamp_s = 0.0
         self.configure(parameters)
@@ -131,9 +132,9 @@ class Compensation:
             window.observe(sample, time_s, stamp_s, specific_force)
         return specific_force if plan.has_tool else ZERO
 
-    def publish(self, sample: Sample, frame: DataMessage) -> None:
+    def publish(self, values: Values, frame: DataMessage) -> None:
         """Compensate a sample and publish its stages; nothing if the tool's weight is not known."""
-        plan = self.plan
+        plan, sample = self.plan, self.decode(values)
         specific_force = self._specific_force(plan, sample, frame)
         is_saturated = self._stops_on_saturation and sample.force_torque_saturated != 0
         if specific_force is None or self.hold or is_saturated:
@@ -147,9 +148,9 @@ class Compensation:
             topic.send(*stages[topic.index], frame)
         self.published += 1
 
-    def observe(self, sample: Sample, frame: DataMessage) -> None:
+    def observe(self, values: Values, frame: DataMessage) -> None:
         """Give source, open window and filter a sample that is not published."""
-        plan = self.plan
+        plan, sample = self.plan, self.decode(values)
         specific_force = self._specific_force(plan, sample, frame)
         filtered = self._filtered
         if filtered in self._wanted and filtered and specific_force is not None and not self.hold:

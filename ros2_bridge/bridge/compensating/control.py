@@ -166,8 +166,8 @@ class CompensationControl:
         output, source, reader = self.output, self.source, self.reader
         if not output.has_subscribers:
             why = output.hold
-            if not why and self.parameters.tool_mass and reader.sample is not None:
-                why = source.why_none(reader.sample, reader.stamp_ns * 1e-9)
+            if not why and self.parameters.tool_mass and reader.values is not None:
+                why = source.why_none(output.decode(reader.values), reader.stamp_ns * 1e-9)
             return why and f"wrench_compensated could not be published if somebody subscribed: {why}"
         if not output.is_stopped or output.sample is None:
             return ""

@@ -21,9 +21,18 @@ from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension
 
 from bota_ethercat.client.client import Client
 from bota_ethercat.framing import DataMessage, TerminalMessage
-from bota_ethercat.pdo import Sample
+from bota_ethercat.pdo import (
+    LAYOUTS,
+    MOTION,
+    ORIENTATION,
+    TEMPERATURE,
+    WRENCH,
+    ImuUnits,
+    SampleDecoder,
+    Values,
+)
 from bridge.parameters.table import Numbers, Parameters
-from bridge.rclpy_internals import packer
+from bridge.rclpy_internals import packing
 from bridge.stream.link import Link
 from bridge.stream.reader import Output
 
@@ -33,9 +42,8 @@ _ARRAY_SIZE: Final = len(ARRAY_LABEL.split())
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
 _NO_ORIENTATION: Final = (-1.0, *(0.0,) * 8)  # REP 145: the covariance of a missing orientation
 _DEPTH: Final = 10  # short: what a subscriber is too slow for is replaced by newer samples
-Send = Callable[[Any], None]  # a message, or one serialized
-Publish = Callable[[Sample, DataMessage], None]
-Make = Callable[[Send, Parameters, "Stamps"], Publish]
+Publish = Callable[[Values, DataMessage], None]
+Make = Callable[[Any, Parameters, "Stamps"], Publish]  # of a publisher
 
 
 def create_publisher(node: Node, message_type: Any, topic: str) -> Any:
@@ -51,7 +59,6 @@ class Topic:
 
     def __init__(self, node: Node, message_type: Any, topic: str) -> None:
         self._publisher = create_publisher(node, message_type, topic)
-        self._send: Send = self._publisher.publish
 
     def is_wanted(self) -> bool:
         return bool(self._publisher.get_subscription_count())
@@ -89,72 +96,84 @@ class MeasuredTopic(Topic):
 
     def __init__(
         self, node: Node, parameters: Parameters, stamps: Stamps, topic: str, message_type: Any,
-        fields: Sequence[str], make: Make,
+        parts: Sequence[slice], make: Make,
     ) -> None:  # fmt: skip
         super().__init__(node, message_type, topic)
-        self.fields, self._make, self._stamps = fields, make, stamps
+        self.parts, self._make, self._stamps = parts, make, stamps
         self.configure(parameters)
 
     def configure(self, parameters: Parameters) -> None:
-        self.publish = self._make(self._send, parameters, self._stamps)
+        self.publish = self._make(self._publisher, parameters, self._stamps)
 
-    def observe(self, sample: Sample, frame: DataMessage) -> None:
+    def observe(self, values: Values, frame: DataMessage) -> None:
         """Nothing: each message stands by itself."""
 
 
 def make_measured(node: Node, parameters: Parameters, stamps: Stamps) -> list[Output]:
-    wrench, motion = ("force", "torque"), ("acceleration", "angular_rate")
-    topics: tuple[tuple[str, Any, Sequence[str], Make], ...] = (
-        ("wrench", WrenchStamped, wrench, _wrench),
-        (parameters.array_topic, Float64MultiArray, (*wrench, *motion), _array),
-        ("imu/data_raw", Imu, motion, _imu),
-        ("imu/data", Imu, (*motion, "orientation"), partial(_imu, oriented=True)),
-        ("temperature", Temperature, ("temperature",), _temperature),
+    topics: tuple[tuple[str, Any, Sequence[slice], Make], ...] = (
+        ("wrench", WrenchStamped, (WRENCH,), _wrench),
+        (parameters.array_topic, Float64MultiArray, (WRENCH, MOTION), _array),
+        ("imu/data_raw", Imu, (MOTION,), _imu),
+        ("imu/data", Imu, (MOTION, ORIENTATION), partial(_imu, oriented=True)),
+        ("temperature", Temperature, (TEMPERATURE,), _temperature),
     )
     return [MeasuredTopic(node, parameters, stamps, *topic) for topic in topics]
 
 
-def _array(send: Send, _: Parameters, __: Stamps) -> Publish:
+def decoder(parameters: Parameters) -> SampleDecoder:
+    """For `Values` of any size."""
+    return SampleDecoder(min(LAYOUTS), ImuUnits(parameters.imu_raw_units))
+
+
+def _array(publisher: Any, parameters: Parameters, _: Stamps) -> Publish:
     """`std_msgs/Float64MultiArray`: N, Nm, m/s², rad/s, in the order of ARRAY_LABEL; it has no header."""
     message = Float64MultiArray()
     message.layout.dim = [MultiArrayDimension(label=ARRAY_LABEL, size=_ARRAY_SIZE, stride=_ARRAY_SIZE)]
     message.data = [0.0] * _ARRAY_SIZE
-    pack = packer(message, _ARRAY_SIZE)
-    return lambda sample, _: send(pack(*sample.array))
+    pack, send = packing(publisher, message, _ARRAY_SIZE)
+    motion = decoder(parameters).motion
+
+    def publish(values: Values, _: DataMessage) -> None:
+        acceleration, angular_rate = motion(values)
+        send(pack(*values[WRENCH], *acceleration, *angular_rate))
+
+    return publish
 
 
-def _wrench(send: Send, parameters: Parameters, stamps: Stamps) -> Publish:
+def _wrench(publisher: Any, parameters: Parameters, stamps: Stamps) -> Publish:
     """`geometry_msgs/WrenchStamped`: N and Nm, in the sensor's frame."""
-    pack = packer(WrenchStamped(header=Header(frame_id=parameters.frame_id)), 6)
-    return lambda sample, frame: send(pack(frame.stamp_ns - stamps.wrench_ns, *sample.force, *sample.torque))
+    pack, send = packing(publisher, WrenchStamped(header=Header(frame_id=parameters.frame_id)), 6)
+    return lambda values, frame: send(pack(frame.stamp_ns - stamps.wrench_ns, *values[WRENCH]))
 
 
-def _imu(send: Send, parameters: Parameters, stamps: Stamps, *, oriented: bool = False) -> Publish:
+def _imu(publisher: Any, parameters: Parameters, stamps: Stamps, *, oriented: bool = False) -> Publish:
     """`sensor_msgs/Imu`: m/s² and rad/s; `oriented`: with the sensor's own estimate of its orientation, and
     nothing where there is none."""
-    pack = packer(Imu(header=Header(frame_id=parameters.imu_frame_id)), 37)
+    pack, send = packing(publisher, Imu(header=Header(frame_id=parameters.imu_frame_id)), 37)
     of_orientation = _covariance(parameters.orientation_covariance) if oriented else _NO_ORIENTATION
     of_rate = _covariance(parameters.angular_velocity_covariance)
     of_acceleration = _covariance(parameters.linear_acceleration_covariance)
+    motion = decoder(parameters).motion
 
-    def publish(sample: Sample, frame: DataMessage) -> None:
-        orientation = sample.orientation if oriented else _UPRIGHT
-        if orientation is not None:
+    def publish(values: Values, frame: DataMessage) -> None:
+        orientation = values[ORIENTATION] if oriented else _UPRIGHT
+        if any(orientation):
+            acceleration, angular_rate = motion(values)
             send(
                 pack(
                     frame.stamp_ns - stamps.imu_ns, *orientation, *of_orientation,
-                    *sample.angular_rate, *of_rate, *sample.acceleration, *of_acceleration,
+                    *angular_rate, *of_rate, *acceleration, *of_acceleration,
                 )
             )  # fmt: skip
 
     return publish
 
 
-def _temperature(send: Send, parameters: Parameters, _: Stamps) -> Publish:
+def _temperature(publisher: Any, parameters: Parameters, _: Stamps) -> Publish:
     """`sensor_msgs/Temperature`: °C, inside the sensor."""
-    pack = packer(Temperature(header=Header(frame_id=parameters.frame_id)), 2)
+    pack, send = packing(publisher, Temperature(header=Header(frame_id=parameters.frame_id)), 2)
     variance = parameters.temperature_variance
-    return lambda sample, frame: send(pack(frame.stamp_ns, sample.temperature, variance))
+    return lambda values, frame: send(pack(frame.stamp_ns, *values[TEMPERATURE], variance))
 
 
 def _covariance(variances: Numbers) -> Numbers:

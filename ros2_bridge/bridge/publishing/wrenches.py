@@ -15,7 +15,7 @@ from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Vector3
 from bridge.parameters.table import Parameters
 from bridge.publishing.messages import Stamps, Topic
-from bridge.rclpy_internals import packer
+from bridge.rclpy_internals import packing
 from bridge.stream.link import NodeClock
 from bridge.tf import TF_PERIOD_S, Tf, UnusableError, check_tf, stale_text
 from ft_compensation.compensator import Stages
@@ -32,7 +32,8 @@ class WrenchTopic(Topic):
 
     def __init__(self, node: Node, topic: str, frame_id: str, stamps: Stamps, stage: str = "final") -> None:
         super().__init__(node, WrenchStamped, topic)
-        self._pack, self._stamps = packer(WrenchStamped(header=Header(frame_id=frame_id)), 6), stamps
+        message, self._stamps = WrenchStamped(header=Header(frame_id=frame_id)), stamps
+        self._pack, self._send = packing(self._publisher, message, 6)
         self.index = Stages._fields.index(stage)
 
     def configure(self, parameters: Parameters) -> None:

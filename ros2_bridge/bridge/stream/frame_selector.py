@@ -73,14 +73,9 @@ class FrameSelector:
             is_usual = self._may_be_negative or 0 < age_ns <= BACKLOG_NS
             usual_ns = self._usual_ns = age_ns if is_usual else 0
         late_ns = age_ns - usual_ns
-        alone = len(fresh) == 1
-        oldest_late_ns = late_ns if alone else now_ns - fresh[0].monotonic_ns - usual_ns
-        if self._skipping is None and oldest_late_ns <= BACKLOG_NS:
-            if late_ns < 0:
-                usual_ns += late_ns // _FALL
-                self._usual_ns = usual_ns if self._may_be_negative or usual_ns > 0 else 0
-            elif alone:  # it was waited for, so its delay is not this node's
-                self._usual_ns = usual_ns + late_ns // _RISE
+        if self._skipping is None and now_ns - fresh[0].monotonic_ns - usual_ns <= BACKLOG_NS:
+            if late_ns < 0 or len(fresh) == 1:  # a later one that was not waited for is late by this node
+                self.is_on_time(newest, now_ns)
         else:
             fresh = self._after_stall(fresh, age_ns, now_ns)
             if not fresh:
@@ -93,6 +88,21 @@ class FrameSelector:
             self.passed_over = fresh[: len(fresh) - len(selected)]
             return selected
         return fresh
+
+    def is_on_time(self, alone: DataMessage, now_ns: int) -> bool:
+        """Whether this frame, which was waited for, is hardly older than usual, as nearly all are.
+
+        If it is, `select` returns it, unless there is a limit; if not, nothing was done.
+        """
+        usual_ns = self._usual_ns
+        if usual_ns is None or self._skipping is not None:
+            return False
+        late_ns = now_ns - alone.monotonic_ns - usual_ns
+        if late_ns > BACKLOG_NS:
+            return False
+        usual_ns += late_ns // (_FALL if late_ns < 0 else _RISE)
+        self._usual_ns = usual_ns if usual_ns > 0 or self._may_be_negative else 0
+        return True
 
     def _after_stall(self, fresh: Sequence[DataMessage], age_ns: int, now_ns: int) -> list[DataMessage]:
         """The newest of `fresh`, or nothing while more is on the way; `age_ns` is its age."""

@@ -20,7 +20,7 @@ from bota_ethercat.control import Event
 from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import no_server
-from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
+from bota_ethercat.pdo import LAYOUTS, Values, flags_of
 from bota_ethercat.replies import MAX_DELAY_MS
 from bota_ethercat.text.untrusted import rows
 from bridge.parameters.table import Parameters
@@ -47,23 +47,24 @@ class Flags(NamedTuple):
 
 
 NO_FLAGS: Final = Flags(0, 0, 0, 0, 0)
-_FIRST_FLAG: Final = Sample._fields.index(Flags._fields[0])
+_SATURATED: Final = Flags._fields.index("force_torque_saturated")
+_UNPACK: Final = {size: layout.struct.unpack for size, layout in LAYOUTS.items()}
 
 
 class Output(Protocol):
     """A topic, or some that belong together, fed with every selected sample."""
 
     @property
-    def fields(self) -> Sequence[str]:
-        """The fields of `Sample` that it publishes: all of them are finite when `publish` is called."""
+    def parts(self) -> Sequence[slice]:
+        """What it publishes of `Values`: all of it is finite when `publish` is called."""
 
     def is_wanted(self) -> bool:
         """Whether anything needs `publish`. Called now and then, not by the reader."""
 
-    def publish(self, sample: Sample, frame: DataMessage, /) -> None:
-        """Publish `sample`, which came in `frame`: its stamp, and for intervals its monotonic time."""
+    def publish(self, values: Values, frame: DataMessage, /) -> None:
+        """Publish `values`, which came in `frame`: its stamp, and for intervals its monotonic time."""
 
-    def observe(self, sample: Sample, frame: DataMessage) -> None:
+    def observe(self, values: Values, frame: DataMessage) -> None:
         """Take note of a sample that `publishing_frequency` leaves out."""
 
     def configure(self, parameters: Parameters) -> None:
@@ -81,12 +82,11 @@ class Outputs:
         """Ask who has subscribed: 1 µs a topic, too much for every sample but not for now and then."""
         self.wanted = tuple(output for output in self.all if output.is_wanted())
 
-    def publish_finite(self, sample: Sample, frame: DataMessage) -> None:
+    def publish_finite(self, values: Values, frame: DataMessage) -> None:
         """Publish a sample that is not finite everywhere where it is."""
         for output in self.wanted:
-            parts = [getattr(sample, field) for field in output.fields]
-            if math.isfinite(sum(sum(p) if isinstance(p, tuple) else p or 0.0 for p in parts)):
-                output.publish(sample, frame)
+            if math.isfinite(sum(sum(values[part]) for part in output.parts)):
+                output.publish(values, frame)
 
 
 class Reader:
@@ -95,12 +95,12 @@ class Reader:
     The monitor reads the attributes, `pop_flags` and `pop_ages`: append and popleft of a deque are atomic.
 
     Attributes:
-        sample, stamp_ns: the newest that was published, and its time since the Unix epoch.
+        values, stamp_ns: the newest that were published, and their time since the Unix epoch.
         saturated: samples whose force or torque was saturated.
         not_finite: samples that were not published for that.
     """
 
-    sample: Sample | None = None
+    values: Values | None = None
     stamp_ns = saturated = not_finite = 0
 
     def __init__(
@@ -108,8 +108,6 @@ class Reader:
         channel: TcpChannel | None = None, clock: NodeClock = SYSTEM_CLOCK,
     ) -> None:  # fmt: skip
         self._sensor, self._outputs, self._log = parameters.sensor, outputs, log
-        units = ImuUnits(parameters.imu_raw_units)
-        self._decode = {size: SampleDecoder(size, units).decode for size in LAYOUTS}
         self.client = Client(
             parameters.server_port, parameters.server_host, sensors=[self._sensor],
             terminals=range(parameters.terminals), channel=channel,
@@ -161,6 +159,8 @@ class Reader:
 
     def read(self, timeout_s: float) -> None:
         """Publish what arrives within `timeout_s`; ConnectionFailedError once `client` has been closed."""
+        if not self._limit_hz:
+            self._read_steady(timeout_s)
         frames: list[DataMessage] = []
         for item in self.client.poll_all(timeout_s):
             if isinstance(item, DataMessage):
@@ -168,54 +168,70 @@ class Reader:
                     frames.append(item)
                 continue
             if frames:
-                self._publish(frames)
+                self._select(frames)
                 frames = []
             self._handle_event(item)
         if frames:
-            self._publish(frames)
+            self._select(frames)
         while self.client.terminal_frames:
             frame = self.client.terminal_frames.popleft()
             if _FIRST_STAMP_NS <= frame.stamp_ns <= _LAST_STAMP_NS:
                 self.on_terminal(frame)
 
-    def _publish(self, frames: Sequence[DataMessage]) -> None:
-        """Decode each sample once, and hand it on; those that are skipped as too old are not looked at."""
+    def _read_steady(self, timeout_s: float) -> None:
+        """Publish each sample as it comes, while nothing is unusual: the way of nearly all."""
+        is_on_time, monotonic_ns = self._selector.is_on_time, self._monotonic_ns
+        for frames in self.client.steady(self._sensor, timeout_s):
+            if len(frames) == 1 and is_on_time(frames[0], monotonic_ns()):
+                self._publish(frames[0])
+            else:
+                self._select(frames)
+
+    def _select(self, frames: Sequence[DataMessage]) -> None:
+        """Publish those of the frames that are to be; others that are skipped as too old are not decoded."""
         selected = self._selector.select(frames, self._monotonic_ns())
         for frame in self._selector.passed_over:
-            sample = self._decoded(frame)
-            if sample.is_finite:
+            values = self._unpacked(frame.process_data)
+            if math.isfinite(sum(values)):
                 for output in self._outputs.wanted:
-                    output.observe(sample, frame)
+                    output.observe(values, frame)
             else:
                 self.not_finite += 1
         for frame in selected:
-            sample = self._decoded(frame)
-            if not _FIRST_STAMP_NS <= frame.stamp_ns <= _LAST_STAMP_NS:
-                self._log.warning(
-                    f"a sample with the impossible time {frame.stamp_ns} ns was not published", **_SOMETIMES
-                )
-            elif sample.is_finite:
-                for output in self._outputs.wanted:
-                    output.publish(sample, frame)
-                self.sample, self.stamp_ns = sample, frame.stamp_ns
-            else:
-                self._outputs.publish_finite(sample, frame)
-                self.not_finite += 1
-                self._log.warning(
-                    f"a sample with numbers that are not finite was not published ({self.not_finite} so far)",
-                    **_SOMETIMES,
-                )
-            self._ages.append(self._monotonic_ns() - frame.monotonic_ns)
+            self._publish(frame)
 
-    def _decoded(self, frame: DataMessage) -> Sample:
-        sample = self._decode[len(frame.process_data)](frame.process_data)
-        flags = sample[_FIRST_FLAG:]
+    def _publish(self, frame: DataMessage) -> None:
+        """Unpack a sample once, and hand it on."""
+        _, stamp_ns, monotonic_ns, _, _, _, process_data = frame
+        values = self._unpacked(process_data)
+        if not _FIRST_STAMP_NS <= stamp_ns <= _LAST_STAMP_NS:
+            self._log.warning(
+                f"a sample with the impossible time {stamp_ns} ns was not published", **_SOMETIMES
+            )
+        elif math.isfinite(sum(values)):  # which no infinity and no NaN survives
+            for output in self._outputs.wanted:
+                output.publish(values, frame)
+            self.values, self.stamp_ns = values, stamp_ns
+        else:
+            self._outputs.publish_finite(values, frame)
+            self.not_finite += 1
+            self._log.warning(
+                f"a sample with numbers that are not finite was not published ({self.not_finite} so far)",
+                **_SOMETIMES,
+            )
+        self._ages.append(self._monotonic_ns() - monotonic_ns)
+
+    def _unpacked(self, process_data: bytes) -> Values:
+        values = _UNPACK[len(process_data)](process_data)
+        if (flags := flags_of(values)) != self._flags or flags[_SATURATED]:
+            self._note_flags(flags)
+        return values
+
+    def _note_flags(self, flags: tuple[int, ...]) -> None:
         if flags != self._flags:
             self._flags = flags
             self._flag_changes.append(flags)
-        if sample.force_torque_saturated:
-            self.saturated += 1
-        return sample
+        self.saturated += flags[_SATURATED] != 0
 
     def _handle_event(self, event: ClientEvent) -> None:
         link = self.link
