@@ -275,10 +275,11 @@ class IdentifyServices:
         if (result := self._result) is None:
             raise CompensationError("there is no result to apply: call identify/solve first")
         accelerometer = result.accelerometer.calibration if result.accelerometer else None
-        self._control.set_payload(result.payload, result.bias, accelerometer)
+        self._control.set_payload(result.payload, result.known, result.bias, accelerometer)
         also = ", accelerometer.offset and accelerometer.scale" if accelerometer else ""
         return Done(
-            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias{also}; to "
+            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity, a likely tool_inertia "
+            f"and the bias{also}; to "
             "keep the tool, start the node with the file"
         )
 

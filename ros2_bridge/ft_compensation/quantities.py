@@ -64,12 +64,21 @@ class Payload(NamedTuple):
         return f"a tool of {self.mass:.3g} kg" if self.mass else "no tool_mass"
 
 
+class PayloadInterval(NamedTuple):
+    """Half the width of the 95 % intervals of a payload; of what is typical, unless it was identified."""
+
+    center: Vector3 = (0.002,) * 3  # m
+    inertia: tuple[float, ...] = (0.0,) * 6  # kg m²; zeros: not identified
+
+
 def wrench_text(wrench: Wrench) -> str:
     numbers = " ".join(f"{axis} {value:.4f}" for axis, value in zip(AXES, wrench.values, strict=True))
     return f"{numbers} (N, Nm)"
 
 
 NO_PAYLOAD: Final = Payload()
+_REACH: Final = 0.1  # m: how far the mass of a tool is likely to be from a center of gravity at the origin
+_LIKELY: Final = 0.2
 # m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered.
 OFFSET_PRIOR: Final = 0.4
 # Likewise of an axis' sensitivity, relative (local gravity is within it), and of what it has of another axis.
@@ -77,6 +86,7 @@ SCALE_PRIOR: Final = 0.005
 NORMAL_95: Final = 1.96  # half of a 95 % interval, in standard deviations
 _SCALE_95: Final = NORMAL_95 * SCALE_PRIOR
 CROSS_AXES: Final = ("xy", "xz", "yx", "yz", "zx", "zy")  # reading's axis, true axis
+ELEMENTS: Final = ("xx", "yy", "zz", "xy", "xz", "yz")  # of a tensor
 Six = tuple[float, float, float, float, float, float]
 
 
@@ -140,6 +150,16 @@ class StationaryLimits:
 
 def _by_axis(*limits: float) -> tuple[float, ...]:
     return tuple(limit for limit in limits for _ in range(3))
+
+
+def likely_inertia(payload: Payload) -> tuple[Six, Six]:
+    """The tensor about the center of gravity by mass and center alone, and half of its 95 % intervals, kg m².
+
+    Of tools that begin at the sensor: they reach about as far beyond their center of gravity as it is away.
+    """
+    largest = payload.mass * (_REACH**2 + length(payload.center) ** 2)
+    moment, half = _LIKELY * largest, largest
+    return (moment, moment, moment, 0.0, 0.0, 0.0), (half, half, half, *(_LIKELY * largest,) * 3)
 
 
 def length(a: Vector3) -> float:

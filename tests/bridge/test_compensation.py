@@ -15,7 +15,8 @@ from rclpy.parameter import Parameter
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode, layout_for
-from ft_compensation.bias import TareBasis, force_bound_95
+from ft_compensation.bias import TareBasis
+from ft_compensation.bounds import force_bound_95
 from ft_compensation.identification.weighted import Array
 from ft_compensation.quantities import Accelerometer, Payload
 from tests.bridge.simulated_node import (

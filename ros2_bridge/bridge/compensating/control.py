@@ -24,10 +24,19 @@ from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.stream.reader import Reader
-from ft_compensation.bias import BiasRamp, TareBasis, force_bound_95
+from ft_compensation.bias import BiasRamp, TareBasis
+from ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.outputs import cutoff_problem
-from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
+from ft_compensation.quantities import (
+    NO_WRENCH,
+    STILL,
+    Accelerometer,
+    Payload,
+    PayloadInterval,
+    Wrench,
+    wrench_text,
+)
 from ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
 
 _FROM_PARAMETER: Final = "parameter"
@@ -114,9 +123,18 @@ class CompensationControl:
     def state(self) -> CompensationState:
         output, source, parameters = self.output, self.source, self.parameters
         payload, bias, has_subscribers = parameters.payload, self.bias, output.has_subscribers
-        bound = None
+        bounds: dict[str, float | str] = {"accelerometer_force": "", "torque_bound": ""}
         if source.is_imu:
-            bound = force_bound_95(payload, parameters.accelerometer, self._ramp.taken)
+            known = parameters.accelerometer, self._ramp.taken
+            torque = torque_bound_95(
+                payload, parameters.payload_interval, *known,
+                turning=source.turning if has_subscribers else STILL,
+                noise=torque_noise_95(self.link.info.settings),
+            )  # fmt: skip
+            bounds = {
+                "accelerometer_force": round(force_bound_95(payload, *known), 3),
+                "torque_bound": round(torque, 4),
+            }
         age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
         parts = ["bias"] if bias != NO_WRENCH else []
         if payload.mass:
@@ -129,7 +147,7 @@ class CompensationControl:
                 "gravity_source": source.name,
                 "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
                 "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
-                "accelerometer_force": "" if bound is None else round(bound, 3),
+                **bounds,
                 "tared": bias != NO_WRENCH,
                 "bias_from": self.origin,
                 "bias_ramping": not self._ramp.arrived(self._sample_s),
@@ -203,10 +221,18 @@ class CompensationControl:
             )
             self.set_bias(NO_WRENCH, "cleared")
 
-    def set_payload(self, payload: Payload, bias: Wrench, accelerometer: Accelerometer | None = None) -> None:
+    def set_payload(
+        self,
+        payload: Payload,
+        known: PayloadInterval,
+        bias: Wrench,
+        accelerometer: Accelerometer | None = None,
+    ) -> None:
         """Put an identified payload, its bias and the accelerometer's correction in force, all at once."""
         values: dict[str, Any] = {
             "tool_mass": payload.mass, "tool_center_of_gravity": [*payload.center],
+            "tool_inertia": [*payload.inertia],
+            "tool_center_of_gravity_interval": [*known.center], "tool_inertia_interval": [*known.inertia],
         }  # fmt: skip
         if accelerometer is not None:
             values |= {f"accelerometer.{name}": [*part] for name, part in accelerometer._asdict().items()}

@@ -25,6 +25,7 @@ from ft_compensation.quantities import (
     ZERO,
     Accelerometer,
     Payload,
+    PayloadInterval,
     Quaternion,
     StationaryLimits,
     length,
@@ -177,6 +178,10 @@ class Parameters:
     tool_center_of_gravity: Vector3 = _row(ZERO, "Its center of gravity in frame_id, m", 0, 10)
     tool_inertia: Numbers = _row(NO_PAYLOAD.inertia,
         "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = a point mass", 0, 1e3)
+    tool_center_of_gravity_interval: Vector3 = _row(PayloadInterval().center,
+        "Half of the 95 % interval of its center of gravity, m; ~/identify finds it", 0, 1)
+    tool_inertia_interval: Numbers = _row(PayloadInterval().inertia,
+        "Half of the 95 % intervals of tool_inertia, kg m²; 0 = not identified", 0, 1e3)
     gravity: Vector3 = _row(DEFAULT_GRAVITY,
         "Gravity, m/s², in the base frame: that of the orientations", 0, 100)
     bias: Numbers = _row((0.0,) * 6,
@@ -239,6 +244,10 @@ class Parameters:
     @cached_property
     def payload(self) -> Payload:
         return Payload(self.tool_mass, self.tool_center_of_gravity, self.tool_inertia)
+
+    @property
+    def payload_interval(self) -> PayloadInterval:
+        return PayloadInterval(self.tool_center_of_gravity_interval, self.tool_inertia_interval)
 
     @cached_property
     def accelerometer(self) -> Accelerometer:

@@ -25,8 +25,10 @@ from ft_compensation.quantities import (
     Accelerometer,
     CompensationError,
     Payload,
+    PayloadInterval,
     Wrench,
     length,
+    likely_inertia,
 )
 from ft_compensation.stationary import triple
 
@@ -81,6 +83,7 @@ class Identified(NamedTuple):
     bias: Wrench
     gravity: float  # its magnitude in the poses, m/s²
     mass_interval: float  # kg
+    inertia_interval: tuple[float, ...]  # kg m²
     centre_interval: Vector3  # m
     bias_interval: Wrench  # N, Nm
     residuals: tuple[Wrench, ...]  # what the answer leaves of each pose, in order: measured minus modelled
@@ -92,6 +95,10 @@ class Identified(NamedTuple):
     # Of the bias, a minute; None if time explains nothing. `bias` is that of the last pose then.
     drift: Wrench | None = None
     touched: int | None = None  # index of the pose that does not fit the others, and is left out
+
+    @property
+    def known(self) -> PayloadInterval:
+        return PayloadInterval(self.centre_interval, self.inertia_interval)
 
 
 def identify(poses: Sequence[Pose]) -> Identified:
@@ -122,6 +129,7 @@ def identify(poses: Sequence[Pose]) -> Identified:
     mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
     _check_mass(mass, mass_interval)
     payload = Payload(mass, triple(found.center.value))
+    inertia, inertia_interval = likely_inertia(payload)  # still, it does not show
     centre_interval = triple(found.center.half)
     gravity = float(np.linalg.norm(equations.gravity, axis=1).mean())
     weight = mass * gravity
@@ -147,10 +155,11 @@ def identify(poses: Sequence[Pose]) -> Identified:
     accelerometer = _accelerometer(found.calibration)
     undetermined = accelerometer.undetermined if accelerometer else ""
     return Identified(
-        payload,
+        payload._replace(inertia=inertia),
         Wrench.of(found.bias.value.tolist()),
         gravity,
         mass_interval,
+        inertia_interval,
         centre_interval,
         Wrench.of(found.bias.half.tolist()),
         tuple(map(Wrench.of, found.residuals.tolist())),
