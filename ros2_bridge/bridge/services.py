@@ -261,7 +261,7 @@ class IdentifyServices:
             "mass": result.payload.mass,
             "mass_interval": result.mass_interval,
             "center": result.payload.center,
-            "center_interval": result.centre_interval,
+            "center_interval": result.payload.center_interval,
             "bias": result.bias.values,
             "bias_interval": result.bias_interval.values,
             "force_residual": result.force_fit.rms,
@@ -275,7 +275,7 @@ class IdentifyServices:
         if (result := self._result) is None:
             raise CompensationError("there is no result to apply: call identify/solve first")
         accelerometer = result.accelerometer.calibration if result.accelerometer else None
-        self._control.set_payload(result.payload, result.known, result.bias, accelerometer)
+        self._control.set_payload(result.payload, result.bias, accelerometer)
         also = ", accelerometer.offset and accelerometer.scale" if accelerometer else ""
         return Done(
             f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity, a likely tool_inertia "

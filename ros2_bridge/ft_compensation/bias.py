@@ -59,7 +59,7 @@ class TareBasis(NamedTuple):
 
     def for_payload(self, payload: Payload) -> tuple[Wrench, TareBasis]:
         """By how much the bias is another for this payload; nothing if the specific force is unknown."""
-        if self.specific_force is None or payload == self.payload:
+        if self.specific_force is None or payload[:3] == self.payload[:3]:
             return NO_WRENCH, self
         before, now = (_weight(each, self.specific_force) for each in (self.payload, payload))
         return before.plus(now, -1.0), self._replace(payload=payload)
@@ -75,9 +75,9 @@ class TareBasis(NamedTuple):
 
     def doubt(self, payload: Payload) -> str:
         """Why the bias may not fit this payload, a sentence; empty if it does."""
-        if self.specific_force is not None or payload == self.payload:
+        if self.specific_force is not None or payload[:3] == self.payload[:3]:
             return ""
-        (was, (ax, ay, az), _), (mass, (bx, by, bz), _) = self.payload, payload
+        (was, (ax, ay, az)), (mass, (bx, by, bz)) = self.payload[:2], payload[:2]
         moved = mass * bx - was * ax, mass * by - was * ay, mass * bz - was * az
         return (
             f"the bias was taken with {self.payload}, and in which pose is not known: with {payload} it may "

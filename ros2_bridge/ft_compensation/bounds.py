@@ -20,7 +20,6 @@ from ft_compensation.quantities import (
     STILL,
     Accelerometer,
     Payload,
-    PayloadInterval,
     Turning,
     length,
     likely_inertia,
@@ -55,7 +54,6 @@ def force_bound_95(payload: Payload, accelerometer: Accelerometer, taken: TareBa
 
 def torque_bound_95(
     payload: Payload,
-    known: PayloadInterval,
     accelerometer: Accelerometer,
     taken: TareBasis | None = None,
     felt: Vector3 = (0.0, 0.0, STANDARD_GRAVITY),
@@ -68,14 +66,15 @@ def torque_bound_95(
     center of gravity's interval under the specific force `felt` there, m/s²; `force_bound_95` at its arm; and
     `noise`, Nm, of the sensor (`torque_noise_95`). `taken` as there. Components may be arrays of samples.
     """
-    halves, (rate, spin) = _inertia_halves(payload, known), turning
+    halves, (rate, spin) = _inertia_halves(payload), turning
     sideways = sum(part * part for part in rate) ** 0.5 * _spread(halves, rate) ** 0.5
     is_tared = taken is not None and taken.specific_force != (0.0, 0.0, 0.0)
-    off_center = (_BETWEEN_POSES if is_tared else _ABOUT_THREE_AXES) * payload.mass * max(known.center)
-    parts = force_bound_95(payload, accelerometer, taken) * length(payload.center), noise
-    squares = _spread(halves, spin) + 0.25 * sideways * sideways
-    squares = squares + off_center * off_center * sum(part * part for part in felt)
-    bound: float = (squares + sum(part * part for part in parts)) ** 0.5
+    off_center = (
+        (_BETWEEN_POSES if is_tared else _ABOUT_THREE_AXES) * payload.mass * max(payload.center_interval)
+    )
+    at_arm = force_bound_95(payload, accelerometer, taken) * length(payload.center)
+    squares = _spread(halves, spin) + 0.25 * sideways**2 + off_center**2 * sum(part * part for part in felt)
+    bound: float = (squares + at_arm**2 + noise**2) ** 0.5
     return bound
 
 
@@ -84,10 +83,10 @@ def torque_noise_95(settings: Mapping[str, SettingValue]) -> float:
     return float(_NOISE * (_NOISE_SINC / (settings.get("sinc_length") or _NOISE_SINC)) ** _NOISE_POWER)
 
 
-def _inertia_halves(payload: Payload, known: PayloadInterval) -> tuple[float, ...]:
+def _inertia_halves(payload: Payload) -> tuple[float, ...]:
     """kg m²: by how much each element of the tensor may be wrong; that of zeros is all of a likely one."""
-    if any(known.inertia):
-        return known.inertia
+    if any(payload.inertia_interval):
+        return payload.inertia_interval
     if any(payload.inertia):
         return (_TYPED * max(payload.inertia),) * 6
     likely, half = likely_inertia(payload)

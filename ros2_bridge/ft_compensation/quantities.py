@@ -59,16 +59,12 @@ class Payload(NamedTuple):
     # Ixx Iyy Izz Ixy Ixz Iyz about the center of gravity, in axes parallel to the sensor's, kg m²: diagonal
     # and off-diagonal elements of the tensor (Ixy is minus the integral of xy), as in URDF. A point mass: 0.
     inertia: tuple[float, ...] = (0.0,) * 6
+    # Half the width of the 95 % intervals; of what is typical, or zeros, unless it was identified.
+    center_interval: Vector3 = (0.002,) * 3
+    inertia_interval: tuple[float, ...] = (0.0,) * 6
 
     def __str__(self) -> str:
         return f"a tool of {self.mass:.3g} kg" if self.mass else "no tool_mass"
-
-
-class PayloadInterval(NamedTuple):
-    """Half the width of the 95 % intervals of a payload; of what is typical, unless it was identified."""
-
-    center: Vector3 = (0.002,) * 3  # m
-    inertia: tuple[float, ...] = (0.0,) * 6  # kg m²; zeros: not identified
 
 
 def wrench_text(wrench: Wrench) -> str:

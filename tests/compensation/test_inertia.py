@@ -14,14 +14,13 @@ from bota_ethercat.pdo import STANDARD_GRAVITY
 from ft_compensation.alignment import align
 from ft_compensation.bounds import torque_bound_95, torque_noise_95
 from ft_compensation.compensator import Compensator
-from ft_compensation.identification.inertia import Motion, identify_inertia, turn
+from ft_compensation.identification.inertia import identify_inertia, turn
 from ft_compensation.identification.payload import Identified, identify
 from ft_compensation.quantities import (
     EXACT,
     Accelerometer,
     CompensationError,
     Payload,
-    PayloadInterval,
     Turning,
     likely_inertia,
 )
@@ -77,7 +76,7 @@ def identified(felt: Felt, tool: Payload, known: Accelerometer = EXACT, *, fir: 
     noise = random.Random(int(1e6 * tool.mass))
     poses = identify([pose(up, tool, BIAS, noise, 0.01) for up in AXES])
     alignment = align(settings(fir=fir), RATE_HZ)
-    return identify_inertia(turn(Motion(*felt), alignment, known, IMU), poses)
+    return identify_inertia(turn(felt.times, np.hstack(felt[1:]), alignment, known, IMU), poses)
 
 
 def left(felt: Felt, tool: Payload, known: Accelerometer) -> tuple[Array, list[Turning], Array]:
@@ -108,7 +107,7 @@ def test_in_20_s_of_motion_every_principal_moment_is_found_to_10_percent(seed: i
     found = identified(felt, tool, known, fir=fir)
     moments, truth = (np.linalg.eigvalsh(tensor(each.inertia)) for each in (found.payload, tool))
     assert np.abs(moments / truth - 1.0).max() < 0.1
-    assert max(found.inertia_interval) < 0.1 * truth[2]
+    assert max(found.payload.inertia_interval) < 0.1 * truth[2]
     if not fir:
         assert rms(left(felt, found.payload, known)[0]) < 0.03
 
@@ -120,7 +119,9 @@ def test_its_intervals_cover_95_percent(count: int) -> None:
         tool = tool_of(seed, mass=0.5 + 0.1 * (seed % 20))
         felt = recorded("turned", seed, tool, 6.0)
         found = identified(felt, tool, imperfect(seed).known)
-        held += (np.abs(np.subtract(found.payload.inertia, tool.inertia)) <= found.inertia_interval).tolist()
+        held += (
+            np.abs(np.subtract(found.payload.inertia, tool.inertia)) <= found.payload.inertia_interval
+        ).tolist()
     assert np.mean(held) > 0.9
 
 
@@ -132,14 +133,11 @@ def test_the_bound_covers_95_percent_of_the_torque_that_is_left(name: str, seed:
     tool, known = tool_of(seed), imperfect(seed).known
     felt, noise = recorded(name, seed, tool, 6.0), torque_noise_95(settings())
     found = identified(recorded("turned", seed, tool), tool, known)
-    for each, interval in (
-        (tool._replace(inertia=(0.0,) * 6), PayloadInterval()),
-        (found.payload, found.known),
-    ):
+    for each in (tool._replace(inertia=(0.0,) * 6), found.payload):
         torque, turnings, felts = left(felt, each, known)
         sizes, imu = np.linalg.norm(torque, axis=1), Accelerometer(*known[:2], *EXACT[2:4], *known[4:])
         bounds = np.array([
-            torque_bound_95(each, interval, imu, None, specific, turning, noise)
+            torque_bound_95(each, imu, None, specific, turning, noise)
             for specific, turning in zip(felts, turnings, strict=True)
         ])  # fmt: skip
         assert (sizes <= bounds).mean() > 0.95
@@ -153,10 +151,10 @@ def test_where_it_hardly_turns_only_what_mass_and_center_make_likely_is_known() 
     likely, half = likely_inertia(still.payload)
     assert "hardly turned about x and y and z" in still.notes[0]
     assert still.payload.inertia == pytest.approx(likely, abs=0.1 * half[0])
-    assert still.inertia_interval == pytest.approx(half, rel=0.2)
+    assert still.payload.inertia_interval == pytest.approx(half, rel=0.2)
     assert "hardly turned about y and z" in about_x.notes[0]
     assert about_x.payload.inertia[0] == pytest.approx(tool.inertia[0], rel=0.1)
-    assert about_x.inertia_interval[0] < 0.05 * half[0]
+    assert about_x.payload.inertia_interval[0] < 0.05 * half[0]
 
 
 def test_samples_with_contact_are_left_out_and_what_no_body_has_is_refused() -> None:

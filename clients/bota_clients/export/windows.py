@@ -35,12 +35,12 @@ from ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import (
     EXACT,
+    NO_PAYLOAD,
     NO_WRENCH,
     STILL,
     ZERO,
     Accelerometer,
     Payload,
-    PayloadInterval,
     Turning,
     Wrench,
 )
@@ -51,7 +51,6 @@ from ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
 Array = npt.NDArray[Any]
 Arrays = dict[str, Array]
 _CHANNELS: Final = dict(zip(Delays._fields, (slice(0, 6), slice(6, 9), slice(9, 12)), strict=True))
-_INTERVALS: Final = {"center": "center_of_gravity", "inertia": "inertia"}
 _UNKNOWN: Final = (math.nan,) * 3
 _SLOT: Final = np.dtype([
     ("measured_ns", "i8", 3),  # by channel; of an empty slot by its place between two samples
@@ -116,16 +115,16 @@ class Windows:
         self._doubted_until_ns = -1
         if tool is None:
             return
-        center, inertia = tuple(tool["tool_center_of_gravity"]), tuple(tool.get("tool_inertia", (0.0,) * 6))
-        self._payload = Payload(float(tool["tool_mass"]), center, inertia)
-        intervals = {name: tool.get(f"tool_{long}_interval") for name, long in _INTERVALS.items()}
-        self._interval = PayloadInterval(**{name: tuple(row) for name, row in intervals.items() if row})
+        mass, center = float(tool["tool_mass"]), tuple(tool["tool_center_of_gravity"])
+        names = "inertia", "center_of_gravity_interval", "inertia_interval"
+        rows = zip(names, NO_PAYLOAD[2:], strict=True)
+        self._payload = Payload(mass, center, *(tuple(tool.get(f"tool_{name}", row)) for name, row in rows))
         self._bias, offset = Wrench.of(tool.get("bias", NO_WRENCH.values)), offset_of(tool)
         self._compensator, self._own_offset = Compensator(self._payload, self._bias), OwnOffset()
         self._own_offset.begin(self._bias, offset, is_measured=offset is not None)
         self._offset: Wrench | None = None
-        rows = {name: tool.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
-        self._accelerometer = Accelerometer(**{name: tuple(row) for name, row in rows.items()})
+        imu = {name: tool.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
+        self._accelerometer = Accelerometer(**{name: tuple(row) for name, row in imu.items()})
         self._imu_position: Vector3 = tuple(tool.get("imu_position", ZERO))
 
     def configure(
@@ -255,7 +254,7 @@ class Windows:
             return math.nan, math.nan
         found[samples.monotonic_ns <= self._doubted_until_ns] = math.nan
         torque = torque_bound_95(
-            self._payload, self._interval, self._accelerometer, None, cast(Any, felt.T), turning,
+            self._payload, self._accelerometer, None, cast(Any, felt.T), turning,
             torque_noise_95(self._known),
         )  # fmt: skip
         force = force_bound_95(self._payload, self._accelerometer)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, Final
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -28,7 +27,7 @@ from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from ft_compensation.alignment import align
-from ft_compensation.identification.inertia import Motion, identify_inertia, turn
+from ft_compensation.identification.inertia import identify_inertia, turn
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
@@ -66,12 +65,11 @@ def show_result(console: Console, result: Identified) -> None:
     table.add_column(f"± ({100 * CONFIDENCE:g} %)", justify="right")
     table.add_column("unit")
     table.add_row("mass", f"{result.payload.mass:.4f}", f"{result.mass_interval:.4f}", "kg")
-    center, interval = ([1000 * x for x in each] for each in (result.payload.center, result.centre_interval))
+    center, inertia, interval, about = ([1000 * x for x in each] for each in result.payload[1:])
     bias, half = result.bias, result.bias_interval
-    moment, about = ([1000 * x for x in each] for each in (result.payload.inertia, result.inertia_interval))
     rows: list[tuple[str, Sequence[float], Sequence[float], int, str]] = [
         ("center of gravity", center, interval, 2, "mm"),
-        ("inertia", moment, about, 3, "g m²"),
+        ("inertia", inertia, about, 3, "g m²"),
         ("bias force", bias.force, half.force, 3, "N"),
         ("bias torque", bias.torque, half.torque, 5, "Nm"),
     ]
@@ -117,9 +115,9 @@ def as_json(
         "tool_mass": result.payload.mass,
         "tool_mass_interval": result.mass_interval,
         "tool_center_of_gravity": result.payload.center,
-        "tool_center_of_gravity_interval": result.centre_interval,
+        "tool_center_of_gravity_interval": result.payload.center_interval,
         "tool_inertia": result.payload.inertia,
-        "tool_inertia_interval": result.inertia_interval,
+        "tool_inertia_interval": result.payload.inertia_interval,
         "bias": result.bias.values,
         "bias_interval": result.bias_interval.values,
         "confidence": CONFIDENCE,
@@ -199,9 +197,8 @@ def _with_inertia(result: Identified, data: Columns, sensor: RecordedSensor) -> 
         data = data.where(data.fresh)
         rows, good = usable_rows(data)
         times = (data.monotonic_ns - data.monotonic_ns[0])[good] * 1e-9
-        motion = Motion(times, *np.split(rows[good], 4, axis=1))
         alignment = align(sensor.info.settings, sensor.info.rate_hz)
-        return identify_inertia(turn(motion, alignment, calibration, imu), result)
+        return identify_inertia(turn(times, rows[good], alignment, calibration, imu), result)
     except CompensationError as refusal:
         return result._replace(notes=(f"the tool's inertia is not identified: {refusal}", *result.notes))
 

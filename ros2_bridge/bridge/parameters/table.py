@@ -25,7 +25,6 @@ from ft_compensation.quantities import (
     ZERO,
     Accelerometer,
     Payload,
-    PayloadInterval,
     Quaternion,
     StationaryLimits,
     length,
@@ -178,9 +177,9 @@ class Parameters:
     tool_center_of_gravity: Vector3 = _row(ZERO, "Its center of gravity in frame_id, m", 0, 10)
     tool_inertia: Numbers = _row(NO_PAYLOAD.inertia,
         "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = a point mass", 0, 1e3)
-    tool_center_of_gravity_interval: Vector3 = _row(PayloadInterval().center,
+    tool_center_of_gravity_interval: Vector3 = _row(NO_PAYLOAD.center_interval,
         "Half of the 95 % interval of its center of gravity, m; ~/identify finds it", 0, 1)
-    tool_inertia_interval: Numbers = _row(PayloadInterval().inertia,
+    tool_inertia_interval: Numbers = _row(NO_PAYLOAD.inertia_interval,
         "Half of the 95 % intervals of tool_inertia, kg m²; 0 = not identified", 0, 1e3)
     gravity: Vector3 = _row(DEFAULT_GRAVITY,
         "Gravity, m/s², in the base frame: that of the orientations", 0, 100)
@@ -243,11 +242,8 @@ class Parameters:
 
     @cached_property
     def payload(self) -> Payload:
-        return Payload(self.tool_mass, self.tool_center_of_gravity, self.tool_inertia)
-
-    @property
-    def payload_interval(self) -> PayloadInterval:
-        return PayloadInterval(self.tool_center_of_gravity_interval, self.tool_inertia_interval)
+        intervals = self.tool_center_of_gravity_interval, self.tool_inertia_interval
+        return Payload(self.tool_mass, self.tool_center_of_gravity, self.tool_inertia, *intervals)
 
     @cached_property
     def accelerometer(self) -> Accelerometer:

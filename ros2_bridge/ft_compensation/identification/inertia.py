@@ -40,18 +40,8 @@ _HARDLY: Final = 0.5  # of the interval before: a moment no better known than so
 _PLACES: Final = [("xyz".index(row), "xyz".index(column)) for row, column in ELEMENTS]
 
 
-class Motion(NamedTuple):
-    """Samples of one sensor, in order."""
-
-    times: Array  # (n,) s
-    force: Array  # (n, 3) N
-    torque: Array  # (n, 3) Nm
-    acceleration: Array  # (n, 3) m/s²
-    rate: Array  # (n, 3) rad/s
-
-
 class Turned(NamedTuple):
-    """What `turn` makes of them: n instants, smoothed alike."""
+    """What `turn` makes of samples: n instants, smoothed alike."""
 
     force: Array  # (n, 3)
     torque: Array  # (n, 3)
@@ -62,19 +52,25 @@ class Turned(NamedTuple):
     is_whole: NDArray[np.bool_]  # (n,): whether no sample is missing there
 
 
-def turn(motion: Motion, alignment: Alignment, accelerometer: Accelerometer, imu: Vector3) -> Turned:
-    """Force and torque, and what the IMU at `imu`, m, felt of them, at one instant and bandwidth."""
+def turn(
+    stamps: Array, samples: Array, alignment: Alignment, accelerometer: Accelerometer, imu: Vector3
+) -> Turned:
+    """Force and torque, and what the IMU at `imu`, m, felt of them, at one instant and bandwidth.
+
+    Of `samples` (n, 12): N, Nm, m/s², rad/s; taken at `stamps` (n,), s, in order.
+    """
     if alignment.lag_s is None:
         raise CompensationError("by the filters that were set it is not known how late the force is")
-    stamps, period = motion.times, alignment.period_s
-    times, settings = np.arange(stamps[0], stamps[-1], period), alignment.settings
-    lag_s, late = alignment.lag_s, [each(settings).delay_s or 0.0 for each in _RESPONSES]
+    period, settings = alignment.period_s, alignment.settings
+    times = np.arange(stamps[0], stamps[-1], period)
+    late = [each(settings).delay_s or 0.0 for each in _RESPONSES]
     taps = np.array(fir_taps()) if settings.get("fir") else np.ones(1)
-    lag_s -= period * (len(taps) - 1) / 2
-    force, torque = (at_times(times, stamps, columns) for columns in (motion.force, motion.torque))
+    lag_s = alignment.lag_s - period * (len(taps) - 1) / 2
+    load, acceleration, rate = np.split(samples, [6, 9], axis=1)
+    load = at_times(times, stamps, load)
     acceleration, rate = (
         smoothed(at_times(times - lag_s + delay_s - late[0], stamps, columns), taps, "full")[: len(times)]
-        for columns, delay_s in zip((motion.acceleration, motion.rate), late, strict=True)
+        for columns, delay_s in zip((acceleration, rate), late, strict=True)
     )
     felt = np.stack(accelerometer.correct(tuple(acceleration.T)), axis=1)
     spin = np.gradient(rate, period, axis=0)
@@ -84,7 +80,7 @@ def turn(motion: Motion, alignment: Alignment, accelerometer: Accelerometer, imu
     felt = felt - arm @ np.array(imu)
     window = hann_window(_WINDOW_S, period)
     every = max(1, round(_WINDOW_S / period / 4))
-    columns = np.concatenate([force, torque, felt, arm.reshape(-1, 9), spun.reshape(-1, 18)], axis=1)
+    columns = np.concatenate([load, felt, arm.reshape(-1, 9), spun.reshape(-1, 18)], axis=1)
     found, times = smoothed(columns, window)[::every], times[::every]
     reach_s = period * len(taps) + abs(lag_s) + _WINDOW_S
     is_gap = np.diff(stamps) > max(alignment.gap_s, 2.5 * period)
@@ -137,22 +133,19 @@ def identify_inertia(turned: Turned, poses: Identified) -> Identified:
     spun = spun * (squares > _LEAST_SPIN**2)[pieces, None]
     design = np.concatenate([-spun, -_crossing(force), still, still * minutes], axis=2)
     likely, half = (np.array(part) for part in likely_inertia(payload))
-    halves = np.concatenate([half, np.maximum(poses.centre_interval, _LEAST_CENTER), np.full(6, np.inf)])
+    halves = np.concatenate([half, np.maximum(payload.center_interval, _LEAST_CENTER), np.full(6, np.inf)])
     known, expected = (NORMAL_95 / halves) ** 2, np.concatenate([likely, payload.center, np.zeros(6)])
     found, deviation, degrees = _solve(design, turned.torque[is_free], pieces, known, expected)
     found, interval = found[:6], float(students_t(degrees)) * deviation[:6]
     interval = np.hypot(np.minimum(interval, half), _GYROSCOPE * abs(found[:3]).max())
-    inertia = _possible(found, interval)
     vague = "".join(axis for axis, is_open in zip("xyz", interval > _HARDLY * half, strict=False) if is_open)
     note = (
         f"the tool hardly turned about {' and '.join(vague)}, so its inertia there is only what mass and "
         "center of gravity make likely: turn it to and fro about each axis for some seconds, touching nothing"
     )
-    return poses._replace(
-        payload=payload._replace(inertia=tuple(inertia.tolist())),
-        inertia_interval=tuple(interval.tolist()),
-        notes=(*([note] if vague else []), *poses.notes),
-    )
+    inertia = _possible(found, interval).tolist()
+    payload = payload._replace(inertia=tuple(inertia), inertia_interval=tuple(interval.tolist()))
+    return poses._replace(payload=payload, notes=(*([note] if vague else []), *poses.notes))
 
 
 def _solve(
