@@ -176,7 +176,7 @@ class Parameters:
     tool_mass: float = _row(0.0, "Mass of what hangs on the sensor, kg; 0 = it is not compensated", 0, 1000)
     tool_center_of_gravity: Vector3 = _row(ZERO, "Its center of gravity in frame_id, m", 0, 10)
     tool_inertia: Numbers = _row(NO_PAYLOAD.inertia,
-        "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = a point mass", 0, 1e3)
+        "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = unknown", 0, 1e3)
     tool_center_of_gravity_interval: Vector3 = _row(NO_PAYLOAD.center_interval,
         "Half of the 95 % interval of its center of gravity, m; ~/identify finds it", 0, 1)
     tool_inertia_interval: Numbers = _row(NO_PAYLOAD.inertia_interval,
