@@ -9,11 +9,10 @@ to be computed when they are shown, not for every sample.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Final
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from bota_ethercat.settings import SettingValue
+from ft_compensation.alignment import Alignment
 from ft_compensation.bias import TareBasis
 from ft_compensation.quantities import (
     NORMAL_95,
@@ -32,6 +31,8 @@ _BETWEEN_POSES: Final = 4.39 / NORMAL_95
 # Nm: what the noise of a healthy sensor's sample keeps to in 95 %, with SINC 51, and the power of the length
 # with which it falls.
 _NOISE, _NOISE_SINC, _NOISE_POWER = 0.0172, 51, 0.78
+# Deviations of accelerometer, m/s², and gyroscope, rad/s; how far the IMU is behind the wrench origin, m.
+_IMU_NOISE, _IMU_BELOW, _TWO_AXES = (0.02, 0.0017), 0.026, 2.45
 _TYPED: Final = 0.1  # of its largest element: half of the interval of a tensor that is given without one
 
 
@@ -78,9 +79,16 @@ def torque_bound_95(
     return bound
 
 
-def torque_noise_95(settings: Mapping[str, SettingValue]) -> float:
-    """Nm: what the noise of a healthy sensor with these settings keeps to in 95 % of samples."""
-    return float(_NOISE * (_NOISE_SINC / (settings.get("sinc_length") or _NOISE_SINC)) ** _NOISE_POWER)
+def torque_noise_95(payload: Payload, alignment: Alignment) -> float:
+    """Nm: what the noise of a healthy sensor and its IMU keeps to in 95 % of samples."""
+    sinc_length, reach = alignment.settings.get("sinc_length") or _NOISE_SINC, length(payload.center)
+    arm = payload.mass * reach
+    arms = arm, arm * (reach + _IMU_BELOW) + max(payload.inertia)
+    of_imu = [
+        _TWO_AXES * each * noise * math.sqrt(float(weights @ weights))
+        for each, noise, weights in zip(arms, _IMU_NOISE, alignment.taps[::2], strict=True)
+    ]
+    return math.hypot(_NOISE * (_NOISE_SINC / sinc_length) ** _NOISE_POWER, *of_imu)
 
 
 def _inertia_halves(payload: Payload) -> tuple[float, ...]:

@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode, layout_for
+from ft_compensation.alignment import align
 from ft_compensation.bias import TareBasis
 from ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
 from ft_compensation.identification.weighted import Array
@@ -22,6 +23,7 @@ from ft_compensation.quantities import Accelerometer, Payload
 from tests.bridge.simulated_node import (
     OVER,
     QUICK,
+    RATE_HZ,
     SETTINGS,
     SIDE,
     STEP_S,
@@ -494,7 +496,7 @@ def test_how_wrong_the_torque_may_be_is_told_in_the_present_motion(arm: Arm, mov
         return float(values(moved.until(compensation="ok")["compensation"])["torque_bound"])
 
     arm.hold(UP)
-    still, noise = told(), torque_noise_95(SETTINGS)
+    still, noise = told(), torque_noise_95(HEAVY, align(SETTINGS, RATE_HZ))
     assert still == pytest.approx(torque_bound_95(HEAVY, Accelerometer(), noise=noise), abs=2e-3)
     arm.play(feel(guided(5, radians=1.0), HEAVY, 20.0, 1.0 / STEP_S))
     moved.run(1.0)

@@ -255,7 +255,7 @@ class Windows:
         found[samples.monotonic_ns <= self._doubted_until_ns] = math.nan
         torque = torque_bound_95(
             self._payload, self._accelerometer, None, cast(Any, felt.T), turning,
-            torque_noise_95(self._known),
+            torque_noise_95(self._payload, self._imu.alignment),
         )  # fmt: skip
         force = force_bound_95(self._payload, self._accelerometer)
         return found, np.stack([np.full(len(found), force), np.broadcast_to(torque, len(found))], axis=1)

@@ -24,6 +24,7 @@ from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.stream.reader import Reader
+from ft_compensation.alignment import align
 from ft_compensation.bias import BiasRamp, TareBasis
 from ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
 from ft_compensation.compensator import Compensator
@@ -120,7 +121,7 @@ class CompensationControl:
             known = payload, parameters.accelerometer, self._ramp.taken
             turning, noise = (
                 source.turning if has_subscribers else STILL,
-                torque_noise_95(self.link.info.settings),
+                torque_noise_95(payload, align(self.link.info.settings, self.link.info.rate_hz)),
             )
             torque = torque_bound_95(*known, turning=turning, noise=noise)
             bounds = [f"{force_bound_95(*known):.3f}", f"{torque:.4f}"]
