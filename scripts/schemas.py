@@ -50,7 +50,8 @@ SI units, in the sensor's frame. `ok`: whether there is a result.
 = failure, tool
 failure: ok false, error str?, poses [pose], rejected [str]
 tool: ok true, tool_mass float, tool_mass_interval float, tool_center_of_gravity [float],
-    tool_center_of_gravity_interval [float], bias [float], bias_interval [float], confidence float,
+    tool_center_of_gravity_interval [float], tool_inertia [float], tool_inertia_interval [float],
+    bias [float], bias_interval [float], confidence float,
     force_rms float, torque_rms float, force_fit fit, torque_fit fit, accelerometer accelerometer?, gravity
     float, notes [str], poses [pose], rejected [str], drift [float]?, touched int?
 fit: rms float, degrees float, chi_square float?, verdict noise|small|large

@@ -261,7 +261,7 @@ class IdentifyServices:
             "mass": result.payload.mass,
             "mass_interval": result.mass_interval,
             "center": result.payload.center,
-            "center_interval": result.centre_interval,
+            "center_interval": result.payload.center_interval,
             "bias": result.bias.values,
             "bias_interval": result.bias_interval.values,
             "force_residual": result.force_fit.rms,
@@ -278,7 +278,8 @@ class IdentifyServices:
         self._control.set_payload(result.payload, result.bias, accelerometer)
         also = ", accelerometer.offset and accelerometer.scale" if accelerometer else ""
         return Done(
-            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity and the bias{also}; to "
+            f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity, a likely tool_inertia "
+            f"and the bias{also}; to "
             "keep the tool, start the node with the file"
         )
 

@@ -8,7 +8,6 @@ known.
 
 from __future__ import annotations
 
-import math
 from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
@@ -16,7 +15,6 @@ from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
-    NORMAL_95,
     ZERO,
     Accelerometer,
     CompensationError,
@@ -27,11 +25,6 @@ from ft_compensation.quantities import (
 )
 from ft_compensation.stationary import StationaryMeans
 
-# From half of an interval of one axis to the radius that holds as often for three (chi, 3 degrees), ...
-_ABOUT_THREE_AXES: Final = 2.80 / NORMAL_95
-# ... and for three times the distance between the directions of gravity in two poses, which are any.
-_BETWEEN_POSES: Final = 4.39 / NORMAL_95
-
 
 def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.5) -> None:
     """CompensationError unless the stationary accelerometer reads `magnitude`, m/s², within `tolerance`."""
@@ -41,23 +34,6 @@ def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.
             f"the stationary accelerometer reads {measured:.2f} m/s² where {magnitude:.2f} should be: check "
             "imu_raw_units, the IMU's settings and its offset"
         )
-
-
-def force_bound_95(payload: Payload, accelerometer: Accelerometer, taken: TareBasis | None = None) -> float:
-    """N: in 95 % of cases what is not known of the accelerometer shows as less force, in any pose.
-
-    A bias `taken` by a tare that went by this accelerometer has the part of its offset in it, and what its
-    scale and crossed axes did in that pose.
-    """
-    cross = accelerometer.cross_axis_interval
-    largest = STANDARD_GRAVITY * max(*accelerometer.scale_interval, *cross)
-    if taken is not None and taken.accelerometer == accelerometer:
-        return payload.mass * _BETWEEN_POSES * largest
-    per_axis = zip(
-        accelerometer.offset_interval, accelerometer.scale_interval, cross[::2], cross[1::2], strict=True
-    )
-    halves = [math.hypot(offset, STANDARD_GRAVITY * max(parts)) for offset, *parts in per_axis]
-    return payload.mass * _ABOUT_THREE_AXES * max(halves)
 
 
 def estimate_bias(means: StationaryMeans, payload: Payload, specific_force: Vector3) -> Wrench:
@@ -83,7 +59,7 @@ class TareBasis(NamedTuple):
 
     def for_payload(self, payload: Payload) -> tuple[Wrench, TareBasis]:
         """By how much the bias is another for this payload; nothing if the specific force is unknown."""
-        if self.specific_force is None or payload == self.payload:
+        if self.specific_force is None or payload[:3] == self.payload[:3]:
             return NO_WRENCH, self
         before, now = (_weight(each, self.specific_force) for each in (self.payload, payload))
         return before.plus(now, -1.0), self._replace(payload=payload)
@@ -99,9 +75,9 @@ class TareBasis(NamedTuple):
 
     def doubt(self, payload: Payload) -> str:
         """Why the bias may not fit this payload, a sentence; empty if it does."""
-        if self.specific_force is not None or payload == self.payload:
+        if self.specific_force is not None or payload[:3] == self.payload[:3]:
             return ""
-        (was, (ax, ay, az), _), (mass, (bx, by, bz), _) = self.payload, payload
+        (was, (ax, ay, az)), (mass, (bx, by, bz)) = self.payload[:2], payload[:2]
         moved = mass * bx - was * ax, mass * by - was * ay, mass * bz - was * az
         return (
             f"the bias was taken with {self.payload}, and in which pose is not known: with {payload} it may "

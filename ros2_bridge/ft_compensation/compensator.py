@@ -39,7 +39,7 @@ class Compensator:
         minus gravity, as an accelerometer there would read. `turning` matters to what is no point mass.
         """
         bias = self.bias
-        m, (cx, cy, cz), inertia = self.payload
+        m, (cx, cy, cz), inertia, _, _ = self.payload
         (bfx, bfy, bfz), (bmx, bmy, bmz) = bias
         fx, fy, fz = force[0] - bfx, force[1] - bfy, force[2] - bfz
         mx, my, mz = torque[0] - bmx, torque[1] - bmy, torque[2] - bmz

@@ -59,6 +59,9 @@ class Payload(NamedTuple):
     # Ixx Iyy Izz Ixy Ixz Iyz about the center of gravity, in axes parallel to the sensor's, kg m²: diagonal
     # and off-diagonal elements of the tensor (Ixy is minus the integral of xy), as in URDF. A point mass: 0.
     inertia: tuple[float, ...] = (0.0,) * 6
+    # Half the width of the 95 % intervals; of what is typical, or zeros, unless it was identified.
+    center_interval: Vector3 = (0.002,) * 3
+    inertia_interval: tuple[float, ...] = (0.0,) * 6
 
     def __str__(self) -> str:
         return f"a tool of {self.mass:.3g} kg" if self.mass else "no tool_mass"
@@ -70,6 +73,8 @@ def wrench_text(wrench: Wrench) -> str:
 
 
 NO_PAYLOAD: Final = Payload()
+_REACH: Final = 0.1  # m: how far the mass of a tool is likely to be from a center of gravity at the origin
+_LIKELY: Final = 0.2
 # m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered.
 OFFSET_PRIOR: Final = 0.4
 # Likewise of an axis' sensitivity, relative (local gravity is within it), and of what it has of another axis.
@@ -77,6 +82,7 @@ SCALE_PRIOR: Final = 0.005
 NORMAL_95: Final = 1.96  # half of a 95 % interval, in standard deviations
 _SCALE_95: Final = NORMAL_95 * SCALE_PRIOR
 CROSS_AXES: Final = ("xy", "xz", "yx", "yz", "zx", "zy")  # reading's axis, true axis
+ELEMENTS: Final = ("xx", "yy", "zz", "xy", "xz", "yz")  # of a tensor
 Six = tuple[float, float, float, float, float, float]
 
 
@@ -140,6 +146,16 @@ class StationaryLimits:
 
 def _by_axis(*limits: float) -> tuple[float, ...]:
     return tuple(limit for limit in limits for _ in range(3))
+
+
+def likely_inertia(payload: Payload) -> tuple[Six, Six]:
+    """The tensor about the center of gravity by mass and center alone, and half of its 95 % intervals, kg m².
+
+    Of tools that begin at the sensor: they reach about as far beyond their center of gravity as it is away.
+    """
+    largest = payload.mass * (_REACH**2 + length(payload.center) ** 2)
+    moment, half = _LIKELY * largest, largest
+    return (moment, moment, moment, 0.0, 0.0, 0.0), (half, half, half, *(_LIKELY * largest,) * 3)
 
 
 def length(a: Vector3) -> float:

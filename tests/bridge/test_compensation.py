@@ -15,12 +15,16 @@ from rclpy.parameter import Parameter
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode, layout_for
-from ft_compensation.bias import TareBasis, force_bound_95
+from ft_compensation.alignment import align
+from ft_compensation.bias import TareBasis
+from ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
 from ft_compensation.identification.weighted import Array
 from ft_compensation.quantities import Accelerometer, Payload
 from tests.bridge.simulated_node import (
     OVER,
     QUICK,
+    RATE_HZ,
+    SETTINGS,
     SIDE,
     STEP_S,
     UP,
@@ -482,6 +486,25 @@ def test_what_the_accelerometers_own_errors_may_make_is_told_in_newtons(arm: Arm
         moved.set(f"accelerometer.{name}", [*getattr(known, name)])
     assert told() == pytest.approx(force_bound_95(HEAVY, known), abs=1e-3)
     assert force_bound_95(HEAVY, known) < 0.1 * force_bound_95(HEAVY, Accelerometer())
+
+
+def test_how_wrong_the_torque_may_be_is_told_in_the_present_motion(arm: Arm, moved: Node) -> None:
+    """An unknown inertia matters while the tool spins; once it is identified, hardly."""
+    Stages(moved)
+
+    def told() -> float:
+        return float(values(moved.until(compensation="ok")["compensation"])["torque_bound"])
+
+    arm.hold(UP)
+    still, noise = told(), torque_noise_95(HEAVY, align(SETTINGS, RATE_HZ))
+    assert still == pytest.approx(torque_bound_95(HEAVY, Accelerometer(), noise=noise), abs=2e-3)
+    arm.play(feel(guided(5, radians=1.0), HEAVY, 20.0, 1.0 / STEP_S))
+    moved.run(1.0)
+    moving = max(told() for _ in range(3))
+    assert moving > still + 0.01
+    moved.set("tool_inertia", [1e-3] * 3 + [0.0] * 3)
+    moved.set("tool_inertia_interval", [1e-6] * 6)
+    assert max(told() for _ in range(3)) < still + 0.01
 
 
 def test_numbers_that_are_not_finite_stop_only_what_needs_them(arm: Arm, moved: Node) -> None:

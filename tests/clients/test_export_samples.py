@@ -120,6 +120,9 @@ def test_the_rows_are_those_of_the_windows(tmp_path: Path) -> None:
         windows = joined(windows_of(recording, Periodic(30.0), Windows(32, tool=TOOL)))
     assert (np.diff(made["monotonic_ns"]) > 0).all()
     assert 0.9 < made["compensated_valid"].mean() < made["valid"].mean() + 1e-9 < 1
+    for name in ("compensated_force_bound_N", "compensated_torque_bound_Nm"):
+        assert (np.isfinite(made[name]) == made["compensated_valid"]).all()
+        assert 0.0 < np.nanmin(made[name]) <= np.nanmax(made[name]) < 10.0
     axes = [name for name in made if re.match("(force|torque)_[xyz]", name)]
     wrench, compensated = (
         np.column_stack([made[f"{part}{name}"] for name in axes]) for part in ("", "compensated_")

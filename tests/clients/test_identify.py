@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bota_clients.identify.cli import main
@@ -245,9 +246,12 @@ def shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """By hand for 6 s, with FIR on."""
     path = tmp_path_factory.mktemp("identify") / "shaken.mcap"
     settings: dict[str, Any] = {**start_up_defaults(), "fir": True}
-    felt = motion.filtered(
-        motion.guided(1, metres=0.06, radians=0.3, hertz=(1.5, 4.0)), Payload(0.7), 6.0, settings
-    )
+    shaking = motion.guided(1, metres=0.06, radians=0.3, hertz=(1.5, 4.0))
+    record_felt(path, motion.filtered(shaking, Payload(0.7), 6.0, settings), settings)
+    return path
+
+
+def record_felt(path: Path, felt: motion.Felt, settings: dict[str, Any]) -> None:
     made = []
     for number, (time_s, *vectors) in enumerate(zip(*felt, strict=True)):
         names = ("force", "torque", "acceleration", "angular_rate")
@@ -259,7 +263,38 @@ def shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
         }
         made.append((time_s + 1.0, number, encode(61, values)))
     record(path, frames(made), **settings)
-    return path
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_the_inertia_is_found_if_the_tool_turned_between_the_poses_and_likely_if_not(
+    turns: bool, tmp_path: Path
+) -> None:
+    """Ten poses, and 12 s in which it is turned to and fro."""
+    begin_s, wrist, arm = 30.0, motion.turned(3), motion.waypoints(1.4, 1.6, 2, radians=5.0)
+
+    def path(t: motion.Array) -> tuple[motion.Array, motion.Array]:
+        share = turns * np.clip((t - begin_s) / 2.0, 0.0, 1.0)[:, None] ** 2
+        (place, angles), (_, more) = arm(np.minimum(t, begin_s)), wrist(t)
+        return place, angles + share * more
+
+    tool = Payload(1.5, (0.05, -0.03, 0.07), (0.009, 0.011, 0.006, 0.001, -0.002, 0.001))
+    settings: dict[str, Any] = start_up_defaults()
+    felt = motion.filtered(path, tool, begin_s + 12.0 * turns, settings)
+    if not turns:  # not even from pose to pose
+        felt = motion.Felt(*(part[felt.times % 3.0 < 1.6] for part in felt))
+    record_felt(tmp_path / "a.mcap", felt, settings)
+    code, found, _ = asked(tmp_path / "a.mcap", "--yaml", tmp_path / "tool.yaml")
+    assert (code, bool(problems("identify", found))) == (0, False)
+    written = written_parameters(tmp_path / "tool.yaml")
+    assert written["tool_inertia"] == pytest.approx(found["tool_inertia"], abs=1e-8)
+    assert written["tool_inertia_interval"] == pytest.approx(found["tool_inertia_interval"], abs=1e-8)
+    errors = np.abs(np.subtract(found["tool_inertia"], tool.inertia))
+    if turns:
+        assert errors.max() < 0.0006
+        assert max(found["tool_inertia_interval"]) < 0.001
+    else:
+        assert (errors < found["tool_inertia_interval"]).all()
+        assert "hardly turned about" in " ".join(found["notes"])
 
 
 def test_the_lag_of_the_force_is_told_beside_what_the_filters_imply(shaken: Path) -> None:

@@ -20,6 +20,9 @@ from bota_clients.identify.cli import main as identify
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
+from ft_compensation.bias import TareBasis
+from ft_compensation.bounds import force_bound_95, torque_bound_95
+from ft_compensation.quantities import Accelerometer, Payload
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.cpp_programs import (
     FAST,
@@ -249,6 +252,34 @@ def test_the_load_of_the_tool_is_that_of_the_golden_table(running: Loop, row: di
     for number, (load, expected) in enumerate(zip(found, row["loads"], strict=True)):
         assert (load is None) == (expected is None), number
         assert load is None or load == pytest.approx(expected, abs=1e-9), number
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_bounds_are_those_of_python(running: Loop, seed: int) -> None:
+    """Identified, typed and unknown tensors; after a tare, and without."""
+    draw = random.Random(seed)
+
+    def some(count: int, largest: float, *, likely: float = 1.0) -> Any:
+        return tuple(draw.uniform(0.0, largest) * (draw.random() < likely) for _ in range(count))
+
+    tensors = some(6, 0.02, likely=float(seed % 3 > 0)), some(6, 0.01, likely=float(seed % 3 == 2))
+    tool = Payload(draw.uniform(0.1, 3.0), some(3, 0.2), tensors[0], some(3, 0.01), tensors[1])
+    imu = Accelerometer(
+        offset_interval=some(3, 0.8), scale_interval=some(3, 0.01), cross_axis_interval=some(6, 0.01)
+    )
+    rows = {
+        "tool_mass": [tool.mass],
+        "tool_center_of_gravity": tool.center, "tool_inertia": tool.inertia,
+        "tool_center_of_gravity_interval": tool.center_interval,
+        "tool_inertia_interval": tool.inertia_interval,
+    }  # fmt: skip
+    rows |= {f"accelerometer.{name}": part for name, part in imu._asdict().items() if "interval" in name}
+    assert running.new(**{name: ",".join(map(repr, row)) for name, row in rows.items()}) == ""
+    felt, rate, spin, noise = some(3, 20.0), some(3, 3.0), some(3, 20.0), draw.uniform(0.0, 0.02)
+    for taken in (None, TareBasis(tool, (0.0, 0.0, 9.8), imu)):
+        told = running.do("bounds", int(taken is not None), *map(repr, (*felt, *rate, *spin, noise)))
+        torque = torque_bound_95(tool, imu, taken, felt, (rate, spin), noise)
+        assert told == pytest.approx([force_bound_95(tool, imu, taken), torque])
 
 
 @pytest.mark.parametrize(("model", "heights"), HEIGHTS.items())

@@ -249,6 +249,12 @@ def guided(
     return path
 
 
+def turned(seed: int, *, rate: float = 3.0, spin: float = 20.0) -> Path:
+    """A wrist that turns about all axes, at up to about `rate`, rad/s, and `spin`, rad/s²."""
+    hertz = spin / rate / (2 * np.pi)
+    return guided(seed, metres=0.05, radians=rate * rate / spin, hertz=(0.6 * hertz, 1.1 * hertz))
+
+
 def together(*paths: Path) -> Path:
     def path(t: Array) -> tuple[Array, Array]:
         each = [one(t) for one in paths]

@@ -14,7 +14,8 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from ft_compensation.alignment import align
-from ft_compensation.bias import TareBasis, estimate_bias, force_bound_95
+from ft_compensation.bias import TareBasis, estimate_bias
+from ft_compensation.bounds import force_bound_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.quantities import (
     DEFAULT_GRAVITY,

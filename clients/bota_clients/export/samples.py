@@ -77,6 +77,8 @@ def _rows(slots: Array, samples: Columns, index: Array, first_ns: int, *, tool: 
         wrench = np.where(found["valid"][:, np.newaxis], slots["compensated"], np.nan)
         found["compensated_valid"] = np.asarray(np.isfinite(wrench).all(axis=1))
         found |= {f"compensated_{name}": part for name, part in zip(axes, wrench.T, strict=False)}
+        force, torque = np.where(found["compensated_valid"], slots["bounds"].T, np.nan).astype(np.float32)
+        found |= {"compensated_force_bound_N": force, "compensated_torque_bound_Nm": torque}
     found["temperature_degC"] = column("temperature").astype(np.float32)
     turned = column("orientation").astype(np.float32)
     found |= {f"orientation_{axis}": part for axis, part in zip("xyzw", turned.T, strict=True)}

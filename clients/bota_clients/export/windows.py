@@ -31,8 +31,19 @@ from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import known_settings
 from ft_compensation.alignment import align
+from ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import EXACT, NO_WRENCH, STILL, ZERO, Accelerometer, Payload, Turning, Wrench
+from ft_compensation.quantities import (
+    EXACT,
+    NO_PAYLOAD,
+    NO_WRENCH,
+    STILL,
+    ZERO,
+    Accelerometer,
+    Payload,
+    Turning,
+    Wrench,
+)
 from ft_compensation.specific_force import ImuSpecificForce
 from ft_compensation.stationary import BAD_WRENCH
 from ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
@@ -46,6 +57,7 @@ _SLOT: Final = np.dtype([
     ("values", "f4", 12),  # force, torque, acceleration, angular rate: N, Nm, m/s², rad/s; NaN: empty
     ("valid", "?", 3),  # by channel
     ("compensated", "f4", 6),  # N, Nm; NaN: not known
+    ("bounds", "f4", 2),  # 95 %, of what is wrong with its force and torque
     ("monotonic_ns", "i8"),  # stamp; of an empty slot by its place
     ("sequence", "i8"),  # -1: there was no such frame, or it is not known which
     ("number", "i8"),  # of the sample, from 0 on; -1: empty
@@ -103,14 +115,16 @@ class Windows:
         self._doubted_until_ns = -1
         if tool is None:
             return
-        center, inertia = tuple(tool["tool_center_of_gravity"]), tuple(tool.get("tool_inertia", (0.0,) * 6))
-        self._payload = Payload(float(tool["tool_mass"]), center, inertia)
+        mass, center = float(tool["tool_mass"]), tuple(tool["tool_center_of_gravity"])
+        names = "inertia", "center_of_gravity_interval", "inertia_interval"
+        rows = zip(names, NO_PAYLOAD[2:], strict=True)
+        self._payload = Payload(mass, center, *(tuple(tool.get(f"tool_{name}", row)) for name, row in rows))
         self._bias, offset = Wrench.of(tool.get("bias", NO_WRENCH.values)), offset_of(tool)
         self._compensator, self._own_offset = Compensator(self._payload, self._bias), OwnOffset()
         self._own_offset.begin(self._bias, offset, is_measured=offset is not None)
         self._offset: Wrench | None = None
-        rows = {name: tool.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
-        self._accelerometer = Accelerometer(**{name: tuple(row) for name, row in rows.items()})
+        imu = {name: tool.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
+        self._accelerometer = Accelerometer(**{name: tuple(row) for name, row in imu.items()})
         self._imu_position: Vector3 = tuple(tool.get("imu_position", ZERO))
 
     def configure(
@@ -215,14 +229,14 @@ class Windows:
         )
         for channel, (part, bits) in enumerate(zip(_CHANNELS.values(), wrong, strict=True)):
             slots["valid"][end, channel] = (bits == 0) & np.isfinite(values[:, part]).all(axis=1)
-        slots["compensated"][end] = self._compensated(samples)
+        slots["compensated"][end], slots["bounds"][end] = self._compensated(samples)
         self._slots = np.concatenate([self._slots, slots])
         return samples
 
-    def _compensated(self, samples: Columns) -> Array | float:
-        """(n, 6) N, Nm, as the ROS 2 node has it; NaN without a tool."""
+    def _compensated(self, samples: Columns) -> tuple[Array | float, Array | float]:
+        """(n, 6) N, Nm, as the ROS 2 node has it; (n, 2) its bounds. NaN without a tool."""
         if self._compensator is None:
-            return math.nan
+            return math.nan, math.nan
         felt, turning = np.zeros((len(samples), 3)), cast(Any, STILL)
         if self._payload.mass:
             rows, turned, follow = list[Vector3](), list[Turning](), self._imu.follow
@@ -232,15 +246,19 @@ class Windows:
                 rows.append((any(acceleration) and follow(acceleration, rate, time_s)) or _UNKNOWN)
                 turned.append(self._imu.turning)
             felt = np.array(rows)
-            if any(self._payload.inertia):
-                turning = np.moveaxis(np.array(turned), 0, 2)
+            turning = np.moveaxis(np.array(turned), 0, 2)
         self._compensator.bias = self._bias
         compensate = cast(Any, self._compensator.compensate)  # of arrays as of numbers
         found = np.vstack(compensate(samples.force.T, samples.torque.T, felt.T, turning).final).T
         if self._own_offset.doubt(self._offset):
-            return math.nan
+            return math.nan, math.nan
         found[samples.monotonic_ns <= self._doubted_until_ns] = math.nan
-        return found
+        torque = torque_bound_95(
+            self._payload, self._accelerometer, None, cast(Any, felt.T), turning,
+            torque_noise_95(self._payload, self._imu.alignment),
+        )  # fmt: skip
+        force = force_bound_95(self._payload, self._accelerometer)
+        return found, np.stack([np.full(len(found), force), np.broadcast_to(torque, len(found))], axis=1)
 
     def at(self, instants_ns: Ints) -> Arrays:
         """Windows of these f instants; the last sample of each is the newest.

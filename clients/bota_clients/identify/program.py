@@ -13,17 +13,26 @@ from rich.console import Console
 from rich.table import Table
 
 from bota_clients.errors import RecordingError
-from bota_clients.identify.stationary_periods import LEAST_S, StationaryPeriod, find_stationary_periods
+from bota_clients.identify.stationary_periods import (
+    LEAST_S,
+    StationaryPeriod,
+    find_stationary_periods,
+    usable_rows,
+)
 from bota_clients.program import say
+from bota_clients.recording.columns import Columns
 from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
+from bota_ethercat.sensor.frames import IMU_HEIGHTS
+from ft_compensation.alignment import align
+from ft_compensation.identification.inertia import identify_inertia, turn
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
 from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
 from ft_compensation.identification.weighted import CONFIDENCE
-from ft_compensation.quantities import CROSS_AXES, CompensationError, Wrench, length
+from ft_compensation.quantities import CROSS_AXES, ELEMENTS, EXACT, CompensationError, Wrench, length
 from ft_compensation.stream import hides_gravity, not_newtons
 
 _WIDTH: Final = 80  # every table fits
@@ -56,10 +65,11 @@ def show_result(console: Console, result: Identified) -> None:
     table.add_column(f"± ({100 * CONFIDENCE:g} %)", justify="right")
     table.add_column("unit")
     table.add_row("mass", f"{result.payload.mass:.4f}", f"{result.mass_interval:.4f}", "kg")
-    center, interval = ([1000 * x for x in each] for each in (result.payload.center, result.centre_interval))
+    center, inertia, interval, about = ([1000 * x for x in each] for each in result.payload[1:])
     bias, half = result.bias, result.bias_interval
     rows: list[tuple[str, Sequence[float], Sequence[float], int, str]] = [
         ("center of gravity", center, interval, 2, "mm"),
+        ("inertia", inertia, about, 3, "g m²"),
         ("bias force", bias.force, half.force, 3, "N"),
         ("bias torque", bias.torque, half.torque, 5, "Nm"),
     ]
@@ -69,7 +79,8 @@ def show_result(console: Console, result: Identified) -> None:
         rows.append(("accelerometer scale", found.scale, found.scale_interval, 4, ""))
         rows.append(("accelerometer cross-axis", found.cross_axis, found.cross_axis_interval, 4, ""))
     for name, values, halves, digits, unit in rows:
-        for axis, *numbers in zip("xyz" if len(values) == 3 else CROSS_AXES, values, halves, strict=True):
+        names = "xyz" if len(values) == 3 else ELEMENTS if name == "inertia" else CROSS_AXES
+        for axis, *numbers in zip(names, values, halves, strict=True):
             table.add_row(f"{name} {axis}", *(f"{number:.{digits}f}" for number in numbers), unit)
     console.print(table)
     console.print(f"residual: {_fit(result.force_fit, 'N')}, {_fit(result.torque_fit, 'Nm')}")
@@ -104,7 +115,9 @@ def as_json(
         "tool_mass": result.payload.mass,
         "tool_mass_interval": result.mass_interval,
         "tool_center_of_gravity": result.payload.center,
-        "tool_center_of_gravity_interval": result.centre_interval,
+        "tool_center_of_gravity_interval": result.payload.center_interval,
+        "tool_inertia": result.payload.inertia,
+        "tool_inertia_interval": result.payload.inertia_interval,
         "bias": result.bias.values,
         "bias_interval": result.bias_interval.values,
         "confidence": CONFIDENCE,
@@ -139,6 +152,8 @@ def run(options: argparse.Namespace) -> int:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
         _say(f"there are more than {MOST_POSES} poses: the longest are used")
     poses, result, error = _solve(periods, options)
+    if result is not None:
+        result = _with_inertia(result, data, sensor)
     if options.json:
         sys.stdout.write(json.dumps(as_json(poses, rejected, result, error), indent=1) + "\n")
     else:
@@ -170,6 +185,22 @@ def run(options: argparse.Namespace) -> int:
                 "changed: record with a newer server"
             )
     return 0
+
+
+def _with_inertia(result: Identified, data: Columns, sensor: RecordedSensor) -> Identified:
+    """The tool's inertia too, as far as the recording has motion."""
+    calibration = result.accelerometer.calibration if result.accelerometer else EXACT
+    imu = 0.0, 0.0, IMU_HEIGHTS.get(sensor.info.name[4:8], 0.0)
+    try:
+        if any(row.info.settings != sensor.info.settings for row in sensor.history):
+            raise CompensationError("settings were changed during the recording")
+        data = data.where(data.fresh)
+        rows, good = usable_rows(data)
+        times = (data.monotonic_ns - data.monotonic_ns[0])[good] * 1e-9
+        alignment = align(sensor.info.settings, sensor.info.rate_hz)
+        return identify_inertia(turn(times, rows[good], alignment, calibration, imu), result)
+    except CompensationError as refusal:
+        return result._replace(notes=(f"the tool's inertia is not identified: {refusal}", *result.notes))
 
 
 def choose(recording: Recording, position: int | None) -> RecordedSensor:

@@ -51,8 +51,7 @@ def find_stationary_periods(
     rejected: list[str] = []
     if len(fresh) < _BLOCK_SAMPLES:
         return periods, rejected
-    rows = np.hstack([fresh.force, fresh.torque, fresh.acceleration, fresh.angular_rate])
-    good = _good(fresh, rows)
+    rows, good = usable_rows(fresh)
     times = (fresh.monotonic_ns - fresh.monotonic_ns[0]) * 1e-9
     rows = np.where(good[:, np.newaxis], rows, 0.0)
     for part in _parts(times):
@@ -73,12 +72,13 @@ def find_stationary_periods(
     return periods, rejected
 
 
-def _good(columns: Columns, rows: Floats) -> Bools:
-    """Samples that can be used: finite and not saturated."""
+def usable_rows(columns: Columns) -> tuple[Floats, Bools]:
+    """(n, 12) force, torque, acceleration, angular rate; (n,) whether they are finite and not saturated."""
+    rows = np.hstack([columns.force, columns.torque, columns.acceleration, columns.angular_rate])
     saturated = columns.force_torque_saturated | columns.acceleration_saturated
     saturated = saturated | columns.angular_rate_saturated | (columns.warnings & int(BAD_WRENCH))
     good: Bools = np.isfinite(rows).all(axis=1) & (saturated == 0)
-    return good
+    return rows, good
 
 
 def _parts(times: Floats) -> Iterator[slice]:

@@ -125,11 +125,15 @@ private:
             log(Level::warning, "the sensor's setting coordinate_system is on: forces are in the frame stored in the sensor");
         if (sensor.inertia_compensation == true)
             log(Level::warning, "the sensor's setting inertia_compensation is on: it subtracts gravity and inertia itself");
-        if (parameters_.payload.mass > 0.0 && parameters_.payload.accelerometer_offset == Vector3{}) {
-            // As force_bound_95 in Python: a tare takes the accelerometer's offset off.
-            const double bound = (parameters_.on_activate_tare ? 0.216 : 1.13) * parameters_.payload.mass;
-            log(Level::warning, "the accelerometer is not identified: the compensated force may be wrong by " + detail::text(bound) +
-                                    " N (95 %); use the file of an identification");
+        if (parameters_.payload.mass > 0.0) {
+            const bool is_known = parameters_.payload.accelerometer_offset != Vector3{};
+            const auto bounds = [this](double spin) {
+                return Bounds(parameters_.payload, parameters_.on_activate_tare, {0, 0, 9.80665}, {}, {spin, 0, 0}, 0.0);
+            };
+            log(is_known ? Level::info : Level::warning,
+                (is_known ? "the" : "the accelerometer is not identified: use the file of an identification; the") +
+                    std::string(" compensated force may be wrong by ") + detail::text(bounds(0.0).force) + " N, torque by " +
+                    detail::text(bounds(0.0).torque) + " Nm, at 20 rad/s^2 by " + detail::text(bounds(20.0).torque) + " Nm (95 %)");
         }
     }
 

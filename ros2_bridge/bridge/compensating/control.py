@@ -24,10 +24,12 @@ from bridge.diagnostics import CompensationState
 from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.stream.reader import Reader
-from ft_compensation.bias import BiasRamp, TareBasis, force_bound_95
+from ft_compensation.alignment import align
+from ft_compensation.bias import BiasRamp, TareBasis
+from ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
 from ft_compensation.compensator import Compensator
 from ft_compensation.outputs import cutoff_problem
-from ft_compensation.quantities import NO_WRENCH, Accelerometer, Payload, Wrench, wrench_text
+from ft_compensation.quantities import NO_WRENCH, STILL, Accelerometer, Payload, Wrench, wrench_text
 from ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
 
 _FROM_PARAMETER: Final = "parameter"
@@ -114,9 +116,15 @@ class CompensationControl:
     def state(self) -> CompensationState:
         output, source, parameters = self.output, self.source, self.parameters
         payload, bias, has_subscribers = parameters.payload, self.bias, output.has_subscribers
-        bound = None
+        bounds = ["", ""]
         if source.is_imu:
-            bound = force_bound_95(payload, parameters.accelerometer, self._ramp.taken)
+            known = payload, parameters.accelerometer, self._ramp.taken
+            turning, noise = (
+                source.turning if has_subscribers else STILL,
+                torque_noise_95(payload, align(self.link.info.settings, self.link.info.rate_hz)),
+            )
+            torque = torque_bound_95(*known, turning=turning, noise=noise)
+            bounds = [f"{force_bound_95(*known):.3f}", f"{torque:.4f}"]
         age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
         parts = ["bias"] if bias != NO_WRENCH else []
         if payload.mass:
@@ -129,7 +137,8 @@ class CompensationControl:
                 "gravity_source": source.name,
                 "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
                 "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
-                "accelerometer_force": "" if bound is None else round(bound, 3),
+                "accelerometer_force": bounds[0],
+                "torque_bound": bounds[1],
                 "tared": bias != NO_WRENCH,
                 "bias_from": self.origin,
                 "bias_ramping": not self._ramp.arrived(self._sample_s),
@@ -207,6 +216,9 @@ class CompensationControl:
         """Put an identified payload, its bias and the accelerometer's correction in force, all at once."""
         values: dict[str, Any] = {
             "tool_mass": payload.mass, "tool_center_of_gravity": [*payload.center],
+            "tool_inertia": [*payload.inertia],
+            "tool_center_of_gravity_interval": [*payload.center_interval],
+            "tool_inertia_interval": [*payload.inertia_interval],
         }  # fmt: skip
         if accelerometer is not None:
             values |= {f"accelerometer.{name}": [*part] for name, part in accelerometer._asdict().items()}
@@ -281,7 +293,9 @@ class CompensationControl:
             self._changes.append(BiasChange(Wrench.of(wanted.bias), _FROM_PARAMETER, offset=offset))
         is_given, before, warning = bool(self._changes), self.bias, ""
         self._change(self._apply_changes)
-        if wanted.payload != was.payload and not is_given:  # the bias of a tare is another one with it
+        if (
+            wanted.payload[:3] != was.payload[:3] and not is_given
+        ):  # the bias of a tare is another one with it
             warning = self._ramp.taken.warning(self.bias.plus(before, -1.0), wanted.payload)
         if warning:
             self._log.warning(warning)

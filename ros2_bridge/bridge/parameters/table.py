@@ -176,7 +176,11 @@ class Parameters:
     tool_mass: float = _row(0.0, "Mass of what hangs on the sensor, kg; 0 = it is not compensated", 0, 1000)
     tool_center_of_gravity: Vector3 = _row(ZERO, "Its center of gravity in frame_id, m", 0, 10)
     tool_inertia: Numbers = _row(NO_PAYLOAD.inertia,
-        "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = a point mass", 0, 1e3)
+        "Ixx Iyy Izz Ixy Ixz Iyz about that, kg m², as in URDF; 0 = unknown", 0, 1e3)
+    tool_center_of_gravity_interval: Vector3 = _row(NO_PAYLOAD.center_interval,
+        "Half of the 95 % interval of its center of gravity, m; ~/identify finds it", 0, 1)
+    tool_inertia_interval: Numbers = _row(NO_PAYLOAD.inertia_interval,
+        "Half of the 95 % intervals of tool_inertia, kg m²; 0 = not identified", 0, 1e3)
     gravity: Vector3 = _row(DEFAULT_GRAVITY,
         "Gravity, m/s², in the base frame: that of the orientations", 0, 100)
     bias: Numbers = _row((0.0,) * 6,
@@ -238,7 +242,8 @@ class Parameters:
 
     @cached_property
     def payload(self) -> Payload:
-        return Payload(self.tool_mass, self.tool_center_of_gravity, self.tool_inertia)
+        intervals = self.tool_center_of_gravity_interval, self.tool_inertia_interval
+        return Payload(self.tool_mass, self.tool_center_of_gravity, self.tool_inertia, *intervals)
 
     @cached_property
     def accelerometer(self) -> Accelerometer:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,8 +118,8 @@ def hann_window(seconds: float, period: float) -> Array:
     return np.asarray(window / window.sum())
 
 
-def smoothed(columns: Array, window: Array) -> Array:
-    return np.stack([np.convolve(column, window, "same") for column in columns.T], axis=1)
+def smoothed(columns: Array, window: Array, mode: Literal["same", "full"] = "same") -> Array:
+    return np.stack([np.convolve(column, window, mode) for column in columns.T], axis=1)
 
 
 def at_times(instants: Array, times: Array, columns: Array) -> Array:

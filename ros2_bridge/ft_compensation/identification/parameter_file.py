@@ -28,6 +28,9 @@ def write_yaml(
     """
     rows: list[tuple[str, Sequence[float], str]] = [
         ("tool_center_of_gravity", result.payload.center, "m, in the sensor's frame"),
+        ("tool_center_of_gravity_interval", result.payload.center_interval, "m, half of 95 %"),
+        ("tool_inertia", result.payload.inertia, "kg m²: xx yy zz xy xz yz, about that"),
+        ("tool_inertia_interval", result.payload.inertia_interval, "kg m², half of 95 %"),
         ("bias", result.bias.values, "N, Nm: Fx Fy Fz Mx My Mz, subtracted"),
     ]
     if offset is not None:

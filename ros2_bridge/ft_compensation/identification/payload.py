@@ -27,6 +27,7 @@ from ft_compensation.quantities import (
     Payload,
     Wrench,
     length,
+    likely_inertia,
 )
 from ft_compensation.stationary import triple
 
@@ -81,7 +82,6 @@ class Identified(NamedTuple):
     bias: Wrench
     gravity: float  # its magnitude in the poses, m/s²
     mass_interval: float  # kg
-    centre_interval: Vector3  # m
     bias_interval: Wrench  # N, Nm
     residuals: tuple[Wrench, ...]  # what the answer leaves of each pose, in order: measured minus modelled
     coverage: Coverage
@@ -121,8 +121,9 @@ def identify(poses: Sequence[Pose]) -> Identified:
         found, kept[touched.pose] = touched.rest, False
     mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
     _check_mass(mass, mass_interval)
-    payload = Payload(mass, triple(found.center.value))
-    centre_interval = triple(found.center.half)
+    payload = Payload(mass, triple(found.center.value), center_interval=triple(found.center.half))
+    inertia, half = likely_inertia(payload)  # at rest it does not show
+    payload = payload._replace(inertia=inertia, inertia_interval=half)
     gravity = float(np.linalg.norm(equations.gravity, axis=1).mean())
     weight = mass * gravity
     moment = weight * max(ARM, length(payload.center))
@@ -138,10 +139,10 @@ def identify(poses: Sequence[Pose]) -> Identified:
             f"{mass:.3g} kg, which cannot be: something held or touched the tool, or there is no tool"
         )
     _check_fit(_residual(whole.residuals[:, 3:], whole.degrees[3:]), touched, most_torque, "Nm")
-    if mass_interval * gravity > most_force or length(centre_interval) * weight > most_torque:
+    if mass_interval * gravity > most_force or length(payload.center_interval) * weight > most_torque:
         raise IdentificationError(
             f"the poses do not suffice: mass {mass:.2g} ± {mass_interval:.2g} kg, center of gravity "
-            f"{_millimeters(payload.center, centre_interval)}; "
+            f"{_millimeters(payload)}; "
             f"{seen.next_pose if touched is None else touched}"
         )
     accelerometer = _accelerometer(found.calibration)
@@ -151,7 +152,6 @@ def identify(poses: Sequence[Pose]) -> Identified:
         Wrench.of(found.bias.value.tolist()),
         gravity,
         mass_interval,
-        centre_interval,
         Wrench.of(found.bias.half.tolist()),
         tuple(map(Wrench.of, found.residuals.tolist())),
         seen,
@@ -159,7 +159,7 @@ def identify(poses: Sequence[Pose]) -> Identified:
             *_misfit_notes(poses, drift, touched),
             *_fit_notes(force, "force", "N"),
             *_fit_notes(torque, "torque", "Nm"),
-            *_other_notes(mass, mass_interval, length(centre_interval), undetermined, seen),
+            *_other_notes(mass, mass_interval, length(payload.center_interval), undetermined, seen),
         ),
         force,
         torque,
@@ -351,8 +351,8 @@ def _other_notes(
         )
 
 
-def _millimeters(center: Vector3, half: Vector3) -> str:
-    axes = zip(center, half, strict=True)
+def _millimeters(payload: Payload) -> str:
+    axes = zip(payload.center, payload.center_interval, strict=True)
     return f"({', '.join(f'{1e3 * value:.2f} ± {1e3 * part:.2f}' for value, part in axes)}) mm"
 
 
@@ -360,7 +360,7 @@ def summary(result: Identified) -> str:
     """The answer in one sentence with its confidence interval, and the notes as further ones."""
     text = (
         f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity "
-        f"{_millimeters(result.payload.center, result.centre_interval)} ({100 * CONFIDENCE:g} % "
+        f"{_millimeters(result.payload)} ({100 * CONFIDENCE:g} % "
         f"confidence) from {result.coverage.poses} poses; residual {result.force_fit.rms:.2g} N "
         f"({result.force_fit.verdict}), {result.torque_fit.rms:.2g} Nm ({result.torque_fit.verdict})"
     )

@@ -187,6 +187,13 @@ int main() {
                 loads.insert(loads.end(), load.begin(), load.end());
             }
             told = json_list(loads, [](double value) { return json_text(value); });
+        } else if (command == "bounds") {
+            std::array<double, 10> n{};
+            int tared = 0;
+            words >> tared;
+            for (double& each : n) words >> each;
+            const Bounds bounds(parameters.payload, tared != 0, {n[0], n[1], n[2]}, {n[3], n[4], n[5]}, {n[6], n[7], n[8]}, n[9]);
+            told = json_list(std::vector<double>{bounds.force, bounds.torque}, [](double value) { return json_text(value); });
         } else if (command == "log") {
             const std::lock_guard<std::mutex> guard(lines_lock);
             told = json_list(lines, [](const std::string& each) { return json_text(each); });

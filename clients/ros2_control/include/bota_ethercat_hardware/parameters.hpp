@@ -126,10 +126,15 @@ inline constexpr Row kRows[] = {
     {"accelerometer.offset", "three numbers (m/s^2)", [](S t, P& p) { return numbers(t, p.payload.accelerometer_offset); }},
     {"accelerometer.scale", "three numbers, about 1", [](S t, P& p) { return numbers(t, p.payload.accelerometer_scale, 0.1); }},
     {"accelerometer.cross_axis", "six numbers", [](S t, P& p) { return numbers(t, p.payload.accelerometer_cross_axis); }},
+    {"tool_center_of_gravity_interval", "three numbers (m)", [](S t, P& p) { return numbers(t, p.payload.center_interval, 0.0); }},
+    {"tool_inertia_interval", "six numbers (kg m^2)", [](S t, P& p) { return numbers(t, p.payload.inertia_interval, 0.0); }},
+    {"accelerometer.offset_interval", "three numbers (m/s^2)", [](S t, P& p) { return numbers(t, p.payload.offset_interval, 0.0); }},
+    {"accelerometer.scale_interval", "three numbers", [](S t, P& p) { return numbers(t, p.payload.scale_interval, 0.0); }},
+    {"accelerometer.cross_axis_interval", "six numbers", [](S t, P& p) { return numbers(t, p.payload.cross_axis_interval, 0.0); }},
     {"bias", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.bias); }},
     {"sensor_offset", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.sensor_offset.emplace()); }},
 };
-inline constexpr std::size_t kOfTool = 8;  // the last rows
+inline constexpr std::size_t kOfTool = 13;  // the last rows
 
 /// Parameters of the ROS 2 node in a YAML file, a line each; false if they are wrong, or tool_mass is not among them.
 inline bool read_payload(const std::string& path, Parameters& into) {
