@@ -118,9 +118,12 @@ class StopSignals:
 
 
 def prepare(rt_priority: int, cpu: int, log: Any) -> None:
-    """Give the node's threads, which run, their scheduling as far as allowed, and log one line of it."""
+    """Give the node's threads, which run, their scheduling as far as allowed, and log one line of that."""
     from bota_ethercat.program.real_time import make_real_time  # noqa: PLC0415 - `client` says where it is missing
 
+    sys.setswitchinterval(_SWITCH_S)
+    gc.collect()
+    gc.freeze()  # what is loaded by now stays: no collection needs to look at it
     if not rt_priority and cpu < 0:
         return
     stream = next((each.native_id for each in threading.enumerate() if each.name == STREAM), None)
@@ -132,9 +135,6 @@ def prepare(rt_priority: int, cpu: int, log: Any) -> None:
         for thread in _threads_sharing_locks():
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 os.sched_setscheduler(thread, os.SCHED_FIFO, below)
-        sys.setswitchinterval(_SWITCH_S)
-        gc.collect()
-        gc.freeze()  # what is loaded by now stays: no collection needs to look at it
     if scheduling.refused:
         log.warning(f"the stream has {scheduling}; samples may be late on a busy machine")
     else:
