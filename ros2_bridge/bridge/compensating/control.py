@@ -130,6 +130,7 @@ class CompensationControl:
                 "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
                 "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
                 "accelerometer_force": "" if bound is None else round(bound, 3),
+                "contact": output.contact.why.value if output.contact else "",
                 "tared": bias != NO_WRENCH,
                 "bias_from": self.origin,
                 "bias_ramping": not self._ramp.arrived(self._sample_s),
