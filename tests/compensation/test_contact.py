@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
 
+from bota_ethercat.client import Client
 from bota_ethercat.pdo import Vector3
-from bota_ethercat.sensor.response import fir_taps
+from bota_ethercat.sensor.response import fir_taps, healthy_noise
 from bota_ethercat.settings import SettingValue
+from bota_ethercat.world import Felt
 from ft_compensation.alignment import align
 from ft_compensation.contact import (
     Capsule,
@@ -26,7 +28,7 @@ from ft_compensation.stationary import triple
 from tests.compensation import motion
 from tests.compensation.making import SEED
 from tests.compensation.motion import Array
-from tests.simulation import more_if_long
+from tests.simulation import MemoryChannel, Simulation, more_if_long
 
 RATE_HZ = 800.0
 CHI_2 = 5.991  # 95 %, 2 degrees of freedom
@@ -197,3 +199,23 @@ def test_it_is_contact_until_the_wrench_is_what_noise_makes() -> None:
 def test_what_cannot_be_configured_is_refused() -> None:
     with pytest.raises(CompensationError, match="set them"):
         ContactDetector(FACE, EXACT, 0.0)
+
+
+@pytest.mark.parametrize("newtons", [0.0, 1.0, 5.0, 20.0])
+def test_of_the_virtual_sensor_it_tells_the_true_point(newtons: float) -> None:
+    """Through its filters, with its noise, the server and the client, from a world that presses."""
+    point = (0.012, -0.016, 0.02)  # 20 mm from the axis
+    force, torque = pushed(point, (0.1 * newtons, 0.0, -newtons))
+    known = Uncertainty.of(healthy_noise(64), 0.0, 0.0, NO_PAYLOAD)
+    contact, found, inside = ContactDetector(FACE, known, RATE_HZ), 0, 0
+    simulation = Simulation(world=lambda _: Felt((*force, *torque)))
+    with Client(12001, channel=MemoryChannel(simulation)).connect() as sensor:
+        for sample in islice(sensor, 2500):
+            contact.update(sample.force, sample.torque)
+            contact.is_contact |= newtons > 0.0  # 1 N is within this noise
+            where = contact.locate(sample.force, sample.torque)
+            if where.region is not None:
+                found += 1
+                inside += where.region.contains(point)
+    assert found == 0 if newtons == 0.0 else found > 2000
+    assert newtons == 0.0 or 0.93 < inside / found < 0.97
