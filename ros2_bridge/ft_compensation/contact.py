@@ -163,9 +163,13 @@ class ContactDetector:
         share = alarms_per_hour / 3600.0 / rate_hz
         self.level = _level(_share_of_six, share, correlation)  # of chi squared
         self._moment_level = _level(lambda u: math.erfc(u * math.sqrt(0.5)), share, correlation)
-        tool, arm = max(uncertainty.tool, uncertainty.motion), length(uncertainty.center)
-        self._force_variance = uncertainty.force**2 + tool**2
-        self._torque_variances = [each**2 + (tool * arm) ** 2 for each in uncertainty.torque]
+        # About a point this far to the tool's center of gravity errors of force and torque are independent.
+        tool, center = max(uncertainty.tool, uncertainty.motion) ** 2, uncertainty.center
+        self._force_variance = both = uncertainty.force**2 + tool
+        self._pivot = _add(ZERO, center, tool / both)
+        rest = tool * uncertainty.force**2 / both  # N²
+        levers = zip(uncertainty.torque, center, strict=True)
+        self._torque_variances = [each**2 + rest * (_dot(center, center) - c * c) for each, c in levers]
         ends = surface[:1] if isinstance(surface, Plane) else surface[:2]
         self._reach = max(map(length, ends)) + surface.radius
         self._spin = uncertainty.spin**2
@@ -173,7 +177,8 @@ class ContactDetector:
     def update(self, force: Vector3, torque: Vector3, turning: Turning = STILL) -> bool:
         """Whether a compensated sample, N and Nm, is contact; `turning`: rad/s and rad/s²."""
         (fx, fy, fz), (mx, my, mz) = force, torque
-        x, y, z = self._torque_variances
+        (px, py, pz), (x, y, z) = self._pivot, self._torque_variances
+        mx, my, mz = mx - py * fz + pz * fy, my - pz * fx + px * fz, mz - px * fy + py * fx
         if self._spin:
             spun = self._spun(turning)
             x, y, z = x + spun, y + spun, z + spun

@@ -62,13 +62,18 @@ public:
     ContactDetector(const Surface& surface, const Uncertainty& uncertainty, double rate_hz, double correlation = 0.0,
                     double alarms_per_hour = 1.0)
         : surface_(surface), known_(uncertainty) {
-        const double share = alarms_per_hour / 3600.0 / rate_hz, tool = std::max(uncertainty.tool, uncertainty.motion);
+        const double share = alarms_per_hour / 3600.0 / rate_hz;
         const auto of_six = [](double u) { return std::exp(-u * u / 2) * (1.0 + u * u / 2 + u * u * u * u / 8); };
         level_ = level(of_six, share, correlation);
         moment_level_ = level([](double u) { return std::erfc(u * std::sqrt(0.5)); }, share, correlation);
-        force_variance_ = known_.force * known_.force + tool * tool;
-        const double leverage = tool * detail::length(known_.center);
-        for (std::size_t i = 0; i < 3; ++i) torque_variance_[i] = known_.torque[i] * known_.torque[i] + leverage * leverage;
+        // About a point this far to the tool's center of gravity errors of force and torque are independent.
+        const double deviation = std::max(known_.tool, known_.motion), tool = deviation * deviation, noise = known_.force * known_.force;
+        const Vector3& center = known_.center;
+        force_variance_ = noise + tool;
+        pivot_ = detail::sum({}, center, tool / force_variance_);
+        for (std::size_t i = 0; i < 3; ++i)
+            torque_variance_[i] = known_.torque[i] * known_.torque[i] +
+                                  tool * noise / force_variance_ * (detail::dot(center, center) - center[i] * center[i]);
         const double ends = std::max(detail::length(surface.start), surface.normal ? 0.0 : detail::length(surface.end));
         reach_ = ends + surface.radius;
     }
@@ -79,7 +84,8 @@ public:
     bool update(const Vector3& force, const Vector3& torque, const Vector3& rate = {}, const Vector3& spin = {}) noexcept {
         const double spun = spun_by(rate, spin);
         double size = detail::dot(force, force) / force_variance_;
-        for (std::size_t i = 0; i < 3; ++i) size += torque[i] * torque[i] / (torque_variance_[i] + spun);
+        const Vector3 about = detail::sum(torque, detail::vector_product(pivot_, force), -1.0);
+        for (std::size_t i = 0; i < 3; ++i) size += about[i] * about[i] / (torque_variance_[i] + spun);
         return is_contact_ = size > (is_contact_ ? kRelease : level_);
     }
 
@@ -188,7 +194,7 @@ private:
     Surface surface_;
     Uncertainty known_;
     double level_ = 0.0, moment_level_ = 0.0, force_variance_ = 0.0, reach_ = 0.0;
-    Vector3 torque_variance_{};
+    Vector3 pivot_{}, torque_variance_{};
     bool is_contact_ = false;
 };
 
