@@ -25,12 +25,12 @@ from ft_compensation.compensator import Stages
 from ft_compensation.contact import ContactDetector, Uncertainty, Why, correlation
 from ft_compensation.quantities import length
 
-_PERIOD_NS: Final = 25_000_000  # of the point, which takes as long as two samples take to compensate
+_PERIOD_NS: Final = 40_000_000  # of the point, which takes as long as two samples take to compensate
 _TYPED: Final = 0.1  # of its largest element: how well a tensor that was given is known
 
 
 class ContactTopic(WrenchTopic):
-    """Takes every compensated sample; publishes at each change of what is detected, and 40 times a second."""
+    """Takes every compensated sample; publishes at each change of what is detected, and 25 times a second."""
 
     def __init__(
         self,
