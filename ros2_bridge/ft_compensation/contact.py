@@ -23,7 +23,7 @@ from ft_compensation.quantities import STILL, ZERO, CompensationError, Payload, 
 _RELEASE, _REGION, _CHI_3 = 12.592, 5.991, 2.795
 # m/s², standard deviations on each axis: of the accelerometer's noise, brought to the instant of the force,
 # and of all that it lets pass in motion, whose extremes are farther out than a Gaussian's.
-_IMU_NOISE, _IMU_MOTION = 0.04, 0.07
+_IMU_NOISE, _IMU_MOTION = 0.04, 0.12
 _SINC: Final = (66.0, 26.0, 1.0)  # autocorrelation of the third-order sinc filter, from lag 0
 
 
