@@ -13,7 +13,7 @@ import pytest
 from bota_ethercat.client import Client, Condition, Reading
 from bota_ethercat.world import Felt
 from docs.examples.mujoco import identify
-from docs.examples.mujoco.touch import FORCE, HOLE, Row, Touch, draw
+from docs.examples.mujoco.touch import FORCE, HOLE, TIP, Row, Touch, draw
 from tests.simulation import PATIENCE_S, MemoryChannel, Simulation
 
 WALL = 15_000.0  # N/m
@@ -78,6 +78,9 @@ def test_it_presses_with_10_n_and_finds_the_hole(robot: Callable[[], Any], tmp_p
     assert np.nanmax([row.force for row in touch.rows]) < 15.0
     assert abs(made.tip[2] - HOLE[2]) < 0.001
     assert made.tip[0] > HOLE[0] + 0.01
+    assert touch.contact is not None
+    assert touch.contact.region is not None
+    assert math.dist(touch.contact.region.center, TIP) < 1.5 * touch.contact.region.largest < 0.02
     if robot is arm:
         draw(tmp_path / "touch.png", touch.rows)
         assert (tmp_path / "touch.png").stat().st_size > 10_000

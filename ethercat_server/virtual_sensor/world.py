@@ -13,7 +13,7 @@ from typing import Final
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS, ImuFilter
-from bota_ethercat.sensor.response import FIR_TAPS, fir_taps
+from bota_ethercat.sensor.response import FIR_TAPS, fir_taps, healthy_noise
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
 from bota_ethercat.world import REST, Felt
 from ethercat_server.virtual_sensor.signals import Measurement, measurement_of, quaternion
@@ -24,10 +24,6 @@ _HOLD, ZERO, FAULT = LOST = ("hold", "zero", "fault")  # what a world that has s
 LOST_AFTER_S: Final = 0.1  # also by how much a time stamp may differ from the time
 _REMEMBERED: Final = 4096  # moments, of which the filters look at the last second at most
 
-# Standard deviation at SINC 51, and the power with which it falls with the length: half of what Bota's
-# own test allows at 51, and a little under half of it at 1024.
-_REFERENCE_SINC = 51
-_NOISE = (*((0.3, 0.62),) * 3, (0.007, 0.78), (0.007, 0.78), (0.0025, 0.78))
 _FILTERS: Final = ("fir", "acceleration_filter", "angular_rate_filter")
 _ACCELERATION_NOISE, _ANGULAR_RATE_NOISE = 0.002, 0.04  # g, °/s
 
@@ -131,9 +127,7 @@ class Measured:
         if wanted == self._settings:
             return
         self._settings = wanted
-        # Standard deviations of force (N) and torque (Nm) with FIR off: a longer filter makes them quieter.
-        ratio = sinc_length / _REFERENCE_SINC
-        self.deviations = tuple(deviation * ratio**-power for deviation, power in _NOISE)
+        self.deviations = healthy_noise(sinc_length)
         _, fir, acceleration, rate = wanted
         period_s = sinc_length / BASE_SAMPLING_RATE_HZ
         self._load_filter = LoadFilter(

@@ -121,9 +121,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         """Make everything; nothing runs yet. Errors as at the start."""
         self.parameters = parameters = self.live.gather({})
         self.stamps = stamps = Stamps(self.get_logger())
-        compensated = Compensation(
-            self, parameters, stamps, lambda: self.reader.link.info.rate_hz, self.clock
-        )
+        compensated = Compensation(self, parameters, stamps, lambda: self.reader.link.info, self.clock)
         wrench, *others = make_measured(self, parameters, stamps)
         self.outputs = Outputs([wrench, compensated, *others])  # control loops' topics first
         self.reader = Reader(

@@ -191,6 +191,8 @@ class BiasServices:
                 "this orientation only"
             )
         spread, residual = means.force_spread + means.torque_spread, means.latest.plus(means.wrench, -1.0)
+        if control.output.contact:
+            control.output.contact.noise = spread
         fields = {"bias": bias.values, "spread": spread, "residual": residual.values}
         return Done(f"bias of {means.samples} samples: {wrench_text(bias)}; {weight}", fields)
 

@@ -12,6 +12,7 @@ import math
 from typing import Final
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.sensor.response import healthy_noise
 from ft_compensation.alignment import Alignment
 from ft_compensation.bias import TareBasis
 from ft_compensation.quantities import (
@@ -28,11 +29,9 @@ from ft_compensation.quantities import (
 _ABOUT_THREE_AXES: Final = 2.80 / NORMAL_95
 # ... and for three times the distance between the directions of gravity in two poses, which are any.
 _BETWEEN_POSES: Final = 4.39 / NORMAL_95
-# Nm: what the noise of a healthy sensor's sample keeps to in 95 %, with SINC 51, and the power of the length
-# with which it falls.
-_NOISE, _NOISE_SINC, _NOISE_POWER = 0.0172, 51, 0.78
 # Deviations of accelerometer, m/s², and gyroscope, rad/s; how far the IMU is behind the wrench origin, m.
 _IMU_NOISE, _IMU_BELOW, _TWO_AXES = (0.02, 0.0017), 0.026, 2.45
+_SHORTEST_SINC: Final = 51  # where the length is not known
 _TYPED: Final = 0.1  # of its largest element: half of the interval of a tensor that is given without one
 
 
@@ -67,7 +66,7 @@ def torque_bound_95(
     center of gravity's interval under the specific force `felt` there, m/s²; `force_bound_95` at its arm; and
     `noise`, Nm, of the sensor (`torque_noise_95`). `taken` as there. Components may be arrays of samples.
     """
-    halves, (rate, spin) = _inertia_halves(payload), turning
+    halves, (rate, spin) = inertia_halves(payload), turning
     sideways = sum(part * part for part in rate) ** 0.5 * _spread(halves, rate) ** 0.5
     is_tared = taken is not None and taken.specific_force != (0.0, 0.0, 0.0)
     off_center = (
@@ -81,17 +80,17 @@ def torque_bound_95(
 
 def torque_noise_95(payload: Payload, alignment: Alignment) -> float:
     """Nm: what the noise of a healthy sensor and its IMU keeps to in 95 % of samples."""
-    sinc_length, reach = alignment.settings.get("sinc_length") or _NOISE_SINC, length(payload.center)
+    reach, sinc_length = length(payload.center), alignment.settings.get("sinc_length") or _SHORTEST_SINC
     arm = payload.mass * reach
     arms = arm, arm * (reach + _IMU_BELOW) + max(payload.inertia)
     of_imu = [
         _TWO_AXES * each * noise * math.sqrt(float(weights @ weights))
         for each, noise, weights in zip(arms, _IMU_NOISE, alignment.taps[::2], strict=True)
     ]
-    return math.hypot(_NOISE * (_NOISE_SINC / sinc_length) ** _NOISE_POWER, *of_imu)
+    return math.hypot(_TWO_AXES * max(healthy_noise(int(sinc_length))[3:]), *of_imu)
 
 
-def _inertia_halves(payload: Payload) -> tuple[float, ...]:
+def inertia_halves(payload: Payload) -> tuple[float, ...]:
     """kg m²: by how much each element of the tensor may be wrong; that of zeros is all of a likely one."""
     if any(payload.inertia_interval):
         return payload.inertia_interval

@@ -7,7 +7,7 @@ is felt follows from them by differences on a grid that is fine enough.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -25,7 +25,7 @@ from bota_ethercat.sensor.response import (
 from bota_ethercat.settings import SettingValue
 from ft_compensation.alignment import Alignment
 from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import EXACT, OFFSET_PRIOR, SCALE_PRIOR, Accelerometer, Payload
+from ft_compensation.quantities import EXACT, OFFSET_PRIOR, SCALE_PRIOR, Accelerometer, Payload, Turning
 from ft_compensation.specific_force import ImuSpecificForce
 
 Array = NDArray[np.float64]
@@ -166,6 +166,7 @@ class Left(NamedTuple):
     times: Array  # (n,) s
     force: Array  # (n, 3) N
     torque: Array  # (n, 3) Nm
+    turning: Sequence[Turning] = ()  # of each
 
     @property
     def size(self) -> Array:
@@ -189,14 +190,15 @@ def left_over(
     """Of these samples, with no contact and no bias; samples that are withheld are missing."""
     x, y, z = (center - imu for center, imu in zip(tool.center, IMU, strict=True))
     imu, compensator = ImuSpecificForce((x, y, z), accelerometer, alignment), Compensator(tool)
-    rows = []
+    rows, turnings = [], []
     for time_s, force, torque, acceleration, rate in zip(*(part.tolist() for part in felt), strict=True):
         specific = imu.follow((*acceleration,), (*rate,), time_s)
         if specific is not None and time_s >= settling_s:
             final = compensator.compensate((*force,), (*torque,), specific, imu.turning).final
             rows.append((time_s, *final.values))
+            turnings.append(imu.turning)
     found = np.array(rows)
-    return Left(found[:, 0], found[:, 1:4], found[:, 4:])
+    return Left(found[:, 0], found[:, 1:4], found[:, 4:], turnings)
 
 
 def rotations(angles: Array) -> Array:

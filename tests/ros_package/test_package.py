@@ -115,6 +115,7 @@ PLOTTED: Final = {
     "/compensation/tool": "geometry_msgs/WrenchStamped",
     "/imu/data_raw": "sensor_msgs/Imu",
     "/temperature": "sensor_msgs/Temperature",
+    "/contact": "geometry_msgs/PoseWithCovarianceStamped",
 }
 
 
@@ -123,7 +124,7 @@ PLOTTED: Final = {
     [
         ("plotjuggler_layout.xml", r'curve [^>]*name="([^"]+)"'),
         ("foxglove_layout.json", r'"value": "(/[^"]+)"'),
-        ("wrench.rviz", r"Value: (/wrench.*)"),
+        ("wrench.rviz", r"Value: (/(?:wrench|contact).*)"),
     ],
 )
 def test_a_layout_plots_fields_of_the_nodes_topics(layout: str, path: str) -> None:

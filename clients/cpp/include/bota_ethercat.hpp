@@ -11,7 +11,7 @@
 //
 // Headers only, Linux, libc only. Protocol version 1 (docs/protocol.md); docs/cpp.md is the manual. This header has everything;
 // a controller needs <bota_ethercat/stream.hpp> (`Client`), and not <bota_ethercat/control.hpp> (`Control`: requests).
-// <bota_ethercat/real_time.hpp> gives a thread a real-time priority.
+// <bota_ethercat/real_time.hpp> gives a thread a real-time priority, <bota_ethercat/contact.hpp> tells contact and its point.
 //
 // Units and frames. Force N, torque Nm, acceleration m/s^2, angular rate rad/s, temperature degrees Celsius; all in
 //   the sensor's own frame, neither filtered nor compensated. A stationary sensor measures +g along the axis that points up.
@@ -24,6 +24,7 @@
 // Network input is not trusted: lengths, depth and numbers are limited, and a server that breaks the framing is disconnected.
 #pragma once
 
+#include "bota_ethercat/contact.hpp"
 #include "bota_ethercat/control.hpp"
 #include "bota_ethercat/real_time.hpp"
 #include "bota_ethercat/stream.hpp"

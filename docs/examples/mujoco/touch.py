@@ -8,6 +8,7 @@ The controller knows the sensor by the TCP client only, as with a real one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -16,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.client import Condition, Reading
+from ft_compensation.contact import Capsule, Contact, ContactDetector, Uncertainty
+from ft_compensation.quantities import Payload
+from ft_compensation.stationary import triple
 
 if TYPE_CHECKING:  # the controller does without MuJoCo
     from docs.examples.mujoco.arm import Arm
@@ -28,6 +32,10 @@ LIMIT: Final = 0.005  # m/s
 SLIDE: Final = 0.015  # m/s
 HOLE: Final = (0.67, 0.0, 0.5)  # its middle in the face of the wall, in the base's frame, m
 DEPTH: Final = 0.015  # of the peg in it, m
+PEG: Final = Capsule((0.0, 0.0, 0.05), (0.0, 0.0, 0.11), 0.01)  # in the sensor's frame, m
+TIP: Final = (0.0, 0.0, 0.12)
+_HZ: Final = 1000.0  # of the control cycles, of which not all have a new sample
+_SLOW: Final = 0.2  # N: of what the mean unloaded force is wrong by, and motion adds, 95 %
 _UNLOADED: Final = 200  # readings before anything is touched
 _PRESS_S: Final = 2.0
 _NEAR: Final = 0.0005  # m
@@ -48,7 +56,9 @@ class Touch:
 
     def __init__(self, robot: Arm) -> None:
         self.robot, self.rows, self.done = robot, list[Row](), False
+        self.contact: Contact | None = None  # the first that has a point
         self._unloaded: list[tuple[float, ...]] = []
+        self._detector: ContactDetector | None = None
         self._plan = self._steps()
 
     def update(self, reading: Reading, seconds: float) -> None:
@@ -59,9 +69,16 @@ class Touch:
             self.rows.append(Row(seconds, np.nan, robot.tip, reading.condition))
             return
         if len(self._unloaded) < _UNLOADED:  # the tool's weight: it does not turn
-            self._unloaded.append(reading.sample.force)
+            self._unloaded.append(reading.sample.force + reading.sample.torque)
             return
-        force = robot.rotation @ (np.array(reading.sample.force) - np.mean(self._unloaded, axis=0))
+        if self._detector is None:
+            noise = Uncertainty.of(np.std(self._unloaded, axis=0).tolist(), _SLOW, 0.0, Payload())
+            self._detector = ContactDetector(PEG, noise, _HZ)
+        load = np.array(reading.sample.force + reading.sample.torque) - np.mean(self._unloaded, axis=0)
+        force = robot.rotation @ load[:3]
+        if self.contact is None and self._detector.update(triple(load[:3]), triple(load[3:])):
+            found = self._detector.locate(triple(load[:3]), triple(load[3:]))
+            self.contact = found if found.region else None
         self.rows.append(Row(seconds, -force[0], robot.tip, reading.condition))
         # The tip gives way to what is more than wanted, unless it is to move along the wall.
         robot.velocity = np.clip(GAIN * (force - _WANTED), -LIMIT, LIMIT)
@@ -116,6 +133,9 @@ def main() -> None:
     touch = Touch(arm)
     perform(touch, arm, options)
     print(f"{np.nanmax([row.force for row in touch.rows]):.1f} N at most in {len(touch.rows)} control cycles")
+    if touch.contact and touch.contact.region:
+        off, within = math.dist(touch.contact.point, TIP), touch.contact.region.largest
+        print(f"contact {1e3 * off:.1f} mm from the tip, 95 % region of {1e3 * within:.1f} mm")
     if options.picture:
         draw(options.picture, touch.rows)
 

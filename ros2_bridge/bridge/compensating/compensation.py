@@ -16,8 +16,10 @@ from rclpy.node import Node
 
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import WRENCH, Sample, Values, Vector3
+from bota_ethercat.replies import SensorInfo
 from bridge.compensating.sources import Source
 from bridge.parameters.table import Parameters
+from bridge.publishing.contact import ContactTopic
 from bridge.publishing.messages import Stamps, decoder
 from bridge.publishing.wrenches import FilteredTopic, TfFrames, WrenchTopic, make_frames
 from bridge.stream.link import NodeClock
@@ -79,7 +81,7 @@ class Compensation:
         node: Node,
         parameters: Parameters,
         stamps: Stamps,
-        rate_hz: Callable[[], float],
+        info: Callable[[], SensorInfo],
         clock: NodeClock,
     ) -> None:
         frames = make_frames(node, parameters, stamps, clock)
@@ -88,10 +90,18 @@ class Compensation:
             WrenchTopic(node, topic, parameters.frame_id, stamps, stage) for topic, stage in _STAGES.items()
         )
         self._filtered = (
-            FilteredTopic(node, parameters, stamps, rate_hz) if parameters.filter_cutoff else None
+            FilteredTopic(node, parameters, stamps, lambda: info().rate_hz)
+            if parameters.filter_cutoff
+            else None
         )
         filtered = [self._filtered] if self._filtered else []
-        self._all: list[WrenchTopic] = [final, *frames, *filtered, *subtracted]
+        self.contact = (
+            ContactTopic(node, parameters, stamps, info, lambda: self.plan)
+            if parameters.contact_surface.strip()
+            else None
+        )
+        touched = [self.contact] if self.contact else []
+        self._all: list[WrenchTopic] = [final, *frames, *filtered, *touched, *subtracted]
         self._wanted: list[WrenchTopic] = []
         self.plan, self.hold = Plan(), ""
         self.window: RestWindow | None = None

@@ -139,6 +139,7 @@ class CompensationControl:
                 "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
                 "accelerometer_force": bounds[0],
                 "torque_bound": bounds[1],
+                "contact": output.contact.why.value if output.contact else "",
                 "tared": bias != NO_WRENCH,
                 "bias_from": self.origin,
                 "bias_ramping": not self._ramp.arrived(self._sample_s),

@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.program.real_time import HIGHEST_PRIORITY
+from ft_compensation.contact import Capsule, Plane, Surface
 from ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
 from ft_compensation.quantities import (
     DEFAULT_GRAVITY,
@@ -38,7 +39,7 @@ AUTO: Final = "auto"  # the value of a path that is for the node to choose
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
 _PORT: Final = 12001
 _LEAST_GRAVITY: Final = 0.1
-_GROUPS: Final = re.compile("^(diagnostics|orientation(?!_cov)|accelerometer|rest|filter|identify)_")
+_GROUPS: Final = re.compile("^(diagnostics|orientation(?!_cov)|accelerometer|rest|filter|contact|identify)_")
 _FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _FARTHEST_M: Final = 10.0
 _REST: Final = StationaryLimits()
@@ -227,6 +228,12 @@ class Parameters:
     rest_acceleration_drift: float = _row(_REST.acceleration_drift,
         "Largest drift of the mean at rest, m/s²", 0, 100)
     filter_cutoff: float = _row(0.0, "Low-pass of wrench_filtered, -3 dB, Hz; 0 = no such topic", 0, 1000)
+    contact_surface: str = _row("", "What is touched, in frame_id, m: plane X Y Z NX NY NZ RADIUS, "
+        "sphere X Y Z RADIUS or capsule X Y Z X Y Z RADIUS; empty = no topics contact",
+        live=False, optional=True)
+    contact_noise: Numbers = _row((0.0,) * 6,
+        "Its standard deviations, N and Nm; 0 = of the latest tare, or of a healthy sensor", 0, 1e3)
+    contact_false_alarms: float = _row(1.0, "Most of them an hour, without contact", 1e-6, 3600)
     identify_file: str = _row(AUTO,
         "YAML file that ~/identify/solve writes; auto = sensor-SERIAL-payload.yaml in bota-ethercat-bridge "
         "of $XDG_STATE_HOME or ~/.local/state")
@@ -297,7 +304,32 @@ def gather(given: Mapping[str, Any]) -> Parameters:
             f"{LEAST_CUTOFF_HZ:g} Hz"
         )
     parse_frames(parameters.wrench_frames)
+    parse_surface(parameters.contact_surface)
     return parameters
+
+
+def parse_surface(text: str) -> Surface | None:
+    """The surface of `contact.surface`, None of an empty one; ParameterError."""
+    if not text.strip():
+        return None
+    kind, *words = text.split()
+    try:
+        *numbers, radius = map(float, words)
+        if not (radius > 0.0 and all(abs(number) <= _FARTHEST_M for number in (*numbers, radius))):
+            raise ValueError("a number is out of range")
+        x, y, z, *more = numbers
+        a, b, c = more if kind in {"plane", "capsule"} else (x, y, z)
+        size = math.hypot(a, b, c)
+        if kind == "plane":
+            return Plane((x, y, z), (a / size, b / size, c / size), radius)
+        if kind == "capsule" or (kind == "sphere" and not more):
+            return Capsule((x, y, z), (a, b, c), radius)
+        raise ValueError(f"{kind!r} is no surface")
+    except (ValueError, ZeroDivisionError) as error:
+        raise ParameterError(
+            f"parameter contact.surface is {text!r}: it must be plane X Y Z NX NY NZ RADIUS, sphere X Y Z "
+            f"RADIUS or capsule X Y Z X Y Z RADIUS, in m ({error})"
+        ) from None
 
 
 def _refuse_slash(what: str, frame: str) -> None:
