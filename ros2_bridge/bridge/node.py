@@ -29,7 +29,7 @@ from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
 from bridge.parameters.declare import NodeParameters
 from bridge.parameters.table import ParameterError, Parameters
-from bridge.process import StopSignals, Worker, prepare, refuse
+from bridge.process import StopSignals, Worker, favor_stream, prepare, refuse
 from bridge.publishing.messages import Stamps, TerminalTopics, make_measured
 from bridge.rclpy_internals import Spinner, is_about_arguments, make_executors, refuse_what_raises
 from bridge.services import create_services
@@ -254,6 +254,7 @@ def run(arguments: Sequence[str], signals: StopSignals | None = None) -> int:
         node = BridgeNode.create()
         if signals is not None:
             signals.call(lambda _: node.finish(0))
+        favor_stream()
         return spin(node)
     except StartError as error:
         return refuse(str(error), 2)

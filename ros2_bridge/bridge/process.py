@@ -117,13 +117,17 @@ class StopSignals:
                 os._exit(128 + number)
 
 
+def favor_stream() -> None:
+    """Let the stream's thread wait neither for Python's lock nor for the garbage of what is loaded by now."""
+    sys.setswitchinterval(_SWITCH_S)
+    gc.collect()
+    gc.freeze()
+
+
 def prepare(rt_priority: int, cpu: int, log: Any) -> None:
     """Give the node's threads, which run, their scheduling as far as allowed, and log one line of that."""
     from bota_ethercat.program.real_time import make_real_time  # noqa: PLC0415 - `client` says where it is missing
 
-    sys.setswitchinterval(_SWITCH_S)
-    gc.collect()
-    gc.freeze()  # what is loaded by now stays: no collection needs to look at it
     if not rt_priority and cpu < 0:
         return
     stream = next((each.native_id for each in threading.enumerate() if each.name == STREAM), None)
