@@ -68,14 +68,18 @@ def torque_bound_95(
     """
     halves, (rate, spin) = inertia_halves(payload), turning
     sideways = sum(part * part for part in rate) ** 0.5 * _spread(halves, rate) ** 0.5
-    is_tared = taken is not None and taken.specific_force != (0.0, 0.0, 0.0)
-    off_center = (
-        (_BETWEEN_POSES if is_tared else _ABOUT_THREE_AXES) * payload.mass * max(payload.center_interval)
-    )
+    off_center = off_center_95(payload, taken)
     at_arm = force_bound_95(payload, accelerometer, taken) * length(payload.center)
     squares = _spread(halves, spin) + 0.25 * sideways**2 + off_center**2 * sum(part * part for part in felt)
     bound: float = (squares + at_arm**2 + noise**2) ** 0.5
     return bound
+
+
+def off_center_95(payload: Payload, taken: TareBasis | None = None) -> float:
+    """kg m: what the center of gravity's interval makes of torque, for each m/s² of specific force."""
+    is_tared = taken is not None and taken.specific_force != (0.0, 0.0, 0.0)
+    factor = _BETWEEN_POSES if is_tared else _ABOUT_THREE_AXES
+    return factor * payload.mass * max(payload.center_interval)
 
 
 def torque_noise_95(payload: Payload, alignment: Alignment) -> float:

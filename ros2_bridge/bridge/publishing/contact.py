@@ -12,7 +12,7 @@ from rclpy.node import Node
 from std_msgs.msg import Bool, Header
 
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.pdo import Vector3
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.response import fir_taps, healthy_noise
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
@@ -20,7 +20,7 @@ from bridge.parameters.table import Parameters, parse_surface
 from bridge.publishing.messages import Stamps, Topic, create_publisher
 from bridge.publishing.wrenches import WrenchTopic
 from bridge.rclpy_internals import packing
-from ft_compensation.bounds import force_bound_95, inertia_halves
+from ft_compensation.bounds import force_bound_95, inertia_halves, off_center_95
 from ft_compensation.compensator import Stages
 from ft_compensation.contact import ContactDetector, Uncertainty, Why, correlation
 
@@ -74,7 +74,8 @@ class ContactTopic(WrenchTopic):
         if plan.source.is_imu:
             weight = force_bound_95(tool, parameters.accelerometer, plan.ramp.taken)
         noise = [a or b for a, b in zip(noise, healthy, strict=True)]
-        known = Uncertainty.of(noise, weight, 0.0, tool, max(inertia_halves(tool)))
+        torque = STANDARD_GRAVITY * off_center_95(tool, plan.ramp.taken)
+        known = Uncertainty.of(noise, weight, torque, tool, max(inertia_halves(tool)))
         surface = parse_surface(parameters.contact_surface)
         assert surface is not None  # there is no topic without one
         self._detector = ContactDetector(
