@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import random
 import subprocess
 import threading
 import time
+from bisect import bisect_right
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,7 @@ from bridge import check_subscription
 from bridge.subscription import Subscription
 from tests.bridge.real_node import retire
 from tests.bridge.scripted_server import ScriptedServer
-from tests.bridge.simulated_node import STEP_S, Node, Server
+from tests.bridge.simulated_node import STEP_S, Node, Server, stamp_ns, values
 from tests.clients.cpp_programs import SANITIZED, SOURCES, build, needs_gxx, patient
 from tests.server.running import PATIENCE_S
 from tests.simulation import more_if_long
@@ -68,16 +70,12 @@ class Subscriber:
             self.step()
 
     def finish(self) -> int:
-        """No samples come any more; what was lost."""
-        self._node.server.paused = True
-        self.run(0.5)
-        self._sources["published"].clear()
-        self._node.run(0.3)
+        """What was lost, once nothing is under way."""
+        self.dropping = 0.0
+        self.run(1.0)
         for name in ("published", "receive"):
-            self._queues[name].extend(self._sources[name])
             while self._queues[name]:
                 self.deliver(name, self._queues[name].popleft())
-        self.counted.end()
         return self.counted.lost
 
 
@@ -113,6 +111,28 @@ def test_lost_messages_are_counted_to_the_sample(topic: str, seed: int) -> None:
         lost = subscriber.finish()
     assert lost == subscriber.dropped > 50
     assert subscriber.counted.received > 100
+
+
+def test_every_report_is_exact(topic: str) -> None:
+    server, heard = Server(), list[int]()
+    with Node(server) as node:
+        messages, reports = node.hear(topic), node.hear("bridge/published")
+        for number in range(300):
+            names = ("orientation.w", "temperature", "orientation.x", "force.x")
+            numbers = [1.0, *(math.nan if number % n == 0 else 0.0 for n in (2, 3, 7))]
+            server.changes = {"process_data": encode(77, dict(zip(names, numbers, strict=True)))}
+            node.step()
+            heard += [stamp_ns(message) for message in messages]
+            messages.clear()
+            for values_of in (each for report in reports for each in by_topic(node, report, topic)):
+                assert int(values_of["count"]) == bisect_right(heard, int(values_of["stamp_ns"]))
+            reports.clear()
+    assert len(heard) > 50
+
+
+def by_topic(node: Node, report: Any, topic: str) -> list[dict[str, str]]:
+    name = node.name.removesuffix("bridge") + topic
+    return [values(status) for status in report.status if status.name == name]
 
 
 def test_what_was_lost_on_the_bus_is_missing_but_not_lost() -> None:
@@ -225,7 +245,7 @@ def test_over_dds_what_a_slow_subscriber_loses_is_counted(start: Any, listener: 
             time.sleep(pause)
 
         own.create_subscription(DiagnosticArray, f"/{listener.tag}/bridge/published", counted.published, 10)
-        own.create_subscription(WrenchStamped, f"/{listener.tag}/wrench", receive, 5)
+        own.create_subscription(WrenchStamped, f"/{listener.tag}/wrench", receive, 50)
         executor = SingleThreadedExecutor()
         executor.add_node(own)
 
@@ -256,8 +276,8 @@ def test_over_dds_what_a_slow_subscriber_loses_is_counted(start: Any, listener: 
         pause = 0.02
         send_all(range(sent, sent + 1000))
         pause = 0.0
-        pass_time(1.0)
-        counted.end()
+        send_all(range(sent + 1000, sent + 1200))
+        pass_time(0.5)
         executor.shutdown()
         retire(own)
         assert counted.lost > 200

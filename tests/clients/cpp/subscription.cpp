@@ -34,6 +34,5 @@ int main() {
       subscription.published(Report{{status}});
     }
   }
-  subscription.end();
   std::cout << subscription.received << " " << subscription.lost << " " << subscription.missing << "\n";
 }
