@@ -38,10 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     node, executor, ages_ns = rclpy.create_node("check_subscription"), SingleThreadedExecutor(), list[int]()
     executor.add_node(node)
     topic, end_s = node.resolve_topic_name(given.topic), time.monotonic() + _DISCOVERY_S
-    while not (publishers := node.get_publishers_info_by_topic(topic)) and time.monotonic() < end_s:
+    publisher, counted = None, Subscription(topic)
+    while publisher is None and time.monotonic() < end_s:
         executor.spin_once(0.1)
-    if publishers:
-        publisher, counted = publishers[0], Subscription(topic)
+        # The name of its node may become known later.
+        found = [each for each in node.get_publishers_info_by_topic(topic) if "UNKNOWN" not in each.node_name]
+        publisher = found[0] if found else None
+    if publisher is not None:
         package, _, kind = publisher.topic_type.split("/")
 
         def receive(message: Any) -> None:
