@@ -27,7 +27,7 @@ CPP_FUNCTIONS: Final = {"choose_server", "make_real_time", "monotonic_now_ns", "
 CPP_TYPES: Final = {
     "Channel", "Client", "Condition", "Control", "Counters", "Description", "Felt", "Frame",
     "ImuUnits", "Options", "Reading", "Reconnect", "Sample", "Scheduling", "SensorInfo", "StreamCounts",
-    "TareResult", "World",
+    "Subscription", "TareResult", "World",
 }  # fmt: skip
 """What docs/cpp.md and docs/world.md tell of; the headers have further names."""
 

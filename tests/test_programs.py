@@ -26,7 +26,7 @@ from tests.simulation import more_if_long
 
 ROOT: Final = Path(__file__).parent.parent
 SCRIPTS: Final[dict[str, str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-PROGRAMS: Final = {name: entry for name, entry in SCRIPTS.items() if name != "bridge-client"}
+PROGRAMS: Final = {name: entry for name, entry in SCRIPTS.items() if not name.startswith("bridge-")}
 CLIENTS: Final = [name for name, entry in PROGRAMS.items() if entry.startswith("bota_clients.")]
 PATHS: Final = os.pathsep.join(str(ROOT / folder) for folder in (".", "protocol", "clients"))
 EXTRA: Final = ("jinja2", "matplotlib", "mcap", "numpy", "rich", "textual", "zstandard")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""/diagnostics: a thread that checks subscribers and state ten times a second, and what it reports.
+"""/diagnostics and ~/published: a thread that checks subscribers and state ten times a second, and what it
+reports.
 
 It publishes every second, and at once when a level changes. What happened for a moment only is kept until a
 regular report has carried it. The five statuses say what `bota_ethercat.health` finds and what to do; their
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from typing import Final, NamedTuple
 
@@ -41,6 +42,7 @@ _LEVELS: Final = {
 }
 Problems = list[tuple[Level, str]]  # how bad, and a sentence
 Judged = tuple[Level, Callable[[], DiagnosticStatus]]  # how bad, and what makes the status of it
+_PUBLISHED: Final = ("count", "stamp_ns", "rate_hz")  # what ~/published has of a topic
 _NO_CONNECTION: Final = "there is no connection to the server, see link"
 _NO_SAMPLES: Final = "there are no new samples, see stream"
 
@@ -70,6 +72,8 @@ class Monitor:
         self._log = node.get_logger()
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
+        self._counts_publisher = create_publisher(node, DiagnosticArray, "~/published")
+        self._noted: list[tuple[str, int, int, float]] = []
         self._published_s = now_s = self._clock.monotonic()
         self._levels: list[Level] = []
         # The server's newest `status` of this connection, what it says of our sensor, and what it owes.
@@ -100,6 +104,7 @@ class Monitor:
 
     def tick(self) -> None:
         self._outputs.refresh()
+        self._publish_counts()
         now_s = self._clock.monotonic()
         regular = now_s - self._published_s >= _REPORT_S
         if regular:
@@ -112,11 +117,39 @@ class Monitor:
         if regular or levels != self._levels:
             self._levels, self._published_s = levels, now_s
             message = DiagnosticArray(status=[make() for _, make in judged])
-            stamp = message.header.stamp
-            stamp.sec, stamp.nanosec = divmod(self._clock.time_ns(), 1_000_000_000)
+            self._stamp(message)
             self._publisher.publish(message)
         if regular:
             self._begin_interval(now_s)
+
+    def _publish_counts(self) -> None:
+        """Publish what the reader has noted since the last tick, and have it do so again."""
+        noted, self._noted = self._noted, []
+        if noted:
+            message = DiagnosticArray(
+                status=[
+                    DiagnosticStatus(name=name, values=_key_values(zip(_PUBLISHED, values, strict=True)))
+                    for name, *values in noted
+                ]
+            )
+            self._stamp(message)
+            self._counts_publisher.publish(message)
+        if self._counts_publisher.get_subscription_count():
+            self._reader.between_samples = self._note_published
+
+    def _note_published(self) -> None:
+        """Note how many messages of each topic have a stamp up to this one; for the reader's thread."""
+        until_ns, rate_hz = self._reader.stamp_ns, self._link.info.rate_hz
+        self._noted = [
+            (topic.name, topic.published, until_ns - self._stamps.of(topic.kind), rate_hz)
+            for output in self._outputs.all
+            for topic in output.topics
+            if topic.published
+        ]
+
+    def _stamp(self, message: DiagnosticArray) -> None:
+        stamp = message.header.stamp
+        stamp.sec, stamp.nanosec = divmod(self._clock.time_ns(), 1_000_000_000)
 
     def _measure(self, now_s: float) -> None:
         ages, link = self._reader.pop_ages(), self._link
@@ -240,7 +273,7 @@ class Monitor:
             level=_LEVELS[level],
             message="; ".join(sentence for _, sentence in problems) or good,
             hardware_id=f"{info.name} {text_of(info.serial)}".strip(),
-            values=[KeyValue(key=key, value=text_of(value)) for key, value in values.items()],
+            values=_key_values(values.items()),
         )
 
     def _judge_link(self, problems: Problems, now_s: float, answer_s: float) -> Judged:
@@ -338,6 +371,10 @@ class Monitor:
         if c.doubtful:
             problems.append((Level.LOOK if has_samples else Level.NOT_POSSIBLE, c.doubtful))
         return self._status("compensation", problems, c.good, c.values)
+
+
+def _key_values(values: Iterable[tuple[str, object]]) -> list[KeyValue]:
+    return [KeyValue(key=key, value=text_of(value)) for key, value in values]
 
 
 def text_of(value: object) -> str:

@@ -37,24 +37,22 @@ def is_about_arguments(error: Exception) -> bool:
     return type(error).__name__ in {"RCLInvalidROSArgsError", "UnknownROSArgsError"}
 
 
-def packing(publisher: Any, message: Any, count: int) -> tuple[Callable[..., Any], Callable[[Any], None]]:
-    """What makes a message of `count` float64, after a stamp (ns since 1970) if there is a header; and what
-    publishes it.
-
-    It is serialized here if rclpy reads it as `message`, but for padding; else it is `message`.
-    """
-    pack = _packer(message, count)
-    is_serialized = isinstance(pack(*[0] * hasattr(message, "header"), *[0.0] * count), bytes)
+def sending(publisher: Any) -> Callable[[bytes], None]:
+    """What publishes a serialized message."""
     # What `publish` calls after checks that take longer. It keeps Python's lock, so the publisher stays.
-    is_direct = is_serialized and is_known()
-    return pack, publisher.handle.publish_raw if is_direct else publisher.publish
+    send: Callable[[bytes], None] = publisher.handle.publish_raw if is_known() else publisher.publish
+    return send
 
 
-def _packer(message: Any, count: int) -> Callable[..., Any]:
+def packing(message: Any, count: int) -> Callable[..., bytes]:
+    """What serializes a message of `count` float64, after a stamp (ns since 1970) if there is a header: by
+    itself if rclpy reads that as `message`, but for padding; else by rclpy.
+    """
     fill, numbers = filling(message), [*map(float, range(count))]
     if not hasattr(message, "header"):
         layout, pack = serialize_message(message)[: -8 * count], Struct(f"<{count}d").pack
-        return fill if not _is_read(layout + pack(*numbers), fill(*numbers)) else lambda *v: layout + pack(*v)
+        is_read = _is_read(layout + pack(*numbers), fill(*numbers))
+        return (lambda *v: layout + pack(*v)) if is_read else lambda *v: serialize_message(fill(*v))
     packed, stamp = StampedNumbers(message.header.frame_id, count).pack, message.header.stamp
 
     def filled(stamp_ns: int, *values: float) -> Any:
@@ -62,7 +60,8 @@ def _packer(message: Any, count: int) -> Callable[..., Any]:
         return fill(*values)
 
     example_ns = 1_234_567_890_123_456_789
-    return packed if _is_read(packed(example_ns, *numbers), filled(example_ns, *numbers)) else filled
+    is_read = _is_read(packed(example_ns, *numbers), filled(example_ns, *numbers))
+    return packed if is_read else lambda *v: serialize_message(filled(*v))
 
 
 def _is_read(serialized: bytes, message: Any) -> bool:

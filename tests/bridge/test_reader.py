@@ -187,7 +187,7 @@ _RARE: tuple[dict[str, Any], ...] = (
 class Collector:
     """An output that keeps what it gets."""
 
-    parts = (WRENCH,)
+    parts, topics = (WRENCH,), ()
 
     def __init__(self) -> None:
         self.got: list[object] = []

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from bota_ethercat.framing import MessageType, encode_data
 from bota_ethercat.pdo import encode
@@ -262,7 +263,7 @@ def test_without_a_cut_off_there_is_no_such_topic() -> None:
         prefix = node.name.removesuffix("bridge")
         assert {name.removeprefix(prefix) for name in node.topics if name.startswith(prefix)} == {
             "sensone_sensor_data", "wrench", "wrench_compensated", "compensation/bias",
-            "compensation/tool", "imu/data_raw", "imu/data", "temperature",
+            "compensation/tool", "imu/data_raw", "imu/data", "temperature", "bridge/published",
         }  # fmt: skip
         node.run(0.2)
         assert "wrench_filtered" not in node.log
@@ -459,14 +460,25 @@ def test_what_is_no_frame(texts: list[str], words: str) -> None:
 def test_every_topic_is_reliable_unless_its_qos_is_overridden() -> None:
     """A best-effort publisher never reaches a reliable subscriber, which is what most tools are."""
     given = {"filter.cutoff": 10.0, "wrench_frames": "[tcp 0 0 0.5]"}
-    best_effort = {"qos_overrides./mine.publisher.reliability": "best_effort"}
+    best_effort = {"reliability": "best_effort", "depth": 500, "history": "keep_last"}
+    best_effort = {f"qos_overrides./mine.publisher.{name}": value for name, value in best_effort.items()}
     with Node(Sensor(), "-r", "wrench:=/mine", **given, **best_effort) as node:
         profiles = {name.rpartition("/")[2]: topic.qos_profile for name, topic in node.topics.items()}
         del profiles["parameter_events"]  # rclpy's
         got = {name: (p.reliability.name, p.durability.name, p.depth) for name, p in profiles.items()}
-    assert got.pop("mine") == ("BEST_EFFORT", "VOLATILE", 10)
+    assert got.pop("mine") == ("BEST_EFFORT", "VOLATILE", 500)
     assert {"wrench_compensated", "wrench_filtered", "tcp", "data_raw", "diagnostics"} <= got.keys()
     assert got == dict.fromkeys(got, ("RELIABLE", "VOLATILE", 10))
+
+
+def test_the_profile_of_recording_has_every_topic_of_the_sensor() -> None:
+    profiles = yaml.safe_load((PACKAGE / "config" / "record_qos.yaml").read_text())
+    names = {line.removeprefix("ROS: topic ") for line in listed(ros=True) if line.startswith("ROS: topic ")}
+    assert profiles.keys() == {f"/{name}" for name in names if name[0] not in "/~"}
+    for profile in profiles.values():
+        policies = {name: value for name, value in profile.items() if name != "depth"}
+        assert policies == {"reliability": "reliable", "durability": "volatile", "history": "keep_last"}
+        assert profile["depth"] >= 1600, "a second of the fastest sensor"
 
 
 def test_topics_and_services_are_those_listed() -> None:

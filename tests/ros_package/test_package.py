@@ -67,7 +67,9 @@ def test_every_package_of_python_files_is_installed() -> None:
     for path in (path for top in tops for path in top.rglob("*.py")):
         assert (path.parent / "__init__.py").exists(), path
     assert {top.name for top in tops} == {name.strip("*") for name in find["include"]}
-    assert (PACKAGE / "resource" / "client").stat().st_mode & 0o111
+    assert all(
+        (PACKAGE / "resource" / name).stat().st_mode & 0o111 for name in ("client", "check_subscription")
+    )
 
 
 def setup_of(package: Path) -> configparser.ConfigParser:
@@ -98,7 +100,8 @@ def test_both_install_the_same_everything_in_the_shared_folders() -> None:
         }
         expected |= colcon
     # colcon makes these itself, from the entry points.
-    expected |= {f"lib/{name}": {PACKAGE / "resource/client"} for name in ("bota_ethercat_bridge", "bridge")}
+    started = {name: PACKAGE / "resource" / name for name in ("client", "check_subscription")}
+    expected |= {"lib/bridge": {started["client"]}, "lib/bota_ethercat_bridge": {*started.values()}}
     assert pip == expected
     # A new folder has to be named in both, or it is installed by neither.
     folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] not in "._"}

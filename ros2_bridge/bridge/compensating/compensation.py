@@ -101,7 +101,7 @@ class Compensation:
             else None
         )
         touched = [self.contact] if self.contact else []
-        self._all: list[WrenchTopic] = [final, *frames, *filtered, *touched, *subtracted]
+        self.topics: list[WrenchTopic] = [final, *frames, *filtered, *touched, *subtracted]
         self._wanted: list[WrenchTopic] = []
         self.plan, self.hold = Plan(), ""
         self.window: RestWindow | None = None
@@ -114,7 +114,7 @@ class Compensation:
         self.configure(parameters)
 
     def is_wanted(self) -> bool:
-        self._wanted = [topic for topic in self._all if topic.is_wanted()]
+        self._wanted = [topic for topic in self.topics if topic.is_wanted()]
         self.frames.want(self._wanted)
         self.has_subscribers = bool(self._wanted)
         self.is_stopped = self.is_stopped and self.has_subscribers
@@ -123,11 +123,11 @@ class Compensation:
     @property
     def problem(self) -> str:
         """Why single topics are silent, or would be with a subscriber; "" if none is."""
-        return "; ".join(topic.problem for topic in self._all if topic.problem)
+        return "; ".join(topic.problem for topic in self.topics if topic.problem)
 
     def configure(self, parameters: Parameters) -> None:
         self._stops_on_saturation = parameters.on_saturation == "stop"
-        for topic in self._all:
+        for topic in self.topics:
             topic.configure(parameters)
 
     def _specific_force(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:

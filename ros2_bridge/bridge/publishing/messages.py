@@ -8,8 +8,10 @@ subscribed, so it must not block and should not allocate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import repeat
+from operator import length_hint
 from typing import Any, Final
 
 from geometry_msgs.msg import WrenchStamped
@@ -32,7 +34,7 @@ from bota_ethercat.pdo import (
     Values,
 )
 from bridge.parameters.table import Numbers, Parameters
-from bridge.rclpy_internals import packing
+from bridge.rclpy_internals import packing, sending
 from bridge.stream.link import Link
 from bridge.stream.reader import Output
 
@@ -42,8 +44,10 @@ _ARRAY_SIZE: Final = len(ARRAY_LABEL.split())
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
 _NO_ORIENTATION: Final = (-1.0, *(0.0,) * 8)  # REP 145: the covariance of a missing orientation
 _DEPTH: Final = 10  # short: what a subscriber is too slow for is replaced by newer samples
+_MANY: Final = 2**62
 Publish = Callable[[Values, DataMessage], None]
-Make = Callable[[Any, Parameters, "Stamps"], Publish]  # of a publisher
+Sends = Iterator[Callable[[bytes], None]]  # what publishes a message, once for each
+Make = Callable[[Sends, Parameters, "Stamps"], Publish]
 
 
 def create_publisher(node: Node, message_type: Any, topic: str) -> Any:
@@ -55,10 +59,17 @@ def create_publisher(node: Node, message_type: Any, topic: str) -> Any:
 
 
 class Topic:
-    """A publisher, and whether anybody has subscribed."""
+    """A publisher, whether anybody has subscribed, and how many messages it has published."""
 
     def __init__(self, node: Node, message_type: Any, topic: str) -> None:
         self._publisher = create_publisher(node, message_type, topic)
+        self.name, self.kind = self._publisher.topic_name, message_type
+        # It counts what is taken out of it: without a line of Python for each sample.
+        self._sends: Sends = repeat(sending(self._publisher), _MANY)
+
+    @property
+    def published(self) -> int:
+        return _MANY - length_hint(self._sends)
 
     def is_wanted(self) -> bool:
         return bool(self._publisher.get_subscription_count())
@@ -72,6 +83,10 @@ class Stamps:
         self.wrench_ns = self.imu_ns = 0
         self.problem = ""  # why some are not those of the measurement, a sentence
         self._log = log
+
+    def of(self, kind: Any) -> int:
+        """By how much those of messages of this type are earlier."""
+        return {WrenchStamped: self.wrench_ns, Imu: self.imu_ns}.get(kind, 0)
 
     def update(self, kind: str, link: Link) -> None:
         self.kind = kind
@@ -99,11 +114,11 @@ class MeasuredTopic(Topic):
         parts: Sequence[slice], make: Make,
     ) -> None:  # fmt: skip
         super().__init__(node, message_type, topic)
-        self.parts, self._make, self._stamps = parts, make, stamps
+        self.parts, self._make, self._stamps, self.topics = parts, make, stamps, [self]
         self.configure(parameters)
 
     def configure(self, parameters: Parameters) -> None:
-        self.publish = self._make(self._publisher, parameters, self._stamps)
+        self.publish = self._make(self._sends, parameters, self._stamps)
 
     def observe(self, values: Values, frame: DataMessage) -> None:
         """Nothing: each message stands by itself."""
@@ -125,31 +140,31 @@ def decoder(parameters: Parameters) -> SampleDecoder:
     return SampleDecoder(min(LAYOUTS), ImuUnits(parameters.imu_raw_units))
 
 
-def _array(publisher: Any, parameters: Parameters, _: Stamps) -> Publish:
+def _array(sends: Sends, parameters: Parameters, _: Stamps) -> Publish:
     """`std_msgs/Float64MultiArray`: N, Nm, m/s², rad/s, in the order of ARRAY_LABEL; it has no header."""
     message = Float64MultiArray()
     message.layout.dim = [MultiArrayDimension(label=ARRAY_LABEL, size=_ARRAY_SIZE, stride=_ARRAY_SIZE)]
     message.data = [0.0] * _ARRAY_SIZE
-    pack, send = packing(publisher, message, _ARRAY_SIZE)
+    pack = packing(message, _ARRAY_SIZE)
     motion = decoder(parameters).motion
 
     def publish(values: Values, _: DataMessage) -> None:
         acceleration, angular_rate = motion(values)
-        send(pack(*values[WRENCH], *acceleration, *angular_rate))
+        next(sends)(pack(*values[WRENCH], *acceleration, *angular_rate))
 
     return publish
 
 
-def _wrench(publisher: Any, parameters: Parameters, stamps: Stamps) -> Publish:
+def _wrench(sends: Sends, parameters: Parameters, stamps: Stamps) -> Publish:
     """`geometry_msgs/WrenchStamped`: N and Nm, in the sensor's frame."""
-    pack, send = packing(publisher, WrenchStamped(header=Header(frame_id=parameters.frame_id)), 6)
-    return lambda values, frame: send(pack(frame.stamp_ns - stamps.wrench_ns, *values[WRENCH]))
+    pack = packing(WrenchStamped(header=Header(frame_id=parameters.frame_id)), 6)
+    return lambda values, frame: next(sends)(pack(frame.stamp_ns - stamps.wrench_ns, *values[WRENCH]))
 
 
-def _imu(publisher: Any, parameters: Parameters, stamps: Stamps, *, oriented: bool = False) -> Publish:
+def _imu(sends: Sends, parameters: Parameters, stamps: Stamps, *, oriented: bool = False) -> Publish:
     """`sensor_msgs/Imu`: m/s² and rad/s; `oriented`: with the sensor's own estimate of its orientation, and
     nothing where there is none."""
-    pack, send = packing(publisher, Imu(header=Header(frame_id=parameters.imu_frame_id)), 37)
+    pack = packing(Imu(header=Header(frame_id=parameters.imu_frame_id)), 37)
     of_orientation = _covariance(parameters.orientation_covariance) if oriented else _NO_ORIENTATION
     of_rate = _covariance(parameters.angular_velocity_covariance)
     of_acceleration = _covariance(parameters.linear_acceleration_covariance)
@@ -159,7 +174,7 @@ def _imu(publisher: Any, parameters: Parameters, stamps: Stamps, *, oriented: bo
         orientation = values[ORIENTATION] if oriented else _UPRIGHT
         if any(orientation):
             acceleration, angular_rate = motion(values)
-            send(
+            next(sends)(
                 pack(
                     frame.stamp_ns - stamps.imu_ns, *orientation, *of_orientation,
                     *angular_rate, *of_rate, *acceleration, *of_acceleration,
@@ -169,11 +184,11 @@ def _imu(publisher: Any, parameters: Parameters, stamps: Stamps, *, oriented: bo
     return publish
 
 
-def _temperature(publisher: Any, parameters: Parameters, _: Stamps) -> Publish:
+def _temperature(sends: Sends, parameters: Parameters, _: Stamps) -> Publish:
     """`sensor_msgs/Temperature`: °C, inside the sensor."""
-    pack, send = packing(publisher, Temperature(header=Header(frame_id=parameters.frame_id)), 2)
+    pack = packing(Temperature(header=Header(frame_id=parameters.frame_id)), 2)
     variance = parameters.temperature_variance
-    return lambda values, frame: send(pack(frame.stamp_ns, *values[TEMPERATURE], variance))
+    return lambda values, frame: next(sends)(pack(frame.stamp_ns, *values[TEMPERATURE], variance))
 
 
 def _covariance(variances: Numbers) -> Numbers:

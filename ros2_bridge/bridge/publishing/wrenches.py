@@ -33,14 +33,14 @@ class WrenchTopic(Topic):
     def __init__(self, node: Node, topic: str, frame_id: str, stamps: Stamps, stage: str = "final") -> None:
         super().__init__(node, WrenchStamped, topic)
         message, self._stamps = WrenchStamped(header=Header(frame_id=frame_id)), stamps
-        self._pack, self._send = packing(self._publisher, message, 6)
+        self._pack = packing(message, 6)
         self.index = Stages._fields.index(stage)
 
     def configure(self, parameters: Parameters) -> None:
         """Take other parameters from the next sample on; for the executor's thread."""
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
-        self._send(self._pack(frame.stamp_ns - self._stamps.wrench_ns, *force, *torque))
+        next(self._sends)(self._pack(frame.stamp_ns - self._stamps.wrench_ns, *force, *torque))
 
 
 class FixedFrameTopic(WrenchTopic):

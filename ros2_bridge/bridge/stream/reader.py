@@ -58,6 +58,10 @@ class Output(Protocol):
     def parts(self) -> Sequence[slice]:
         """What it publishes of `Values`: all of it is finite when `publish` is called."""
 
+    @property
+    def topics(self) -> Sequence[Any]:
+        """Each `bridge.publishing.messages.Topic` of it."""
+
     def is_wanted(self) -> bool:
         """Whether anything needs `publish`. Called now and then, not by the reader."""
 
@@ -98,8 +102,10 @@ class Reader:
         values, stamp_ns: the newest that were published, and their time since the Unix epoch.
         saturated: samples whose force or torque was saturated.
         not_finite: samples that were not published for that.
+        between_samples: called once, in the reader's thread, when all topics have what they get of a sample.
     """
 
+    between_samples: Callable[[], object] | None = None
     values: Values | None = None
     stamp_ns = saturated = not_finite = 0
 
@@ -159,6 +165,9 @@ class Reader:
 
     def read(self, timeout_s: float) -> None:
         """Publish what arrives within `timeout_s`; ConnectionFailedError once `client` has been closed."""
+        if (call := self.between_samples) is not None:
+            self.between_samples = None
+            call()
         if not self._limit_hz:
             self._read_steady(timeout_s)
         frames: list[DataMessage] = []
@@ -214,6 +223,7 @@ class Reader:
             self.values, self.stamp_ns = values, stamp_ns
         else:
             self._outputs.publish_finite(values, frame)
+            self.stamp_ns = stamp_ns
             self.not_finite += 1
             self._log.warning(
                 f"a sample with numbers that are not finite was not published ({self.not_finite} so far)",

@@ -1,0 +1,289 @@
+"""What a subscriber has lost is counted to the sample: by the node's counts, in Python and in C++."""
+
+from __future__ import annotations
+
+import math
+import random
+import subprocess
+import threading
+import time
+from bisect import bisect_right
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import WrenchStamped
+from rclpy.executors import SingleThreadedExecutor
+
+from bota_ethercat.pdo import encode
+from bridge import check_subscription
+from bridge.subscription import Subscription
+from tests.bridge.real_node import retire
+from tests.bridge.scripted_server import ScriptedServer
+from tests.bridge.simulated_node import STEP_S, Node, Server, stamp_ns, values
+from tests.clients.cpp_programs import SANITIZED, SOURCES, build, needs_gxx, patient
+from tests.server.running import PATIENCE_S
+from tests.simulation import more_if_long
+
+QUATERNION = {"orientation.w": 1.0}
+Event = tuple[str, Any]
+
+
+class Subscriber:
+    """Gets the messages of a topic in time or late, and not those that it drops; so the reports."""
+
+    def __init__(self, node: Node, topic: str, seed: int) -> None:
+        self._node, self._random = node, random.Random(seed)
+        self._sources = {"receive": node.hear(topic), "published": node.hear("bridge/published")}
+        self._queues: dict[str, deque[Any]] = {name: deque() for name in self._sources}
+        self.counted = Subscription(node.name.removesuffix("bridge") + topic)
+        self.dropped, self.dropping = 0, 0.0
+        self.is_matched = False
+        self.events: list[Event] = []
+
+    def step(self) -> None:
+        for name, source in self._sources.items():
+            for message in source:
+                if name == "receive" and (not self.is_matched or self._random.random() < self.dropping):
+                    self.dropped += self.is_matched
+                elif name == "receive" or self._random.random() < 0.7:
+                    self._queues[name].append(message)
+            source.clear()
+            if self._random.random() < 0.2:  # late by many samples
+                while self._queues[name]:
+                    self.deliver(name, self._queues[name].popleft())
+
+    def deliver(self, name: str, message: Any) -> None:
+        argument = message.header.stamp if name == "receive" else message
+        self.events.append((name, argument))
+        more = (self._node.server.time_ns(),) if name == "receive" else ()
+        before = self.counted.lost
+        getattr(self.counted, name)(argument, *more)
+        assert self.counted.lost >= before, "each report is right by itself"
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            self._node.step()
+            self.step()
+
+    def finish(self) -> int:
+        """What was lost, once nothing is under way."""
+        self.dropping = 0.0
+        self.run(1.0)
+        for name in ("published", "receive"):
+            while self._queues[name]:
+                self.deliver(name, self._queues[name].popleft())
+        return self.counted.lost
+
+
+@pytest.fixture(params=["wrench", "wrench_compensated", "imu/data", "temperature"])
+def topic(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.mark.parametrize("seed", more_if_long([1], range(1, 12)))
+def test_lost_messages_are_counted_to_the_sample(topic: str, seed: int) -> None:
+    """Also while the node leaves out samples of the topic: not finite, without orientation, limited."""
+    server, rng = Server(), random.Random(-seed)
+    bad = [{"temperature": float("nan")}, {"force.x": float("inf")}, {"orientation.x": float("nan")}, {}]
+
+    def step() -> None:
+        server.changes = {"process_data": encode(77, QUATERNION)}
+        if rng.random() < 0.2:
+            server.changes = {"process_data": encode(77, rng.choice(bad))}
+        Server.step(server)
+
+    server.step = step  # type: ignore[method-assign]
+    with Node(server) as node:
+        subscriber = Subscriber(node, topic, seed)
+        subscriber.run(1.0)  # published for others, before this one is matched
+        subscriber.is_matched = True
+        subscriber.run(1.0)
+        subscriber.dropping = 0.3
+        subscriber.run(3.0)
+        node.set("publishing_frequency", 30.0)
+        subscriber.run(2.0)
+        node.set("publishing_frequency", 0.0)
+        subscriber.run(1.0)
+        lost = subscriber.finish()
+    assert lost == subscriber.dropped > 50
+    assert subscriber.counted.received > 100
+
+
+def test_every_report_is_exact(topic: str) -> None:
+    server, heard = Server(), list[int]()
+    with Node(server) as node:
+        messages, reports = node.hear(topic), node.hear("bridge/published")
+        for number in range(300):
+            names = ("orientation.w", "temperature", "orientation.x", "force.x")
+            numbers = [1.0, *(math.nan if number % n == 0 else 0.0 for n in (2, 3, 7))]
+            server.changes = {"process_data": encode(77, dict(zip(names, numbers, strict=True)))}
+            node.step()
+            heard += [stamp_ns(message) for message in messages]
+            messages.clear()
+            for values_of in (each for report in reports for each in by_topic(node, report, topic)):
+                assert int(values_of["count"]) == bisect_right(heard, int(values_of["stamp_ns"]))
+            reports.clear()
+    assert len(heard) > 50
+
+
+def by_topic(node: Node, report: Any, topic: str) -> list[dict[str, str]]:
+    name = node.name.removesuffix("bridge") + topic
+    return [values(status) for status in report.status if status.name == name]
+
+
+def test_what_was_lost_on_the_bus_is_missing_but_not_lost() -> None:
+    server = Server()
+    with Node(server) as node:
+        subscriber = Subscriber(node, "wrench", 3)
+        subscriber.is_matched = True
+        subscriber.run(1.5)
+        for _ in range(7):
+            server.now_ns += round(STEP_S * 1e9)
+        subscriber.run(1.0)
+        subscriber.dropping = 1
+        subscriber.run(0.05)
+        subscriber.dropping = 0
+        subscriber.run(0.5)
+        assert (subscriber.finish(), subscriber.counted.missing) == (5, 12)
+
+
+def test_it_begins_anew_with_a_clock_that_is_set_back_and_a_node_that_starts_anew() -> None:
+    server = Server()
+    with Node(server) as node:
+        subscriber = Subscriber(node, "wrench", 5)
+        subscriber.is_matched = True
+        subscriber.run(1.0)
+        server.clock_step_ns = -3 * 10**9
+        subscriber.run(1.0)
+        subscriber.dropping = 0.5
+        subscriber.run(1.0)
+        before = subscriber.finish()
+        assert before == subscriber.dropped > 30
+        received = subscriber.counted.received
+    counted, server = subscriber.counted, Server()
+    server.now_ns += 10 * 10**9
+    with Node(server) as node:
+        other = Subscriber(node, "wrench", 6)
+        counted._topic, other.counted = other.counted._topic, counted
+        other.is_matched = True
+        other.run(1.0)
+        other.dropping = 0.5
+        other.run(1.0)
+        assert other.finish() - before == other.dropped > 30
+        assert counted.received > received + 100
+
+
+def test_nobody_asks_for_the_counts_unless_somebody_listens() -> None:
+    with Node(Server()) as node:
+        node.hear("wrench")
+        node.run(0.5)
+        assert node.node.reader.between_samples is None
+
+
+@needs_gxx
+@patient
+def test_cpp_counts_the_same(tmp_path: Path) -> None:
+    server = Server()
+    with Node(server) as node:
+        subscriber = Subscriber(node, "wrench", 7)
+        subscriber.is_matched = True
+        subscriber.run(1.0)
+        subscriber.dropping = 0.3
+        subscriber.run(2.0)
+        server.clock_step_ns = -(10**9)
+        subscriber.run(2.0)
+        subscriber.finish()
+        name = f"{node.name.removesuffix('bridge')}wrench"
+    lines = [name]
+    for kind, argument in subscriber.events:
+        if kind == "receive":
+            lines.append(f"r {argument.sec} {argument.nanosec}")
+        for status in argument.status if kind == "published" else ():
+            lines.append(" ".join(["p", status.name, *(value.value for value in status.values)]))
+    program = build(SOURCES / "subscription.cpp", SANITIZED)
+    said = subprocess.run(
+        [program], input="\n".join(lines), capture_output=True, text=True, check=True
+    ).stdout
+    counted = subscriber.counted
+    assert [int(word) for word in said.split()] == [counted.received, counted.lost, counted.missing]
+    assert counted.lost > 50
+
+
+@pytest.mark.parametrize(
+    ("lost", "depth", "age_ms", "best_effort", "words"),
+    [
+        (0, 10, 1.0, False, ""),
+        (5, 10, 1.0, False, "raise the depth to 100"),
+        (5, 10, 1.0, True, "lost by best effort"),
+        (5, 100, 120.0, False, "the queue is always full"),
+        (5, 1000, 3.0, False, "long pauses"),
+        (0, 1000, 8.0, False, "too old for a control loop"),
+    ],
+)
+def test_what_to_change(lost: int, depth: int, age_ms: float, best_effort: bool, words: str) -> None:
+    counted = Subscription("/wrench")
+    counted.received, counted.lost, counted.missing, counted.rate_hz = 800, lost, lost, 800.0
+    said = [*check_subscription.report(counted, [round(age_ms * 1e6)] * 800, depth, best_effort=best_effort)]
+    assert f"received 800, lost {lost}, missing {lost}" == said[0]
+    assert words in " ".join(said[2:])
+    assert bool(said[2:]) == bool(words)
+
+
+@pytest.mark.long
+def test_over_dds_what_a_slow_subscriber_loses_is_counted(start: Any, listener: Any) -> None:
+    with ScriptedServer() as server:
+        node = start(server.port).node
+        counted, pause = Subscription(f"/{listener.tag}/wrench"), 0.0
+        own = rclpy.create_node(f"{listener.tag}_slow", start_parameter_services=False)
+
+        def receive(message: Any) -> None:
+            counted.receive(message.header.stamp, time.time_ns())
+            time.sleep(pause)
+
+        own.create_subscription(DiagnosticArray, f"/{listener.tag}/bridge/published", counted.published, 10)
+        own.create_subscription(WrenchStamped, f"/{listener.tag}/wrench", receive, 50)
+        executor = SingleThreadedExecutor()
+        executor.add_node(own)
+
+        def pass_time(seconds: float) -> None:
+            end_s = time.monotonic() + seconds
+            while time.monotonic() < end_s:
+                executor.spin_once(0.01)
+
+        def send(numbers: range) -> None:
+            for number in numbers:
+                server.send_sample(float(number))
+                time.sleep(0.002)
+
+        def send_all(numbers: range) -> None:
+            sender = threading.Thread(target=send, args=[numbers])
+            sender.start()
+            while sender.is_alive():
+                executor.spin_once(0.01)
+
+        server.subscribed.wait(PATIENCE_S)
+        sent = 0
+        while not counted.rate_hz:
+            send_all(range(sent, sent + 100))
+            sent += 100
+        pass_time(0.5)  # for the reports
+        begun = published(node) - counted.received  # before the two had found each other
+        assert counted.lost == 0
+        pause = 0.02
+        send_all(range(sent, sent + 1000))
+        pause = 0.0
+        send_all(range(sent + 1000, sent + 1200))
+        pass_time(0.5)
+        executor.shutdown()
+        retire(own)
+        assert counted.lost > 200
+        assert counted.received + counted.lost + begun == published(node)
+
+
+def published(node: Any) -> int:
+    counts = node.reader.counts
+    return int(counts.new - counts.stale)
