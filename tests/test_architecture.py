@@ -90,7 +90,7 @@ PACKAGES: Final[dict[str, set[str]]] = {
     "pyarrow": {"bota_clients.export"},
     "zarr": {"bota_clients.export"},
     "rosbags": {"bota_clients.export"},
-    "yaml": {"bota_clients.export"},
+    "yaml": {"bota_clients.export", "bota_clients.identify"},
 } | {
     ros: {"bridge"}
     for ros in (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 import random
 import struct
@@ -283,7 +284,14 @@ def test_the_inertia_is_found_if_the_tool_turned_between_the_poses_and_likely_if
     if not turns:  # not even from pose to pose
         felt = motion.Felt(*(part[felt.times % 3.0 < 1.6] for part in felt))
     record_felt(tmp_path / "a.mcap", felt, settings)
-    code, found, _ = asked(tmp_path / "a.mcap", "--yaml", tmp_path / "tool.yaml")
+    files = {suffix: tmp_path / f"tool.{suffix}" for suffix in ("yaml", "bota", "again")}
+    code, found, _ = asked(tmp_path / "a.mcap", "--yaml", files["yaml"], "--bota", files["bota"])
+    assert run_here(main, files["yaml"], "--bota", files["again"]).code == 0
+    of_bota, again = (
+        json.loads(files[name].read_text(), parse_float=lambda text: round(float(text), 6))
+        for name in ("bota", "again")
+    )
+    assert of_bota == again
     assert (code, bool(problems("identify", found))) == (0, False)
     written = written_parameters(tmp_path / "tool.yaml")
     assert written["tool_inertia"] == pytest.approx(found["tool_inertia"], abs=1e-8)

@@ -33,14 +33,13 @@ from bota_ethercat.settings import known_settings
 from ft_compensation.alignment import align
 from ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
 from ft_compensation.compensator import Compensator
+from ft_compensation.identification.parameter_file import payload_of
 from ft_compensation.quantities import (
     EXACT,
-    NO_PAYLOAD,
     NO_WRENCH,
     STILL,
     ZERO,
     Accelerometer,
-    Payload,
     Turning,
     Wrench,
 )
@@ -115,10 +114,7 @@ class Windows:
         self._doubted_until_ns = -1
         if tool is None:
             return
-        mass, center = float(tool["tool_mass"]), tuple(tool["tool_center_of_gravity"])
-        names = "inertia", "center_of_gravity_interval", "inertia_interval"
-        rows = zip(names, NO_PAYLOAD[2:], strict=True)
-        self._payload = Payload(mass, center, *(tuple(tool.get(f"tool_{name}", row)) for name, row in rows))
+        self._payload = payload_of(tool)
         self._bias, offset = Wrench.of(tool.get("bias", NO_WRENCH.values)), offset_of(tool)
         self._compensator, self._own_offset = Compensator(self._payload, self._bias), OwnOffset()
         self._own_offset.begin(self._bias, offset, is_measured=offset is not None)

@@ -22,13 +22,16 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         "which the sensor was held stationary in several poses.",
         "Record with ethercat-record: hold the sensor stationary for two seconds with each axis once up "
         "and once down, touching nothing. The motion in between does not matter. 'ethercat-identify delay' "
-        "tells how much later force and torque are than the accelerometer.",
+        "tells how much later force and torque are than the accelerometer. A FILE.json of Bota's payload "
+        "utilities is converted by --yaml, and a FILE.yaml of this program by --bota.",
     )
     add = made.add_argument
     _add_recording(made)
     add("--gravity", type=number(9.0, 10.0), metavar="M/S2",
         help=f"acceleration of gravity, m/s² ({STANDARD_GRAVITY}); written to OUT.yaml if given")  # fmt: skip
     add("--yaml", type=Path, metavar="OUT", help="write the result as parameters of the ROS 2 node")
+    add("--bota", type=Path, metavar="OUT",
+        help="write mass, center of gravity and inertia for Bota's BotaPayloadCompensator")  # fmt: skip
     add_force(made)
     add("--json", action="store_true", help="print everything as JSON instead of a table")
     return made.parse_args(argv)
@@ -58,7 +61,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["delay"]:
         return start("ethercat-identify", "identify.delay", parse_delay(given[1:]))
-    return start("ethercat-identify", "identify.program", parse_options(given))
+    options = parse_options(given)
+    is_tool = options.path.suffix in {".json", ".yaml", ".yml"}
+    return start("ethercat-identify", "identify.bota_file" if is_tool else "identify.program", options)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bota_clients.errors import RecordingError
+from bota_clients.identify.bota_file import write_bota
 from bota_clients.identify.stationary_periods import (
     LEAST_S,
     StationaryPeriod,
@@ -136,8 +137,8 @@ def as_json(
 
 
 def run(options: argparse.Namespace) -> int:
-    if options.yaml is not None:
-        refuse_existing(options.yaml, force=options.force)
+    for output in filter(None, (options.yaml, options.bota)):
+        refuse_existing(output, force=options.force)
     with open_recording(options.path) as recording:
         sensor = choose(recording, options.sensor)
         if recording.cut_off is not None:
@@ -168,6 +169,9 @@ def run(options: argparse.Namespace) -> int:
     if result is None:
         _say(error or "no result")
         return 1
+    if options.bota is not None:
+        write_bota(options.bota, result.payload)
+        _say(f"written to {options.bota}")
     if options.yaml is not None:
         who = f"{sensor.info.name}, serial number {sensor.info.serial}, from {options.path.name}"
         gravity = None if options.gravity is None else (0.0, 0.0, -options.gravity)

@@ -143,7 +143,7 @@ def identify_inertia(turned: Turned, poses: Identified) -> Identified:
         f"the tool hardly turned about {' and '.join(vague)}, so its inertia there is only what mass and "
         "center of gravity make likely: turn it to and fro about each axis for some seconds, touching nothing"
     )
-    inertia = _possible(found, interval).tolist()
+    inertia = possible_inertia(found, interval).tolist()
     payload = payload._replace(inertia=tuple(inertia), inertia_interval=tuple(interval.tolist()))
     return poses._replace(payload=payload, notes=(*([note] if vague else []), *poses.notes))
 
@@ -177,7 +177,7 @@ def _solve(
     return answer / scale, np.sqrt(np.diag(covariance)) / scale, max(count - unknowns / 3.0, 1.0)
 
 
-def _possible(found: Array, interval: Array) -> Array:
+def possible_inertia(found: Array, interval: Array) -> Array:
     """The nearest tensor that a body can have; CompensationError if that is beyond the interval.
 
     Half its trace less itself is the second moment of the mass, which is nowhere negative: this is that the

@@ -1,0 +1,106 @@
+"""The tool in a file of Bota's `bota-payload-utils`: written, and turned into the node's parameters and back.
+
+Its estimator writes such a file and its compensator reads it, by runs of version 1.0.3, without the `bias` in
+it. There the inertia is about the origin of the wrench, here about the center of gravity.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bota_clients.errors import RecordingError
+from bota_clients.program import say
+from bota_ethercat.program.new_file import NewFile, refuse_existing
+from ft_compensation.identification.inertia import possible_inertia
+from ft_compensation.identification.parameter_file import payload_of, write_payload
+from ft_compensation.quantities import ELEMENTS, CompensationError, Payload, likely_inertia, vector
+
+_say = partial(say, "ethercat-identify")
+
+
+def write_bota(path: Path, payload: Payload) -> None:
+    """Write it, or replace it, with compensation of motion on if the inertia is known; FileError."""
+    elements = np.array(payload.inertia) + _of_the_center(payload)
+    properties = {
+        "mass": payload.mass,
+        "com": dict(zip("xyz", payload.center, strict=True)),
+        "inertia": dict(zip((f"I{name}" for name in ELEMENTS), elements.tolist(), strict=True)),
+    }
+    config = {"payload_properties": properties, "enable_dynamic_compensation": any(payload.inertia)}
+    with NewFile(path, force=True) as file:
+        file.write(json.dumps({"payload_compensator_config": config}, indent=2) + "\n")
+        file.finish()
+
+
+def read_bota(path: Path) -> tuple[Payload, str]:
+    """The tool, and why it has no inertia or ""; RecordingError if there is no mass and center.
+
+    Nothing tells how good a tensor is: its intervals are as wide as those of an unknown one.
+    """
+    try:
+        found: Any = json.loads(path.read_bytes())["payload_compensator_config"]["payload_properties"]
+        mass, center = float(found["mass"]), vector([found["com"][axis] for axis in "xyz"], "com")
+        elements = [float(found["inertia"][f"I{name}"]) for name in ELEMENTS]
+        if not all(map(math.isfinite, (mass, *elements))):
+            raise ValueError("mass and inertia are finite numbers")
+    except (OSError, LookupError, TypeError, ValueError) as error:
+        why = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise RecordingError(f"{path} is no configuration of Bota's payload compensator: {why}") from None
+    if mass <= 0.0:
+        raise RecordingError(
+            f"{path} has a mass of {mass:g} kg, which no tool has: force or acceleration had another sign "
+            "when it was estimated; use ethercat-identify with a recording"
+        )
+    payload = Payload(mass, center)
+    half = likely_inertia(payload)[1]
+    try:
+        inertia = possible_inertia(np.array(elements) - _of_the_center(payload), np.array(half))
+    except CompensationError as refusal:
+        return payload, str(refusal)
+    return payload._replace(inertia=tuple(inertia.tolist()), inertia_interval=half), ""
+
+
+def _read_yaml(path: Path) -> Payload:
+    import yaml  # noqa: PLC0415 - of the extra `dataset`
+
+    try:
+        payload = payload_of(yaml.safe_load(path.read_bytes())["/**"]["ros__parameters"])
+        if not 0.0 < payload.mass < np.inf:
+            raise ValueError(f"tool_mass is {payload.mass:g}")
+    except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError) as error:
+        why = " ".join(str(error).split())
+        raise RecordingError(f"{path} does not have a tool's parameters: {why}") from None
+    return payload
+
+
+def _of_the_center(payload: Payload) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """kg m² (6,): by how much the inertia about the origin is more than that about the center of gravity."""
+    x, y, z = payload.center
+    second = np.array([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
+    return payload.mass * second
+
+
+def run(options: argparse.Namespace) -> int:
+    """From a .json of Bota's to --yaml, or from such a .yaml to --bota."""
+    path: Path = options.path
+    is_bota = path.suffix == ".json"
+    output, name = (options.yaml, "yaml") if is_bota else (options.bota, "bota")
+    if output is None:
+        raise RecordingError(f"{path} is a tool already: give --{name} OUT to convert it")
+    refuse_existing(output, force=options.force)
+    if is_bota:
+        payload, why = read_bota(path)
+        write_payload(output, payload, f"from {path.name}, Bota's: tare once, a bias is not taken from it")
+        if why:
+            _say(f"the inertia in {path} is left out: {why}")
+    else:
+        write_bota(output, _read_yaml(path))
+    _say(f"written to {output}")
+    return 0
