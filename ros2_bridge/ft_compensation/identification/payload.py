@@ -149,6 +149,7 @@ def identify(poses: Sequence[Pose]) -> Identified:
         seen,
         (
             *_misfit_notes(poses, drift, touched),
+            *_mounting_notes(found.mounting),
             *_fit_notes(force, "force", "N"),
             *_fit_notes(torque, "torque", "Nm"),
             *_other_notes(mass, mass_interval, length(payload.center_interval), undetermined, seen),
@@ -180,8 +181,20 @@ class _Equations:
         if len(times) == len(poses) >= _FEWEST_IN_TIME and np.ptp(times) > 0.0:
             self.minutes = (np.array(times) - times[-1]) / _SECONDS_A_MINUTE
 
+        self._is_turned = False
+
     def solve(self, regressor: Array | None = None) -> Estimate:
-        return estimate(self.wrench, self.gravity, self._acceleration, self._noise, regressor)
+        given = self.wrench, self.gravity, self._acceleration, self._noise, regressor
+        return estimate(*given, is_turned=self._is_turned)
+
+    def look_for_mounting(self, found: Estimate) -> Estimate:
+        """With the rotation between robot and sensor from here on, if that explains what is left."""
+        if self._acceleration is not None:
+            return found
+        self._is_turned = True
+        turned = self.solve()
+        self._is_turned = float(_chance(found, turned)) < _CHANCE
+        return turned if self._is_turned else found
 
 
 class _Touched(NamedTuple):
@@ -204,6 +217,7 @@ def _explained(equations: _Equations) -> tuple[Estimate, Wrench | None, _Touched
     found, count = equations.solve(), len(equations.wrench)
     if count < _FEWEST_IN_TIME:
         return found, None, None
+    found = equations.look_for_mounting(found)
     suspects = np.argsort(np.abs(found.residuals / _rms(found.residuals)).max(axis=1))[-_SUSPECTS:]
     without = equations.solve(np.eye(count)[suspects])
     chances = _chance(found, without) * count
@@ -335,6 +349,16 @@ def _misfit_notes(poses: Sequence[Pose], drift: Wrench | None, touched: _Touched
         )
     if touched is not None:
         yield str(touched)
+
+
+def _mounting_notes(mounting: Value | None) -> Iterator[str]:
+    if mounting is not None and (np.abs(mounting.value) > mounting.half).any():
+        axes = zip("xyz", np.degrees(mounting.value), np.degrees(mounting.half), strict=True)
+        turned = ", ".join(f"{axis} {value:.2f} ± {half:.2f}" for axis, value, half in axes)
+        yield (
+            f"gravity is turned by {turned} degrees in the sensor's frame beyond the robot's orientation, "
+            "which the answer takes into account and compensation does not: correct how the sensor is mounted"
+        )
 
 
 def _fit_notes(fit: Fit, name: str, unit: str) -> Iterator[str]:
