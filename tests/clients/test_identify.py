@@ -305,6 +305,22 @@ def test_the_inertia_is_found_if_the_tool_turned_between_the_poses_and_likely_if
         assert "hardly turned about" in " ".join(found["notes"])
 
 
+def test_without_a_rest_all_is_found_by_motion_and_a_wrong_unit_is_refused(tmp_path: Path) -> None:
+    tool = Payload(1.5, (0.05, -0.03, 0.07), (0.009, 0.011, 0.006, 0.001, -0.002, 0.001))
+    settings: dict[str, Any] = start_up_defaults()
+    felt = motion.filtered(motion.turned(3), tool, 16.0, settings)
+    record_felt(tmp_path / "a.mcap", felt, settings)
+    code, found, _ = asked(tmp_path / "a.mcap", "--yaml", tmp_path / "tool.yaml")
+    assert (code, bool(problems("identify", found)), found["poses"]) == (0, False, [])
+    truths: dict[str, Any] = {"mass": tool.mass, "center_of_gravity": tool.center, "inertia": tool.inertia}
+    for name, truth in truths.items():
+        half = np.abs(found[f"tool_{name}_interval"])
+        assert (np.abs(np.subtract(found[f"tool_{name}"], truth)) <= 1.5 * half).all()
+    assert "from free motion" in (tmp_path / "tool.yaml").read_text().splitlines()[1]
+    record_felt(tmp_path / "b.mcap", felt._replace(rate=np.radians(felt.rate)), settings)
+    assert "or, by motion alone: gravity turns 5" in refused(tmp_path / "b.mcap")
+
+
 def test_the_lag_of_the_force_is_told_beside_what_the_filters_imply(shaken: Path) -> None:
     code, found, _ = asked("delay", shaken)
     assert code == 0

@@ -453,3 +453,27 @@ def test_the_interval_of_an_offset_holds_it_and_shrinks_with_more_poses() -> Non
         assert (np.abs(found.calibration[0].value - truth) <= found.calibration[0].half).mean() > 0.9
         halves.append(float(np.median(found.calibration[0].half)))
     assert halves[1] < 0.5 * halves[0] < 0.01
+
+
+@pytest.mark.parametrize("degrees", [0.0, 0.1, 0.5, 1.5])
+def test_a_mounting_turned_against_the_robot_is_found_told_and_in_the_intervals(
+    degrees: float,
+) -> None:
+    held = []
+    for seed in range(60):
+        draw, noise = np.random.default_rng([seed, 9]), random.Random(seed)
+        axis = draw.normal(size=3)
+        axis *= math.radians(degrees) / np.linalg.norm(axis)
+        tool = Payload(draw.uniform(0.4, 3.0), tuple((draw.normal(size=3) * 0.05).tolist()))
+        poses = []
+        for up in (*AXES, *draw.normal(size=(6, 3)).tolist()):
+            told = np.array(gravity_for(up))
+            turned = told - np.cross(axis, told) + 0.5 * np.cross(axis, np.cross(axis, told))
+            x, y, z = turned.tolist()
+            poses.append(pose(up, tool, noise=noise)._replace(gravity=(x, y, z)))
+        found = identify(poses)
+        held += (
+            np.abs(np.subtract(found.payload.center, tool.center)) < found.payload.center_interval
+        ).tolist()
+        assert (degrees < 0.4) or "beyond the robot's orientation" in found.notes[0]
+    assert np.mean(held) >= 0.9

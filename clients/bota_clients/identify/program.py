@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, Final
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -24,16 +25,25 @@ from bota_clients.program import say
 from bota_clients.recording.columns import Columns
 from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
-from bota_ethercat.pdo import STANDARD_GRAVITY
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from ft_compensation.alignment import align
-from ft_compensation.identification.inertia import identify_inertia, turn
+from ft_compensation.identification.free_motion import identify_in_motion
+from ft_compensation.identification.inertia import Turned, identify_inertia, turn
 from ft_compensation.identification.parameter_file import write_yaml
 from ft_compensation.identification.payload import Fit, Identified, identify, summary
-from ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
+from ft_compensation.identification.poses import MOST_POSES, Pose, coverage, pose_of
 from ft_compensation.identification.weighted import CONFIDENCE
-from ft_compensation.quantities import CROSS_AXES, ELEMENTS, EXACT, CompensationError, Wrench, length
+from ft_compensation.quantities import (
+    CROSS_AXES,
+    ELEMENTS,
+    EXACT,
+    Accelerometer,
+    CompensationError,
+    Wrench,
+    length,
+)
 from ft_compensation.stream import hides_gravity, not_newtons
 
 _WIDTH: Final = 80  # every table fits
@@ -155,6 +165,11 @@ def run(options: argparse.Namespace) -> int:
     poses, result, error = _solve(periods, options)
     if result is not None:
         result = _with_inertia(result, data, sensor)
+    elif coverage([pose for _, pose in poses]).missing is not None:
+        try:
+            result, poses = _in_motion(data, sensor), ()
+        except CompensationError as refusal:
+            error = f"{error}; or, by motion alone: {refusal}"
     if options.json:
         sys.stdout.write(json.dumps(as_json(poses, rejected, result, error), indent=1) + "\n")
     else:
@@ -193,18 +208,36 @@ def run(options: argparse.Namespace) -> int:
 
 def _with_inertia(result: Identified, data: Columns, sensor: RecordedSensor) -> Identified:
     """The tool's inertia too, as far as the recording has motion."""
-    calibration = result.accelerometer.calibration if result.accelerometer else EXACT
-    imu = 0.0, 0.0, IMU_HEIGHTS.get(sensor.info.name[4:8], 0.0)
     try:
-        if any(row.info.settings != sensor.info.settings for row in sensor.history):
-            raise CompensationError("settings were changed during the recording")
-        data = data.where(data.fresh)
-        rows, good = usable_rows(data)
-        times = (data.monotonic_ns - data.monotonic_ns[0])[good] * 1e-9
-        alignment = align(sensor.info.settings, sensor.info.rate_hz)
-        return identify_inertia(turn(times, rows[good], alignment, calibration, imu), result)
+        return _inertia(result, data, sensor)
     except CompensationError as refusal:
         return result._replace(notes=(f"the tool's inertia is not identified: {refusal}", *result.notes))
+
+
+def _in_motion(data: Columns, sensor: RecordedSensor) -> Identified:
+    """All by free motion, of which no body of negative inertia is a part either; CompensationError."""
+    return _inertia(identify_in_motion(_turned(data, sensor, EXACT), _imu(sensor)), data, sensor)
+
+
+def _inertia(result: Identified, data: Columns, sensor: RecordedSensor) -> Identified:
+    calibration = result.accelerometer.calibration if result.accelerometer else EXACT
+    return identify_inertia(_turned(data, sensor, calibration), result)
+
+
+def _imu(sensor: RecordedSensor) -> Vector3:
+    return 0.0, 0.0, IMU_HEIGHTS.get(sensor.info.name[4:8], 0.0)
+
+
+def _turned(data: Columns, sensor: RecordedSensor, calibration: Accelerometer) -> Turned:
+    if any(row.info.settings != sensor.info.settings for row in sensor.history):
+        raise CompensationError("settings were changed during the recording")
+    data = data.where(data.fresh)
+    rows, good = usable_rows(data)
+    times = np.asarray((data.monotonic_ns - data.monotonic_ns[:1])[good] * 1e-9)
+    if not len(times):
+        raise CompensationError("no sample can be used")
+    alignment = align(sensor.info.settings, sensor.info.rate_hz)
+    return turn(times, rows[good], alignment, calibration, _imu(sensor))
 
 
 def choose(recording: Recording, position: int | None) -> RecordedSensor:

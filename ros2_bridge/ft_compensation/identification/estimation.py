@@ -6,7 +6,9 @@ Each axis of force and torque has a variance of its own. Where gravity is from t
 sensitivities and cross-axis terms are unknowns too: with g = -G u / |u| and u = (1 - K) (a - offset) / scale,
 |u| = G is one more equation a pose, and the directions enter force and torque. Of these twelve, what is
 typical of such an accelerometer is assumed in advance: what the poses do not determine stays near zero, its
-interval wide. A regressor (time, or the indicator of one pose) may shift each axis of force and torque.
+interval wide. Where gravity is from the orientation of a robot, the sensor may be mounted turned by about a
+degree, likewise: g + turn x g. A regressor (time, or the indicator of one pose) may shift each axis of force
+and torque.
 
 Leading axes of the arrays, shown as `...`, are independent problems.
 """
@@ -29,6 +31,7 @@ _FLOOR_ALONE: Final = 1e-12
 # Of an axis' variance at the offset that the lengths alone give: six poses could be made to fit one axis
 # perfectly by an offset that they hardly determine.
 _LEAST_SHARE: Final = 0.3
+_MOUNTING: Final = 0.01  # rad: standard deviation of the mounting about each axis
 _NOTHING: Final = 1e-9  # kg: no mass at all has its center anywhere
 _OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
 _ROW, _OTHER = np.nonzero(~np.eye(3, dtype=bool))  # of the cross-axis terms, as CROSS_AXES
@@ -50,6 +53,8 @@ class Estimate(NamedTuple):
     bias: Value  # (6,), N and Nm
     # Of the accelerometer: offset (3,), m/s², scale (3,): what its axes read per m/s², cross-axis terms (6,).
     calibration: tuple[Value, Value, Value] | None  # None where gravity is not from it
+    # (3,), rad: by which gravity is turned in the sensor's frame, beyond what its orientation tells.
+    mounting: Value | None  # None if it is not looked for
     shift: Value | None  # (6,), N and Nm for each unit of the regressor
     gravity: Array  # (n, 3), m/s²: as far as known now
     residuals: Array  # (n, 6), N and Nm: measured minus modelled
@@ -62,12 +67,14 @@ def estimate(
     acceleration: Array | None = None,
     acceleration_variance: Array | float = 0.0,
     regressor: Array | None = None,
+    *,
+    is_turned: bool = False,
 ) -> Estimate:
     """Solve the poses: wrench (..., n, 6), N and Nm, and gravity (..., n, 3), in the sensor's frame, m/s².
 
     Also `acceleration` (..., n, 3), m/s², if gravity is from it, with `acceleration_variance` (...,) of its
-    means by the sensor's noise, (m/s²)²; and the `regressor` (..., n). LinAlgError if the equations leave an
-    unknown open.
+    means by the sensor's noise, (m/s²)², or `is_turned` to have the mounting found; and the
+    `regressor` (..., n). LinAlgError if the equations leave an unknown open.
     """
     if regressor is not None:  # of several regressors, each is a problem
         many = regressor.shape[:-1]
@@ -75,9 +82,12 @@ def estimate(
         gravity = np.broadcast_to(gravity, (*many, *gravity.shape[-2:]))
         acceleration = None if acceleration is None else np.broadcast_to(acceleration, gravity.shape)
     measured = np.swapaxes(wrench, -1, -2)
-    calibration = shift = None
+    calibration = mounting = shift = None
     if acceleration is None:
-        solution = _alone(gravity, measured, regressor)
+        if is_turned:
+            gravity, solution = _mounted(gravity, measured, regressor)
+        else:
+            solution = _alone(gravity, measured, regressor)
     else:
         gravity, solution = _with_accelerometer(
             measured, acceleration, gravity, acceleration_variance, regressor
@@ -96,6 +106,8 @@ def estimate(
     if regressor is not None:
         linear = 16
         shift = Value(answer[..., 10:16], half[..., 10:16])
+    if is_turned:
+        mounting = Value(answer[..., linear:], half[..., linear:])
     if acceleration is not None:
         first, second, third = (
             slice(linear + begin, linear + end) for begin, end in ((0, 3), (3, 6), (6, 12))
@@ -110,6 +122,7 @@ def estimate(
         Value(center, half[..., 4:7]),
         Value(answer[..., [1, 2, 3, 7, 8, 9]], half[..., [1, 2, 3, 7, 8, 9]]),
         calibration,
+        mounting,
         shift,
         gravity,
         wrench - np.swapaxes(_times(_design(gravity, regressor), answer[..., :linear]), -1, -2),
@@ -122,6 +135,31 @@ def _alone(gravity: Array, measured: Array, regressor: Array | None, floor: floa
     design = _design(gravity, regressor)
     unknowns = design.shape[-1]
     return solve(design, measured, Known(np.zeros((unknowns, unknowns)), np.full(6, floor**2)))
+
+
+def _mounted(gravity: Array, measured: Array, regressor: Array | None) -> tuple[Array, Solution]:
+    """Gravity and the unknowns of force and torque, those of the mounting last; by Gauss and Newton."""
+    told, size = gravity, np.linalg.norm(gravity, axis=-1, keepdims=True)
+    solution = _alone(told, measured, regressor)
+    answer, linear = solution.answer, solution.answer.shape[-1]
+    answer = np.concatenate([answer, np.zeros((*answer.shape[:-1], 3))], axis=-1)
+    known = Known(np.diag([0.0] * linear + [_MOUNTING**-2] * 3), np.full(6, _FLOOR_ALONE**2))
+    turn = np.cross(np.eye(3), told[..., np.newaxis, :])  # (..., n, 3 of the mounting, 3)
+    turn = np.moveaxis(turn, -1, -3)  # (..., 3, n, 3 of the mounting)
+    for _ in range(_LENGTH_ROUNDS):
+        shown = _shown(answer, turn)
+        target = measured + _times(shown, answer[..., linear:])
+        solution = solve(np.concatenate([_design(gravity, regressor), shown], axis=-1), target, known)
+        answer = solution.answer
+        gravity = told + np.cross(answer[..., np.newaxis, linear:], told)
+        gravity = gravity * size / np.linalg.norm(gravity, axis=-1, keepdims=True)
+    return gravity, solution
+
+
+def _shown(answer: Array, turn: Array) -> Array:
+    """(..., 6, n, p): change of force and torque by what turns gravity by `turn` (..., 3, n, p)."""
+    moment = np.cross(answer[..., 4:7, np.newaxis, np.newaxis], turn, axis=-3)
+    return np.concatenate([answer[..., :1, np.newaxis, np.newaxis] * turn, moment], axis=-3)
 
 
 class _Linear(NamedTuple):
@@ -188,9 +226,7 @@ def _with_accelerometer(
         design = np.zeros((*measured.shape[:-2], 7, measured.shape[-1], unknowns))
         design[..., :6, :, :linear] = _design(at.gravity, regressor)
         turn = np.moveaxis(at.turn, -2, -3)
-        design[..., :3, :, linear:] = answer[..., 0, np.newaxis, np.newaxis, np.newaxis] * turn
-        moment = answer[..., 4:7]
-        design[..., 3:6, :, linear:] = np.cross(moment[..., :, np.newaxis, np.newaxis], turn, axis=-3)
+        design[..., :6, :, linear:] = _shown(answer, turn)
         design[..., 6:, :, linear:] = at.stretch
         # Gravity has the present calibration in it already, and the linear equations add it.
         twice = _times(design[..., linear:], answer[..., linear:])

@@ -32,11 +32,13 @@ _AROUND_S: Final = 0.2  # left out before and after a contact
 _LEAST_PIECES: Final = 4
 # rad/s², rms of a piece: less is mostly noise of the gyroscope, which would pass for motion.
 _LEAST_SPIN: Final = 0.3
-_GRAVITY, _GAIN = (7.0, 13.0), (0.7, 1.4)  # m/s²; none: of a healthy IMU in motion
-_TOLD: Final = 0.4  # correlation of what gravity does and what the gyroscope says
+# m/s²; how far from 1, also in standard errors: of a healthy IMU in motion.
+_GRAVITY, _GAIN, _CHANCE = (7.0, 13.0), 0.35, 4.0
+_CHANGES: Final = 1.0  # m/s³, rms: with less an offset of the gyroscope would be most of the turning
 _LEAST_CENTER: Final = 5e-4  # m: how well poses tell the center of gravity of what moves, at best
 _GYROSCOPE: Final = 0.01  # tolerance of its sensitivity, 95 %
 _HARDLY: Final = 0.5  # of the interval before: a moment no better known than so is not determined
+_AT_FIRST: Final = 1e6  # weights: what is measured goes first, not what was known before
 _PLACES: Final = [("xyz".index(row), "xyz".index(column)) for row, column in ELEMENTS]
 
 
@@ -75,8 +77,8 @@ def turn(
     felt = np.stack(accelerometer.correct(tuple(acceleration.T)), axis=1)
     spin = np.gradient(rate, period, axis=0)
     _check_imu(felt, rate, period)
-    arm = _crossing(spin) + _crossing(rate) @ _crossing(rate)
-    spun = _elements(spin) + _crossing(rate) @ _elements(rate)
+    arm = crossing(spin) + crossing(rate) @ crossing(rate)
+    spun = _elements(spin) + crossing(rate) @ _elements(rate)
     felt = felt - arm @ np.array(imu)
     window = hann_window(_WINDOW_S, period)
     every = max(1, round(_WINDOW_S / period / 4))
@@ -99,12 +101,18 @@ def _check_imu(felt: Array, rate: Array, period: float) -> None:
             f"the accelerometer reads {size:.2f} m/s² mostly, where gravity is 9.81: check imu_raw_units"
         )
     window = hann_window(2 * _WINDOW_S, period)
-    changes = np.gradient(smoothed(felt, window), period, axis=0)
-    turns = smoothed(np.cross(felt, rate), window)
-    both, each = float((turns * changes).sum()), float((turns**2).sum())
-    if both**2 > _TOLD**2 * each * float((changes**2).sum()) and not _GAIN[0] < both / each < _GAIN[1]:
+    inner = slice(len(window), -len(window))
+    changes = np.gradient(smoothed(felt, window), period, axis=0)[inner]
+    turns = smoothed(np.cross(felt, rate), window)[inner]
+    each = float((turns**2).sum()) or 1.0
+    gain = float((turns * changes).sum()) / each
+    # What else accelerates the sensor is by chance in step with its turns: from piece to piece.
+    starts = np.arange(0, len(turns), max(1, round(2 * _PIECE_S / period)))
+    by_chance = np.add.reduceat((turns * (changes - gain * turns)).sum(axis=1), starts)
+    error = max(_GAIN, _CHANCE * float(np.linalg.norm(by_chance)) / each)
+    if abs(gain - 1.0) > error and (changes**2).sum() > _CHANGES**2 * len(changes):
         raise CompensationError(
-            f"gravity turns {both / each:.3g} times as fast as the gyroscope says, which should be 1: the "
+            f"gravity turns {gain:.3g} times as fast as the gyroscope says, which should be 1: the "
             "angular rate has another sign or frame, or is in °/s (0.0175): check imu_raw_units"
         )
 
@@ -117,26 +125,19 @@ def identify_inertia(turned: Turned, poses: Identified) -> Identified:
     payload, weight = poses.payload, poses.payload.mass * poses.gravity
     felt = turned.felt + turned.arm @ np.array(payload.center)
     beyond = np.linalg.norm(turned.force - poses.bias.force + payload.mass * felt, axis=1)
-    spread = max(1, round(_AROUND_S / float(np.diff(turned.times[:2])[0])))
-    is_touched = beyond > _CONTACT_N + _CONTACT_SHARE * weight
-    is_free = turned.is_whole & (np.convolve(is_touched, np.ones(2 * spread + 1), "same") < 0.5)
-    times = turned.times[is_free]
-    pieces = np.unique((times / _PIECE_S).astype(int), return_inverse=True)[1]
-    if not len(times) or pieces[-1] < _LEAST_PIECES:
+    is_free = untouched(turned, beyond, weight)
+    minutes, pieces, spun = divided(turned)
+    if len(np.unique(pieces[is_free])) <= _LEAST_PIECES:
         raise CompensationError("something touched the tool all the time between the poses")
-    minutes = (times - times.mean())[:, None, None] / 60.0
-    still = np.broadcast_to(np.eye(3), (len(times), 3, 3))
-    force = -payload.mass * felt[is_free]  # with far less noise than the measured one
-    spun = turned.spun[is_free]
-    squares = np.zeros((int(pieces[-1]) + 1, 6))
-    np.add.at(squares, pieces, (spun**2).sum(axis=1) / np.bincount(pieces)[pieces, None])
-    spun = spun * (squares > _LEAST_SPIN**2)[pieces, None]
-    design = np.concatenate([-spun, -_crossing(force), still, still * minutes], axis=2)
+    still = np.broadcast_to(np.eye(3), (len(pieces), 3, 3))
+    force = -payload.mass * felt  # with far less noise than the measured one
+    design = np.concatenate([-spun, -crossing(force), still, still * minutes], axis=2)[is_free]
     likely, half = (np.array(part) for part in likely_inertia(payload))
     halves = np.concatenate([half, np.maximum(payload.center_interval, _LEAST_CENTER), np.full(6, np.inf)])
     known, expected = (NORMAL_95 / halves) ** 2, np.concatenate([likely, payload.center, np.zeros(6)])
-    found, deviation, degrees = _solve(design, turned.torque[is_free], pieces, known, expected)
-    found, interval = found[:6], float(students_t(degrees)) * deviation[:6]
+    measured, pieces = turned.torque[is_free], pieces[is_free]
+    found, covariance, degrees = solve_pieces(design, measured, pieces, known, expected)
+    found, interval = found[:6], float(students_t(degrees)) * np.sqrt(np.diag(covariance)[:6])
     interval = np.hypot(np.minimum(interval, half), _GYROSCOPE * abs(found[:3]).max())
     vague = "".join(axis for axis, is_open in zip("xyz", interval > _HARDLY * half, strict=False) if is_open)
     note = (
@@ -148,33 +149,51 @@ def identify_inertia(turned: Turned, poses: Identified) -> Identified:
     return poses._replace(payload=payload, notes=(*([note] if vague else []), *poses.notes))
 
 
-def _solve(
+def untouched(turned: Turned, beyond: Array, weight: float) -> NDArray[np.bool_]:
+    """(n,): no sample is missing, and so much force, N, that the tool does not explain is no contact."""
+    spread = max(1, round(_AROUND_S / float(np.diff(turned.times[:2])[0])))
+    is_touched = beyond > _CONTACT_N + _CONTACT_SHARE * weight
+    return turned.is_whole & (np.convolve(is_touched, np.ones(2 * spread + 1), "same") < 0.5)
+
+
+def divided(turned: Turned) -> tuple[Array, NDArray[np.int64], Array]:
+    """Minutes (n, 1, 1), numbers of the pieces (n,), and `spun` where it is more than noise."""
+    pieces = (turned.times / _PIECE_S).astype(int) - int(turned.times[0] / _PIECE_S)
+    squares, lengths = np.zeros((pieces[-1] + 1, 6)), np.maximum(np.bincount(pieces), 1)
+    np.add.at(squares, pieces, (turned.spun**2).sum(axis=1) / lengths[pieces, None])
+    spun = turned.spun * (squares > _LEAST_SPIN**2)[pieces, None]
+    return (turned.times - turned.times.mean())[:, None, None] / 60.0, pieces, spun
+
+
+def solve_pieces(
     design: Array, measured: Array, pieces: NDArray[np.int64], known: Array, expected: Array
 ) -> tuple[Array, Array, float]:
-    """The unknowns (p,) of `design` (n, 3, p) times unknowns = `measured` (n, 3), deviations and degrees.
+    """The unknowns (p,) of `design` (n, k, p) times unknowns = `measured` (n, k), covariance and degrees.
 
     `pieces` (n,) numbers those whose residuals are correlated. `known` (p,): inverse of the variance about
     `expected` that was known before.
     """
-    count, unknowns = int(pieces[-1]) + 1, design.shape[2]
+    pieces = np.unique(pieces, return_inverse=True)[1]
+    (_, kinds, unknowns), count = design.shape, int(pieces[-1]) + 1
     scale = np.sqrt((design**2).mean(axis=(0, 1)))
     scale[scale == 0.0] = 1.0  # of what the motion does not show at all
     design, known, expected = design / scale, known / scale**2, expected * scale
-    weights = np.ones(3)
+    weights = np.full(kinds, _AT_FIRST)
     for _ in range(3):
         weighted = design * weights[:, None]
-        information = np.einsum("nip,niq->pq", weighted, design) + np.diag(known)
-        right = np.einsum("nip,ni->p", weighted, measured) + known * expected
+        information = np.tensordot(weighted, design, ([0, 1], [0, 1])) + np.diag(known)
+        right = np.tensordot(weighted, measured, ([0, 1], [0, 1])) + known * expected
         answer = np.linalg.lstsq(information, right, rcond=1e-12)[0]
         residuals = measured - design @ answer
         # Neighboring instants tell the same: so many as a piece has count as one.
         weights = 1.0 / (np.maximum((residuals**2).mean(axis=0), 1e-12) * 2.0)
     scores = np.zeros((count, unknowns))
     np.add.at(scores, pieces, np.einsum("nip,ni->np", design * weights[:, None], residuals))
-    meat = scores.T @ scores * count / max(count - unknowns / 3.0, 1.0)
+    degrees = max(count - unknowns / kinds, 1.0)
+    meat = scores.T @ scores * count / degrees
     inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
     covariance = inverse @ (meat + np.diag(known)) @ inverse
-    return answer / scale, np.sqrt(np.diag(covariance)) / scale, max(count - unknowns / 3.0, 1.0)
+    return answer / scale, covariance / np.outer(scale, scale), degrees
 
 
 def possible_inertia(found: Array, interval: Array) -> Array:
@@ -198,7 +217,7 @@ def possible_inertia(found: Array, interval: Array) -> Array:
     return np.array([tensor[i, j] for i, j in _PLACES])
 
 
-def _crossing(vectors: Array) -> Array:
+def crossing(vectors: Array) -> Array:
     """(n, 3, 3): times another vector, this one's cross product with it."""
     x, y, z = vectors.T
     nothing = np.zeros_like(x)

@@ -47,7 +47,7 @@ _FEWEST_IN_TIME: Final = 6  # poses: fewer leave nothing to tell drift from a pa
 _SECONDS_A_MINUTE: Final = 60.0
 _TINY: Final = 1e-12
 _PARALLEL: Final = 1e-3  # (m/s²)²: gravity along what was read is from the accelerometer
-_NEGLIGIBLE: Final = 0.01  # of the weight: a residual below it is not worth a word
+NEGLIGIBLE: Final = 0.01  # of the weight: a residual below it is not worth a word
 _RARE: Final = 3.09  # standard deviations that noise exceeds once in a thousand times
 
 
@@ -120,7 +120,7 @@ def identify(poses: Sequence[Pose]) -> Identified:
     if touched is not None:
         found, kept[touched.pose] = touched.rest, False
     mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
-    _check_mass(mass, mass_interval)
+    check_mass(mass, mass_interval)
     payload = Payload(mass, triple(found.center.value), center_interval=triple(found.center.half))
     inertia, half = likely_inertia(payload)  # at rest it does not show
     payload = payload._replace(inertia=inertia, inertia_interval=half)
@@ -133,19 +133,11 @@ def identify(poses: Sequence[Pose]) -> Identified:
     most_force = _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight
     most_torque = _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment
     _check_fit(_residual(whole.residuals[:, :3], whole.degrees[:3]), touched, most_force, "N")
-    if length(payload.center) > LARGEST_CENTRE:
-        raise IdentificationError(
-            f"the center of gravity would be {length(payload.center):.2g} m from the sensor with a mass of "
-            f"{mass:.3g} kg, which cannot be: something held or touched the tool, or there is no tool"
-        )
+    check_center(payload)
     _check_fit(_residual(whole.residuals[:, 3:], whole.degrees[3:]), touched, most_torque, "Nm")
-    if mass_interval * gravity > most_force or length(payload.center_interval) * weight > most_torque:
-        raise IdentificationError(
-            f"the poses do not suffice: mass {mass:.2g} ± {mass_interval:.2g} kg, center of gravity "
-            f"{_millimeters(payload)}; "
-            f"{seen.next_pose if touched is None else touched}"
-        )
-    accelerometer = _accelerometer(found.calibration)
+    if why := too_vague(payload, mass_interval, gravity):
+        raise IdentificationError(f"the poses {why}; {seen.next_pose if touched is None else touched}")
+    accelerometer = accelerometer_of(found.calibration)
     undetermined = accelerometer.undetermined if accelerometer else ""
     return Identified(
         payload,
@@ -157,6 +149,7 @@ def identify(poses: Sequence[Pose]) -> Identified:
         seen,
         (
             *_misfit_notes(poses, drift, touched),
+            *_mounting_notes(found.mounting),
             *_fit_notes(force, "force", "N"),
             *_fit_notes(torque, "torque", "Nm"),
             *_other_notes(mass, mass_interval, length(payload.center_interval), undetermined, seen),
@@ -188,8 +181,20 @@ class _Equations:
         if len(times) == len(poses) >= _FEWEST_IN_TIME and np.ptp(times) > 0.0:
             self.minutes = (np.array(times) - times[-1]) / _SECONDS_A_MINUTE
 
+        self._is_turned = False
+
     def solve(self, regressor: Array | None = None) -> Estimate:
-        return estimate(self.wrench, self.gravity, self._acceleration, self._noise, regressor)
+        given = self.wrench, self.gravity, self._acceleration, self._noise, regressor
+        return estimate(*given, is_turned=self._is_turned)
+
+    def look_for_mounting(self, found: Estimate) -> Estimate:
+        """With the rotation between robot and sensor from here on, if that explains what is left."""
+        if self._acceleration is not None:
+            return found
+        self._is_turned = True
+        turned = self.solve()
+        self._is_turned = float(_chance(found, turned)) < _CHANCE
+        return turned if self._is_turned else found
 
 
 class _Touched(NamedTuple):
@@ -212,6 +217,7 @@ def _explained(equations: _Equations) -> tuple[Estimate, Wrench | None, _Touched
     found, count = equations.solve(), len(equations.wrench)
     if count < _FEWEST_IN_TIME:
         return found, None, None
+    found = equations.look_for_mounting(found)
     suspects = np.argsort(np.abs(found.residuals / _rms(found.residuals)).max(axis=1))[-_SUSPECTS:]
     without = equations.solve(np.eye(count)[suspects])
     chances = _chance(found, without) * count
@@ -226,7 +232,7 @@ def _explained(equations: _Equations) -> tuple[Estimate, Wrench | None, _Touched
     pose, off = int(suspects[which]), without.shift.value[which]
     force, torque = float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
     weight = float(found.mass.value[0]) * STANDARD_GRAVITY
-    if chances[which] < _CHANCE and force + torque / ARM > _NEGLIGIBLE * weight:
+    if chances[which] < _CHANCE and force + torque / ARM > NEGLIGIBLE * weight:
         rest = equations.solve(np.eye(count)[pose])
         rest.residuals[pose] += off
         return found, None, _Touched(pose, force, torque, rest)
@@ -253,7 +259,7 @@ def _chance(before: Estimate, after: Estimate) -> Array:
     return np.asarray(share**half * (1.0 + half * rest * (1.0 + 0.5 * (half + 1.0) * rest)))
 
 
-def _accelerometer(parts: tuple[Value, Value, Value] | None) -> OffsetFit | None:
+def accelerometer_of(parts: tuple[Value, Value, Value] | None) -> OffsetFit | None:
     if parts is None:
         return None
     limit = _UNKNOWN * NORMAL_95 * OFFSET_PRIOR
@@ -263,7 +269,7 @@ def _accelerometer(parts: tuple[Value, Value, Value] | None) -> OffsetFit | None
     return OffsetFit(Accelerometer(offset, scale, offset_half, scale_half, cross, cross_half), open_axes)
 
 
-def _check_mass(mass: float, interval: float) -> None:
+def check_mass(mass: float, interval: float) -> None:
     if mass < -interval:
         raise IdentificationError(
             f"the mass would be negative ({mass:.3g} kg): force and gravity have opposite signs, so the "
@@ -278,6 +284,29 @@ def _check_mass(mass: float, interval: float) -> None:
         raise IdentificationError(
             f"a mass of {mass:.3g} kg cannot hang on a sensor: check the units of the force"
         )
+
+
+def check_center(payload: Payload) -> None:
+    if length(payload.center) > LARGEST_CENTRE:
+        raise IdentificationError(
+            f"the center of gravity would be {length(payload.center):.2g} m from the sensor with a mass of "
+            f"{payload.mass:.3g} kg, which cannot be: something held or touched the tool, or there is no tool"
+        )
+
+
+def too_vague(payload: Payload, mass_interval: float, gravity: float) -> str:
+    """That what was measured does not suffice, with how wide the intervals are; empty if it does."""
+    weight = payload.mass * gravity
+    moment = weight * max(ARM, length(payload.center))
+    force, torque = (
+        _FORGIVEN_MISFIT * arm + _LARGEST_MISFIT * of for arm, of in ((1, weight), (ARM, moment))
+    )
+    if mass_interval * gravity <= force and length(payload.center_interval) * weight <= torque:
+        return ""
+    return (
+        f"do not suffice: mass {payload.mass:.2g} ± {mass_interval:.2g} kg, center of gravity "
+        f"{_millimeters(payload)}"
+    )
 
 
 def _residual(residuals: Array, degrees: Array) -> float:
@@ -306,7 +335,7 @@ def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, we
         ninth = 2.0 / (9.0 * freedom)
         if chi_square <= (1.0 - ninth + _RARE * math.sqrt(ninth)) ** 3:
             return Fit(rms, freedom, chi_square, "noise")
-    return Fit(rms, freedom, chi_square, "small" if rms <= _NEGLIGIBLE * weight else "large")
+    return Fit(rms, freedom, chi_square, "small" if rms <= NEGLIGIBLE * weight else "large")
 
 
 def _misfit_notes(poses: Sequence[Pose], drift: Wrench | None, touched: _Touched | None) -> Iterator[str]:
@@ -320,6 +349,16 @@ def _misfit_notes(poses: Sequence[Pose], drift: Wrench | None, touched: _Touched
         )
     if touched is not None:
         yield str(touched)
+
+
+def _mounting_notes(mounting: Value | None) -> Iterator[str]:
+    if mounting is not None and (np.abs(mounting.value) > mounting.half).any():
+        axes = zip("xyz", np.degrees(mounting.value), np.degrees(mounting.half), strict=True)
+        turned = ", ".join(f"{axis} {value:.2f} ± {half:.2f}" for axis, value, half in axes)
+        yield (
+            f"gravity is turned by {turned} degrees in the sensor's frame beyond the robot's orientation, "
+            "which the answer takes into account and compensation does not: correct how the sensor is mounted"
+        )
 
 
 def _fit_notes(fit: Fit, name: str, unit: str) -> Iterator[str]:
@@ -361,7 +400,7 @@ def summary(result: Identified) -> str:
     text = (
         f"mass {result.payload.mass:.4f} ± {result.mass_interval:.4f} kg, center of gravity "
         f"{_millimeters(result.payload)} ({100 * CONFIDENCE:g} % "
-        f"confidence) from {result.coverage.poses} poses; residual {result.force_fit.rms:.2g} N "
+        f"confidence) from {result.coverage.source}; residual {result.force_fit.rms:.2g} N "
         f"({result.force_fit.verdict}), {result.torque_fit.rms:.2g} Nm ({result.torque_fit.verdict})"
     )
     return ". ".join([text, *result.notes])

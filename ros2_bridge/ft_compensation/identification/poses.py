@@ -82,6 +82,10 @@ class Coverage(NamedTuple):
     unchecked: str = ""  # the direction along which nothing contradicts an error, if there is one
 
     @property
+    def source(self) -> str:
+        return f"{self.poses} poses" if self.poses else "free motion"
+
+    @property
     def advice(self) -> str:
         if self.missing is None:
             return f"the poses suffice; one more would help most: {self.next_pose}"

@@ -1,0 +1,114 @@
+"""Mass, center of gravity, bias and tensor from free motion alone; what is no free motion is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from bota_ethercat.pdo import STANDARD_GRAVITY
+from ft_compensation.alignment import align
+from ft_compensation.identification.free_motion import identify_in_motion
+from ft_compensation.identification.inertia import Turned, identify_inertia, turn
+from ft_compensation.identification.payload import Identified
+from ft_compensation.quantities import EXACT, Accelerometer, CompensationError
+from tests.compensation import motion
+from tests.compensation.making import BIAS, SEED
+from tests.compensation.motion import IMU, Felt, imperfect, settings
+from tests.compensation.test_inertia import RATE_HZ, path_of, recorded, tool_of
+from tests.simulation import more_if_long
+
+
+def identified(felt: Felt) -> Identified:
+    def turned(accelerometer: Accelerometer) -> Turned:
+        return turn(felt.times, np.hstack(felt[1:]), align(settings(), RATE_HZ), accelerometer, IMU)
+
+    found = identify_in_motion(turned(EXACT), IMU)
+    assert found.accelerometer is not None
+    return identify_inertia(turned(found.accelerometer.calibration), found)
+
+
+@pytest.mark.parametrize("count", more_if_long([2], [2, 8]))
+def test_intervals_cover_95_percent_in_every_kind_of_motion(count: int) -> None:
+    held = []
+    for seed in range(1000 * SEED, 1000 * SEED + count):
+        tool, true = tool_of(seed, mass=0.4 + 0.15 * (seed % 17)), imperfect(seed).known
+        for name in ("turned", *motion.moves(0)):
+            found = identified(recorded(name, seed, tool))
+            assert found.accelerometer is not None
+            read = found.accelerometer.calibration
+            for value, half, truth in (
+                ((found.payload.mass,), (found.mass_interval,), (tool.mass,)),
+                (found.payload.center, found.payload.center_interval, tool.center),
+                (found.bias.values, found.bias_interval.values, BIAS.values),
+                (found.payload.inertia, found.payload.inertia_interval, tool.inertia),
+                (read.scale, read.scale_interval, true.scale),
+                (read.cross_axis, read.cross_axis_interval, true.cross_axis),
+            ):
+                held += (np.abs(np.subtract(value, truth)) <= half).tolist()
+            assert found.mass_interval < 0.012 * tool.mass
+            assert max(found.payload.center_interval) < 1e-3
+    assert np.mean(held) > 0.9
+
+
+def upward(felt: Felt, newtons: float) -> Felt:
+    rotation = motion.rotations(path_of("turned", SEED + 6)(felt.times)[1])
+    return pushed(felt, newtons * rotation[:, 2])
+
+
+def pushed(felt: Felt, force: motion.Array) -> Felt:
+    return felt._replace(force=felt.force + force, torque=felt.torque + np.cross([0.02, 0.1, 0.1], force))
+
+
+def held(felt: Felt) -> Felt:
+    grip = np.random.default_rng(SEED).normal(0.0, 2.0, size=(42, 3))
+    return pushed(felt, np.stack([np.interp(felt.times * 2.0, range(42), axis) for axis in grip.T], axis=1))
+
+
+def part_of_the_time(felt: Felt, share: float) -> Felt:
+    return pushed(felt, (felt.times[:, None] % 4.0 < 4.0 * share) * np.array([4.0, -2.0, 1.0]))
+
+
+FREE = "not those of a tool that moves freely"
+REFUSED: dict[str, tuple[Callable[[Felt], Felt], str]] = {
+    "held": (held, FREE),
+    "pulled up": (lambda felt: upward(felt, 4.0), FREE),
+    "pushed": (lambda felt: part_of_the_time(felt, 0.5), FREE),
+    "sign of the force": (lambda felt: felt._replace(force=-felt.force), "mass would be negative"),
+    "sign of the torque": (lambda felt: felt._replace(torque=-felt.torque), FREE),
+    "of one axis": (lambda felt: felt._replace(torque=felt.torque * [1, -1, 1]), FREE),
+    "sign of the acceleration": (
+        lambda felt: felt._replace(acceleration=-felt.acceleration),
+        "negative|freely",
+    ),
+    "sign of the rate": (lambda felt: felt._replace(rate=-felt.rate), r"gravity turns -\d"),
+    "°/s": (lambda felt: felt._replace(rate=np.degrees(felt.rate)), r"gravity turns 0\.0\d.* °/s"),
+    "g": (
+        lambda felt: felt._replace(acceleration=felt.acceleration / STANDARD_GRAVITY),
+        r"accelerometer reads \d\.\d+ m/s² mostly, where gravity is 9\.81",
+    ),
+    "kgf": (lambda felt: felt._replace(force=felt.force / STANDARD_GRAVITY), FREE),
+    "Nmm": (lambda felt: felt._replace(torque=felt.torque * 1e3), FREE),
+    "short": (lambda felt: Felt(*(part[felt.times < 6.0] for part in felt)), "at least 10 s of motion"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_is_no_free_motion_is_refused_by_what_the_physics_shows(what: str) -> None:
+    change, told = REFUSED[what]
+    with pytest.raises(CompensationError, match=told):
+        identified(change(recorded("turned", SEED + 6, tool_of(SEED + 6))))
+
+
+def test_a_touch_is_left_out_and_hardly_any_motion_is_refused() -> None:
+    tool = tool_of(SEED + 6)
+    found = identified(part_of_the_time(recorded("turned", SEED + 6, tool), 0.2))
+    assert found.payload.mass == pytest.approx(tool.mass, abs=0.01)
+    assert found.payload.center == pytest.approx(tool.center, abs=4e-4)
+    assert "something touched the tool in" in " ".join(found.notes)
+    with pytest.raises(CompensationError, match=r"do not suffice.*about each axis|cannot be told from zero"):
+        identified(recorded("still", SEED + 6, tool))
+    found = identified(recorded("about x", SEED + 6, tool))
+    assert found.payload.mass == pytest.approx(tool.mass, abs=found.mass_interval)
+    assert "hardly turned about y and z" in found.notes[0]
