@@ -197,7 +197,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             return super().set_parameters_atomically(parameter_list)
 
     def _apply(self, parameters: Parameters) -> None:
-        self.stamps.update(parameters.stamp, self.reader.link)
+        self.stamps.update(parameters, self.reader.link)
         self.compensation.apply(parameters)
         self.monitor.limits = parameters.limits
         self.reader.limit_rate(parameters.publishing_frequency)
@@ -205,7 +205,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             output.configure(parameters)
 
     def _on_link_change(self) -> None:
-        self.stamps.update(self.compensation.parameters.stamp, self.reader.link)
+        self.stamps.update(self.compensation.parameters, self.reader.link)
         self.compensation.link_changed()
         self.live.settings_changed()
 

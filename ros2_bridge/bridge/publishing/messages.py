@@ -30,7 +30,9 @@ from bota_ethercat.pdo import (
     ImuUnits,
     SampleDecoder,
     Values,
+    Vector3,
 )
+from bota_ethercat.sensor.response import imu_variances
 from bridge.parameters.table import Numbers, Parameters
 from bridge.rclpy_internals import packing
 from bridge.stream.link import Link
@@ -65,16 +67,26 @@ class Topic:
 
 
 class Stamps:
-    """How much earlier than the samples their stamps are, ns: by the parameter `stamp` and the filters."""
+    """How much earlier than the samples their stamps are, ns: by the parameter `stamp` and the filters.
+
+    Also, by the filters: `covariances` of the IMU's orientation, angular rate and acceleration.
+    """
 
     def __init__(self, log: Any) -> None:
         self.kind = "sample"  # what stamps are the time of
         self.wrench_ns = self.imu_ns = 0
+        self.covariances: list[Numbers] = [_NO_ORIENTATION] * 3  # (9,) each
         self.problem = ""  # why some are not those of the measurement, a sentence
         self._log = log
 
-    def update(self, kind: str, link: Link) -> None:
-        self.kind = kind
+    def update(self, parameters: Parameters, link: Link) -> None:
+        self.kind = kind = parameters.stamp
+        given = (
+            parameters.orientation_covariance,
+            parameters.angular_velocity_covariance,
+            parameters.linear_acceleration_covariance,
+        )
+        self.covariances = list(map(_covariance, given, imu_variances(link.info.settings)))
         if not link.is_connected:
             return
         delays = {"wrench": link.info.delay_ns.force_torque, "imu": link.info.delay_ns.acceleration}
@@ -150,18 +162,17 @@ def _imu(publisher: Any, parameters: Parameters, stamps: Stamps, *, oriented: bo
     """`sensor_msgs/Imu`: m/s² and rad/s; `oriented`: with the sensor's own estimate of its orientation, and
     nothing where there is none."""
     pack, send = packing(publisher, Imu(header=Header(frame_id=parameters.imu_frame_id)), 37)
-    of_orientation = _covariance(parameters.orientation_covariance) if oriented else _NO_ORIENTATION
-    of_rate = _covariance(parameters.angular_velocity_covariance)
-    of_acceleration = _covariance(parameters.linear_acceleration_covariance)
     motion = decoder(parameters).motion
 
     def publish(values: Values, frame: DataMessage) -> None:
         orientation = values[ORIENTATION] if oriented else _UPRIGHT
         if any(orientation):
             acceleration, angular_rate = motion(values)
+            of_orientation, of_rate, of_acceleration = stamps.covariances
             send(
                 pack(
-                    frame.stamp_ns - stamps.imu_ns, *orientation, *of_orientation,
+                    frame.stamp_ns - stamps.imu_ns,
+                    *orientation, *(of_orientation if oriented else _NO_ORIENTATION),
                     *angular_rate, *of_rate, *acceleration, *of_acceleration,
                 )
             )  # fmt: skip
@@ -176,8 +187,9 @@ def _temperature(publisher: Any, parameters: Parameters, _: Stamps) -> Publish:
     return lambda values, frame: send(pack(frame.stamp_ns, *values[TEMPERATURE], variance))
 
 
-def _covariance(variances: Numbers) -> Numbers:
-    return tuple(variances[position // 4] if position % 4 == 0 else 0.0 for position in range(9))
+def _covariance(given: Vector3, typical: Vector3) -> Numbers:
+    x, y, z = (variance or usual for variance, usual in zip(given, typical, strict=True))
+    return x, 0.0, 0.0, 0.0, y, 0.0, 0.0, 0.0, z
 
 
 class TerminalTopics:
