@@ -11,7 +11,7 @@ import contextlib
 import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import rclpy
 from diagnostic_msgs.msg import KeyValue
@@ -35,6 +35,9 @@ from bridge.rclpy_internals import Spinner, is_about_arguments, make_executors, 
 from bridge.services import create_services
 from bridge.stream.link import SYSTEM_CLOCK, NodeClock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
+
+if TYPE_CHECKING:  # Python 3.10 has none
+    from typing import Self
 
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
 # What a node has, and what destroys one.
