@@ -28,7 +28,7 @@ MAX_SII_WORDS: Final = 128
 MAX_TRACE_SIZE: Final = 64 << 20  # bytes of a trace file
 
 
-class _Text(str, Enum):  # noqa: UP042 - enum.StrEnum needs Python 3.11, and Humble has 3.10
+class _Text(str, Enum):  # enum.StrEnum needs Python 3.11
     __str__ = str.__str__
 
 

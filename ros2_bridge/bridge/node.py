@@ -11,7 +11,7 @@ import contextlib
 import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import KeyValue
@@ -36,10 +36,8 @@ from bridge.services import create_services
 from bridge.stream.link import SYSTEM_CLOCK, NodeClock, RequestFailedError, RequestRefusedError
 from bridge.stream.reader import Outputs, Reader
 
-if TYPE_CHECKING:  # Python 3.10 has none
-    from typing import Self
-
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
+_Node = TypeVar("_Node", bound="BridgeNode")  # typing.Self needs Python 3.11
 # What a node has, and what destroys one.
 _KINDS: Final = {
     "publishers": "destroy_publisher", "subscriptions": "destroy_subscription", "timers": "destroy_timer",
@@ -190,7 +188,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
     on_shutdown = on_error = on_cleanup  # one that fails leaves it unconfigured
 
     @classmethod
-    def create(cls, arguments: Sequence[str] | None = None) -> Self:
+    def create(cls: type[_Node], arguments: Sequence[str] | None = None) -> _Node:
         with _sentences():
             return cls(arguments)
 
