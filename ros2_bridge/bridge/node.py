@@ -27,7 +27,7 @@ from bota_ethercat.client.channel import TcpChannel
 from bridge.compensating.compensation import Compensation
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
-from bridge.parameters.declare import NodeParameters
+from bridge.parameters.declare import NodeParameters, converted
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import StopSignals, Worker, prepare, refuse
 from bridge.publishing.messages import Stamps, TerminalTopics, make_measured
@@ -195,7 +195,10 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
     def set_parameters_atomically(self, parameter_list: list[Any]) -> Any:
         """As rclpy, which calls this for every request, but while no other thread sets any."""
         with self.setting:
-            return super().set_parameters_atomically(parameter_list)
+            result = super().set_parameters_atomically(parameters := converted(parameter_list))
+            if result.successful:
+                self.live.after_set(parameters)
+            return result
 
     def _apply(self, parameters: Parameters) -> None:
         self.stamps.update(parameters, self.reader.link)
