@@ -17,6 +17,7 @@ from typing import Any, Final
 import pytest
 
 from bota_ethercat.program.version import VERSION
+from scripts import ros_packages
 from tests.ros_package.package_files import PACKAGES, ROOT, commands, shared_files
 from tests.server.running import free_port, needs_bus
 
@@ -25,6 +26,7 @@ pytestmark = pytest.mark.timeout(600)  # virtual environments are made
 CLIENT, BRIDGE = "bota-ethercat", "bota-ethercat-bridge"
 DATED: Final = "## [0.1.0] - 2026-01-01\n"
 MARKER: Final = "share/ament_index/resource_index/packages"
+REPOSITORY: Final = "https://git.bota.test/ft/ethercat"
 READ: Final = "from bota_ethercat.client import connect; print(next(iter(connect({}, timeout_s=30.0))).force)"
 
 
@@ -53,13 +55,15 @@ def python(version: str) -> str | None:
     return None
 
 
-def checkout(folder: Path, changelog: str) -> Path:
-    """This checkout as it is now, committed on one day with that line in its changelog."""
+def checkout(folder: Path, changelog: str, repository: str = REPOSITORY) -> Path:
+    """This checkout as it is now, committed on one day with that line in its changelog, ready to release."""
     folder.mkdir()
     copy = 'git -C "$1" ls-files -z -co --exclude-standard | tar c -C "$1" --null -T - | tar x'
     subprocess.run(["bash", "-c", copy, "bash", ROOT], cwd=folder, check=True)
     text = (folder / "CHANGELOG.md").read_text()
     (folder / "CHANGELOG.md").write_text(text.replace("## [Unreleased]\n", changelog, 1))
+    if repository:
+        assert ros_packages.main([repository], folder) == 0
     who = {f"GIT_{who}_{what}": "a@b" for who in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
     on = {"GIT_AUTHOR_DATE": "2026-01-01T00:00Z", "GIT_COMMITTER_DATE": "2026-01-01T00:00Z"}
     for words in ("init --quiet", "add --all", "commit --quiet --message release"):
@@ -126,17 +130,22 @@ def test_the_same_commit_gives_the_same_bytes(release: Path, tmp_path: Path) -> 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("changelog", "left", "complaint"),
+    ("changelog", "repository", "left", "arguments", "complaint"),
     [
-        ("## [Unreleased]\n", "", "CHANGELOG.md has no section '## [0.1.0] - DATE'"),
-        (DATED, "new", "the checkout has changes that are not committed"),
+        ("## [Unreleased]\n", REPOSITORY, "", (), "CHANGELOG.md has no section '## [0.1.0] - DATE'"),
+        (DATED, REPOSITORY, "new", (), "the checkout has changes that are not committed"),
+        (DATED, "", "", (), "the packages have no repository's URL: give that of this project"),
+        (DATED, REPOSITORY, "", ("https://github.com/OWNER/name",), "is no repository's URL: give that of"),
+        (DATED, "", "", (REPOSITORY,), "wrote CHANGELOG.rst and URLs of the ROS packages: commit them"),
     ],
 )
-def test_what_is_no_release_is_refused(changelog: str, left: str, complaint: str, tmp_path: Path) -> None:
-    source = checkout(tmp_path / "source", changelog)
+def test_what_is_no_release_is_refused(
+    changelog: str, repository: str, left: str, arguments: tuple[str, ...], complaint: str, tmp_path: Path
+) -> None:
+    source = checkout(tmp_path / "source", changelog, repository)
     if left:
         (source / left).touch()
-    done = build(source, tmp_path / "made")
+    done = run_quietly(source / "scripts/release", tmp_path / "made", *arguments)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert complaint in done.stderr
 

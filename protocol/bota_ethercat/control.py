@@ -10,7 +10,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable, Mapping
-from enum import StrEnum
+from enum import Enum
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.errors import ConnectionFailedError, RequestError, SettingError
@@ -28,7 +28,11 @@ MAX_SII_WORDS: Final = 128
 MAX_TRACE_SIZE: Final = 64 << 20  # bytes of a trace file
 
 
-class ErrorCode(StrEnum):
+class _Text(str, Enum):  # enum.StrEnum needs Python 3.11
+    __str__ = str.__str__
+
+
+class ErrorCode(_Text):
     """The `code` of an error reply."""
 
     BAD_REQUEST = "bad_request"
@@ -40,7 +44,7 @@ class ErrorCode(StrEnum):
     INTERNAL = "internal"
 
 
-class Event(StrEnum):
+class Event(_Text):
     """What the server sends to framed connections unasked."""
 
     SENSOR_LOST = "sensor_lost"

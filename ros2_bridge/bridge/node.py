@@ -11,7 +11,7 @@ import contextlib
 import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, Self
+from typing import Any, Final, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import KeyValue
@@ -27,7 +27,7 @@ from bota_ethercat.client.channel import TcpChannel
 from bridge.compensating.compensation import Compensation
 from bridge.compensating.control import CompensationControl
 from bridge.diagnostics import Monitor
-from bridge.parameters.declare import NodeParameters
+from bridge.parameters.declare import NodeParameters, converted
 from bridge.parameters.table import ParameterError, Parameters
 from bridge.process import StopSignals, Worker, favor_stream, prepare, refuse
 from bridge.publishing.messages import Stamps, TerminalTopics, make_measured
@@ -37,6 +37,7 @@ from bridge.stream.link import SYSTEM_CLOCK, NodeClock, RequestFailedError, Requ
 from bridge.stream.reader import Outputs, Reader
 
 SUPERVISOR_KEY, SUPERVISOR_STOP = "ft_sensors", "1"
+_Node = TypeVar("_Node", bound="BridgeNode")  # typing.Self needs Python 3.11
 # What a node has, and what destroys one.
 _KINDS: Final = {
     "publishers": "destroy_publisher", "subscriptions": "destroy_subscription", "timers": "destroy_timer",
@@ -185,17 +186,20 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
     on_shutdown = on_error = on_cleanup  # one that fails leaves it unconfigured
 
     @classmethod
-    def create(cls, arguments: Sequence[str] | None = None) -> Self:
+    def create(cls: type[_Node], arguments: Sequence[str] | None = None) -> _Node:
         with _sentences():
             return cls(arguments)
 
     def set_parameters_atomically(self, parameter_list: list[Any]) -> Any:
         """As rclpy, which calls this for every request, but while no other thread sets any."""
         with self.setting:
-            return super().set_parameters_atomically(parameter_list)
+            result = super().set_parameters_atomically(parameters := converted(parameter_list))
+            if result.successful:
+                self.live.after_set(parameters)
+            return result
 
     def _apply(self, parameters: Parameters) -> None:
-        self.stamps.update(parameters.stamp, self.reader.link)
+        self.stamps.update(parameters, self.reader.link)
         self.compensation.apply(parameters)
         self.monitor.limits = parameters.limits
         self.reader.limit_rate(parameters.publishing_frequency)
@@ -203,7 +207,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
             output.configure(parameters)
 
     def _on_link_change(self) -> None:
-        self.stamps.update(self.compensation.parameters.stamp, self.reader.link)
+        self.stamps.update(self.compensation.parameters, self.reader.link)
         self.compensation.link_changed()
         self.live.settings_changed()
 

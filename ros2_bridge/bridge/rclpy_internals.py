@@ -138,6 +138,8 @@ def make_executors(node: Node, parameters: Any) -> tuple[Executor, dict[str, Exe
             "parameters": _PartExecutor(node, lambda group: group is parameters),
         }
         return _PartExecutor(node, lambda group: group is ordinary, *beside.values()), {**beside}
+    text = "this version of rclpy is not known: its MultiThreadedExecutor is used, which takes more CPU"
+    node.get_logger().info(text)
     executor = MultiThreadedExecutor(_THREADS, context=node.context)
     executor.add_node(node)
     return executor, {}

@@ -11,7 +11,7 @@ Another frame: rotated, and its torque about the other frame's origin (docs/ros2
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import Vector3
 from ft_compensation.quantities import CompensationError, Quaternion, Wrench, unit_quaternion
@@ -95,7 +95,7 @@ class WrenchTransform(NamedTuple):
     translation: Vector3  # the origin of the source frame in the target frame, m
 
     @classmethod
-    def of(cls, translation: Vector3, quaternion: Quaternion) -> Self:
+    def of(cls, translation: Vector3, quaternion: Quaternion) -> WrenchTransform:
         """From the pose of the source frame in the target frame, as TF gives it. ValueError if it is none."""
         x, y, z, w = unit_quaternion(quaternion)
         if not math.isfinite(sum(translation)):
@@ -107,7 +107,7 @@ class WrenchTransform(NamedTuple):
         )
         return cls(rotation, translation)
 
-    def inverse(self) -> Self:
+    def inverse(self) -> WrenchTransform:
         (a, b, c), (d, e, f), (g, h, i) = self.rotation
         x, y, z = self.translation
         back = (a, d, g), (b, e, h), (c, f, i)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import AXES, STANDARD_GRAVITY, Vector3
 
@@ -34,7 +34,7 @@ class Wrench(NamedTuple):
     torque: Vector3  # Nm, about the wrench origin
 
     @classmethod
-    def of(cls, values: object) -> Self:
+    def of(cls, values: object) -> Wrench:
         """From six numbers: Fx Fy Fz (N) Mx My Mz (Nm). ValueError if they are not six finite numbers."""
         fx, fy, fz, mx, my, mz = _finite(values, 6, "a wrench")
         return cls((fx, fy, fz), (mx, my, mz))

@@ -15,16 +15,18 @@ from launch import LaunchDescription
 
 FOLDER = Path(__file__).parent
 
-# Namespace, in the order of the bus, and the model that stands there if the bus is virtual.
-SENSORS = {"sensone": "BFT-SENS-ECAT-M8", "rokubi": "BFT-ROKS-ECAT-M8"}
-
+# The models, in the order of the bus, if that is virtual.
+MODELS = "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8"
+NAMES = "first_name", "second_name"  # arguments
 
 # Those of bridge.launch.py, for two nodes; its others go for both as they are.
 ARGUMENTS = {
     "namespace": ("", "Namespace of both nodes' own, such as a robot's"),
+    "first_name": ("sensone", "The first sensor's name: the namespace of its node, and before its frames"),
+    "second_name": ("rokubi", "The second sensor's name, likewise"),
     "sensor": ("0", "The first sensor's position on the bus, from 0; the other is the next"),
     "array_topic": ("sensor_data", "Topic of the Float64MultiArray, in the node's namespace"),
-    "frame_id": ("ft_sensor", "Frame of the wrench, after the sensor's name and _"),
+    "frame_id": ("ft_sensor", "Frame of the wrench, after the sensor's name and _: arm/ft is arm/NAME_ft"),
     "imu_frame_id": ("ft_sensor_imu", "Frame of the IMU, likewise"),
     "sensor_options": ("", "Options of ethercat-virtual-sensor, such as '--pdo 77'; the models are given"),
     "server_port": ("12001", "TCP port of the server"),
@@ -34,6 +36,11 @@ ARGUMENTS = {
 
 def value(name):
     return LaunchConfiguration(name)
+
+
+def named(name, frame):
+    """The frame of that argument, with the sensor's name before the last part of it."""
+    return PythonExpression(["'%s%s", value(name), "_%s' % '", value(frame), "'.rpartition('/')"])
 
 
 def generate_launch_description():
@@ -52,22 +59,20 @@ def generate_launch_description():
                         IncludeLaunchDescription(
                             str(FOLDER / "bridge.launch.py"),
                             launch_arguments={
-                                "namespace": name,
+                                "namespace": value(name),
                                 "sensor": PythonExpression([value("sensor"), f" + {place}"]),
-                                "frame_id": [f"{name}_", value("frame_id")],
-                                "imu_frame_id": [f"{name}_", value("imu_frame_id")],
+                                "frame_id": named(name, "frame_id"),
+                                "imu_frame_id": named(name, "imu_frame_id"),
                             }.items(),
                         ),
                     ]
                 )
-                for place, name in enumerate(SENSORS)
+                for place, name in enumerate(NAMES)
             ),
             IncludeLaunchDescription(
                 str(FOLDER / "virtual_server.launch.py"),
                 condition=IfCondition(value("virtual")),
-                launch_arguments=[
-                    ("sensor_options", [f"--model {','.join(SENSORS.values())} ", value("sensor_options")])
-                ],
+                launch_arguments=[("sensor_options", [f"--model {MODELS} ", value("sensor_options")])],
             ),
         ]
     )

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import functools
 import operator
+import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+import yaml
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode
@@ -47,6 +50,29 @@ def test_a_healthy_stream(node: Node) -> None:
         "nothing is subtracted: there is no bias and no tool_mass; nobody has subscribed"
     )
     assert (compensation["tared"], compensation["gravity_source"]) == ("false", "imu")
+
+
+def test_the_analyzer_of_the_package_takes_the_statuses_of_every_node_and_no_others(node: Node) -> None:
+    file = Path(__file__).parents[2] / "ros2_bridge/config/diagnostic_aggregator.yaml"
+    parameters = yaml.safe_load(file.read_text())["/**"]["ros__parameters"]
+    analyzer = parameters.pop("force_torque")
+    assert (parameters, analyzer.pop("type")) == (
+        {"path": "Sensors"},
+        "diagnostic_aggregator/GenericAnalyzer",
+    )
+    assert analyzer.keys() == {"path", "regex", "timeout"}
+    (pattern,) = analyzer["regex"]
+    names = [
+        f"{space}{name}: {each}"
+        for each in node.statuses()
+        for space in ("", "left/")
+        for name in ("bridge", "bota_ft_sensor")
+    ]
+    assert len(names) == 20
+    assert all(
+        re.fullmatch(pattern, name) for name in (*names, *(each.name for each in node._arrays[-1].status))
+    )
+    assert not any(re.fullmatch(pattern, name) for name in ("camera: link", "abridge: link", "bridge: other"))
 
 
 def test_it_is_published_every_second_and_at_once_when_a_level_changes(node: Node, server: Server) -> None:

@@ -63,6 +63,7 @@ def test_the_supervisor_is_heard_during_each_service(
     monkeypatch.setattr(rclpy_internals, "RIGHT_FOR", versions)
     node = start(server.port, **{"rest.duration": 60.0})
     node.says("connected to")
+    assert ("this version of rclpy is not known" in node.log) == (not versions)
     server.answers |= {"tare": lambda _: None, "configure": lambda _: None}
 
     def actions() -> set[str]:

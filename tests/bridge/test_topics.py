@@ -125,6 +125,35 @@ def test_orientation_where_the_sensor_estimates_one(published: Published) -> Non
     assert [(m.orientation_covariance[0], m.orientation.w) for m in raw] == [(-1.0, 1.0)] * 4
 
 
+def test_covariances_are_typical_of_the_filters_in_force_but_for_those_that_are_given() -> None:
+    """The noise densities over the bandwidths of the manual's tables."""
+    server = Server()
+    server.description["sensors"][0]["settings"] |= {"acceleration_filter": 1, "angular_rate_filter": 3}
+    server.changes = {"process_data": encode(77, QUATERNION)}
+    with Node(server, angular_velocity_covariance="[0.0, 0.5, 0.0]") as node:
+        heard = node.hear("imu/data")
+
+        def variances() -> list[list[float]]:
+            imu = node.fresh(heard, 0.2)[-1]
+            matrices = (
+                imu.orientation_covariance,
+                imu.angular_velocity_covariance,
+                imu.linear_acceleration_covariance,
+            )
+            assert all(list(each)[1:4] == list(each)[5:8] == [0.0] * 3 for each in matrices)
+            return [list(each)[::4] for each in matrices]
+
+        for acceleration_filter, acceleration_hz, rate_filter, rate_hz in ((1, 460, 3, 184), (5, 20, 7, 10)):
+            server.reconfigure(acceleration_filter=acceleration_filter, angular_rate_filter=rate_filter)
+            orientation, rate, acceleration = variances()
+            typical = math.radians(0.01) ** 2 * rate_hz
+            assert acceleration == pytest.approx([(250e-6 * 9.80665) ** 2 * acceleration_hz] * 3)
+            assert rate == pytest.approx([typical, 0.5, typical])
+            assert orientation == pytest.approx([acceleration[0] / 9.80665**2] * 2 + [math.pi**2 / 3])
+        node.set("linear_acceleration_covariance", [1.0, 2.0, 3.0])
+        assert variances()[1:] == [pytest.approx([typical, 0.5, typical]), [1.0, 2.0, 3.0]]
+
+
 def test_stamps_of_the_measurement_are_earlier_by_the_delay_of_the_channels_filter() -> None:
     server = Server()
     row = server.description["sensors"][0]

@@ -41,7 +41,7 @@ ARGUMENTS = {
     "bridge": NODE,
     "virtual_server": SERVER,
     "demo": NODE | SERVER,
-    "two_sensors": NODE | SERVER | {"virtual"},
+    "two_sensors": NODE | SERVER | {"virtual", "first_name", "second_name"},
 }
 
 
@@ -300,6 +300,20 @@ def test_namespace_log_level_respawn_and_text_that_looks_like_a_number(launch: L
 def test_two_sensors_are_in_a_robots_namespace(launch: Launch) -> None:
     launched = launch("two_sensors.launch.py", "namespace:=left", f"server_port:={free_port()}")
     launched.says(r"\[left.sensone.bridge\]: no server", r"\[left.rokubi.bridge\]: no server")
+
+
+@pytest.mark.ros
+def test_two_sensors_have_names_and_frames_of_ones_own(launch: Launch) -> None:
+    names = "namespace:=/cell/arm", "first_name:=wrist", "second_name:=foot", f"server_port:={free_port()}"
+    launched = launch("two_sensors.launch.py", *names)
+    launched.says(r"\[cell.arm.wrist.bridge\]: no server", r"\[cell.arm.foot.bridge\]: no server")
+    # A node says what frame it was given only if it is none.
+    refused = launch("two_sensors.launch.py", *names, "frame_id:=/arm/link/ft")
+    refused.says(
+        *(f"parameter frame_id is '/arm/link/{name}_ft': frames have no" for name in ("wrist", "foot"))
+    )
+    refused = launch("two_sensors.launch.py", *names, "imu_frame_id:=/imu")
+    refused.says("imu_frame_id is '/wrist_imu'", "imu_frame_id is '/foot_imu'")
 
 
 @pytest.mark.ros

@@ -5,16 +5,20 @@ from __future__ import annotations
 import configparser
 import functools
 import re
+import shutil
 import sys
 import tomllib
 from pathlib import Path
 from typing import Final
 
 import pytest
+from catkin_pkg.changelog import Changelog, populate_changelog_from_rst
 from catkin_pkg.package import parse_package
 from catkin_pkg.packages import find_packages
+from docutils.core import publish_doctree
 
 from bota_ethercat.program.version import VERSION
+from scripts.ros_packages import changelog, folders, main
 from tests.ros_package.package_files import PACKAGE, PACKAGES, ROOT, SHARED_FOLDERS, shared_files
 from tests.test_architecture import imports
 
@@ -42,6 +46,73 @@ def test_the_manifests_and_one_version() -> None:
             assert package.get_build_type() == "ament_python"
             metadata = setup_of(PACKAGES[package.name])["metadata"]
             assert dict(metadata) == {"name": package.name, "version": version}
+
+
+def test_the_folder_of_each_package_has_by_itself_what_an_index_takes() -> None:
+    markdown, license_text = (ROOT / "CHANGELOG.md").read_text(), (ROOT / "LICENSE").read_bytes()
+    assert {folder.relative_to(ROOT) for folder in folders()} == set(map(Path, find_packages(str(ROOT))))
+    for folder in folders():
+        package = parse_package(str(folder))
+        assert [(folder / each.file).read_bytes() for each in package.licenses] == [license_text]
+        assert not (folder / package.licenses[0].file).is_symlink()  # an archive of the folder has no target
+        assert (folder / "README.md").read_text().startswith(f"# {package.name}\n")
+        assert (folder / "CHANGELOG.rst").read_text() == changelog(package.name, markdown)
+
+
+# catkin_pkg uses what docutils calls obsolete.
+@pytest.mark.filterwarnings("ignore:nodes.Node.traverse:DeprecationWarning")
+def test_a_changelog_has_catkins_form() -> None:
+    text = """# Changelog
+## [Unreleased]
+### Added
+- not yet
+## [1.10.0] - 2026-03-01
+### Added
+- Node: `rest.*_drift` and
+  [`--at`](docs/a.md) of a_ *link*.
+### Removed
+- That.
+## [1.9.1] - 2026-02-03
+### Changed
+- This.
+"""
+    made = changelog("some_package", text)
+    publish_doctree(made, settings_overrides={"halt_level": 2, "report_level": 5})  # a warning is an error
+    parsed = populate_changelog_from_rst(Changelog("some_package"), made)
+    versions = {
+        version: (f"{date:%F}", str(content[0])) for version, date, content in parsed.foreach_version()
+    }
+    assert {version: date for version, (date, _) in versions.items()} == {
+        "1.10.0": "2026-03-01", "1.9.1": "2026-02-03",
+    }  # fmt: skip
+    assert "* Node: ``rest.*_drift`` and ``--at`` of a\\_ \\*link\\*.\n\n* Removed\n\n  * That." in made
+    assert "not yet" not in made
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ["", "example", "http://git.bota.test/ft/x", "https://git.bota.test", "https://localhost/ft/x", "https://example.com/ft/x",
+     "https://github.com/OWNER/x", "https://github.com/your-name/x", "https://github.com/ft/TODO"],
+)  # fmt: skip
+def test_the_urls_are_asked_for_once_and_a_placeholder_is_refused(
+    wrong: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder in folders():
+        (tmp_path / folder.relative_to(ROOT)).mkdir(parents=True)
+        shutil.copy(folder / "package.xml", tmp_path / folder.relative_to(ROOT))
+    shutil.copy(ROOT / "CHANGELOG.md", tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    assert main([wrong] if wrong else [], tmp_path) == 1
+    assert "give that of this project" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+    for given in ("https://github.com/ft/first", "https://git.bota.test/ft/x/"), (), ():
+        for each in given:
+            assert main([each], tmp_path) == 0
+        assert given or main([], tmp_path) == 0
+        for folder in folders(tmp_path):
+            urls = {url.type: url.url for url in parse_package(str(folder)).urls if url.type != "website"}
+            url = "https://git.bota.test/ft/x"
+            assert urls == {"bugtracker": f"{url}/issues", "repository": url}
 
 
 def test_everything_that_is_imported_is_a_dependency_once() -> None:

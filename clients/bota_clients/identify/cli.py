@@ -21,8 +21,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         "Identifies mass and center of gravity of the tool and the bias of the sensor from a recording in "
         "which the sensor was held stationary in several poses.",
         "Record with ethercat-record: hold the sensor stationary for two seconds with each axis once up "
-        "and once down, touching nothing; or turn it to and fro for 20 s. 'ethercat-identify delay' tells how "
-        "much later force and torque are than the accelerometer. A FILE.json of Bota's payload utilities is "
+        "and once down, touching nothing; or turn it to and fro for 20 s. 'ethercat-identify delay' tells "
+        "how much later force and torque are than the accelerometer. A FILE.json of Bota's payload utilities is "
         "converted by --yaml, and a FILE.yaml of this program by --bota.",
     )
     add = made.add_argument

@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from bota_ethercat.errors import FileError
 
@@ -66,7 +66,7 @@ class NewFile:
             with contextlib.suppress(OSError):
                 self._beside.unlink()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> NewFile:
         return self
 
     def __exit__(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the sensor's filters do to a signal: the delay of each channel, and how it is known.
+"""What the sensor's filters do to a signal: the delay and the noise of each channel, and how it is known.
 
 Force and torque: Bota publishes rate and -3 dB point (`filters`), no delay. With the FIR filter off the
 point is 0.262 of the rate, that of a third-order sinc filter, which delays by 1.5 sample periods. With FIR
@@ -21,6 +21,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Final, NamedTuple
 
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILTERS, ImuFilter
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
 
@@ -31,6 +32,8 @@ _KAISER_BETA: Final = 8.8
 # the length grows: half of what Bota's own test allows at 51, and a little under half of it at 1024.
 _NOISE_SINC: Final = 51
 _NOISE: Final = (*((0.3, 0.62),) * 3, (0.007, 0.78), (0.007, 0.78), (0.0025, 0.78))
+_GYROSCOPE_NOISE_DENSITY_DPS_RTHZ: Final = 0.01  # MPU-9250's data sheet; Bota gives the accelerometer's only
+_UNKNOWN: Final = (0.0, 0.0, 0.0)
 
 
 class DelaySource(Enum):
@@ -133,6 +136,22 @@ def noise_bandwidth(fir: bool) -> float:
 def healthy_noise(sinc_length: int) -> tuple[float, ...]:
     """Standard deviations of force (N) and torque (Nm), with FIR off: a longer filter makes them quieter."""
     return tuple(deviation * (sinc_length / _NOISE_SINC) ** -power for deviation, power in _NOISE)
+
+
+def imu_variances(settings: Mapping[str, SettingValue]) -> tuple[Vector3, Vector3, Vector3]:
+    """Typical variances (x, y, z) of orientation, rad², angular rate, (rad/s)², and acceleration, (m/s²)².
+
+    White noise of these densities over the bandwidth of the filters in force; zeros: they are not known. An
+    orientation is as noisy as gravity's direction, and its heading is anywhere in a turn.
+    """
+    accelerometer = ACCELERATION_FILTERS.get(settings.get("acceleration_filter", 0))
+    gyroscope = ANGULAR_RATE_FILTERS.get(settings.get("angular_rate_filter", 0))
+    if accelerometer is None or gyroscope is None:
+        return _UNKNOWN, _UNKNOWN, _UNKNOWN
+    tilt = ((accelerometer.noise_density_ug_rthz or 0) * 1e-6) ** 2 * accelerometer.bandwidth_hz
+    rate = math.radians(_GYROSCOPE_NOISE_DENSITY_DPS_RTHZ) ** 2 * gyroscope.bandwidth_hz
+    acceleration = tilt * STANDARD_GRAVITY**2
+    return (tilt, tilt, math.pi**2 / 3), (rate, rate, rate), (acceleration, acceleration, acceleration)
 
 
 @functools.cache

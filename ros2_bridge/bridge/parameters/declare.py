@@ -84,9 +84,7 @@ class NodeParameters:
         for service in node.services:
             service.callback_group = self.group
             self.group.add_entity(service)
-        node.add_pre_set_parameters_callback(_convert)
         node.add_on_set_parameters_callback(self._on_set)
-        node.add_post_set_parameters_callback(self._after_set)
         self.settings_changed: Callable[[], object] = node.create_guard_condition(self._follow).trigger
 
     def _declare_table(self) -> Parameters:
@@ -178,7 +176,8 @@ class NodeParameters:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _after_set(self, parameters: Sequence[Parameter]) -> None:
+    def after_set(self, parameters: Sequence[Parameter]) -> None:
+        """To be called when these have been set (rclpy has a callback for it since Iron)."""
         if any(parameter.name in _ROWS for parameter in parameters):
             self.apply(self.gather({}))
 
@@ -221,15 +220,15 @@ class NodeParameters:
                 self._following = False
 
 
-def _convert(parameters: Sequence[Parameter]) -> list[Parameter]:
+def converted(parameters: Sequence[Parameter]) -> list[Parameter]:
     """Whole numbers as the floats that are meant: `ros2 param set /bridge tool_mass 1`."""
-    converted = []
+    result = []
     for parameter in parameters:
         try:
             value: Any = _ROWS[parameter.name].check(parameter.value)
         except (KeyError, ParameterError):  # of others, or refused soon, with a sentence
-            converted.append(parameter)
+            result.append(parameter)
         else:
             value = [*value] if isinstance(value, tuple) else value
-            converted.append(Parameter(parameter.name, value=value))
-    return converted
+            result.append(Parameter(parameter.name, value=value))
+    return result

@@ -161,9 +161,9 @@ class Parameters:
     imu_raw_units: str = _row(ImuUnits.G_DPS.value, "What the sensor sends acceleration and angular rate in",
         choices=tuple(units.value for units in ImuUnits), live=False)
     orientation_covariance: Vector3 = _row(ZERO,
-        "Variances of the IMU's orientation, rad²; 0 = unknown", 0, 1e12)
-    angular_velocity_covariance: Vector3 = _row(ZERO, "Its variances, (rad/s)²; 0 = unknown", 0, 1e12)
-    linear_acceleration_covariance: Vector3 = _row(ZERO, "Its variances, (m/s²)²; 0 = unknown", 0, 1e12)
+        "Variances of the IMU's orientation, rad²; 0 = typical of its filter", 0, 1e12)
+    angular_velocity_covariance: Vector3 = _row(ZERO, "Its variances, (rad/s)²; 0 = typical", 0, 1e12)
+    linear_acceleration_covariance: Vector3 = _row(ZERO, "Its variances, (m/s²)²; 0 = typical", 0, 1e12)
     temperature_variance: float = _row(0.0, "Of the temperature, K²; 0 = unknown", 0, 1e6)
     # Those limits of every verdict that can be set for this node.
     diagnostics_stale_after: float = _row(LIMITS.stale_after, "Error: no new sample for so many s", 0.05, 60)

@@ -40,7 +40,7 @@ class ContactTopic(WrenchTopic):
     ) -> None:
         Topic.__init__(self, node, PoseWithCovarianceStamped, "contact")
         message = PoseWithCovarianceStamped(header=Header(frame_id=parameters.frame_id))
-        self._pack, self._send = packing(self._publisher, message, 43)
+        self._pack = packing(message, 43)
         self._stamps, self.index = stamps, Stages._fields.index("final")
         self._detected = create_publisher(node, Bool, "contact/detected")
         self._info, self._plan = info, plan
@@ -99,4 +99,6 @@ class ContactTopic(WrenchTopic):
         a, b, c, d, e, f, g, h, i = region.covariance()
         none = (0.0, 0.0, 0.0)
         covariance = a, b, c, *none, d, e, f, *none, g, h, i, *none, *(0.0,) * 18
-        self._send(self._pack(frame.stamp_ns - self._stamps.wrench_ns, *region.center, *pose, *covariance))
+        next(self._sends)(
+            self._pack(frame.stamp_ns - self._stamps.wrench_ns, *region.center, *pose, *covariance)
+        )

@@ -32,7 +32,9 @@ from bota_ethercat.pdo import (
     ImuUnits,
     SampleDecoder,
     Values,
+    Vector3,
 )
+from bota_ethercat.sensor.response import imu_variances
 from bridge.parameters.table import Numbers, Parameters
 from bridge.rclpy_internals import packing, sending
 from bridge.stream.link import Link
@@ -76,11 +78,15 @@ class Topic:
 
 
 class Stamps:
-    """How much earlier than the samples their stamps are, ns: by the parameter `stamp` and the filters."""
+    """How much earlier than the samples their stamps are, ns: by the parameter `stamp` and the filters.
+
+    Also, by the filters: `covariances` of the IMU's orientation, angular rate and acceleration.
+    """
 
     def __init__(self, log: Any) -> None:
         self.kind = "sample"  # what stamps are the time of
         self.wrench_ns = self.imu_ns = 0
+        self.covariances: list[Numbers] = [_NO_ORIENTATION] * 3  # (9,) each
         self.problem = ""  # why some are not those of the measurement, a sentence
         self._log = log
 
@@ -88,8 +94,14 @@ class Stamps:
         """By how much those of messages of this type are earlier."""
         return {WrenchStamped: self.wrench_ns, Imu: self.imu_ns}.get(kind, 0)
 
-    def update(self, kind: str, link: Link) -> None:
-        self.kind = kind
+    def update(self, parameters: Parameters, link: Link) -> None:
+        self.kind = kind = parameters.stamp
+        given = (
+            parameters.orientation_covariance,
+            parameters.angular_velocity_covariance,
+            parameters.linear_acceleration_covariance,
+        )
+        self.covariances = list(map(_covariance, given, imu_variances(link.info.settings)))
         if not link.is_connected:
             return
         delays = {"wrench": link.info.delay_ns.force_torque, "imu": link.info.delay_ns.acceleration}
@@ -165,18 +177,17 @@ def _imu(sends: Sends, parameters: Parameters, stamps: Stamps, *, oriented: bool
     """`sensor_msgs/Imu`: m/s² and rad/s; `oriented`: with the sensor's own estimate of its orientation, and
     nothing where there is none."""
     pack = packing(Imu(header=Header(frame_id=parameters.imu_frame_id)), 37)
-    of_orientation = _covariance(parameters.orientation_covariance) if oriented else _NO_ORIENTATION
-    of_rate = _covariance(parameters.angular_velocity_covariance)
-    of_acceleration = _covariance(parameters.linear_acceleration_covariance)
     motion = decoder(parameters).motion
 
     def publish(values: Values, frame: DataMessage) -> None:
         orientation = values[ORIENTATION] if oriented else _UPRIGHT
         if any(orientation):
             acceleration, angular_rate = motion(values)
+            of_orientation, of_rate, of_acceleration = stamps.covariances
             next(sends)(
                 pack(
-                    frame.stamp_ns - stamps.imu_ns, *orientation, *of_orientation,
+                    frame.stamp_ns - stamps.imu_ns,
+                    *orientation, *(of_orientation if oriented else _NO_ORIENTATION),
                     *angular_rate, *of_rate, *acceleration, *of_acceleration,
                 )
             )  # fmt: skip
@@ -191,8 +202,9 @@ def _temperature(sends: Sends, parameters: Parameters, _: Stamps) -> Publish:
     return lambda values, frame: next(sends)(pack(frame.stamp_ns, *values[TEMPERATURE], variance))
 
 
-def _covariance(variances: Numbers) -> Numbers:
-    return tuple(variances[position // 4] if position % 4 == 0 else 0.0 for position in range(9))
+def _covariance(given: Vector3, typical: Vector3) -> Numbers:
+    x, y, z = (variance or usual for variance, usual in zip(given, typical, strict=True))
+    return x, 0.0, 0.0, 0.0, y, 0.0, 0.0, 0.0, z
 
 
 class TerminalTopics:
