@@ -22,8 +22,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         "which the sensor was held stationary in several poses.",
         "Record with ethercat-record: hold the sensor stationary for two seconds with each axis once up "
         "and once down, touching nothing; or turn it to and fro for 20 s. 'ethercat-identify delay' tells "
-        "how much later force and torque are than the accelerometer. A FILE.json of Bota's payload utilities is "
-        "converted by --yaml, and a FILE.yaml of this program by --bota.",
+        "how much later force and torque are than the accelerometer. A FILE.json of Bota's payload "
+        "utilities is converted by --yaml, and a FILE.yaml of this program by --bota.",
     )
     add = made.add_argument
     _add_recording(made)
