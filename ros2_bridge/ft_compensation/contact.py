@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.sensor.response import fir_taps
@@ -72,7 +72,7 @@ class Uncertainty(NamedTuple):
     @classmethod
     def of(
         cls, noise: Sequence[float], force_95: float, torque_95: float, tool: Payload, spin_95: float = 0.0
-    ) -> Self:
+    ) -> Uncertainty:
         """From deviations of the sensor's noise (6), and 95 % bounds: N, Nm, and kg m² of inertia."""
         weight, motion = (
             math.hypot(force_95 / _CHI_3, each * tool.mass) for each in (_IMU_NOISE, _IMU_MOTION)
