@@ -197,6 +197,21 @@ def test_reading_connects_by_itself(server: MemoryServer, rate_hz: float | None)
 
 
 @pytest.mark.parametrize("timeout_s", [0, -1.0])
+def test_a_new_connection_does_not_wait_either(timeout_s: float) -> None:
+    """Over a socket: the waiting is the kernel's."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        channel = TcpChannel("127.0.0.1", listener.getsockname()[1])
+        assert channel.connect(PATIENCE_S)
+        waking = threading.Timer(1.0, channel.shutdown)  # one that waits says then that it has failed
+        waking.start()
+        try:
+            assert channel.receive(bytearray(10), timeout_s) == 0
+        finally:
+            waking.cancel()
+            channel.close()
+
+
+@pytest.mark.parametrize("timeout_s", [0, -1.0])
 def test_a_timeout_of_0_takes_what_has_arrived(server: MemoryServer, timeout_s: float) -> None:
     sensor, begun_ns = client_of(server, 2), server.now_ns
     for number in range(3):

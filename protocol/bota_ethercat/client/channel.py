@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import select
 import socket
@@ -66,7 +67,7 @@ class TcpChannel:
         self._untried: list[_Found] = []
         self._sock: socket.socket | None = None
         self._give_up_ns = 0
-        self._timeout_s = -1.0
+        self._timeout_s = math.nan  # the kernel's; nan: not set, and equal to none
         self.monotonic_ns: Callable[[], int] = time.monotonic_ns
         self.own: tuple[str, int] = ("", 0)
         self.same_address = False
@@ -149,7 +150,7 @@ class TcpChannel:
         for option, value in _KEEPALIVE:
             sock.setsockopt(socket.IPPROTO_TCP, option, value)
         sock.settimeout(None if _DONT_WAIT else _SEND_TIMEOUT_S)
-        self._timeout_s = -1.0
+        self._timeout_s = math.nan
         if _DONT_WAIT:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _timeval(_SEND_TIMEOUT_S))
 
