@@ -85,6 +85,15 @@ def encode_json(message: JsonObject) -> bytes:
     return _PREFIX.pack(_TYPE_SIZE + len(text), MessageType.JSON) + text
 
 
+class SingleData(NamedTuple):
+    """Whole DATA messages of one size, in a decoder's own buffer."""
+
+    buffer: bytearray  # where to read into, at its start
+    size: int  # of a message
+    prefix: bytes  # how each begins
+    unpack: Callable[[bytearray, int], tuple[Any, ...]]  # the fields of `DataMessage` of one at an offset
+
+
 class FrameDecoder:
     """Decodes a framed connection's bytes.
 
@@ -112,13 +121,16 @@ class FrameDecoder:
             self._make_room(4096)
         return memoryview(self._buffer)[self._end :]
 
-    def single(self, size: int) -> tuple[bytearray, bytes, Callable[..., tuple[Any, ...]]]:
-        """For DATA messages with `size` bytes of process data that come alone: where to read into, how one
-        begins, and what gives its fields. While nothing is buffered; what is none goes to `received`.
+    def single(self, size: int) -> SingleData | None:
+        """How to read DATA messages with `size` bytes of process data without `received`; None while part of
+        a message waits. What is no such message goes to `received`.
         """
+        if self.pending:
+            return None
         self._start = self._end = 0
         length = _DATA_OVERHEAD + size
-        return self._buffer, _PREFIX.pack(length, _DATA), _UNPACK_DATA[length]
+        prefix, unpack = _PREFIX.pack(length, _DATA), _UNPACK_DATA[length]
+        return SingleData(self._buffer, _LENGTH.size + length, prefix, unpack)
 
     def received(self, count: int) -> None:
         """`count` bytes were written to the start of `get_buffer()`."""

@@ -141,16 +141,16 @@ Vector3 = tuple[float, float, float]
 Values = tuple[Any, ...]  # the fields of process data in their order, as unpacked
 
 
-def part(first: str, last: str) -> slice:
+def _part(first: str, last: str) -> slice:
     """Where the fields from `first` to `last` are in `Values`."""
     index = LAYOUTS[max(LAYOUTS)].index
     return slice(index(first), index(last) + 1)
 
 
-WRENCH: Final = part("force.x", "torque.z")
-MOTION: Final = part("acceleration.x", "angular_rate.z")  # with the flag between the two
-TEMPERATURE: Final = part("temperature", "temperature")
-ORIENTATION: Final = part("orientation.x", "orientation.w")  # () if it is not mapped
+WRENCH: Final = _part("force.x", "torque.z")
+MOTION: Final = _part("acceleration.x", "angular_rate.z")  # with the flag between the two
+TEMPERATURE: Final = _part("temperature", "temperature")
+ORIENTATION: Final = _part("orientation.x", "orientation.w")  # () if it is not mapped
 
 
 class Sample(NamedTuple):
@@ -190,11 +190,7 @@ class Sample(NamedTuple):
 
 
 flags_of: Callable[[Values], tuple[int, ...]] = itemgetter(
-    *(
-        PDO_FIELDS.index(field)
-        for field in PDO_FIELDS
-        if field.name in Sample._fields and field.type is not PdoType.REAL
-    )
+    *(place for place, field in enumerate(PDO_FIELDS) if field.type is not PdoType.REAL)
 )
 """The fields of `Sample` that say how the sensor is, `status` and those after it."""
 

@@ -125,7 +125,7 @@ def favor_stream() -> None:
 
 
 def prepare(rt_priority: int, cpu: int, log: Any) -> None:
-    """Give the node's threads, which run, their scheduling as far as allowed, and log one line of that."""
+    """Give the node's threads, which run, their scheduling as far as allowed, and log one line of it."""
     from bota_ethercat.program.real_time import make_real_time  # noqa: PLC0415 - `client` says where it is missing
 
     if not rt_priority and cpu < 0:

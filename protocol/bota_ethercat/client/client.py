@@ -41,7 +41,7 @@ _MAX_EVENTS: Final = 1000
 _MAX_READS: Final = 64  # reads in one call, so that it returns whatever arrives
 _BACKLOG: Final = 2048  # bytes received at once that are more than any steady stream: more may be waiting
 _AGAIN_S: Final = 0.5
-_STEADY_NS: Final = 50_000_000
+_STEADY_NS: Final = 50_000_000  # so old may counts be that other threads read, half of the node's tick
 _CLOSED: Final = "this client has been closed"
 
 
@@ -266,13 +266,12 @@ class Client:
         """
         session, receive, monotonic_ns = self.session, self.channel.receive, self.channel.monotonic_ns
         state = session.state(sensor)
-        frame = begin = state.steady
-        single = None if frame is None else session.single(frame)
-        if frame is None or begin is None or single is None or not self._open:
+        begin = state.steady
+        if begin is None or (single := session.single(begin)) is None:
             return
-        buffer, prefix, unpack = single
-        size, warnings, sequence = len(prefix) + 28 + len(frame[6]), frame[6][WARNINGS], frame[0]
-        looked_ns, timeout_ns, count = self._looked_ns, round(timeout_s * 1e9), 0
+        buffer, size, prefix, unpack = single
+        frame, sequence, warnings = begin, begin.sequence, begin.process_data[WARNINGS]
+        looked_ns, timeout_ns = self._looked_ns, round(timeout_s * 1e9)
         until_ns = looked_ns + _STEADY_NS
         self._watched_ns = until_ns + timeout_ns
         self._reader, self._stepping = threading.get_ident(), True

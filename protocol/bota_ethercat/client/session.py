@@ -30,7 +30,14 @@ from bota_ethercat.errors import (
     RefusedError,
     RemoteProtocolError,
 )
-from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, TerminalMessage, encode_json
+from bota_ethercat.framing import (
+    DataFlag,
+    DataMessage,
+    FrameDecoder,
+    SingleData,
+    TerminalMessage,
+    encode_json,
+)
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import Description, position_of
 from bota_ethercat.text.json_text import JsonObject
@@ -171,9 +178,9 @@ class Session:
         """Where to read into; then call `received`."""
         return self._decoder.get_buffer()
 
-    def single(self, frame: DataMessage) -> tuple[bytearray, bytes, Callable[..., tuple[Any, ...]]] | None:
-        """`FrameDecoder.single` for messages like this one; None while anything else is to be done first."""
-        if self.items or self._raw or self._decoder.pending or not self.connected:
+    def single(self, frame: DataMessage) -> SingleData | None:
+        """How to read messages of the size of this one; None while anything else is to be done first."""
+        if self.items or self._raw or not self.connected:
             return None
         return self._decoder.single(len(frame.process_data))
 
