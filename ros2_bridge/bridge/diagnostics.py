@@ -51,7 +51,7 @@ class CompensationState(NamedTuple):
     """How the compensation is at one moment. What is wrong is a sentence each, empty if nothing is."""
 
     good: str = ""  # what to say when all is well
-    values: Mapping[str, object] = {}
+    values: Callable[[], Mapping[str, object]] = dict  # made only to be published
     stopped: str = ""  # why nothing is published, or would be with a subscriber, or single topics are silent
     doubtful: str = ""  # why what is published may be wrong
     withheld: int = 0  # samples since the node started that were not compensated
@@ -264,7 +264,9 @@ class Monitor:
             self._judge_compensation(compensation, has_samples=has_samples),
         ]
 
-    def _status(self, name: str, problems: Problems, good: str, values: Mapping[str, object]) -> Judged:
+    def _status(
+        self, name: str, problems: Problems, good: str, values: Callable[[], Mapping[str, object]]
+    ) -> Judged:
         """The worst level, and all sentences, the worst first; `good` if there is none."""
         problems, info = sorted(problems, key=lambda problem: -problem[0]), self._link.info
         level = problems[0][0] if problems else Level.GOOD
@@ -273,7 +275,7 @@ class Monitor:
             level=_LEVELS[level],
             message="; ".join(sentence for _, sentence in problems) or good,
             hardware_id=f"{info.name} {text_of(info.serial)}".strip(),
-            values=_key_values(values.items()),
+            values=_key_values(values().items()),
         )
 
     def _judge_link(self, problems: Problems, now_s: float, answer_s: float) -> Judged:
@@ -291,7 +293,7 @@ class Monitor:
             "server_uptime_s": self._server.uptime_s,
             "last_problem": link.problem,
         }
-        return self._status("link", problems, f"connected to {link.address}", values)
+        return self._status("link", problems, f"connected to {link.address}", lambda: values)
 
     def _judge_stream(self, problems: Problems) -> Judged:
         link, counts, server = self._link, self._counts, self._server
@@ -317,7 +319,7 @@ class Monitor:
             "server_age_p99_us": age.p99,
         }
         good = "samples arrive" if self._rate_hz is None else f"{self._rate_hz:.0f} samples a second"
-        return self._status("stream", problems, good, values)
+        return self._status("stream", problems, good, lambda: values)
 
     def _judge_sensor(self, problems: Problems, temperature: float | None) -> Judged:
         link, info, flags, status = self._link, self._link.info, self._flags, self._said.status
@@ -341,7 +343,7 @@ class Monitor:
             "last_emergency": None if last.code is None else f"emergency 0x{last.code:04X} ({last.text})",
             "last_emergency_ago_s": last.ago_s,
         }
-        return self._status("sensor", problems, "as it should be", values)
+        return self._status("sensor", problems, "as it should be", lambda: values)
 
     def _judge_clock(self, problems: Problems, *, has_samples: bool) -> Judged:
         clock, delays = self._said.status.clock, self._link.info.delay_ns
@@ -354,7 +356,7 @@ class Monitor:
         values = clock._asdict() | {"stamp": self._stamps.kind}
         for name, delay_ns in zip(delays._fields[:2], delays, strict=False):
             values[f"delay_{name}_ms"] = None if delay_ns is None else delay_ns / 1e6
-        return self._status("clock", problems, "locked to the sensor's clock", values)
+        return self._status("clock", problems, "locked to the sensor's clock", lambda: values)
 
     def _judge_compensation(self, c: CompensationState, *, has_samples: bool) -> Judged:
         problems, flags = Problems(), self._flags

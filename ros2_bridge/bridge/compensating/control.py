@@ -116,16 +116,6 @@ class CompensationControl:
     def state(self) -> CompensationState:
         output, source, parameters = self.output, self.source, self.parameters
         payload, bias, has_subscribers = parameters.payload, self.bias, output.has_subscribers
-        bounds = ["", ""]
-        if source.is_imu:
-            known = payload, parameters.accelerometer, self._ramp.taken
-            turning, noise = (
-                source.turning if has_subscribers else STILL,
-                torque_noise_95(payload, align(self.link.info.settings, self.link.info.rate_hz)),
-            )
-            torque = torque_bound_95(*known, turning=turning, noise=noise)
-            bounds = [f"{force_bound_95(*known):.3f}", f"{torque:.4f}"]
-        age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
         parts = ["bias"] if bias != NO_WRENCH else []
         if payload.mass:
             parts.append("weight and inertia of the tool" if source.is_imu else "weight of the tool")
@@ -133,20 +123,7 @@ class CompensationControl:
         good = f"subtracted: {', '.join(parts)}" if parts else none
         return CompensationState(
             good if has_subscribers else f"{good}; nobody has subscribed",
-            {
-                "gravity_source": source.name,
-                "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
-                "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
-                "accelerometer_force": bounds[0],
-                "torque_bound": bounds[1],
-                "contact": output.contact.why.value if output.contact else "",
-                "tared": bias != NO_WRENCH,
-                "bias_from": self.origin,
-                "bias_ramping": not self._ramp.arrived(self._sample_s),
-                "subscribed": has_subscribers,
-                "compensated": output.published,
-                "withheld": output.withheld,
-            },
+            self._values,
             stopped=self._why_stopped() or output.problem,
             doubtful=self.conflict()
             or (self.own_offset.doubt(self.offset) if self.link.is_connected else "")
@@ -155,6 +132,31 @@ class CompensationControl:
             withheld=output.withheld,
             why_withheld=output.why_withheld or f"{_NOTHING_CURRENT} ({source.name})",
         )
+
+    def _values(self) -> dict[str, object]:
+        output, source, payload = self.output, self.source, self.parameters.payload
+        has_subscribers, bounds = output.has_subscribers, ["", ""]
+        if source.is_imu:
+            known = payload, self.parameters.accelerometer, self._ramp.taken
+            turning = source.turning if has_subscribers else STILL
+            noise = torque_noise_95(payload, align(self.link.info.settings, self.link.info.rate_hz))
+            torque = torque_bound_95(*known, turning=turning, noise=noise)
+            bounds = [f"{force_bound_95(*known):.3f}", f"{torque:.4f}"]
+        age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
+        return {
+            "gravity_source": source.name,
+            "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
+            "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
+            "accelerometer_force": bounds[0],
+            "torque_bound": bounds[1],
+            "contact": output.contact.why.value if output.contact else "",
+            "tared": self.bias != NO_WRENCH,
+            "bias_from": self.origin,
+            "bias_ramping": not self._ramp.arrived(self._sample_s),
+            "subscribed": has_subscribers,
+            "compensated": output.published,
+            "withheld": output.withheld,
+        }
 
     def conflict(self, *, needs_tool: bool = False) -> str:
         """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
@@ -294,9 +296,8 @@ class CompensationControl:
             self._changes.append(BiasChange(Wrench.of(wanted.bias), _FROM_PARAMETER, offset=offset))
         is_given, before, warning = bool(self._changes), self.bias, ""
         self._change(self._apply_changes)
-        if (
-            wanted.payload[:3] != was.payload[:3] and not is_given
-        ):  # the bias of a tare is another one with it
+        # The bias of a tare is another one with another tool.
+        if wanted.payload[:3] != was.payload[:3] and not is_given:
             warning = self._ramp.taken.warning(self.bias.plus(before, -1.0), wanted.payload)
         if warning:
             self._log.warning(warning)
