@@ -34,7 +34,7 @@ _LEAST_SHARE: Final = 0.3
 _MOUNTING: Final = 0.01  # rad: standard deviation of the mounting about each axis
 _NOTHING: Final = 1e-9  # kg: no mass at all has its center anywhere
 _OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
-_ROW, _OTHER = np.nonzero(~np.eye(3, dtype=bool))  # of the cross-axis terms, as CROSS_AXES
+CROSS_ROW, CROSS_COLUMN = np.nonzero(~np.eye(3, dtype=bool))  # of the cross-axis terms, as CROSS_AXES
 _LENGTH_ROUNDS: Final = 3
 _ROUNDS: Final = 9
 _CONVERGED: Final = 1e-7
@@ -175,7 +175,7 @@ def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:
     """About `calibration` (..., 12). `size` (..., n) is the magnitude of gravity."""
     offset, scale = calibration[..., np.newaxis, :3], 1.0 + calibration[..., np.newaxis, 3:6]
     crossed = np.zeros((*calibration.shape[:-1], 3, 3))
-    crossed[..., _ROW, _OTHER] = calibration[..., 6:]
+    crossed[..., CROSS_ROW, CROSS_COLUMN] = calibration[..., 6:]
     straight = (np.eye(3) - crossed)[..., np.newaxis, :, :]
     v = (acceleration - offset) / scale
     u = (straight @ v[..., np.newaxis])[..., 0]
@@ -184,7 +184,7 @@ def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:
     change = np.zeros((*u.shape, _OF_CALIBRATION))
     change[..., :3] = -straight / scale[..., np.newaxis, :]
     change[..., 3:6] = -straight * (v / scale)[..., np.newaxis, :]
-    change[..., _ROW, 6 + np.arange(6)] = -v[..., _OTHER]
+    change[..., CROSS_ROW, 6 + np.arange(6)] = -v[..., CROSS_COLUMN]
     along = (up[..., np.newaxis, :] @ change)[..., 0, :]
     across = change - up[..., np.newaxis] * along[..., np.newaxis, :]
     return _Linear(

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from ft_compensation.identification.estimation import Value
+from ft_compensation.identification.estimation import CROSS_COLUMN, CROSS_ROW, Value
 from ft_compensation.identification.inertia import Turned, crossing, divided, solve_pieces, untouched
 from ft_compensation.identification.payload import (
     ARM,
@@ -55,7 +55,6 @@ _MISFIT_N, _MISFIT_SHARE = 0.1, 0.01  # N, of the weight: rms that is no more fr
 _HEALTHY: Final = 5.0  # standard deviations that no accelerometer is beyond
 _NEARLY_ALL: Final = 0.97
 _MORE: Final = "turn the tool to and fro about each axis for 20 s, touching nothing"
-_ROW, _OTHER = np.nonzero(~np.eye(3, dtype=bool))  # as CROSS_AXES
 
 
 def identify_in_motion(turned: Turned, imu: Vector3) -> Identified:
@@ -67,7 +66,7 @@ def identify_in_motion(turned: Turned, imu: Vector3) -> Identified:
     errors = np.zeros((len(read), 3, 12))  # of what is felt, by offset, scale, crossed axes
     errors[:, range(3), range(3)] = 1.0
     errors[:, range(3), range(3, 6)] = read
-    errors[:, _ROW, 6 + np.arange(6)] = read[:, _OTHER]
+    errors[:, CROSS_ROW, 6 + np.arange(6)] = read[:, CROSS_COLUMN]
     minutes, pieces, spun = divided(turned)
     still = np.broadcast_to(np.eye(6), (len(pieces), 6, 6))
     biases = np.concatenate([still, still * minutes], axis=2)

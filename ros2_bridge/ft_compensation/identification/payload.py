@@ -125,13 +125,11 @@ def identify(poses: Sequence[Pose]) -> Identified:
     inertia, half = likely_inertia(payload)  # at rest it does not show
     payload = payload._replace(inertia=inertia, inertia_interval=half)
     gravity = float(np.linalg.norm(equations.gravity, axis=1).mean())
-    weight = mass * gravity
-    moment = weight * max(ARM, length(payload.center))
+    weight, moment = _loads(payload, gravity)
     few = [pose for pose, is_kept in zip(poses, kept, strict=True) if is_kept]
     force = judge(few, found.residuals[kept, :3], found.degrees[:3], "force", weight)
     torque = judge(few, found.residuals[kept, 3:], found.degrees[3:], "torque", moment)
-    most_force = _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight
-    most_torque = _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment
+    most_force, most_torque = _limits(payload, gravity)
     _check_fit(_residual(whole.residuals[:, :3], whole.degrees[:3]), touched, most_force, "N")
     check_center(payload)
     _check_fit(_residual(whole.residuals[:, 3:], whole.degrees[3:]), touched, most_torque, "Nm")
@@ -294,13 +292,24 @@ def check_center(payload: Payload) -> None:
         )
 
 
+def _loads(payload: Payload, gravity: float) -> tuple[float, float]:
+    """The tool's weight, N, and the moment, Nm, that it has at its center of gravity, or at ARM."""
+    weight = payload.mass * gravity
+    return weight, weight * max(ARM, length(payload.center))
+
+
+def _limits(payload: Payload, gravity: float) -> tuple[float, float]:
+    """N, Nm: residuals and intervals beyond these are no answer."""
+    weight, moment = _loads(payload, gravity)
+    return (
+        _FORGIVEN_MISFIT + _LARGEST_MISFIT * weight,
+        _FORGIVEN_MISFIT * ARM + _LARGEST_MISFIT * moment,
+    )
+
+
 def too_vague(payload: Payload, mass_interval: float, gravity: float) -> str:
     """That what was measured does not suffice, with how wide the intervals are; empty if it does."""
-    weight = payload.mass * gravity
-    moment = weight * max(ARM, length(payload.center))
-    force, torque = (
-        _FORGIVEN_MISFIT * arm + _LARGEST_MISFIT * of for arm, of in ((1, weight), (ARM, moment))
-    )
+    (weight, _), (force, torque) = _loads(payload, gravity), _limits(payload, gravity)
     if mass_interval * gravity <= force and length(payload.center_interval) * weight <= torque:
         return ""
     return (
