@@ -7,7 +7,7 @@ Exit codes: 0 nothing lost, 1 something lost or nothing received, 2 wrong argume
 
 from __future__ import annotations
 
-import argparse
+import contextlib
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -16,10 +16,12 @@ from typing import Any, Final
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 
+from bota_ethercat.program.arguments import Parser, seconds, whole
 from bridge.subscription import Subscription
 
 _DISCOVERY_S: Final = 10.0
@@ -28,37 +30,41 @@ _DEEP: Final = 100  # deep enough for a pause of the process, but not for a slow
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser("check_subscription", description=(__doc__ or "").partition("\n\n")[0])
+    parser = Parser("check_subscription", "What a plain rclpy subscriber loses here, and what to change.", "")
     parser.add_argument("topic", help="with stamps: wrench, imu/data_raw, ...")
-    parser.add_argument("--depth", type=int, default=10, help="of the subscriber's QoS (10)")
+    parser.add_argument("--depth", type=whole(1, 10**6), default=10, help="of the subscriber's QoS (10)")
     parser.add_argument("--best-effort", action="store_true", help="instead of reliable")
-    parser.add_argument("--for", type=float, default=10.0, dest="seconds", metavar="SECONDS", help="(10)")
+    parser.add_argument("--for", type=seconds, default=10.0, dest="seconds", metavar="SECONDS", help="(10)")
     given = parser.parse_args(remove_ros_args(["", *(sys.argv[1:] if arguments is None else arguments)])[1:])
     rclpy.init(args=arguments)
     node, executor, ages_ns = rclpy.create_node("check_subscription"), SingleThreadedExecutor(), list[int]()
     executor.add_node(node)
-    topic, end_s = node.resolve_topic_name(given.topic), time.monotonic() + _DISCOVERY_S
-    publisher, counted = None, Subscription(topic)
-    while publisher is None and time.monotonic() < end_s:
-        executor.spin_once(0.1)
-        # The name of its node may become known later.
-        found = [each for each in node.get_publishers_info_by_topic(topic) if "UNKNOWN" not in each.node_name]
-        publisher = found[0] if found else None
-    if publisher is not None:
-        package, _, kind = publisher.topic_type.split("/")
+    try:
+        topic = node.resolve_topic_name(given.topic)
+    except RuntimeError as error:  # rclpy has no public name for it
+        parser.error(f"{given.topic!r} is no topic: {str(error).partition(', at /')[0]}")
+    counted = Subscription(topic)
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):  # what came until then is told
+        if (publisher := _find(node, executor, topic)) is not None:
+            package, _, name = publisher.topic_type.split("/")
+            kind = getattr(import_module(f"{package}.msg"), name)
+            if not hasattr(kind, "header"):
+                parser.error(
+                    f"{topic} has no stamps ({publisher.topic_type}): name wrench, imu/data_raw, ..."
+                )
 
-        def receive(message: Any) -> None:
-            counted.receive(message.header.stamp, time.time_ns())
-            ages_ns.append(counted.age_ns)
+            def receive(message: Any) -> None:
+                counted.receive(message.header.stamp, time.time_ns())
+                ages_ns.append(counted.age_ns)
 
-        of_node = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}/published"
-        node.create_subscription(DiagnosticArray, of_node, counted.published, 10)
-        policy = ReliabilityPolicy.BEST_EFFORT if given.best_effort else ReliabilityPolicy.RELIABLE
-        profile = QoSProfile(depth=given.depth, reliability=policy)
-        node.create_subscription(getattr(import_module(f"{package}.msg"), kind), topic, receive, profile)
-        end_s = time.monotonic() + given.seconds
-        while time.monotonic() < end_s:
-            executor.spin_once(0.1)
+            of_node = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}/published"
+            node.create_subscription(DiagnosticArray, of_node, counted.published, 10)
+            policy = ReliabilityPolicy.BEST_EFFORT if given.best_effort else ReliabilityPolicy.RELIABLE
+            profile = QoSProfile(depth=given.depth, reliability=policy)
+            node.create_subscription(kind, topic, receive, profile)
+            end_s = time.monotonic() + given.seconds
+            while time.monotonic() < end_s:
+                executor.spin_once(0.1)
     rclpy.try_shutdown()
     if not ages_ns:
         sys.stderr.write(
@@ -68,6 +74,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for line in report(counted, sorted(ages_ns), given.depth, best_effort=given.best_effort):
         sys.stdout.write(f"{line}\n")
     return int(counted.lost > 0)
+
+
+def _find(node: Node, executor: SingleThreadedExecutor, topic: str) -> Any:
+    """A publisher of the topic; None if there is none in time."""
+    end_s = time.monotonic() + _DISCOVERY_S
+    while time.monotonic() < end_s:
+        executor.spin_once(0.1)
+        for publisher in node.get_publishers_info_by_topic(topic):
+            if "UNKNOWN" not in publisher.node_name:  # which becomes known later
+                return publisher
+    return None
 
 
 def report(counted: Subscription, ages_ns: Sequence[int], depth: int, *, best_effort: bool) -> Iterator[str]:

@@ -233,6 +233,24 @@ def test_what_to_change(lost: int, depth: int, age_ms: float, best_effort: bool,
     assert bool(said[2:]) == bool(words)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["wrench", "--depth", "0"], "--depth: '0': it must be a whole number from 1"),
+        (["wrench", "--for", "-1"], "--for: '-1': it must be a number of seconds"),
+        (["a b"], "'a b' is no topic: failed to resolve name: topic name must not contain"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence(
+    arguments: list[str], words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(rclpy, "init", lambda **_: None)  # it is up
+    with pytest.raises(SystemExit) as ended:
+        check_subscription.main(arguments)
+    assert ended.value.code == 2
+    assert words in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_over_dds_what_a_slow_subscriber_loses_is_counted(start: Any, listener: Any) -> None:
     with ScriptedServer() as server:
