@@ -2,9 +2,10 @@
 """What brings the IMU's samples to the instant and the bandwidth of force and torque.
 
 The sensor's filters delay force and torque by 0.9 ms (SINC 32) to 120 ms (SINC 512 with FIR), what its
-accelerometer measures by 1.9 ms and its gyroscope by 2.9 ms (`bota_ethercat.sensor.response`). A polynomial
-through the latest samples is evaluated at the instant that force and torque are of (docs/compensation.md).
-The slope of a parabola is taken 1.5 ms before the newest sample at the latest: nearer, noise grows steeply.
+accelerometer measures by 1.9 ms and its gyroscope by 2.9 ms (`bota_ethercat.sensor.response`). Weighted sums
+of the IMU's latest samples are what the filters of force and torque make of the motion: exactly, if it is a
+line; else with the least error that is to be expected, of what arms do and of the IMU's noise, which grows
+where they look ahead (Wiener's filter; docs/compensation.md). `Alignment` of compensation.hpp is its twin.
 """
 
 from __future__ import annotations
@@ -20,18 +21,21 @@ from bota_ethercat.sensor.response import (
     FIR_TAPS,
     acceleration_response,
     angular_rate_response,
+    fir_gain,
     force_lag_s,
-    kaiser,
+    imu_noise,
+    sinc_gain,
 )
 from bota_ethercat.settings import SettingValue
 
 Array = NDArray[np.float64]
 
 _UNKNOWN_HZ: Final = 1600.0  # taken for a rate that is unknown: samples that are fewer are interpolated
-_NEGLIGIBLE: Final = 0.1  # of a sample period
-_PARABOLA_S, _LINE_S = 0.014, 0.0025  # lengths of the fits
-_LATEST_SLOPE_S: Final = 0.0015
-_FURTHEST_S: Final = 0.002
+_HISTORY_S: Final = 0.014  # what precedes it tells no more
+# Motion that is expected beyond a line: rms, m/s² and rad/s, and Hz up to which its density is about
+# constant. Chosen by what is left of moves, polishing and vibration; the optimum is flat.
+_ACCELERATION, _RATE = (10.0, 9.0), (2.0, 1.5)
+_HERTZ: Final = 0.5 * 2.0 ** (np.arange(21) / 2)
 # Over lost samples the IMU's are interpolated: with FIR on, as its window is longer, for so long; else an
 # angular acceleration would be too late by half of the gap.
 _LONGEST_GAP_S: Final = 0.1
@@ -48,6 +52,12 @@ class Alignment(NamedTuple):
     lead: int  # so many samples after a gap tell nothing of the instant that force and torque are of
     settings: Mapping[str, SettingValue]
 
+    def noise(self, lever_m: float = 0.0) -> tuple[float, float]:
+        """Deviations, m/s² on each axis so far from the IMU, and rad/s², by its filters' noise."""
+        acceleration, rate = imu_noise(self.settings)
+        spin = rate * float(np.linalg.norm(self.taps[2]))
+        return math.hypot(acceleration * float(np.linalg.norm(self.taps[0])), spin * lever_m), spin
+
 
 def align(
     settings: Mapping[str, SettingValue], rate_hz: float = 0.0, lag_s: float | None = None
@@ -58,50 +68,36 @@ def align(
     """
     known_s = force_lag_s(settings, rate_hz or None) if lag_s is None else lag_s
     is_known, rate_hz = rate_hz > 0.0, rate_hz or _UNKNOWN_HZ
-    delays_s = [response(settings).delay_s for response in (acceleration_response, angular_rate_response)]
-    accelerometer_s, gyroscope_s = (delay_s or 0.0 for delay_s in delays_s)
-    at_s = min(-(known_s or 0.0), _FURTHEST_S)  # after the newest sample
-    turned_s = min(at_s + gyroscope_s - accelerometer_s, _FURTHEST_S)
-    gap_s = _LONGEST_GAP_S
-    if settings.get("fir") and known_s is not None:
-        window = _window(-at_s * rate_hz)
-        slope = np.convolve(_window(-turned_s * rate_hz - 1.0), (0.5 * rate_hz, 0.0, -0.5 * rate_hz))
-        rows = [window, _window(-turned_s * rate_hz), slope]
-    else:
-        if is_known:
-            gap_s = max(_GAP_S, _GAP_PERIODS / rate_hz)
-        count = max(3, round(_PARABOLA_S * rate_hz) + 1)
-        slope_at = min(turned_s, -_LATEST_SLOPE_S) * rate_hz
-        rows = [
-            _value(at_s * rate_hz, max(2, round(_LINE_S * rate_hz) + 1)),
-            _fit(2, count, turned_s * rate_hz)[0],
-            _fit(2, count, slope_at)[1] * rate_hz,
-        ]
-    taps = np.zeros((3, max(map(len, rows))))
-    for row, weights in zip(taps, rows, strict=True):
-        row[len(row) - len(weights) :] = weights[::-1]
-    lead = 1 + math.floor(max(-at_s, 0.0) * rate_hz)
-    return Alignment(1.0 / rate_hz, taps, known_s, gap_s, lead, settings)
+    accelerometer, gyroscope = (each(settings) for each in (acceleration_response, angular_rate_response))
+    later_s = (gyroscope.delay_s or 0.0) - (accelerometer.delay_s or 0.0)
+    at_s, fir = known_s or 0.0, bool(settings.get("fir")) and known_s is not None
+    gains = [
+        1.0 if known_s is None else sinc_gain(share) * (fir_gain(share) if fir else 1.0)
+        for share in (_HERTZ / rate_hz).tolist()
+    ]
+    ahead = math.ceil(max(at_s, 0.0) * rate_hz)
+    count = ahead + max(3, round(_HISTORY_S * rate_hz)) + FIR_TAPS // 2 * fir
+    ages, given = np.arange(count) / rate_hz, np.array(gains)
+    (value, _), turned = (
+        _weights(motion, noise, ages, lag, given)
+        for motion, noise, lag in zip(
+            (_ACCELERATION, _RATE), imu_noise({}), (at_s, at_s - later_s), strict=True
+        )
+    )
+    taps = np.array([np.eye(count)[0] if known_s is None else value, *turned])[:, ::-1]
+    gap_s = max(_GAP_S, _GAP_PERIODS / rate_hz) if is_known and not fir else _LONGEST_GAP_S
+    lead = 1 + math.floor(max(at_s, 0.0) * rate_hz)
+    return Alignment(1.0 / rate_hz, np.ascontiguousarray(taps), known_s, gap_s, lead, settings)
 
 
-def _value(at: float, count: int) -> Array:
-    """Of the newest sample and those before it, at `at` sample periods after the newest."""
-    if abs(at) < _NEGLIGIBLE:
-        return np.ones(1)
-    if at > 0.0:
-        return np.asarray(_fit(1, count, at)[0])
-    whole, part = divmod(-at, 1.0)
-    return np.array([0.0] * int(whole) + [1.0 - part, part])
-
-
-def _fit(order: int, count: int, at: float) -> Array:
-    """Value, slope, ... at this instant of the polynomial through so many samples, by least squares."""
-    fitted: Array = np.linalg.pinv(np.vander(-np.arange(count) - at, order + 1, increasing=True))
-    return fitted
-
-
-def _window(center: float) -> Array:
-    """The FIR filter's, that many sample periods before the newest sample."""
-    half = (FIR_TAPS - 1) / 2
-    window = np.array([kaiser((k - center) / half) for k in range(max(1, math.floor(center + half) + 1))])
-    return np.asarray(window / window.sum())
+def _weights(motion: tuple[float, float], noise: float, ages: Array, lag_s: float, gains: Array) -> Array:
+    """(2, n): of samples of these `ages`, to value and slope `lag_s` before now behind filters of `gains`."""
+    (rms, from_hz), pace = motion, 2.0 * math.pi * _HERTZ
+    band = 0.5 * math.log(2.0) * _HERTZ / from_hz
+    expected = rms**2 * band / (1.0 + (_HERTZ / from_hz) ** 2) ** 3
+    alike = (expected @ np.cos(np.outer(pace, ages)))[np.abs(np.subtract.outer(*[np.arange(len(ages))] * 2))]
+    line, late = np.stack([np.ones(len(ages)), ages]), np.outer(pace, ages - lag_s)
+    normal = np.block([[alike + noise**2 * np.eye(len(ages)), line.T], [line, np.zeros((2, 2))]])
+    seen = expected * gains
+    wanted = [[*(seen @ np.cos(late)), 1.0, lag_s], [*(-(seen * pace) @ np.sin(late)), 0.0, -1.0]]
+    return np.asarray(np.linalg.solve(normal, np.array(wanted).T)[: len(ages)].T)

@@ -29,8 +29,8 @@ from ft_compensation.quantities import (
 _ABOUT_THREE_AXES: Final = 2.80 / NORMAL_95
 # ... and for three times the distance between the directions of gravity in two poses, which are any.
 _BETWEEN_POSES: Final = 4.39 / NORMAL_95
-# Deviations of accelerometer, m/s², and gyroscope, rad/s; how far the IMU is behind the wrench origin, m.
-_IMU_NOISE, _IMU_BELOW, _TWO_AXES = (0.02, 0.0017), 0.026, 2.45
+IMU_BELOW: Final = 0.026  # m: how far the IMU is behind the wrench origin
+_TWO_AXES: Final = 2.45
 _SHORTEST_SINC: Final = 51  # where the length is not known
 _TYPED: Final = 0.1  # of its largest element: half of the interval of a tensor that is given without one
 
@@ -84,14 +84,11 @@ def off_center_95(payload: Payload, taken: TareBasis | None = None) -> float:
 
 def torque_noise_95(payload: Payload, alignment: Alignment) -> float:
     """Nm: what the noise of a healthy sensor and its IMU keeps to in 95 % of samples."""
-    reach, sinc_length = length(payload.center), alignment.settings.get("sinc_length") or _SHORTEST_SINC
-    arm = payload.mass * reach
-    arms = arm, arm * (reach + _IMU_BELOW) + max(payload.inertia)
-    of_imu = [
-        _TWO_AXES * each * noise * math.sqrt(float(weights @ weights))
-        for each, noise, weights in zip(arms, _IMU_NOISE, alignment.taps[::2], strict=True)
-    ]
-    return math.hypot(_TWO_AXES * max(healthy_noise(int(sinc_length))[3:]), *of_imu)
+    reach, known = length(payload.center), alignment.settings
+    felt, spin = alignment.noise(reach + IMU_BELOW)
+    healthy = healthy_noise(int(known.get("sinc_length") or _SHORTEST_SINC), fir=bool(known.get("fir")))
+    parts = max(healthy[3:]), payload.mass * reach * felt, max(payload.inertia) * spin
+    return _TWO_AXES * math.hypot(*parts)
 
 
 def inertia_halves(payload: Payload) -> tuple[float, ...]:

@@ -21,9 +21,7 @@ from ft_compensation.quantities import STILL, ZERO, CompensationError, Payload, 
 
 # Chi squared that 95 % keep to, with 6 and with 2 degrees of freedom, and the root of that with 3.
 _RELEASE, _REGION, _CHI_3 = 12.592, 5.991, 2.795
-# m/s², standard deviations on each axis: of the accelerometer's noise, brought to the instant of the force,
-# and of all that it lets pass in motion, whose extremes are farther out than a Gaussian's.
-_IMU_NOISE, _IMU_MOTION = 0.04, 0.12
+_IMU_MOTION: Final = 0.12  # m/s² on each axis: deviation of what alignment leaves of motion, by its extremes
 _SINC: Final = (66.0, 26.0, 1.0)  # autocorrelation of the third-order sinc filter, from lag 0
 
 
@@ -71,11 +69,13 @@ class Uncertainty(NamedTuple):
 
     @classmethod
     def of(
-        cls, noise: Sequence[float], force_95: float, torque_95: float, tool: Payload, spin_95: float = 0.0
-    ) -> Uncertainty:
-        """From deviations of the sensor's noise (6), and 95 % bounds: N, Nm, and kg m² of inertia."""
+        cls, noise: Sequence[float], force_95: float, torque_95: float, tool: Payload, spin_95: float = 0.0,
+        imu: float = 0.0,
+    ) -> Uncertainty:  # fmt: skip
+        """From deviations of the sensor's noise (6), 95 % bounds, N, Nm, and kg m² of inertia, and the
+        deviation of the specific force by the `imu`, m/s² on each axis (`Alignment.noise`)."""
         weight, motion = (
-            math.hypot(force_95 / _CHI_3, each * tool.mass) for each in (_IMU_NOISE, _IMU_MOTION)
+            math.hypot(force_95 / _CHI_3, imu * tool.mass, each * tool.mass) for each in (0.0, _IMU_MOTION)
         )
         x, y, z = (math.hypot(each, torque_95 / _CHI_3) for each in noise[3:])
         force = math.hypot(*noise[:3]) / math.sqrt(3.0)

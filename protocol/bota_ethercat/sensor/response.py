@@ -34,6 +34,7 @@ _NOISE_SINC: Final = 51
 _NOISE: Final = (*((0.3, 0.62),) * 3, (0.007, 0.78), (0.007, 0.78), (0.0025, 0.78))
 _GYROSCOPE_NOISE_DENSITY_DPS_RTHZ: Final = 0.01  # MPU-9250's data sheet; Bota gives the accelerometer's only
 _UNKNOWN: Final = (0.0, 0.0, 0.0)
+_IMU_FILTERS: Final = {"acceleration_filter": 1, "angular_rate_filter": 3}  # as sensors are delivered
 
 
 class DelaySource(Enum):
@@ -133,9 +134,17 @@ def noise_bandwidth(fir: bool) -> float:
     return (0.5 + sum(gain * gain for gain in gains)) / steps
 
 
-def healthy_noise(sinc_length: int) -> tuple[float, ...]:
-    """Standard deviations of force (N) and torque (Nm), with FIR off: a longer filter makes them quieter."""
-    return tuple(deviation * (sinc_length / _NOISE_SINC) ** -power for deviation, power in _NOISE)
+def healthy_noise(sinc_length: int, *, fir: bool = False) -> tuple[float, ...]:
+    """Standard deviations of force (N) and torque (Nm): a longer filter makes them quieter."""
+    passed = math.hypot(*fir_taps()) if fir else 1.0
+    return tuple(passed * deviation * (sinc_length / _NOISE_SINC) ** -power for deviation, power in _NOISE)
+
+
+def imu_noise(settings: Mapping[str, SettingValue]) -> tuple[float, float]:
+    """Standard deviations of acceleration, m/s², and angular rate, rad/s, by filters that are known or usual."""
+    known = {name: settings.get(name) or number for name, number in _IMU_FILTERS.items()}
+    _, rate, acceleration = imu_variances(known)
+    return math.sqrt(acceleration[0]), math.sqrt(rate[0])
 
 
 def imu_variances(settings: Mapping[str, SettingValue]) -> tuple[Vector3, Vector3, Vector3]:
@@ -157,11 +166,11 @@ def imu_variances(settings: Mapping[str, SettingValue]) -> tuple[Vector3, Vector
 @functools.cache
 def fir_taps() -> tuple[float, ...]:
     """The FIR filter's coefficients; their sum is 1."""
-    window = [kaiser(2 * k / (FIR_TAPS - 1) - 1) for k in range(FIR_TAPS)]
+    window = [_kaiser(2 * k / (FIR_TAPS - 1) - 1) for k in range(FIR_TAPS)]
     return tuple(value / sum(window) for value in window)
 
 
-def kaiser(x: float) -> float:
+def _kaiser(x: float) -> float:
     """The FIR filter's window, 1 in its middle, at x from -1 to 1; 0 beyond."""
     return _bessel(_KAISER_BETA * math.sqrt(1 - x * x)) / _bessel(_KAISER_BETA) if -1 <= x <= 1 else 0.0
 

@@ -14,15 +14,17 @@ from std_msgs.msg import Bool, Header
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.replies import SensorInfo
-from bota_ethercat.sensor.response import fir_taps, healthy_noise
+from bota_ethercat.sensor.response import healthy_noise
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 from bridge.parameters.table import Parameters, parse_surface
 from bridge.publishing.messages import Stamps, Topic, create_publisher
 from bridge.publishing.wrenches import WrenchTopic
 from bridge.rclpy_internals import packing
-from ft_compensation.bounds import force_bound_95, inertia_halves, off_center_95
+from ft_compensation.alignment import align
+from ft_compensation.bounds import IMU_BELOW, force_bound_95, inertia_halves, off_center_95
 from ft_compensation.compensator import Stages
 from ft_compensation.contact import ContactDetector, Uncertainty, Why, correlation
+from ft_compensation.quantities import length
 
 _PERIOD_NS: Final = 40_000_000  # of the point, which takes as long as two samples take to compensate
 
@@ -67,15 +69,16 @@ class ContactTopic(WrenchTopic):
         if made_of == self._made_of:
             return
         self._made_of = made_of
-        passed = math.sqrt(sum(tap * tap for tap in fir_taps())) if info.settings.get("fir") else 1.0
-        healthy = [passed * each for each in healthy_noise(round(BASE_SAMPLING_RATE_HZ / info.rate_hz))]
+        sinc_length, fir = round(BASE_SAMPLING_RATE_HZ / info.rate_hz), bool(info.settings.get("fir"))
+        healthy = healthy_noise(sinc_length, fir=fir)
         noise = parameters.contact_noise if any(parameters.contact_noise) else self.noise or healthy
-        weight = 0.0
+        weight = imu = 0.0
         if plan.source.is_imu:
+            imu, _ = align(info.settings, info.rate_hz).noise(length(tool.center) + IMU_BELOW)
             weight = force_bound_95(tool, parameters.accelerometer, plan.ramp.taken)
         noise = [a or b for a, b in zip(noise, healthy, strict=True)]
         torque = STANDARD_GRAVITY * off_center_95(tool, plan.ramp.taken)
-        known = Uncertainty.of(noise, weight, torque, tool, max(inertia_halves(tool)))
+        known = Uncertainty.of(noise, weight, torque, tool, max(inertia_halves(tool)), imu)
         surface = parse_surface(parameters.contact_surface)
         assert surface is not None  # there is no topic without one
         self._detector = ContactDetector(

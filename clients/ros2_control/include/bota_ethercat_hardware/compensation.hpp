@@ -108,27 +108,22 @@ inline double imu_height(std::string_view model) noexcept {
     return 0.0;
 }
 
-/// Weights of the IMU's latest samples, the newest first, that bring it to the instant of force and torque.
+/// Weights of the IMU's latest samples, the newest first, that bring it to the instant and the bandwidth of force and torque: as
+/// ft_compensation/alignment.py, which explains them.
 struct Alignment {
     using Taps = std::vector<double>;
 
     /// Force and torque are `lag_s` later than the accelerometer (none: unknown), the gyroscope `gyroscope_s`.
     Alignment(std::optional<double> lag_s, double gyroscope_s, bool fir, double rate_hz) : period_s(1.0 / rate_hz) {
-        constexpr double kParabolaS = 0.014, kLineS = 0.0025, kLatestSlopeS = 0.0015, kFurthestS = 0.002;
-        const double at_s = std::min(-lag_s.value_or(0.0), kFurthestS), turned_s = std::min(at_s + gyroscope_s, kFurthestS);
-        const double at = at_s * rate_hz, turned = turned_s * rate_hz;
-        lead = 1 + static_cast<int>(std::max(-at, 0.0));
-        if (fir && lag_s) {  // the IMU passes the window of the FIR filter, too
-            const Taps before = window(-turned - 1.0);
-            taps = {window(-at), window(-turned), Taps(before.size() + 2)};
-            for (std::size_t k = 0; k < before.size(); ++k)
-                taps[2][k] += 0.5 * rate_hz * before[k], taps[2][k + 2] -= 0.5 * rate_hz * before[k];
-            return;
-        }
-        gap_s = std::max(0.008, 2.5 / rate_hz);
-        const int count = std::max(3, static_cast<int>(std::nearbyint(kParabolaS * rate_hz)) + 1);
-        taps = {value(at, std::max(2, static_cast<int>(std::nearbyint(kLineS * rate_hz)) + 1)), fit(2, count, turned, 1.0, 0.0),
-                fit(2, count, std::min(turned_s, -kLatestSlopeS) * rate_hz, 0.0, rate_hz)};
+        const double at_s = lag_s.value_or(0.0), late = std::max(at_s, 0.0) * rate_hz;
+        const bool whole = fir && lag_s;  // the IMU passes the FIR filter, too
+        lead = 1 + static_cast<int>(late);
+        if (!whole) gap_s = std::max(0.008, 2.5 / rate_hz);
+        const int count = static_cast<int>(std::ceil(late)) + std::max(3, static_cast<int>(std::nearbyint(0.014 * rate_hz))) + 11 * whole;
+        for (std::size_t band = 0; band < kBands; ++band) gains_[band] = lag_s ? gain(hertz(band) * period_s, whole) : 1.0;
+        const double acceleration_noise = 250e-6 * 9.80665 * std::sqrt(460.0), rate_noise = 0.01 * kPi / 180.0 * std::sqrt(184.0);
+        const auto turned = [&](bool slope) { return fitted(2.0, 1.5, rate_noise, at_s - gyroscope_s, count, slope); };
+        taps = {lag_s ? fitted(10.0, 9.0, acceleration_noise, at_s, count, false) : Taps{1.0}, turned(false), turned(true)};
     }
 
     double period_s, gap_s = 0.1;  ///< samples further apart than `gap_s` do not belong together
@@ -136,51 +131,59 @@ struct Alignment {
     std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
 
 private:
-    /// Of the polynomial through `count` samples, by least squares: `value` times its value and `slope` times its slope, `at`
-    /// sample periods after the newest. Centered, 1, v and v^2 less its mean are orthogonal.
-    static Taps fit(int order, int count, double at, double value, double slope) {
-        const double middle = 0.5 * (count - 1), mean = (count * count - 1) / 12.0, v0 = at + middle;
-        double squares = 0.0, fourths = 0.0;
-        for (int k = 0; k < count; ++k) {
-            const double v = middle - k, parabola = v * v - mean;
-            squares += v * v, fourths += parabola * parabola;
-        }
-        Taps taps;
-        for (int k = 0; k < count; ++k) {
-            const double v = middle - k, parabola = order == 2 ? (v * v - mean) / fourths : 0.0;
-            taps.push_back(value * (1.0 / count + v0 * v / squares + (v0 * v0 - mean) * parabola) +
-                           slope * (v / squares + 2.0 * v0 * parabola));
-        }
-        return taps;
-    }
+    static constexpr std::size_t kBands = 21;
+    static constexpr double kPi = 3.14159265358979323846;
 
-    /// Between two samples, or on a line through `count`.
-    static Taps value(double at, int count) {
-        if (std::abs(at) < 0.1) return {1.0};
-        if (at > 0.0) return fit(1, count, at, 1.0, 0.0);
-        Taps taps(static_cast<std::size_t>(-at) + 2, 0.0);
-        taps.back() = -at - std::floor(-at);
-        taps[taps.size() - 2] = 1.0 - taps.back();
-        return taps;
-    }
+    static double hertz(std::size_t band) { return 0.5 * std::pow(2.0, 0.5 * static_cast<double>(band)); }
 
-    /// The FIR filter's (22 taps, Kaiser, beta 8.8), that many sample periods before the newest sample.
-    static Taps window(double center) {
-        constexpr double kHalf = 10.5, kBeta = 8.8;
+    /// Of the sinc filter, and of the FIR filter (22 taps, Kaiser, beta 8.8), at this share of the rate.
+    static double gain(double share, bool fir) {
         const auto bessel = [](double x) {  // modified, of order 0
             double sum = 0.0, term = 1.0;
             for (int k = 1; k <= 30; ++k) sum += term, term *= x * x / (4.0 * k * k);
             return sum;
         };
-        Taps taps(static_cast<std::size_t>(std::max(0.0, center + kHalf)) + 1);
-        double sum = 0.0;
-        for (std::size_t k = 0; k < taps.size(); ++k) {
-            const double x = (static_cast<double>(k) - center) / kHalf;
-            sum += taps[k] = std::abs(x) <= 1.0 ? bessel(kBeta * std::sqrt(1.0 - x * x)) : 0.0;
+        double sum = 0.0, passed = 0.0;
+        for (int k = 0; fir && k < 22; ++k) {
+            const double x = (k - 10.5) / 10.5, tap = bessel(8.8 * std::sqrt(1.0 - x * x));
+            sum += tap, passed += tap * std::cos(2.0 * kPi * share * (k - 10.5));
         }
-        for (double& tap : taps) tap /= sum;
-        return taps;
+        return std::pow(std::abs(std::sin(kPi * share) / (kPi * share)), 3) * (fir ? std::abs(passed / sum) : 1.0);
     }
+
+    /// To the value `lag_s` before the newest sample, or the slope, of a motion with this density and noise.
+    Taps fitted(double rms, double from_hz, double noise, double lag_s, int count, bool slope) const {
+        const auto n = static_cast<std::size_t>(count);
+        std::vector<Taps> rows(n + 2, Taps(n + 3));
+        for (std::size_t band = 0; band < kBands; ++band) {
+            const double hz = hertz(band), ratio = hz / from_hz, pace = 2.0 * kPi * hz;
+            const double expected = rms * rms * 0.5 * std::log(2.0) * ratio / std::pow(1.0 + ratio * ratio, 3), seen = expected * gains_[band];
+            for (std::size_t i = 0; i < n; ++i) {
+                const double age_s = static_cast<double>(i) * period_s, late = pace * (age_s - lag_s);
+                for (std::size_t j = 0; j < n; ++j) rows[i][j] += expected * std::cos(pace * (age_s - static_cast<double>(j) * period_s));
+                rows[i][n + 2] += slope ? -seen * pace * std::sin(late) : seen * std::cos(late);
+            }
+        }
+        for (std::size_t i = 0; i < n; ++i) {
+            rows[i][i] += noise * noise;
+            rows[i][n] = rows[n][i] = 1.0;
+            rows[i][n + 1] = rows[n + 1][i] = static_cast<double>(i) * period_s;
+        }
+        rows[n][n + 2] = slope ? 0.0 : 1.0;
+        rows[n + 1][n + 2] = slope ? -1.0 : lag_s;
+        for (std::size_t k = 0; k < rows.size(); ++k) {  // Gauss and Jordan
+            std::swap(rows[k], *std::max_element(rows.begin() + static_cast<std::ptrdiff_t>(k), rows.end(),
+                                                 [k](const Taps& a, const Taps& b) { return std::abs(a[k]) < std::abs(b[k]); }));
+            for (std::size_t i = 0; i < rows.size(); ++i)
+                if (const double share = rows[i][k] / rows[k][k]; i != k)
+                    for (std::size_t j = k; j < n + 3; ++j) rows[i][j] -= share * rows[k][j];
+        }
+        Taps found(n);
+        for (std::size_t i = 0; i < n; ++i) found[i] = rows[i][n + 2] / rows[i][i];
+        return found;
+    }
+
+    std::array<double, kBands> gains_{};
 };
 
 /// The load of the tool, of one sample after the other.
