@@ -76,7 +76,7 @@ def align(
         for share in (_HERTZ / rate_hz).tolist()
     ]
     ahead = math.ceil(max(at_s, 0.0) * rate_hz)
-    count = ahead + max(3, round(_HISTORY_S * rate_hz)) + FIR_TAPS // 2 * fir
+    count = ahead + (FIR_TAPS // 2 + 2 if fir else max(3, round(_HISTORY_S * rate_hz)))
     ages, given = np.arange(count) / rate_hz, np.array(gains)
     (value, _), turned = (
         _weights(motion, noise, ages, lag, given)
