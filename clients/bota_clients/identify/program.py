@@ -95,6 +95,8 @@ def show_result(console: Console, result: Identified) -> None:
             table.add_row(f"{name} {axis}", *(f"{number:.{digits}f}" for number in numbers), unit)
     console.print(table)
     console.print(f"residual: {_fit(result.force_fit, 'N')}, {_fit(result.torque_fit, 'Nm')}")
+    if result.accelerometer is not None and result.accelerometer.model:
+        console.print(f"accelerometer: {result.accelerometer.model}")
     for note in result.notes:
         console.print(f"note: {note}")
 
@@ -136,7 +138,7 @@ def as_json(
         "torque_rms": result.torque_fit.rms,
         "force_fit": result.force_fit._asdict(),
         "torque_fit": result.torque_fit._asdict(),
-        "accelerometer": fit and {**fit.calibration._asdict(), "undetermined": fit.undetermined},
+        "accelerometer": fit and {**fit.calibration._asdict(), "undetermined": fit.undetermined, "model": fit.model},
         "drift": result.drift and result.drift.values,
         "touched": result.touched,
         "gravity": result.gravity,

@@ -33,7 +33,9 @@ _FLOOR_ALONE: Final = 1e-12
 _LEAST_SHARE: Final = 0.3
 _MOUNTING: Final = 0.01  # rad: standard deviation of the mounting about each axis
 _NOTHING: Final = 1e-9  # kg: no mass at all has its center anywhere
-_OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
+OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
+_PRIOR: Final = np.array([OFFSET_PRIOR] * 3 + [SCALE_PRIOR] * 9)
+_FIXED: Final = 1e-7  # standard deviation of what is not free
 CROSS_ROW, CROSS_COLUMN = np.nonzero(~np.eye(3, dtype=bool))  # of the cross-axis terms, as CROSS_AXES
 _LENGTH_ROUNDS: Final = 3
 _ROUNDS: Final = 9
@@ -69,11 +71,12 @@ def estimate(
     regressor: Array | None = None,
     *,
     is_turned: bool = False,
+    free: int = OF_CALIBRATION,
 ) -> Estimate:
     """Solve the poses: wrench (..., n, 6), N and Nm, and gravity (..., n, 3), in the sensor's frame, m/s².
 
     Also `acceleration` (..., n, 3), m/s², if gravity is from it, with `acceleration_variance` (...,) of its
-    means by the sensor's noise, (m/s²)², or `is_turned` to have the mounting found; and the
+    means by the sensor's noise, (m/s²)², of whose calibration the first `free` unknowns are fitted, or `is_turned` to have the mounting found; and the
     `regressor` (..., n). LinAlgError if the equations leave an unknown open.
     """
     if regressor is not None:  # of several regressors, each is a problem
@@ -90,7 +93,7 @@ def estimate(
             solution = _alone(gravity, measured, regressor)
     else:
         gravity, solution = _with_accelerometer(
-            measured, acceleration, gravity, acceleration_variance, regressor
+            measured, acceleration, gravity, acceleration_variance, regressor, free
         )
     answer, unknowns = solution.answer, solution.answer.shape[-1]
     mass = answer[..., :1]
@@ -181,7 +184,7 @@ def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:
     u = (straight @ v[..., np.newaxis])[..., 0]
     length = np.linalg.norm(u, axis=-1)
     up = u / length[..., np.newaxis]
-    change = np.zeros((*u.shape, _OF_CALIBRATION))
+    change = np.zeros((*u.shape, OF_CALIBRATION))
     change[..., :3] = -straight / scale[..., np.newaxis, :]
     change[..., 3:6] = -straight * (v / scale)[..., np.newaxis, :]
     change[..., CROSS_ROW, 6 + np.arange(6)] = -v[..., CROSS_COLUMN]
@@ -196,19 +199,20 @@ def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:
 
 
 def _with_accelerometer(
-    measured: Array, acceleration: Array, gravity: Array, noise: Array | float, regressor: Array | None
+    measured: Array, acceleration: Array, gravity: Array, noise: Array | float, regressor: Array | None,
+    free: int,
 ) -> tuple[Array, Solution]:
     """Gravity (..., n, 3) and the unknowns, those of the calibration last; by Gauss and Newton.
 
     The lengths alone come first: the errors of an uncorrected direction would pass for noise.
     """
     size = np.linalg.norm(gravity, axis=-1)
-    prior = np.diag([OFFSET_PRIOR**-2] * 3 + [SCALE_PRIOR**-2] * 9)
+    prior = np.diag(np.where(np.arange(OF_CALIBRATION) < free, _PRIOR, _FIXED) ** -2)
     assumed = np.zeros((*measured.shape[:-2], 7))
     assumed[..., 6] = _LENGTH_DEVIATION**2 + noise
     degrees = np.array([0.0] * 6 + [_LENGTH_DEGREES])
     lengths = Known(prior, _FLOOR[6:] ** 2, degrees[6:], assumed[..., 6:])
-    calibration = np.zeros((*measured.shape[:-2], _OF_CALIBRATION))
+    calibration = np.zeros((*measured.shape[:-2], OF_CALIBRATION))
     for _ in range(_LENGTH_ROUNDS):
         at = _linearize(acceleration, size, calibration)
         only = solve(at.stretch, at.excess + _times(at.stretch, calibration), lengths)

@@ -16,12 +16,13 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from ft_compensation.identification.estimation import Estimate, Value, estimate
+from ft_compensation.identification.estimation import OF_CALIBRATION, Estimate, Value, estimate
 from ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
 from ft_compensation.identification.weighted import CONFIDENCE, Array
 from ft_compensation.quantities import (
     NORMAL_95,
     OFFSET_PRIOR,
+    SCALE_PRIOR,
     Accelerometer,
     CompensationError,
     Payload,
@@ -41,7 +42,11 @@ _UNKNOWN: Final = 0.5
 
 ARM: Final = 0.05  # m: what makes a torque of a force where the center of gravity is nearer
 _CHANCE: Final = 0.01  # of seeing drift, or a touch, where there is none
-_SUSPECTS: Final = 12  # poses with the largest residuals
+_SUSPECTS: Final = 12  # poses with the largest residuals; also, of those that are left out one by one
+# Of the accelerometer's calibration, the unknowns that are fitted; the fewest whose error of a pose that is
+# left out is so near to the least: more would fit errors of the wrench.
+_MODELS: Final = {"nothing": 0, "offset": 3, "offset and scale": 6, "offset, scale and crossed axes": 12}
+_AS_GOOD: Final = 1.05
 _SAME_POSE: Final = 0.97  # cosine
 _FEWEST_IN_TIME: Final = 6  # poses: fewer leave nothing to tell drift from a payload
 _SECONDS_A_MINUTE: Final = 60.0
@@ -70,6 +75,7 @@ class OffsetFit(NamedTuple):
 
     calibration: Accelerometer
     undetermined: str  # axes whose offset the poses do not determine: "", "x", ...
+    model: str = ""  # what was fitted of it, and why, a phrase; empty: all, and nothing else was tried
 
 
 class Identified(NamedTuple):
@@ -113,6 +119,7 @@ def identify(poses: Sequence[Pose]) -> Identified:
         raise IdentificationError(f"the poses do not suffice: {seen.missing}; {seen.next_pose}")
     equations = _Equations(poses)
     try:
+        model, every = equations.choose()
         whole, drift, touched = _explained(equations)
     except np.linalg.LinAlgError:
         raise IdentificationError("the poses do not suffice: their equations leave an unknown open") from None
@@ -135,7 +142,7 @@ def identify(poses: Sequence[Pose]) -> Identified:
     _check_fit(_residual(whole.residuals[:, 3:], whole.degrees[3:]), touched, most_torque, "Nm")
     if why := too_vague(payload, mass_interval, gravity):
         raise IdentificationError(f"the poses {why}; {seen.next_pose if touched is None else touched}")
-    accelerometer = accelerometer_of(found.calibration)
+    accelerometer = accelerometer_of(_with_unfitted(found.calibration, every), model)
     undetermined = accelerometer.undetermined if accelerometer else ""
     return Identified(
         payload,
@@ -179,11 +186,27 @@ class _Equations:
         if len(times) == len(poses) >= _FEWEST_IN_TIME and np.ptp(times) > 0.0:
             self.minutes = (np.array(times) - times[-1]) / _SECONDS_A_MINUTE
 
-        self._is_turned = False
+        self._is_turned, self._free = False, OF_CALIBRATION
+
+    def choose(self) -> tuple[str, Estimate | None]:
+        """Fit as much of the accelerometer as the poses tell: what that is, and the answer with all of it."""
+        count = len(self.wrench)
+        if self._acceleration is None or count < _FEWEST_IN_TIME:
+            return "", None
+        left_out, errors = np.eye(count)[:: math.ceil(count / _SUSPECTS)], {}
+        for name, self._free in _MODELS.items():
+            shift = self.solve(left_out).shift
+            assert shift is not None
+            errors[name] = _rms(shift.value[:, :3].reshape(-1, 1)).item()
+        every, most = self.solve(), _AS_GOOD * min(errors.values())
+        chosen = next(name for name, error in errors.items() if error <= most)
+        self._free = _MODELS[chosen]
+        rest = ", ".join(f"{error:.3g} N with {name}" for name, error in errors.items() if name != chosen)
+        return f"{chosen} fitted: a pose that is left out is off by {errors[chosen]:.3g} N ({rest})", every
 
     def solve(self, regressor: Array | None = None) -> Estimate:
         given = self.wrench, self.gravity, self._acceleration, self._noise, regressor
-        return estimate(*given, is_turned=self._is_turned)
+        return estimate(*given, is_turned=self._is_turned, free=self._free)
 
     def look_for_mounting(self, found: Estimate) -> Estimate:
         """With the rotation between robot and sensor from here on, if that explains what is left."""
@@ -257,14 +280,28 @@ def _chance(before: Estimate, after: Estimate) -> Array:
     return np.asarray(share**half * (1.0 + half * rest * (1.0 + 0.5 * (half + 1.0) * rest)))
 
 
-def accelerometer_of(parts: tuple[Value, Value, Value] | None) -> OffsetFit | None:
+def _with_unfitted(
+    parts: tuple[Value, Value, Value] | None, every: Estimate | None
+) -> tuple[Value, Value, Value] | None:
+    """Where something was not fitted, its interval has what it would have been, or what is typical."""
+    if parts is None or every is None or every.calibration is None:
+        return parts
+    likely = (NORMAL_95 * each for each in (OFFSET_PRIOR, SCALE_PRIOR, SCALE_PRIOR))
+    offset, scale, cross = (
+        Value(part.value, np.maximum(part.half, np.minimum(abs(whole.value - part.value) + whole.half, most)))
+        for part, whole, most in zip(parts, every.calibration, likely, strict=True)
+    )
+    return offset, scale, cross
+
+
+def accelerometer_of(parts: tuple[Value, Value, Value] | None, model: str = "") -> OffsetFit | None:
     if parts is None:
         return None
     limit = _UNKNOWN * NORMAL_95 * OFFSET_PRIOR
     open_axes = "".join(axis for axis, half in zip("xyz", parts[0].half, strict=True) if half > limit)
     values = (tuple(each.tolist()) for part in parts for each in part)
     offset, offset_half, scale, scale_half, cross, cross_half = values
-    return OffsetFit(Accelerometer(offset, scale, offset_half, scale_half, cross, cross_half), open_axes)
+    return OffsetFit(Accelerometer(offset, scale, offset_half, scale_half, cross, cross_half), open_axes, model)
 
 
 def check_mass(mass: float, interval: float) -> None:
@@ -423,6 +460,7 @@ def accelerometer_text(fit: OffsetFit) -> str:
     return (
         f"Accelerometer: offset {offset} m/s², scale {scale}, cross-axis terms up to "
         f"{max(map(abs, found.cross_axis)):.4f} ± {max(found.cross_axis_interval):.4f}"
+        f"{fit.model and '; ' + fit.model}"
     )
 
 
