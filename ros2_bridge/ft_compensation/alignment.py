@@ -34,7 +34,7 @@ _UNKNOWN_HZ: Final = 1600.0  # taken for a rate that is unknown: samples that ar
 _HISTORY_S: Final = 0.014  # what precedes it tells no more
 # Motion that is expected beyond a line: rms, m/s² and rad/s, and Hz up to which its density is about
 # constant. Chosen by what is left of moves, polishing and vibration; the optimum is flat.
-_ACCELERATION, _RATE = (10.0, 9.0), (2.0, 1.5)
+_ACCELERATION, _RATE = (10.0, 9.0), (4.0, 1.5)
 _HERTZ: Final = 0.5 * 2.0 ** (np.arange(21) / 2)
 # Over lost samples the IMU's are interpolated: with FIR on, as its window is longer, for so long; else an
 # angular acceleration would be too late by half of the gap.

@@ -18,7 +18,7 @@ from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, force_lag_s
 from bota_ethercat.settings import SettingValue
-from ft_compensation.identification.delay import Lag, find_lag
+from ft_compensation.identification.delay import Lag, check_held_out, find_lag
 from ft_compensation.quantities import CompensationError
 
 
@@ -28,39 +28,45 @@ def run(options: argparse.Namespace) -> int:
         data, _ = at_last_offset(recording, sensor, options.imu_units)
     if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise RecordingError(f"{options.path}: settings were changed during it: record without that")
-    settings, found, error = sensor.info.settings, None, ""
+    settings, found, error, left = sensor.info.settings, None, "", (0.0, 0.0)
     try:
-        found = _find(data, settings)
+        found, left = _find(data, settings)
     except CompensationError as refusal:
         error = str(refusal)
     expected_s = force_lag_s(settings, sensor.info.rate_hz or None)
     expected_ms = None if expected_s is None else expected_s * 1e3
     if options.json:
-        sys.stdout.write(json.dumps(_as_json(found, expected_ms, error), indent=1) + "\n")
+        sys.stdout.write(json.dumps(_as_json(found, expected_ms, error, left), indent=1) + "\n")
     elif found is not None:
         implied = "unknown" if expected_ms is None else f"{expected_ms:.2f} ms"
         sys.stdout.write(
             f"force and torque come {found.seconds * 1e3:.2f} ms (± {found.interval_s * 1e3:.2f} ms, 95 %) "
             f"after the accelerometer; by the filters that were set: {implied}\n"
+            f"in parts that did not choose it, {left[0]:.3g} N are left with it, {left[1]:.3g} N without\n"
         )
     if found is None:
         say("ethercat-identify", f"{options.path}: {error}")
     return int(found is None)
 
 
-def _find(data: Columns, settings: Mapping[str, SettingValue]) -> Lag:
+def _find(data: Columns, settings: Mapping[str, SettingValue]) -> tuple[Lag, tuple[float, float]]:
     data = data.where(data.fresh)
     force, acceleration, rate = data.force, data.acceleration, data.angular_rate
     usable = np.isfinite(np.concatenate([force, acceleration, rate], axis=1)).all(axis=1)
     times = (data.monotonic_ns - data.monotonic_ns[:1])[usable] * 1e-9
     imu, gyroscope = acceleration_response(settings), angular_rate_response(settings)
     later_s = (gyroscope.delay_s or 0.0) - (imu.delay_s or 0.0)
-    return find_lag(times, force[usable], acceleration[usable], rate[usable], later_s)
+    samples = np.concatenate([force, acceleration, rate], axis=1)[usable]
+    lag = find_lag(times, *np.split(samples, [3, 6], axis=1), later_s)
+    return lag, check_held_out(times, samples, settings, lag)
 
 
-def _as_json(found: Lag | None, expected_ms: float | None, error: str) -> dict[str, Any]:
+def _as_json(
+    found: Lag | None, expected_ms: float | None, error: str, left: tuple[float, float]
+) -> dict[str, Any]:
     if found is None:
         return {"ok": False, "error": error}
     lag_ms, interval_ms = found.seconds * 1e3, found.interval_s * 1e3
     values = {"lag_ms": lag_ms, "interval_ms": interval_ms, "expected_ms": expected_ms}
+    values |= {"left_N": left[0], "left_unaligned_N": left[1]}
     return {"ok": True, **values, "explained": found.explained}

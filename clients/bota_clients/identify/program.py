@@ -138,7 +138,8 @@ def as_json(
         "torque_rms": result.torque_fit.rms,
         "force_fit": result.force_fit._asdict(),
         "torque_fit": result.torque_fit._asdict(),
-        "accelerometer": fit and {**fit.calibration._asdict(), "undetermined": fit.undetermined, "model": fit.model},
+        "accelerometer": fit
+        and {**fit.calibration._asdict(), "undetermined": fit.undetermined, "model": fit.model},
         "drift": result.drift and result.drift.values,
         "touched": result.touched,
         "gravity": result.gravity,

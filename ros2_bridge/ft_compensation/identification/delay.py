@@ -5,18 +5,21 @@ Nothing touches the tool, so the force is a linear function of what the IMU felt
 specific force, the angular acceleration and the products of the angular rates. The lag with the least sum of
 squares is taken: the axes of the two need not be the same, nor their gains exact, and a trend of the bias is
 taken out first. Its interval is the wider of two: that of the lags of eight parts of the recording, which
-covers what the model leaves out (a cable, a tool that bends), and what the residuals' noise gives.
+covers what the model leaves out (a cable, a tool that bends), and what the residuals' noise gives. A lag is
+worth nothing unless compensation by it leaves less force in parts of the recording that did not choose it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bota_ethercat.settings import SettingValue
+from ft_compensation.alignment import Alignment, align
 from ft_compensation.quantities import CompensationError
 
 Array = NDArray[np.float64]
@@ -111,6 +114,43 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
             "faster, two to five times a second in all directions"
         )
     return Lag(best, interval, explained)
+
+
+def check_held_out(
+    stamps: Array, samples: Array, settings: Mapping[str, SettingValue], lag: Lag
+) -> tuple[float, float]:
+    """Force left, rms N, aligned by this lag and not aligned, in each part by a tool of the other parts.
+
+    Of `samples` (n, 9): N, m/s² and rad/s, by the samples that compensation has: what it looks ahead costs
+    what it costs. CompensationError if the alignment makes it worse.
+    """
+    period = float(np.median(np.diff(stamps)))
+    times = np.arange(stamps[0], stamps[-1], period)
+    force, acceleration, rate = np.split(at_times(times, stamps, samples), [3, 6], axis=1)
+    plain = align({}, 1.0 / period)
+    aligned, not_aligned = (
+        _held_out(force, acceleration, rate, each)
+        for each in (align(settings, 1.0 / period, lag.seconds), plain)
+    )
+    if aligned < not_aligned:
+        return aligned, not_aligned
+    raise CompensationError(
+        f"a lag of {lag.seconds * 1e3:.2f} ms fits best, but compensation by it leaves {aligned:.2g} N in parts "
+        f"of the recording that did not choose it, and {not_aligned:.2g} N without: do not use it"
+    )
+
+
+def _held_out(force: Array, acceleration: Array, rate: Array, alignment: Alignment) -> float:
+    columns = zip((acceleration, rate, rate), alignment.taps[:, ::-1], strict=True)
+    felt, turned, spun = (smoothed(each, taps, "full")[: len(force)] for each, taps in columns)
+    products = (turned[:, :, None] * turned[:, None]).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    rows = np.concatenate([felt, spun, products, np.ones((len(felt), 1))], axis=1)
+    squares = 0.0
+    for part in np.array_split(np.arange(alignment.taps.shape[1], len(rows)), _PARTS):
+        rest = np.delete(np.arange(len(rows)), part)
+        tool = np.linalg.lstsq(rows[rest], force[rest], rcond=None)[0]
+        squares += float(((force[part] - rows[part] @ tool) ** 2).sum())
+    return math.sqrt(squares / (len(rows) - alignment.taps.shape[1]))
 
 
 def hann_window(seconds: float, period: float) -> Array:

@@ -61,6 +61,7 @@ class Estimate(NamedTuple):
     gravity: Array  # (n, 3), m/s²: as far as known now
     residuals: Array  # (n, 6), N and Nm: measured minus modelled
     degrees: Array  # (6,): degrees of freedom of the residuals of each axis
+    excess: Array  # (n,), m/s²: by how much gravity is longer than the corrected acceleration; zeros without
 
 
 def estimate(
@@ -86,13 +87,14 @@ def estimate(
         acceleration = None if acceleration is None else np.broadcast_to(acceleration, gravity.shape)
     measured = np.swapaxes(wrench, -1, -2)
     calibration = mounting = shift = None
+    excess = np.zeros(gravity.shape[:-1])
     if acceleration is None:
         if is_turned:
             gravity, solution = _mounted(gravity, measured, regressor)
         else:
             solution = _alone(gravity, measured, regressor)
     else:
-        gravity, solution = _with_accelerometer(
+        gravity, solution, excess = _with_accelerometer(
             measured, acceleration, gravity, acceleration_variance, regressor, free
         )
     answer, unknowns = solution.answer, solution.answer.shape[-1]
@@ -130,6 +132,7 @@ def estimate(
         gravity,
         wrench - np.swapaxes(_times(_design(gravity, regressor), answer[..., :linear]), -1, -2),
         solution.degrees[..., :6],
+        excess,
     )
 
 
@@ -199,10 +202,14 @@ def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:
 
 
 def _with_accelerometer(
-    measured: Array, acceleration: Array, gravity: Array, noise: Array | float, regressor: Array | None,
+    measured: Array,
+    acceleration: Array,
+    gravity: Array,
+    noise: Array | float,
+    regressor: Array | None,
     free: int,
-) -> tuple[Array, Solution]:
-    """Gravity (..., n, 3) and the unknowns, those of the calibration last; by Gauss and Newton.
+) -> tuple[Array, Solution, Array]:
+    """Gravity (..., n, 3), the unknowns, those of the calibration last, and `excess`; by Gauss and Newton.
 
     The lengths alone come first: the errors of an uncorrected direction would pass for noise.
     """
@@ -241,7 +248,7 @@ def _with_accelerometer(
         at = _linearize(acceleration, size, answer[..., linear:])
         if moved <= _CONVERGED:
             break
-    return at.gravity, solution
+    return at.gravity, solution, at.excess[..., 0, :]
 
 
 def _times(design: Array, answer: Array) -> Array:

@@ -43,8 +43,8 @@ _UNKNOWN: Final = 0.5
 ARM: Final = 0.05  # m: what makes a torque of a force where the center of gravity is nearer
 _CHANCE: Final = 0.01  # of seeing drift, or a touch, where there is none
 _SUSPECTS: Final = 12  # poses with the largest residuals; also, of those that are left out one by one
-# Of the accelerometer's calibration, the unknowns that are fitted; the fewest whose error of a pose that is
-# left out is so near to the least: more would fit errors of the wrench.
+# Of the accelerometer's calibration, the unknowns that are fitted: the fewest whose error of a pose that is
+# left out is so near to the least. More would fit errors of the wrench.
 _MODELS: Final = {"nothing": 0, "offset": 3, "offset and scale": 6, "offset, scale and crossed axes": 12}
 _AS_GOOD: Final = 1.05
 _SAME_POSE: Final = 0.97  # cosine
@@ -195,9 +195,11 @@ class _Equations:
             return "", None
         left_out, errors = np.eye(count)[:: math.ceil(count / _SUSPECTS)], {}
         for name, self._free in _MODELS.items():
-            shift = self.solve(left_out).shift
-            assert shift is not None
-            errors[name] = _rms(shift.value[:, :3].reshape(-1, 1)).item()
+            found = self.solve(left_out)
+            assert found.shift is not None
+            longer = found.mass.value * (found.excess * left_out).sum(axis=-1, keepdims=True)
+            off = np.concatenate([found.shift.value[:, :3], longer], axis=1)
+            errors[name] = math.sqrt(float((off**2).sum(axis=1).mean()))
         every, most = self.solve(), _AS_GOOD * min(errors.values())
         chosen = next(name for name, error in errors.items() if error <= most)
         self._free = _MODELS[chosen]
@@ -301,7 +303,9 @@ def accelerometer_of(parts: tuple[Value, Value, Value] | None, model: str = "") 
     open_axes = "".join(axis for axis, half in zip("xyz", parts[0].half, strict=True) if half > limit)
     values = (tuple(each.tolist()) for part in parts for each in part)
     offset, offset_half, scale, scale_half, cross, cross_half = values
-    return OffsetFit(Accelerometer(offset, scale, offset_half, scale_half, cross, cross_half), open_axes, model)
+    return OffsetFit(
+        Accelerometer(offset, scale, offset_half, scale_half, cross, cross_half), open_axes, model
+    )
 
 
 def check_mass(mass: float, interval: float) -> None:

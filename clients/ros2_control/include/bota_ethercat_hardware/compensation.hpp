@@ -122,7 +122,7 @@ struct Alignment {
         const int count = static_cast<int>(std::ceil(late)) + (whole ? 13 : std::max(3, static_cast<int>(std::nearbyint(0.014 * rate_hz))));
         for (std::size_t band = 0; band < kBands; ++band) gains_[band] = lag_s ? gain(hertz(band) * period_s, whole) : 1.0;
         const double acceleration_noise = 250e-6 * 9.80665 * std::sqrt(460.0), rate_noise = 0.01 * kPi / 180.0 * std::sqrt(184.0);
-        const auto turned = [&](bool slope) { return fitted(2.0, 1.5, rate_noise, at_s - gyroscope_s, count, slope); };
+        const auto turned = [&](bool slope) { return fitted(4.0, 1.5, rate_noise, at_s - gyroscope_s, count, slope); };
         taps = {lag_s ? fitted(10.0, 9.0, acceleration_noise, at_s, count, false) : Taps{1.0}, turned(false), turned(true)};
     }
 
