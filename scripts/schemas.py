@@ -43,7 +43,8 @@ alignment: stamp_ns int, monotonic_ns int, offset_ms float, interval_ms float, d
 How much later force and torque are than the accelerometer. `ok`: whether there is a result.
 = failure, delay
 failure: ok false, error str
-delay: ok true, lag_ms float, interval_ms float, expected_ms float?, explained float
+delay: ok true, lag_ms float, interval_ms float, expected_ms float?, explained float,
+    left_N float "Force left by compensation in held-out parts, rms.", left_unaligned_N float "Without."
 
 # identify: ethercat-identify --json
 SI units, in the sensor's frame. `ok`: whether there is a result.
@@ -56,7 +57,7 @@ tool: ok true, tool_mass float, tool_mass_interval float, tool_center_of_gravity
     float, notes [str], poses [pose], rejected [str], drift [float]?, touched int?
 fit: rms float, degrees float, chi_square float?, verdict noise|small|large
 accelerometer: offset [float], scale [float], offset_interval [float], scale_interval [float], undetermined
-    str, cross_axis [float], cross_axis_interval [float]
+    str, model str "What was fitted of it, and why.", cross_axis [float], cross_axis_interval [float]
 pose: begin_s float, seconds float, samples int, force [float], torque [float], gravity [float],
     force_spread [float], torque_spread [float], residual_force~ [float], residual_torque~ [float]
 

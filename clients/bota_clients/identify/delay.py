@@ -57,7 +57,7 @@ def _find(data: Columns, settings: Mapping[str, SettingValue]) -> tuple[Lag, tup
     imu, gyroscope = acceleration_response(settings), angular_rate_response(settings)
     later_s = (gyroscope.delay_s or 0.0) - (imu.delay_s or 0.0)
     samples = np.concatenate([force, acceleration, rate], axis=1)[usable]
-    lag = find_lag(times, *np.split(samples, [3, 6], axis=1), later_s)
+    lag = find_lag(times, force[usable], acceleration[usable], rate[usable], later_s)
     return lag, check_held_out(times, samples, settings, lag)
 
 

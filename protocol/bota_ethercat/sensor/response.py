@@ -141,7 +141,7 @@ def healthy_noise(sinc_length: int, *, fir: bool = False) -> tuple[float, ...]:
 
 
 def imu_noise(settings: Mapping[str, SettingValue]) -> tuple[float, float]:
-    """Standard deviations of acceleration, m/s², and angular rate, rad/s, by filters that are known or usual."""
+    """Standard deviations of acceleration, m/s², and angular rate, rad/s, by known or usual filters."""
     known = {name: settings.get(name) or number for name, number in _IMU_FILTERS.items()}
     _, rate, acceleration = imu_variances(known)
     return math.sqrt(acceleration[0]), math.sqrt(rate[0])

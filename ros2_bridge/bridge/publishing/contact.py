@@ -76,9 +76,15 @@ class ContactTopic(WrenchTopic):
         if plan.source.is_imu:
             imu, _ = align(info.settings, info.rate_hz).noise(length(tool.center) + IMU_BELOW)
             weight = force_bound_95(tool, parameters.accelerometer, plan.ramp.taken)
-        noise = [a or b for a, b in zip(noise, healthy, strict=True)]
         torque = STANDARD_GRAVITY * off_center_95(tool, plan.ramp.taken)
-        known = Uncertainty.of(noise, weight, torque, tool, max(inertia_halves(tool)), imu)
+        known = Uncertainty.of(
+            [a or b for a, b in zip(noise, healthy, strict=True)],
+            weight,
+            torque,
+            tool,
+            max(inertia_halves(tool)),
+            imu,
+        )
         surface = parse_surface(parameters.contact_surface)
         assert surface is not None  # there is no topic without one
         self._detector = ContactDetector(

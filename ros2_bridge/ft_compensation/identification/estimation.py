@@ -77,8 +77,8 @@ def estimate(
     """Solve the poses: wrench (..., n, 6), N and Nm, and gravity (..., n, 3), in the sensor's frame, m/s².
 
     Also `acceleration` (..., n, 3), m/s², if gravity is from it, with `acceleration_variance` (...,) of its
-    means by the sensor's noise, (m/s²)², of whose calibration the first `free` unknowns are fitted, or `is_turned` to have the mounting found; and the
-    `regressor` (..., n). LinAlgError if the equations leave an unknown open.
+    means by the sensor's noise, (m/s²)², of whose calibration the first `free` unknowns are fitted; or
+    `is_turned` to have the mounting found; and the `regressor` (..., n). LinAlgError if an unknown is open.
     """
     if regressor is not None:  # of several regressors, each is a problem
         many = regressor.shape[:-1]
