@@ -15,7 +15,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat.sensor.response import fir_taps
+from bota_ethercat.sensor.response import fir_taps, imu_noise
 from bota_ethercat.settings import SettingValue
 from ft_compensation.quantities import STILL, ZERO, CompensationError, Payload, Turning, length
 
@@ -70,7 +70,7 @@ class Uncertainty(NamedTuple):
     @classmethod
     def of(
         cls, noise: Sequence[float], force_95: float, torque_95: float, tool: Payload, spin_95: float = 0.0,
-        imu: float = 0.0,
+        imu: float = imu_noise({})[0],
     ) -> Uncertainty:  # fmt: skip
         """From deviations of the sensor's noise (6), 95 % bounds, N, Nm, and kg m² of inertia, and the
         deviation of the specific force by the `imu`, m/s² on each axis (`Alignment.noise`)."""

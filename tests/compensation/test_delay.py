@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bota_ethercat.sensor.response import acceleration_response, force_torque_response
-from ft_compensation.identification.delay import Lag, find_lag
+from ft_compensation.identification.delay import Lag, check_held_out, find_lag
 from ft_compensation.quantities import CompensationError, Payload
 from tests.compensation import motion
 from tests.compensation.making import SEED
@@ -43,6 +43,24 @@ def test_the_lag_is_found(sinc_length: int, fir: bool, seed: int) -> None:
     assert found.seconds == pytest.approx(truth, abs=max(2 * found.interval_s, 2e-4))
     assert found.interval_s < 2e-3
     assert found.explained > 0.95
+
+
+@pytest.mark.parametrize("seed", more_if_long([2], range(2, 6)))
+@pytest.mark.parametrize("sinc_length", [32, 128, 512])
+def test_a_lag_is_tried_on_parts_that_did_not_choose_it(sinc_length: int, seed: int) -> None:
+    """A lag that makes it worse is refused, as one that looks ahead by an IMU that is too noisy for that."""
+    chosen, seed = settings(sinc_length), seed + 1000 * SEED
+    felt = motion.filtered(shaken(seed), TOOL, 10.0, chosen, seed=seed)
+    noise = np.random.default_rng(seed)
+    samples = np.hstack([felt.force + noise.normal(0, 0.1, felt.force.shape), felt.acceleration, felt.rate])
+    found = lag_of(felt)
+    aligned, not_aligned = check_held_out(felt.times, samples, chosen, found)
+    assert aligned < 0.95 * not_aligned
+    with pytest.raises(CompensationError, match="do not use it"):
+        check_held_out(felt.times, samples, chosen, found._replace(seconds=found.seconds + 0.05))
+    samples[:, 3:6] += noise.normal(0, 3.0, felt.force.shape)
+    with pytest.raises(CompensationError, match="do not use it"):
+        check_held_out(felt.times, samples, chosen, found._replace(seconds=-0.012))
 
 
 def other_make(path: motion.Path, rate_hz: float, lag_s: float, seed: int) -> Lag:

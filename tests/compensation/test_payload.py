@@ -21,8 +21,8 @@ from ft_compensation.identification.payload import IdentificationError, identify
 from ft_compensation.identification.poses import Pose, coverage, pose_of
 from ft_compensation.identification.weighted import Array, students_t
 from ft_compensation.quantities import NO_WRENCH, SCALE_PRIOR, CompensationError, Payload, Wrench
-from ft_compensation.stationary import StationaryMeans
-from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, pose, written_parameters
+from ft_compensation.stationary import StationaryMeans, triple
+from tests.compensation.making import AXES, BIAS, SEED, TOOL, gravity_for, load, pose, written_parameters
 from tests.simulation import more_if_long
 
 Up = tuple[float, float, float]
@@ -102,6 +102,43 @@ def test_the_offset_of_the_accelerometer_is_found_with_the_payload(seed: int, le
         felt = calibration.correct(reading.acceleration((x, y, z)))
         final = compensator.compensate(*load((x, y, z)), felt).final
         assert math.hypot(*final.force) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("crossed", "scale", "chosen"),
+    [(0.0, 0.0, {"offset"}), (0.005, 0.0, {"offset"}), (0.0, 0.01, {"offset, scale and crossed axes"})],
+    ids=["exact", "the wrench's axes are crossed", "the accelerometer's scale"],
+)
+def test_as_much_of_the_accelerometer_is_fitted_as_the_poses_tell(
+    crossed: float, scale: float, chosen: set[str]
+) -> None:
+    """24 poses, as of an arm: with errors that are the wrench's no more than the offset; and it helps."""
+    left, models = [], []
+    for seed in range(1000 * SEED, 1000 * SEED + 5):
+        reading, draw = Reading(seed, 0.3, scale, scale), np.random.default_rng([seed, 8])
+        axes, means = np.eye(3) + crossed * draw.normal(size=(3, 3)), []
+        for up in [*AXES, *draw.normal(size=(38, 3)).tolist()]:
+            force = axes @ np.subtract(load(up).force, BIAS.force) + BIAS.force + draw.normal(0.0, 0.02, 3)
+            read = triple(reading.acceleration(up) + draw.normal(0.0, 0.005, 3))
+            means.append(still(up)._replace(wrench=Wrench(triple(force), load(up).torque), acceleration=read))
+        poses = [pose_of(each) for each in means[:24]]
+        with pytest.MonkeyPatch.context() as patch:
+            ours = identify(poses)
+            patch.setattr("ft_compensation.identification.payload._FEWEST_IN_TIME", 99)
+            every = identify(poses)
+        for found in (ours, every):
+            assert found.accelerometer is not None
+            models.append(found.accelerometer.model.split(" fitted")[0])
+            compensator, correct = (
+                Compensator(found.payload, found.bias),
+                found.accelerometer.calibration.correct,
+            )
+            rest = [
+                compensator.compensate(*m.wrench, correct(m.acceleration)).final.force for m in means[24:]
+            ]
+            left.append(np.square(rest).sum())
+    assert max(set(models[::2]), key=models[::2].count) in chosen
+    assert math.sqrt(sum(left[::2]) / sum(left[1::2])) < 1.05
 
 
 @pytest.mark.parametrize("reads", [0.0, 0.0981, 4.0])
