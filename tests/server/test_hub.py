@@ -23,8 +23,8 @@ from ethercat_server.serving.connection import (
     MAX_REQUEST_LENGTH,
     Connection,
     ConnectionState,
-    Limits,
     DataSubscription,
+    Limits,
 )
 from ethercat_server.serving.hub import Hub
 from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
