@@ -124,6 +124,8 @@ def test_the_same_commit_gives_the_same_bytes(release: Path, tmp_path: Path) -> 
     wheel, source = "-py3-none-any.whl", ".tar.gz"
     names = {f"bota_ethercat{part}{kind}" for part in ("", "_bridge") for kind in (wheel, source)}
     assert kinds == names | {"bota_ethercat_bridge.cdx.json"}
+    whole, part = (set(zipfile.ZipFile(path).namelist()) for path in sorted(release.glob("*.whl")))
+    assert not whole & part  # of bota_ethercat_bridge each has some
     bill = json.loads((release / "bota_ethercat_bridge-0.1.0.cdx.json").read_text())
     assert {"bota-ethercat", "pysoem", "pyroute2"} <= {each["name"] for each in bill["components"]}
 

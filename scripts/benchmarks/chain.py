@@ -195,7 +195,7 @@ class Chain(contextlib.ExitStack):
         given = f"server_port:={PORT}", f"sensor:={position}", f"rt_priority:={priority}"
         renamed = f"__node:=bridge_{position}", f"wrench:=/benchmark_{position}"
         words = [*(word for each in renamed for word in ("-r", each)), *(w for p in given for w in ("-p", p))]
-        self.python(f"node {position}", "bridge.client", "--ros-args", *words)
+        self.python(f"node {position}", "bota_ethercat_bridge.client", "--ros-args", *words)
 
     def recorder(
         self, kind: str, *arguments: object, priority: int = 0, warm_up_s: float = WARM_UP_S

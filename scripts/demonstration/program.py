@@ -46,7 +46,7 @@ def listening(client: Client, measurement: Measurement, lock: threading.Lock) ->
     from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
 
-    from bridge.rclpy_internals import Spinner  # noqa: PLC0415
+    from bota_ethercat_bridge.rclpy_internals import Spinner  # noqa: PLC0415
 
     def receive() -> None:
         for frame in client.frames():

@@ -21,8 +21,8 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
-from bridge import client, process
-from bridge.rclpy_internals import Spinner
+from bota_ethercat_bridge import client, process
+from bota_ethercat_bridge.rclpy_internals import Spinner
 from tests import without_ipv6
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
@@ -38,7 +38,7 @@ def test_a_missing_module_is_named(
     missing: str, remedy: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(client, "StopSignals", lambda: None)  # which blocks them in this process
-    for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bridge"}]:
+    for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bota_ethercat_bridge"}]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
     assert client.main([]) == 1
@@ -72,7 +72,7 @@ def test_a_missing_module_is_named(
 def test_what_the_environment_makes_impossible_is_a_sentence(variables: dict[str, str], said: str) -> None:
     """Processes: at some of it the middleware ends them by itself, and ROS reads the rest once."""
     done = subprocess.run(
-        [sys.executable, "-m", "bridge.client"], env={**os.environ, **variables},
+        [sys.executable, "-m", "bota_ethercat_bridge.client"], env={**os.environ, **variables},
         capture_output=True, text=True, check=False, timeout=PATIENCE_S,
     )  # fmt: skip
     *_, line = done.stderr.splitlines()
@@ -89,7 +89,7 @@ def hang(*_, **__):
     print("hangs", flush=True)
     ctypes.PyDLL(None).sleep(600)  # with Python's lock, as rclpy calls the middleware
 {where} = hang
-from bridge import client
+from bota_ethercat_bridge import client
 sys.exit(client.main([]))
 """
 
@@ -116,7 +116,7 @@ def test_without_ipv6_it_waits_for_the_server() -> None:
     port = free_port()
     arguments = ("--ros-args", "-p", f"server_port:={port}", "-r", f"__ns:=/test_{port}")
     under = sys.executable, str(Path(without_ipv6.__file__))
-    with contextlib.closing(Program("bridge.client", arguments, under)) as node:
+    with contextlib.closing(Program("bota_ethercat_bridge.client", arguments, under)) as node:
         node.wait_for(f"no server at localhost:{port} (Connection refused)")
         with ScriptedServer(port):
             node.wait_for("connected to")

@@ -15,10 +15,10 @@ import yaml
 
 from bota_ethercat.framing import MessageType, encode_data
 from bota_ethercat.pdo import encode
-from bridge import rclpy_internals
-from bridge.node import StartError
-from bridge.parameters.table import ParameterError, parse_frames
-from ft_compensation.outputs import WrenchFilter
+from bota_ethercat_bridge import rclpy_internals
+from bota_ethercat_bridge.ft_compensation.outputs import WrenchFilter
+from bota_ethercat_bridge.node import StartError
+from bota_ethercat_bridge.parameters.table import ParameterError, parse_frames
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.scripted_server import process_data
 from tests.bridge.simulated_node import RATE_HZ, STEP_S, UP, ZERO6, Node, Server, six, stamp_ns, values

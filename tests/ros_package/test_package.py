@@ -116,13 +116,13 @@ def test_the_urls_are_asked_for_once_and_a_placeholder_is_refused(
 
 
 def test_everything_that_is_imported_is_a_dependency_once() -> None:
-    ours = {"bridge", "ft_compensation", "bota_ethercat", "__future__", *sys.stdlib_module_names}
+    ours = {"bota_ethercat_bridge", "bota_ethercat", "__future__", *sys.stdlib_module_names}
     ours.add("bota_ethercat_msgs")  # used where it is there
     # Packages that are not named as their modules; the package tf2_ros is C++.
     packages = {"tf2_ros": "tf2_ros_py", "numpy": "python3-numpy"}
     needed = {
         packages.get(name, name)
-        for folder in ("bridge", "ft_compensation", "launch")
+        for folder in ("bota_ethercat_bridge", "bridge", "ft_compensation", "launch")
         for path in (PACKAGE / folder).rglob("*.py")
         for name in {imported.split(".")[0] for imported in imports(path)} - ours
     }
@@ -176,7 +176,7 @@ def test_both_install_the_same_everything_in_the_shared_folders() -> None:
     assert pip == expected
     # A new folder has to be named in both, or it is installed by neither.
     folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] not in "._"}
-    code = {"bridge", "ft_compensation", "resource"}
+    code = {"bota_ethercat_bridge", "bridge", "ft_compensation", "resource"}
     assert {name for name in folders if not name.endswith(".egg-info")} == {*SHARED_FOLDERS, *code}
 
 
