@@ -16,29 +16,31 @@ from bota_ethercat.program.real_time import make_real_time
 from bota_ethercat.program.signals import signals_call
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic import look_up
-from ethercat_server.process.realtime import DEFAULT_PRIORITY
-from ethercat_server.sensor.objects.dictionary import MODELS
+from ethercat_server.sensor.models import MODELS
 from ethercat_server.virtual_sensor import control
-from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_clock
-from ethercat_server.virtual_sensor.faults import COMMANDS, PPM_LIMIT
-from ethercat_server.virtual_sensor.foreign import KINDS, MOST_SLAVES, SENSOR, parse_chain, slaves_in
+from ethercat_server.virtual_sensor.commands import CLOCK_WORDS, COMMANDS, PPM_LIMIT, parse_clock
 from ethercat_server.virtual_sensor.options import (
+    FAULT,
+    KINDS,
+    LOST,
+    MOST_SLAVES,
+    SENSOR,
     ForeignOptions,
     SensorOptions,
     SlaveOptions,
     UsageError,
     model_name,
+    parse_chain,
+    slaves_in,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
-from ethercat_server.virtual_sensor.world import FAULT, LOST, ExternalWorld
 
 _PROGRAM: Final = "ethercat-virtual-sensor"
 _SERIAL_NUMBERS: Final = 100  # for each bus: more than it has slaves
 
 
 def _clock(text: str) -> str:
-    parse_clock(text)
+    list(parse_clock(text))
     return text
 
 
@@ -106,6 +108,8 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _number_of(ifname: str) -> int:
     """Of an interface: another has another, and it is the same after a restart."""
+    from ethercat_server.ethercat.nic import look_up  # noqa: PLC0415 - likewise
+
     try:
         return int.from_bytes(look_up(ifname).address[3:])
     except InterfaceError:  # said when it is to be opened
@@ -124,6 +128,8 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
         count = max(named, 1)
     if named > count:
         raise UsageError(f"{named} sensors are named but there are to be {count}: name no more than that")
+
+    from ethercat_server.virtual_sensor.world import ExternalWorld  # noqa: PLC0415 - --help need not wait for it
 
     def of(given: list[Any], position: int, default: Any) -> Any:
         """The last one applies to the rest."""
@@ -151,6 +157,8 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
 
 def _get_priority() -> None:
     """That of SCHED_FIFO above a master's: real sensors do not wait for a CPU."""
+    from ethercat_server.process.realtime import DEFAULT_PRIORITY  # noqa: PLC0415 - likewise
+
     if refused := make_real_time(DEFAULT_PRIORITY + 1).refused:
         _say(f"not granted: {', '.join(refused)}; samples may come late")
 
