@@ -17,7 +17,6 @@ from bota_ethercat.program.signals import signals_call
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
 from ethercat_server.sensor.models import MODELS
-from ethercat_server.virtual_sensor import control
 from ethercat_server.virtual_sensor.commands import CLOCK_WORDS, COMMANDS, PPM_LIMIT, parse_clock
 from ethercat_server.virtual_sensor.options import (
     FAULT,
@@ -99,8 +98,9 @@ def build_parser() -> argparse.ArgumentParser:
         "none: not even that, so where nothing changes no sample is new",
     )  # fmt: skip
     parser.add_argument(
-        "--control", metavar="PATH", help=f"Unix socket for commands (default {control.own_socket()})"
-    )
+        "--control", metavar="PATH",
+        help="Unix socket for commands (default: one of this user, in /run/user or the temporary directory)",
+    )  # fmt: skip
     parser.add_argument("--send", metavar="COMMAND", help="have the one that listens there obey, and end")
     parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
     return parser
@@ -175,7 +175,7 @@ def main(
     parser = build_parser()
     args = parser.parse_args(argv)
     if args.send is not None:
-        return _send(args.control or control.own_socket(), args.send)
+        return _send(args.control, args.send)
     if args.iface is None:
         parser.error("name an interface, or a command with --send")
     try:
@@ -217,8 +217,11 @@ def _say(sentence: object) -> None:
     print(f"{_PROGRAM}: {sentence}", file=sys.stderr)
 
 
-def _send(path: str, command: str) -> int:
+def _send(path: str | None, command: str) -> int:
     """Exit code 0 if the virtual sensor that listens there has obeyed."""
+    from ethercat_server.virtual_sensor import control  # noqa: PLC0415 - likewise
+
+    path = path or control.own_socket()
     try:
         answer = control.send(path, command)
     except OSError as error:

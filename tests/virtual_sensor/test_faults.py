@@ -295,7 +295,7 @@ from {package}cli import build_parser
 build_parser().format_help()
 print(*sorted(name.removeprefix({package!r}) for name in sys.modules if name.startswith({package!r})))"""
     loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert loaded.stdout.split() == ["cli", "commands", "control", "options", "signals"]
+    assert loaded.stdout.split() == ["cli", "commands", "options", "signals"]
 
 
 @given(st.text(max_size=60))
