@@ -93,10 +93,10 @@ def test_every_option_of_every_program_is_completed_and_in_its_man_page(share: P
         }
         for name, entry in programs.items():
             text = (share / place.format(name)).read_text().replace("\\", "")
-            for option in re.findall(
-                r"^  (?:-\w, )?--([a-z-]+)", completions.parser_of(entry).format_help(), re.M
-            ):
-                assert option in text, (kind, name, option)
+            options = re.findall(r"^  (--[a-z-]+)", completions.parser_of(entry).format_help(), re.M)
+            assert options
+            for option in options:  # fish has them without the dashes
+                assert option.removeprefix("--") in text, (kind, name, option)
 
 
 @pytest.mark.skipif(not shutil.which("groff"), reason="there is no groff on this machine")
