@@ -436,7 +436,10 @@ def examine_bus(
         text = f"{holder} uses it as an EtherCAT master and serves no port"
         found = bad(text, "two masters disturb each other: stop it", f"sudo kill {holder.pid}")
     elif holder is not None:
-        found = skipped("an EtherCAT master of another user has it: run with sudo to see which")
+        found = skipped(
+            "an EtherCAT master of another user, or outside of this container, has it: "
+            "run with sudo, or on the host, to see which"
+        )
     elif isinstance(unknown := machine.facts.get("link"), CannotLookError):
         found = skipped(str(unknown))
     if found is None:

@@ -20,8 +20,8 @@ from ethercat_server.virtual_sensor.signals import (
     FORMULAS,
     SCENES,
     Formula,
-    Measurement,
-    measurement_of,
+    PhysicalSample,
+    physical_sample,
 )
 from ethercat_server.virtual_sensor.world import ExternalWorld, Measured
 
@@ -177,16 +177,16 @@ class Sampler:
         warnings = self._warnings if number < self._warnings_until else 0
         return self._pack(reading, warnings, saturated)
 
-    def _with_last_bit(self, reading: Measurement, number: int) -> Measurement:
+    def _with_last_bit(self, reading: PhysicalSample, number: int) -> PhysicalSample:
         """The reading of sample `number` with up to the last bit of each converter added or subtracted."""
         values = [*reading.force_torque, *reading.acceleration, *reading.angular_rate]
         chance = _scattered(number, self._seed)
         for position, bit in enumerate(_LAST_BITS):
             values[position] += bit * ((chance % _STEPS + 0.5) / _STEPS * 2 - 1)
             chance //= _STEPS
-        return measurement_of(values, reading.temperature, reading.orientation)
+        return physical_sample(values, reading.temperature, reading.orientation)
 
-    def _disturb(self, reading: Measurement) -> tuple[Measurement, int]:
+    def _disturb(self, reading: PhysicalSample) -> tuple[PhysicalSample, int]:
         """The reading with every fault in it, and which channels are saturated, as bits."""
         if not (self.noise or self.limits or self.frozen):
             return reading, 0
@@ -200,9 +200,9 @@ class Sampler:
                 bits |= 1 << position
         for position, kept in self.frozen.items():
             self.frozen[position] = values[position] = values[position] if kept is None else kept
-        return measurement_of(values, reading.temperature, reading.orientation), bits
+        return physical_sample(values, reading.temperature, reading.orientation), bits
 
-    def _pack(self, reading: Measurement, warnings: int, saturated: int) -> bytes:
+    def _pack(self, reading: PhysicalSample, warnings: int, saturated: int) -> bytes:
         """Process data of one sample, as the settings have it.
 
         Offsets are added; values beyond the range are clipped and set the saturation fields and warnings; the
