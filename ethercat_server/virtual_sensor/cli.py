@@ -47,12 +47,12 @@ def _each(parse: Callable[[str], Any]) -> Callable[[str], list[Any]]:
     return lambda text: [parse(word) for word in text.split(",") if word]
 
 
-_SEVERAL: Final = "; several, comma separated or repeated, for a chain"
+_SEVERAL: Final = "; for several sensors comma separated or repeated"
 _ALONG_THE_CHAIN: Final[tuple[tuple[str, str, Callable[[str], Any], str], ...]] = (
-    ("model", "NAME", model_name, f"default {MODELS[0]}"),
-    ("serial", "N", whole(0, 2**32 - 1), "default: by the interface's MAC address"),
-    ("ppm", "X", number(-PPM_LIMIT, PPM_LIMIT), "clock error"),
-    ("dc", "WORD[=VALUE][+...]", _clock, "distributed clock, see below"),
+    ("model", "NAME", model_name, f"model (default {MODELS[0]})"),
+    ("serial", "N", whole(0, 2**32 - 1), "serial number (default: derived from the interface's MAC address)"),
+    ("ppm", "X", number(-PPM_LIMIT, PPM_LIMIT), "error of the sensor's clock, positive if fast"),
+    ("dc", "WORD[=VALUE][+...]", _clock, "faults of the distributed clock, listed below"),
 )
 
 
@@ -62,21 +62,22 @@ def build_parser() -> argparse.ArgumentParser:
     words = "\n".join(f"  {w.usage:34} {w.meaning}" for w in CLOCK_WORDS)
     parser = Parser(
         _PROGRAM,
-        "Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
-        "and other slaves beside them.",
-        f"commands, by --send, or one per line on stdin:\n{commands}\n\n"
-        f"of a distributed clock, in --dc or as a command:\n{words}",
+        "Simulates a chain of Bota force/torque sensors, and of other slaves, on a network interface.",
+        f"commands, with --send or one per line on stdin (@N: of sensor N, by default 0):\n{commands}\n\n"
+        f"faults of the distributed clock, in --dc or after the command dc:\n{words}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("iface", metavar="IFACE", nargs="?", help="interface, one end of a veth pair")
+    parser.add_argument(
+        "iface", metavar="IFACE", nargs="?", help="one end of a veth pair, with the master at the other end"
+    )
     parser.add_argument(
         "--chain", metavar="SLAVES", type=parse_chain,
-        help=f"all slaves in wire order: {SENSOR}, {', '.join(KINDS)}; "
-        "KIND:STATE if another master has left one in this AL state",
+        help=f"all slaves in wire order, comma separated, of {SENSOR}, {', '.join(KINDS)}; "
+        "with :STATE one that another master has left in this AL state",
     )  # fmt: skip
     parser.add_argument(
         "--sensors", metavar="N", type=whole(1, MOST_SLAVES),
-        help="sensors on the bus (default: as many as named, or 1)",
+        help="number of sensors (default: as many as the options below name, at least 1)",
     )  # fmt: skip
     for name, metavar, parse, meaning in _ALONG_THE_CHAIN:
         parser.add_argument(
@@ -88,21 +89,32 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--sinc", metavar="N", type=sinc_length, help="SINC length after power-on (default 64)"
     )
-    parser.add_argument("--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data")
+    parser.add_argument(
+        "--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data (default 61)"
+    )
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
-    parser.add_argument("--world", metavar="PATH", help="measure what datagrams to this Unix socket say")
-    parser.add_argument("--world-lost", choices=LOST, default=FAULT, help="when it stops (default fault)")
+    parser.add_argument("--world", metavar="PATH", help="measure what a simulation sends to this Unix socket")
+    parser.add_argument(
+        "--world-lost",
+        choices=LOST,
+        default=FAULT,
+        help="what is measured when it stops sending: its last values, zeros, or nothing new (default fault)",
+    )
     parser.add_argument(
         "--noise", choices=("on", "off", "none"), default="on",
-        help="off: scene, poses and world have but that of the converters' last bits, as constant and rest; "
-        "none: not even that, so where nothing changes no sample is new",
+        help="off: only that of the converters' last bit; none: none at all, and a sample that equals the "
+        "one before it is not new (default on)",
     )  # fmt: skip
     parser.add_argument(
         "--control", metavar="PATH",
         help="Unix socket for commands (default: one of this user, in /run/user or the temporary directory)",
     )  # fmt: skip
-    parser.add_argument("--send", metavar="COMMAND", help="have the one that listens there obey, and end")
-    parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
+    parser.add_argument(
+        "--send",
+        metavar="COMMAND",
+        help="send a command to the virtual sensor that runs, print its answer and exit",
+    )
+    parser.add_argument("--exit-on-eof", action="store_true", help="exit when stdin ends")
     return parser
 
 

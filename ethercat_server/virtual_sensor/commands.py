@@ -72,7 +72,7 @@ _CHANNEL = _one_of("channel", CHANNELS)
 
 COMMANDS: Final = (
     Fault("lose N", "lose the next N frames", (_COUNT,)),
-    Fault("deaf [SECONDS]", "lose every frame, until `hear` or for a time", (_AMOUNT,)),
+    Fault("deaf [SECONDS]", "lose every frame until `hear`, or for this time", (_AMOUNT,)),
     Fault("deaf-after N", "lose every frame after the next N", (_COUNT,)),
     Fault("hear", "end `deaf`, `deaf-after`, `lose` and `damage`"),
     Fault("damage N [@N]", "corrupt the next N frames on the cable before this slave", (_COUNT,)),
@@ -92,7 +92,7 @@ COMMANDS: Final = (
     Fault("cut-save N [@N]", "lose power in the next save after N entries", (whole(0, 1000),)),
     Fault("mute-mailbox N [@N]", "drop the next N mailbox requests", (_COUNT,)),
     Fault("emergency CODE [REGISTER [HEX]] [@N]",
-        "send a CoE emergency before all that the mailbox holds", (_WORD, _BYTE, _hex)),
+        "send a CoE emergency before anything else in the mailbox", (_WORD, _BYTE, _hex)),
     Fault("sii error|busy|ok [@N]",
         "result of reading the EEPROM", (_one_of("result", ("error", "busy", "ok")),)),
     Fault("warn BITS [SAMPLES] [@N]",
@@ -116,12 +116,12 @@ COMMANDS: Final = (
     Fault("quit", "end the program"),
 )  # fmt: skip
 CLOCK_WORDS: Final = (
-    Fault("ok", "nothing is wrong; rate and time stay"),
-    Fault("none", "no DC: no feature bit, registers read zero"),
+    Fault("ok", "end all faults; rate and time stay as they are"),
+    Fault("none", "no distributed clock: no feature bit, its registers read zero"),
     Fault("32-bit", "system and local time have 32 bits"),
     Fault("no-events", "no 0x09FC: it reads zero"),
     Fault("stuck", "0x09FC stands still"),
-    Fault("late US", "0x09FC is too late by this, too early if negative", (number(-1e6, 1e6),)),
+    Fault("late US", "0x09FC is late by this; negative is early", (number(-1e6, 1e6),)),
     Fault("at NS", "the local clock jumps to this time", (number(0, 2.0**62),)),
     Fault("ppm X", "rate of the local clock, without a jump of the time", (number(-PPM_LIMIT, PPM_LIMIT),)),
 )  # fmt: skip

@@ -192,7 +192,8 @@ scripts/install-service ens5 13000
 echo "users $(getent passwd ethercat ethercat-bridge | grep -c nologin)"
 [ /opt/ethercat-server/bin/python -ef /usr/bin/python3 ]  # gets its updates
 cd /usr/share
-ls {bash-completion/completions,zsh/vendor-completions,fish/vendor_completions.d,man/man1}/*ethercat-server* | wc -l
+folders=$(echo {bash-completion/completions,zsh/vendor-completions,fish/vendor_completions.d,man/man1})
+for each in $folders; do ls $each/*ethercat-server*; done | wc -l
 cd "$1"
 setpriv --reuid=ethercat --regid=ethercat --clear-groups /opt/ethercat-server/bin/ethercat-server --version
 mkdir /var/lib/ethercat-sensors  # as the service does
