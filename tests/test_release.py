@@ -17,7 +17,7 @@ from typing import Any, Final
 import pytest
 
 from bota_ethercat.program.version import VERSION
-from scripts import ros_packages
+from scripts import completions, ros_packages
 from tests.ros_package.package_files import PACKAGES, ROOT, commands, shared_files
 from tests.server.running import free_port, needs_bus
 
@@ -179,6 +179,18 @@ def test_each_distribution_in_an_environment_of_its_own(release: Path, version: 
         server.terminate()
         server.stderr.read()
     assert (server.returncode, read.returncode) == (0, 0), read.stderr
+
+
+@pytest.mark.long
+def test_each_wheel_has_what_shells_complete_and_man_shows_of_its_programs(release: Path) -> None:
+    whole, part = (set(project(path)["scripts"]) for path in ("pyproject.toml", "clients/pyproject.toml"))
+    for wheel, programs in (("bota_ethercat-", part), ("bota_ethercat_bridge-", whole - part)):
+        (path,) = release.glob(f"{wheel}*.whl")
+        with zipfile.ZipFile(path) as archive:
+            names = {name.partition(".data/data/share/")[2] for name in archive.namelist()}
+        for place in completions.PLACES.values():
+            wanted = {place.format(name) for name in programs if not name.startswith(completions.OF_ROS)}
+            assert {name for name in names if Path(name).parent == Path(place).parent} == wanted
 
 
 @pytest.mark.long

@@ -45,8 +45,7 @@ from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.sensor import scan
-from ethercat_server.sensor.objects import dictionary
+from ethercat_server.sensor import models, scan
 from ethercat_server.sensor.sensor import is_known_model
 
 MOST_PORTS: Final = 4
@@ -134,7 +133,7 @@ def identity(slave: ExaminedSlave) -> CheckResult:
         whose = f"vendor 0x{sii['vendor']:08X}, product 0x{sii['product']:08X}"
         return ok(f"{text}, {whose}: not a Bota Gen-0 sensor, the server leaves it alone", **values)
     if not is_known_model(sii["name"]):
-        supported = ", ".join(dictionary.MODELS)
+        supported = ", ".join(models.MODELS)
         return bad(text, f"not supported by the server, which supports {supported}", **values)
     return ok(f"{text}, supported", **values)
 

@@ -15,7 +15,14 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import FORMULAS, SCENES, Formula, PhysicalSample, physical_sample
+from ethercat_server.virtual_sensor.signals import (
+    CHANNELS,
+    FORMULAS,
+    SCENES,
+    Formula,
+    PhysicalSample,
+    physical_sample,
+)
 from ethercat_server.virtual_sensor.world import ExternalWorld, Measured
 
 _PPM_SCALE = 10**12  # ppm in steps of one millionth
@@ -54,17 +61,12 @@ class SamplingClock:
         self._set(self.sinc_length if sinc_length is None else sinc_length, self.ppm if ppm is None else ppm)
 
 
-# As the fields of the process data are named, in their order.
-CHANNELS: Final[tuple[str, ...]] = tuple(
-    f"{vector}.{axis}" for vector in ("force", "torque", "acceleration", "angular_rate") for axis in "xyz"
-)
 # Channels that are saturated, as bits, and the warning of each of the three saturation fields.
 _SATURATION: Final = (
     (0o0077, WarningFlag.FORCE_TORQUE_SATURATED),
     (0o0700, WarningFlag.ACCELERATION_SATURATED),
     (0o7000, WarningFlag.ANGULAR_RATE_SATURATED),
 )
-MOST_SKIPPED: Final = 90.0  # %
 _SKIP_STEPS: Final = 1 << 32
 
 

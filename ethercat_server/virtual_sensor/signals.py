@@ -15,6 +15,12 @@ from typing import Final, NamedTuple
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.world import Felt
 
+# As the fields of the process data are named, in their order.
+CHANNELS: Final[tuple[str, ...]] = tuple(
+    f"{vector}.{axis}" for vector in ("force", "torque", "acceleration", "angular_rate") for axis in "xyz"
+)
+World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MONOTONIC if it is external
+
 
 class PhysicalSample(NamedTuple):
     """One sample before settings act on it, in the units of the process data."""

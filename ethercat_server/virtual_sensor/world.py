@@ -16,11 +16,9 @@ from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILT
 from bota_ethercat.sensor.response import FIR_TAPS, fir_taps, healthy_noise
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
 from bota_ethercat.world import REST, Felt
-from ethercat_server.virtual_sensor.signals import PhysicalSample, physical_sample, quaternion
+from ethercat_server.virtual_sensor.options import FAULT, ZERO
+from ethercat_server.virtual_sensor.signals import PhysicalSample, World, physical_sample, quaternion
 
-World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MONOTONIC if it is external
-
-_HOLD, ZERO, FAULT = LOST = ("hold", "zero", "fault")  # what a world that has stopped is taken for
 LOST_AFTER_S: Final = 0.1  # also by how much a time stamp may differ from the time
 _REMEMBERED: Final = 4096  # moments, of which the filters look at the last second at most
 
