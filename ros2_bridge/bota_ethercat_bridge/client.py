@@ -14,6 +14,8 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C is never a traceback, wha
 
 import sys  # noqa: E402
 from collections.abc import Sequence  # noqa: E402
+from importlib import import_module  # noqa: E402
+from typing import Any  # noqa: E402
 
 from bota_ethercat_bridge.process import StopSignals, environment_problem, refuse  # noqa: E402
 
@@ -39,15 +41,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if problem := environment_problem():
         return refuse(problem, 1)
+    run = _load("node", "run")
+    if run is None:
+        return 1
+    code: int = run(own, signals) if signals.begin() else 0
+    return code
+
+
+def check_subscription() -> int:
+    """The program `bridge-check-subscription`, in the module of that name."""
+    measure = _load("check_subscription", "main")
+    return 1 if measure is None else int(measure())
+
+
+def _load(module: str, function: str) -> Any:
+    """A function of a module that needs ROS; None, after the reason is said, where that is missing."""
     try:
-        from bota_ethercat_bridge.node import run  # noqa: PLC0415 - --help needs no ROS, which may be missing
+        return getattr(import_module(f"bota_ethercat_bridge.{module}"), function)
     except ImportError as error:
         missing = (error.name or "").partition(".")[0]
         remedy = "source ROS 2, or pip install the extra 'ros'"
         if missing == "bota_ethercat":
             remedy = "build the package bota_ethercat_protocol too"
-        return refuse(f"{missing} cannot be loaded ({error}): {remedy}", 1)
-    return run(own, signals) if signals.begin() else 0
+        refuse(f"{missing} cannot be loaded ({error}): {remedy}", 1)
+    return None
 
 
 if __name__ == "__main__":

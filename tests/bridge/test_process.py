@@ -44,6 +44,9 @@ def test_a_missing_module_is_named(
     assert client.main([]) == 1
     said = capsys.readouterr().err
     assert re.match(rf"bridge-client: {missing} cannot be loaded \(.*\): {remedy}", said)
+    if missing == "rclpy":
+        assert client.check_subscription() == 1
+        assert capsys.readouterr().err == said
 
 
 @pytest.mark.parametrize(
