@@ -59,7 +59,7 @@ class CompensationState(NamedTuple):
     follows_imu: bool = False  # whether the tool's weight and inertia are from the sensor's IMU
 
 
-class Monitor:
+class DiagnosticsPublisher:
     """Its `thread` runs until `stop`. `on_failure` is called with an unexpected error."""
 
     def __init__(

@@ -26,7 +26,7 @@ from rclpy.utilities import remove_ros_args
 from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat_bridge.compensating.compensation import Compensation
 from bota_ethercat_bridge.compensating.control import CompensationControl
-from bota_ethercat_bridge.diagnostics import Monitor
+from bota_ethercat_bridge.diagnostics import DiagnosticsPublisher
 from bota_ethercat_bridge.parameters.declare import NodeParameters, converted
 from bota_ethercat_bridge.parameters.table import ParameterError, Parameters
 from bota_ethercat_bridge.process import StopSignals, Worker, favor_stream, prepare, refuse
@@ -137,7 +137,7 @@ class BridgeNode(LifecycleNodeMixin, Node):  # type: ignore[misc]  # rclpy has n
         self.live.link = link = self.reader.link
         self.compensation = CompensationControl(self, parameters, compensated, self.reader, self.live)
         self.live.apply = self._apply
-        self.monitor = Monitor(
+        self.monitor = DiagnosticsPublisher(
             self, parameters.limits, self.reader, self.compensation.state, self.outputs, stamps, self.fail
         )
         create_services(self)

@@ -19,7 +19,7 @@ class UnusableError(Exception):
     """There is no pose or orientation just now; the text says why."""
 
 
-class Pose(NamedTuple):
+class FramePose(NamedTuple):
     translation: Vector3  # m
     rotation: Quaternion
     stamp_ns: int  # since the Unix epoch; 0: static, it holds at any time
@@ -45,7 +45,7 @@ class Tf:
         self._buffer = Buffer()
         self.close = TransformListener(self._buffer, node, spin_thread=False).unregister
 
-    def look_up(self, base: str, frame: str) -> Pose:
+    def look_up(self, base: str, frame: str) -> FramePose:
         """The latest pose of `frame` in `base`; UnusableError."""
         from tf2_ros import TransformException  # noqa: PLC0415
 
@@ -56,7 +56,7 @@ class Tf:
         except (TransformException, ValueError) as error:
             why = " ".join(str(error).split())
             raise UnusableError(f"TF has no pose of {frame} in {base}: {why}") from None
-        return Pose((t.x, t.y, t.z), rotation, stamp_ns(found.header.stamp))
+        return FramePose((t.x, t.y, t.z), rotation, stamp_ns(found.header.stamp))
 
 
 def stamp_ns(stamp: Any) -> int:
