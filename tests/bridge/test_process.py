@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import queue
 import re
@@ -21,7 +22,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
-from bota_ethercat_bridge import client, process
+from bota_ethercat_bridge import client, node, process
 from bota_ethercat_bridge.rclpy_internals import Spinner
 from tests import without_ipv6
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
@@ -47,6 +48,25 @@ def test_a_missing_module_is_named(
     if missing == "rclpy":
         assert client.check_subscription() == 1
         assert capsys.readouterr().err == said
+
+
+def test_the_node_runs_with_what_favors_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    interval_s, found = sys.getswitchinterval(), list[object]()
+
+    def spin(_: object) -> int:
+        found.extend((sys.getswitchinterval() < interval_s, gc.get_freeze_count() > 0))
+        return 7
+
+    monkeypatch.setattr(node.rclpy, "init", lambda **_: None)
+    monkeypatch.setattr(node.rclpy, "try_shutdown", lambda: None)
+    monkeypatch.setattr(node.BridgeNode, "create", lambda: None)
+    monkeypatch.setattr(node, "spin", spin)
+    try:
+        assert node.run([]) == 7
+    finally:
+        sys.setswitchinterval(interval_s)
+        gc.unfreeze()
+    assert found == [True, True]
 
 
 @pytest.mark.parametrize(
