@@ -22,7 +22,8 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
-from bota_ethercat_bridge import client, node, process
+from bota_ethercat_bridge import client, process
+from bota_ethercat_bridge import node as program
 from bota_ethercat_bridge.rclpy_internals import Spinner
 from tests import without_ipv6
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
@@ -57,12 +58,12 @@ def test_the_node_runs_with_what_favors_the_stream(monkeypatch: pytest.MonkeyPat
         found.extend((sys.getswitchinterval() < interval_s, gc.get_freeze_count() > 0))
         return 7
 
-    monkeypatch.setattr(node.rclpy, "init", lambda **_: None)
-    monkeypatch.setattr(node.rclpy, "try_shutdown", lambda: None)
-    monkeypatch.setattr(node.BridgeNode, "create", lambda: None)
-    monkeypatch.setattr(node, "spin", spin)
+    monkeypatch.setattr(rclpy, "init", lambda **_: None)
+    monkeypatch.setattr(rclpy, "try_shutdown", lambda: None)
+    monkeypatch.setattr(program.BridgeNode, "create", lambda: None)
+    monkeypatch.setattr(program, "spin", spin)
     try:
-        assert node.run([]) == 7
+        assert program.run([]) == 7
     finally:
         sys.setswitchinterval(interval_s)
         gc.unfreeze()
