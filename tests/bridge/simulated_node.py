@@ -25,7 +25,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 
 from bota_ethercat.control import Event, event
 from bota_ethercat.errors import ConnectionFailedError
@@ -114,6 +114,7 @@ class Topic:
         self.handle = SimpleNamespace(publish_raw=self.publish)
         self.is_heard = False
         self.messages: list[Any] = []
+        self.serialized: list[bytes] = []
         self.turn = 0  # of the latest message, counted over all topics
 
     def __getattr__(self, name: str) -> Any:
@@ -125,10 +126,14 @@ class Topic:
     def publish(self, message: Any) -> None:
         self._publisher.get_subscription_count()  # InvalidHandle once it is destroyed
         self.turn = next(TURNS)
+        serialized = message
         if isinstance(message, bytes):
             message = deserialize_message(message, self._publisher.msg_type)
+        elif self.is_heard:
+            serialized = serialize_message(message)
         if self.is_heard:
             self.messages.append(copy.deepcopy(message))
+            self.serialized.append(serialized)
 
 
 class Guard:
