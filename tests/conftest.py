@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from scripts.benchmarks.chain import loopback_up
+from scripts.chain import loopback_up
 from tests.exception_cycles import no_exception_cycles
 
 _DOMAINS = 101

@@ -17,7 +17,7 @@ from bota_ethercat.control import ACTIONS, ErrorCode, Event
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import Sample
 from bota_ethercat.settings import SETTINGS
-from bridge.parameters.table import PARAMETERS
+from bota_ethercat_bridge.parameters.table import PARAMETERS
 
 ROOT: Final = Path(__file__).parent.parent
 LIST: Final = Path(__file__).with_suffix(".txt")

@@ -57,10 +57,10 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
-from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
-from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.options import SensorOptions, parse_chain, slaves_in
 from ethercat_server.virtual_sensor.sensor import Firmware
-from ethercat_server.virtual_sensor.world import ExternalWorld, World
+from ethercat_server.virtual_sensor.signals import World
+from ethercat_server.virtual_sensor.world import ExternalWorld
 from scripts.benchmarks.records import ClockReading, decode_clock
 from tests.server.running import OLD, Commanded, FramedClient
 

@@ -15,10 +15,14 @@ ROOT: Final = Path(__file__).parent.parent
 ROOTS: Final = {
     "bota_ethercat": ROOT / "protocol",
     "bota_clients": ROOT / "clients",
-    "bridge": ROOT / "ros2_bridge",
-    "ft_compensation": ROOT / "ros2_bridge",
+    **dict.fromkeys(("bota_ethercat_bridge", "bridge", "ft_compensation"), ROOT / "ros2_bridge"),
 }
 S: Final = "ethercat_server"
+B: Final = "bota_ethercat_bridge"
+ROS: Final = {
+    "rclpy", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", "diagnostic_msgs", "rcl_interfaces",
+    "tf2_ros", "bota_ethercat_msgs",
+}  # fmt: skip
 
 PROTOCOL: Final = {
     "bota_ethercat",
@@ -62,24 +66,26 @@ ROOMS: Final[dict[str, set[str]]] = {
     f"{S}.tool": ACCESS | {f"{S}.daemon", f"{S}.tool"},
     f"{S}.doctor": ACCESS | {f"{S}.daemon", f"{S}.doctor"},
     # ROS 2.
-    "ft_compensation": {"ft_compensation"} | PROTOCOL,
-    "bridge": {"bridge", "ft_compensation", "bota_ethercat.client"} | PROTOCOL,
+    f"{B}.ft_compensation": {f"{B}.ft_compensation"} | PROTOCOL,
+    B: {B, f"{B}.ft_compensation", "bota_ethercat.client"} | PROTOCOL,
+    "bridge": {"bota_ethercat.renamed"},  # the old names
+    "ft_compensation": {"bota_ethercat.renamed"},
     # Programs that are ordinary clients of the server.
     "bota_clients": {"bota_clients"} | PROTOCOL,
     "bota_clients.recording": CLIENTS,
-    "bota_clients.export": CLIENTS | {"bota_clients.export", "bota_clients.identify", "ft_compensation"},
+    "bota_clients.export": CLIENTS | {"bota_clients.export", "bota_clients.identify", f"{B}.ft_compensation"},
     "bota_clients.record": CLIENTS | {"bota_clients.record"},
     "bota_clients.report": CLIENTS | {"bota_clients.report", "bota_clients.record"},
     "bota_clients.monitor": CLIENTS | {"bota_clients.monitor", "bota_clients.record"},
     "bota_clients.replay": CLIENTS | {"bota_clients.replay", f"{S}.serving", S},
-    "bota_clients.identify": CLIENTS | {"bota_clients.identify", "ft_compensation"},
+    "bota_clients.identify": CLIENTS | {"bota_clients.identify", f"{B}.ft_compensation"},
 }
 """A room, and the rooms it may import. A room without a line of its own belongs to the one above it."""
 
 PACKAGES: Final[dict[str, set[str]]] = {
     "pysoem": {f"{S}.ethercat.soem"},
     "pyroute2": {S},
-    "numpy": {"ft_compensation", "bridge", "bota_clients"},
+    "numpy": {B, "bota_clients"},
     "matplotlib": {"bota_clients.report"},
     "mcap": {"bota_clients.recording"},
     "zstandard": {"bota_clients.recording"},
@@ -91,26 +97,20 @@ PACKAGES: Final[dict[str, set[str]]] = {
     "zarr": {"bota_clients.export"},
     "rosbags": {"bota_clients.export"},
     "yaml": {"bota_clients.export", "bota_clients.identify"},
-} | {
-    ros: {"bridge"}
-    for ros in (
-        "rclpy", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", "diagnostic_msgs", "rcl_interfaces",
-        "tf2_ros", "bota_ethercat_msgs",
-    )
-}  # fmt: skip
+} | {package: {B} for package in ROS}
 """Everything that is not the standard library, and which modules may load it."""
 
 WITHOUT_ROS: Final = (
-    "bridge.stream", "bridge.client", "bridge.process", "bridge.parameters.table",
+    f"{B}.stream", f"{B}.client", f"{B}.process", f"{B}.parameters.table",
 )  # fmt: skip
-"""What can run, and be tested, where there is no ROS; `bridge.client` loads it later."""
+"""What can run, and be tested, where there is no ROS; `client` loads it later."""
 SOCKETS: Final = {"socket", "socketserver", "select", "selectors", "asyncio", "ssl"}
 THREADS: Final = {"threading", "_thread", "multiprocessing", "concurrent", "subprocess", "queue"}
 
 
 def modules() -> Iterator[tuple[str, Path]]:
     """Every module of the product: its dotted name and its file."""
-    for package in ("bota_ethercat", S, "bridge", "ft_compensation", "bota_clients"):
+    for package in ("bota_ethercat", S, B, "bridge", "ft_compensation", "bota_clients"):
         root = ROOTS.get(package, ROOT)
         for path in sorted((root / package).rglob("*.py")):
             if "ros2_control" in path.parts:  # a ROS package in C++; this is its launch file
@@ -172,7 +172,8 @@ def may_import(module: str, imported: str) -> bool:
         return not {room(imported), imported}.isdisjoint(ROOMS[room(module)])
     package = imported.split(".", maxsplit=1)[0]
     return package in sys.stdlib_module_names or any(
-        is_below(module, position) for position in PACKAGES.get(package, ())
+        room(module) == B if package in ROS else is_below(module, position)
+        for position in PACKAGES.get(package, ())
     )
 
 
@@ -239,5 +240,5 @@ def reached(module: str) -> set[str]:
 def test_what_needs_no_ros_loads_none(part: str) -> None:
     for name in MODULES:
         if is_below(name, part):
-            ros = {found for found in reached(name) if PACKAGES.get(found.split(".")[0]) == {"bridge"}}
+            ros = {found for found in reached(name) if found.split(".")[0] in ROS}
             assert not ros, name

@@ -17,8 +17,9 @@ import pytest
 
 from scripts.benchmarks import modes, statistics
 from scripts.benchmarks import program as benchmark
-from scripts.benchmarks.chain import ScriptError, Turn, clocks_steady
+from scripts.benchmarks.chain import Turn, clocks_steady
 from scripts.benchmarks.records import ArrivalRecorder, began, deadlines
+from scripts.chain import ScriptError
 from tests.server.running import needs_bus
 
 ROOT = Path(__file__).parent.parent

@@ -17,7 +17,7 @@ from typing import Any, Final
 import pytest
 
 from bota_ethercat.program.version import VERSION
-from scripts import ros_packages
+from scripts import completions, ros_packages
 from tests.ros_package.package_files import PACKAGES, ROOT, commands, shared_files
 from tests.server.running import free_port, needs_bus
 
@@ -124,6 +124,8 @@ def test_the_same_commit_gives_the_same_bytes(release: Path, tmp_path: Path) -> 
     wheel, source = "-py3-none-any.whl", ".tar.gz"
     names = {f"bota_ethercat{part}{kind}" for part in ("", "_bridge") for kind in (wheel, source)}
     assert kinds == names | {"bota_ethercat_bridge.cdx.json"}
+    whole, part = (set(zipfile.ZipFile(path).namelist()) for path in sorted(release.glob("*.whl")))
+    assert not whole & part  # of bota_ethercat_bridge each has some
     bill = json.loads((release / "bota_ethercat_bridge-0.1.0.cdx.json").read_text())
     assert {"bota-ethercat", "pysoem", "pyroute2"} <= {each["name"] for each in bill["components"]}
 
@@ -177,6 +179,18 @@ def test_each_distribution_in_an_environment_of_its_own(release: Path, version: 
         server.terminate()
         server.stderr.read()
     assert (server.returncode, read.returncode) == (0, 0), read.stderr
+
+
+@pytest.mark.long
+def test_each_wheel_has_what_shells_complete_and_man_shows_of_its_programs(release: Path) -> None:
+    whole, part = (set(project(path)["scripts"]) for path in ("pyproject.toml", "clients/pyproject.toml"))
+    for wheel, programs in (("bota_ethercat-", part), ("bota_ethercat_bridge-", whole - part)):
+        (path,) = release.glob(f"{wheel}*.whl")
+        with zipfile.ZipFile(path) as archive:
+            names = {name.partition(".data/data/share/")[2] for name in archive.namelist()}
+        for place in completions.PLACES.values():
+            wanted = {place.format(name) for name in programs if not name.startswith(completions.OF_ROS)}
+            assert {name for name in names if Path(name).parent == Path(place).parent} == wanted
 
 
 @pytest.mark.long

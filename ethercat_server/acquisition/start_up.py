@@ -19,6 +19,7 @@ from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import Steps
 from ethercat_server.ethercat.slave.coe import Sdo
+from ethercat_server.sensor import models
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects import dictionary
 from ethercat_server.sensor.scan import Slave, look_safely
@@ -132,7 +133,7 @@ def _find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> 
         )
     if not of_sensors:
         raise BusError(
-            f"no Bota Gen-0 sensor (vendor 0x{dictionary.VENDOR_ID:08X}, product {dictionary.PRODUCT_CODE}) "
+            f"no Bota Gen-0 sensor (vendor 0x{models.VENDOR_ID:08X}, product {models.PRODUCT_CODE}) "
             f"is on {bus.ifname}, only {', '.join(map(str, others))}: check the sensor's cable and power, "
             "and that this is the interface it is connected to"
         )
@@ -241,7 +242,7 @@ def _find(bus: Bus, number: int, slave: Slave, wanted: Wanted, check_interrupt: 
     if not is_known_model(identity.name):
         raise BusError(
             f"sensor {number} on {bus.ifname} is a {identity.name!r}, a model this server does not know: "
-            f"it knows the Gen-0 models {', '.join(dictionary.MODELS)}"
+            f"it knows the Gen-0 models {', '.join(models.MODELS)}"
         )
     who = (number, identity.name, identity.serial)
     asked = frozenset(wanted.asked_settings(*who))

@@ -45,8 +45,7 @@ from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.sensor import scan
-from ethercat_server.sensor.objects import dictionary
+from ethercat_server.sensor import models, scan
 from ethercat_server.sensor.sensor import is_known_model
 
 MOST_PORTS: Final = 4
@@ -134,7 +133,7 @@ def identity(slave: ExaminedSlave) -> CheckResult:
         whose = f"vendor 0x{sii['vendor']:08X}, product 0x{sii['product']:08X}"
         return ok(f"{text}, {whose}: not a Bota Gen-0 sensor, the server leaves it alone", **values)
     if not is_known_model(sii["name"]):
-        supported = ", ".join(dictionary.MODELS)
+        supported = ", ".join(models.MODELS)
         return bad(text, f"not supported by the server, which supports {supported}", **values)
     return ok(f"{text}, supported", **values)
 
@@ -437,7 +436,10 @@ def examine_bus(
         text = f"{holder} uses it as an EtherCAT master and serves no port"
         found = bad(text, "two masters disturb each other: stop it", f"sudo kill {holder.pid}")
     elif holder is not None:
-        found = skipped("an EtherCAT master of another user has it: run with sudo to see which")
+        found = skipped(
+            "an EtherCAT master of another user, or outside of this container, has it: "
+            "run with sudo, or on the host, to see which"
+        )
     elif isinstance(unknown := machine.facts.get("link"), CannotLookError):
         found = skipped(str(unknown))
     if found is None:

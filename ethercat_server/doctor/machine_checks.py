@@ -366,7 +366,7 @@ def _receivers(machine: Host) -> Iterator[CheckResult]:
         yield (warning if only_this else note)(
             f"process {process.pid} ({process.name})"
             if process
-            else "a process of another user, or container",
+            else "a process of another user, or outside of this container",
             "it has a packet socket that gets a copy of each frame: a capture program, or another master",
             f"sudo kill {process.pid}" if process else "sudo ss --packet --processes",
         )

@@ -73,7 +73,7 @@ class Unreadable(NamedTuple):
     reason: str
 
 
-class Subscription:
+class DataSubscription:
     """Which DATA a client wants. Lists are by the sensor's number; the terminals follow."""
 
     def __init__(self, wanted: Sequence[bool], every: int, fresh_only: bool) -> None:
@@ -239,7 +239,7 @@ class Connection:
         self.state = ConnectionState.READING
         self.framed: FrameDecoder | None = None
         self.bare: BareJsonDecoder | None = None
-        self.subscription: Subscription | None = None
+        self.subscription: DataSubscription | None = None
         self._watched = watched
         self._watched.readers.add(self.fd)
         self.outbox = Outbox(stream, monotonic_ns, self._watched.writers)
@@ -426,7 +426,7 @@ class Connection:
                 wants.gap[number] = True
 
 
-def _choose(wants: Subscription, frame: bytes, number: int, flags: int, now_ns: int) -> bytes | None:
+def _choose(wants: DataSubscription, frame: bytes, number: int, flags: int, now_ns: int) -> bytes | None:
     """What a subscription gets of a DATA frame that is not like most."""
     if not wants.wanted[number]:
         return None

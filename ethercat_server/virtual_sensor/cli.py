@@ -16,29 +16,30 @@ from bota_ethercat.program.real_time import make_real_time
 from bota_ethercat.program.signals import signals_call
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic import look_up
-from ethercat_server.process.realtime import DEFAULT_PRIORITY
-from ethercat_server.sensor.objects.dictionary import MODELS
-from ethercat_server.virtual_sensor import control
-from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_clock
-from ethercat_server.virtual_sensor.faults import COMMANDS, PPM_LIMIT
-from ethercat_server.virtual_sensor.foreign import KINDS, MOST_SLAVES, SENSOR, parse_chain, slaves_in
+from ethercat_server.sensor.models import MODELS
+from ethercat_server.virtual_sensor.commands import CLOCK_WORDS, COMMANDS, PPM_LIMIT, parse_clock
 from ethercat_server.virtual_sensor.options import (
+    FAULT,
+    KINDS,
+    LOST,
+    MOST_SLAVES,
+    SENSOR,
     ForeignOptions,
     SensorOptions,
     SlaveOptions,
     UsageError,
     model_name,
+    parse_chain,
+    slaves_in,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
-from ethercat_server.virtual_sensor.world import FAULT, LOST, ExternalWorld
 
 _PROGRAM: Final = "ethercat-virtual-sensor"
 _SERIAL_NUMBERS: Final = 100  # for each bus: more than it has slaves
 
 
 def _clock(text: str) -> str:
-    parse_clock(text)
+    list(parse_clock(text))
     return text
 
 
@@ -46,12 +47,12 @@ def _each(parse: Callable[[str], Any]) -> Callable[[str], list[Any]]:
     return lambda text: [parse(word) for word in text.split(",") if word]
 
 
-_SEVERAL: Final = "; several, comma separated or repeated, for a chain"
+_SEVERAL: Final = "; for several sensors comma separated or repeated"
 _ALONG_THE_CHAIN: Final[tuple[tuple[str, str, Callable[[str], Any], str], ...]] = (
-    ("model", "NAME", model_name, f"default {MODELS[0]}"),
-    ("serial", "N", whole(0, 2**32 - 1), "default: by the interface's MAC address"),
-    ("ppm", "X", number(-PPM_LIMIT, PPM_LIMIT), "clock error"),
-    ("dc", "WORD[=VALUE][+...]", _clock, "distributed clock, see below"),
+    ("model", "NAME", model_name, f"model (default {MODELS[0]})"),
+    ("serial", "N", whole(0, 2**32 - 1), "serial number (default: derived from the interface's MAC address)"),
+    ("ppm", "X", number(-PPM_LIMIT, PPM_LIMIT), "error of the sensor's clock, positive if fast"),
+    ("dc", "WORD[=VALUE][+...]", _clock, "faults of the distributed clock, listed below"),
 )
 
 
@@ -61,21 +62,22 @@ def build_parser() -> argparse.ArgumentParser:
     words = "\n".join(f"  {w.usage:34} {w.meaning}" for w in CLOCK_WORDS)
     parser = Parser(
         _PROGRAM,
-        "Answer EtherCAT frames on a network interface as Bota force/torque sensors do, "
-        "and other slaves beside them.",
-        f"commands, by --send, or one per line on stdin:\n{commands}\n\n"
-        f"of a distributed clock, in --dc or as a command:\n{words}",
+        "Simulates a chain of Bota force/torque sensors, and of other slaves, on a network interface.",
+        f"commands, with --send or one per line on stdin (@N: of sensor N, by default 0):\n{commands}\n\n"
+        f"faults of the distributed clock, in --dc or after the command dc:\n{words}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("iface", metavar="IFACE", nargs="?", help="interface, one end of a veth pair")
+    parser.add_argument(
+        "iface", metavar="IFACE", nargs="?", help="one end of a veth pair, with the master at the other end"
+    )
     parser.add_argument(
         "--chain", metavar="SLAVES", type=parse_chain,
-        help=f"all slaves in wire order: {SENSOR}, {', '.join(KINDS)}; "
-        "KIND:STATE if another master has left one in this AL state",
+        help=f"all slaves in wire order, comma separated, of {SENSOR}, {', '.join(KINDS)}; "
+        "with :STATE one that another master has left in this AL state",
     )  # fmt: skip
     parser.add_argument(
         "--sensors", metavar="N", type=whole(1, MOST_SLAVES),
-        help="sensors on the bus (default: as many as named, or 1)",
+        help="number of sensors (default: as many as the options below name, at least 1)",
     )  # fmt: skip
     for name, metavar, parse, meaning in _ALONG_THE_CHAIN:
         parser.add_argument(
@@ -87,25 +89,39 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--sinc", metavar="N", type=sinc_length, help="SINC length after power-on (default 64)"
     )
-    parser.add_argument("--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data")
+    parser.add_argument(
+        "--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data (default 61)"
+    )
     parser.add_argument("--signal", choices=SIGNALS, default="scene", help="measured signal (default scene)")
-    parser.add_argument("--world", metavar="PATH", help="measure what datagrams to this Unix socket say")
-    parser.add_argument("--world-lost", choices=LOST, default=FAULT, help="when it stops (default fault)")
+    parser.add_argument("--world", metavar="PATH", help="measure what a simulation sends to this Unix socket")
+    parser.add_argument(
+        "--world-lost",
+        choices=LOST,
+        default=FAULT,
+        help="what is measured when it stops sending: its last values, zeros, or nothing new (default fault)",
+    )
     parser.add_argument(
         "--noise", choices=("on", "off", "none"), default="on",
-        help="off: scene, poses and world have but that of the converters' last bits, as constant and rest; "
-        "none: not even that, so where nothing changes no sample is new",
+        help="off: only that of the converters' last bit; none: none at all, and a sample that equals the "
+        "one before it is not new (default on)",
     )  # fmt: skip
     parser.add_argument(
-        "--control", metavar="PATH", help=f"Unix socket for commands (default {control.own_socket()})"
+        "--control", metavar="PATH",
+        help="Unix socket for commands (default: one of this user, in /run/user or the temporary directory)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--send",
+        metavar="COMMAND",
+        help="send a command to the virtual sensor that runs, print its answer and exit",
     )
-    parser.add_argument("--send", metavar="COMMAND", help="have the one that listens there obey, and end")
-    parser.add_argument("--exit-on-eof", action="store_true", help="end when stdin ends")
+    parser.add_argument("--exit-on-eof", action="store_true", help="exit when stdin ends")
     return parser
 
 
 def _number_of(ifname: str) -> int:
     """Of an interface: another has another, and it is the same after a restart."""
+    from ethercat_server.ethercat.nic import look_up  # noqa: PLC0415 - likewise
+
     try:
         return int.from_bytes(look_up(ifname).address[3:])
     except InterfaceError:  # said when it is to be opened
@@ -124,6 +140,8 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
         count = max(named, 1)
     if named > count:
         raise UsageError(f"{named} sensors are named but there are to be {count}: name no more than that")
+
+    from ethercat_server.virtual_sensor.world import ExternalWorld  # noqa: PLC0415 - --help need not wait for it
 
     def of(given: list[Any], position: int, default: Any) -> Any:
         """The last one applies to the rest."""
@@ -151,6 +169,8 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
 
 def _get_priority() -> None:
     """That of SCHED_FIFO above a master's: real sensors do not wait for a CPU."""
+    from ethercat_server.process.realtime import DEFAULT_PRIORITY  # noqa: PLC0415 - likewise
+
     if refused := make_real_time(DEFAULT_PRIORITY + 1).refused:
         _say(f"not granted: {', '.join(refused)}; samples may come late")
 
@@ -167,7 +187,7 @@ def main(
     parser = build_parser()
     args = parser.parse_args(argv)
     if args.send is not None:
-        return _send(args.control or control.own_socket(), args.send)
+        return _send(args.control, args.send)
     if args.iface is None:
         parser.error("name an interface, or a command with --send")
     try:
@@ -209,8 +229,11 @@ def _say(sentence: object) -> None:
     print(f"{_PROGRAM}: {sentence}", file=sys.stderr)
 
 
-def _send(path: str, command: str) -> int:
+def _send(path: str | None, command: str) -> int:
     """Exit code 0 if the virtual sensor that listens there has obeyed."""
+    from ethercat_server.virtual_sensor import control  # noqa: PLC0415 - likewise
+
+    path = path or control.own_socket()
     try:
         answer = control.send(path, command)
     except OSError as error:

@@ -15,6 +15,7 @@ from bota_ethercat.settings import SettingValue, sampling_rate_hz
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.coe import AbortCode
 from ethercat_server.ethercat.slave.sii import MailboxProtocol
+from ethercat_server.sensor import models
 from ethercat_server.sensor.objects import dictionary as table
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
 from ethercat_server.virtual_sensor.mailbox import Address, ObjectTable, TransferRefusedError
@@ -70,7 +71,7 @@ def sensor_device(model: str, serial: int, pdo_size: int) -> Device:
     output = table.BY_ADDRESS[0x7000, 0]
     inputs = tuple(table.BY_ADDRESS[INPUT_OBJECT, field.subindex] for field in LAYOUTS[pdo_size].fields)
     return Device(
-        model, "Force/torque sensors", table.VENDOR_ID, table.PRODUCT_CODE, table.REVISION, serial,
+        model, "Force/torque sensors", models.VENDOR_ID, models.PRODUCT_CODE, models.REVISION, serial,
         (Pdo(0x1600, "Outputs", (output,)),),
         (Pdo(0x1A00, "Inputs", inputs),),
         MailboxProtocol.CoE | MailboxProtocol.FoE,

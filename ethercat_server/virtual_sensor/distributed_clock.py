@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Any, Final
 
-from bota_ethercat.program.arguments import number
 from ethercat_server.ethercat.slave import registers as reg
-from ethercat_server.virtual_sensor.options import Fault, UsageError
 
 RATE_SCALE: Final = 10**12  # rates are in parts of this
 HOP_NS: Final = 700  # from slave to slave, cable included
@@ -143,37 +141,19 @@ class DcUnit:
         self.events.update(now)
         return now
 
-
-CLOCK_WORDS: Final = (
-    Fault("ok", "nothing is wrong; rate and time stay", lambda c, _: c.events.repair()),
-    Fault("none", "no DC: no feature bit, registers read zero", lambda c, _: c.remove()),
-    Fault("32-bit", "system and local time have 32 bits", lambda c, _: c.narrow()),
-    Fault("no-events", "no 0x09FC: it reads zero", lambda c, _: c.events.remove()),
-    Fault("stuck", "0x09FC stands still", lambda c, _: setattr(c.events, "stuck", True)),
-    Fault("late US", "0x09FC is too late by this, too early if negative",
-            lambda c, _, us: setattr(c.events, "shift", round(us * 1000)), (number(-1e6, 1e6),)),
-    Fault("at NS", "the local clock jumps to this time",
-            lambda c, now, ns: c.local.set(now, round(ns)), (number(0, 2.0**62),)),
-    Fault("ppm X", "rate of the local clock, without a jump of the time",
-            lambda c, now, ppm: c.local.set_ppm(now, ppm), (number(-100_000, 100_000),)),
-)  # fmt: skip
-_FROM_POWER_ON: Final = ("none", "32-bit")  # which cannot come about while the controller runs
+    def apply(self, word: str, numbers: Sequence[float]) -> None:
+        """Do what a word of `commands.CLOCK_WORDS` says."""
+        EFFECTS[word](self, self.settle(), *numbers)
 
 
-def parse_word(name: str, values: Sequence[str], *, running: bool) -> Callable[[DcUnit], None]:
-    """What one word does to a clock, one that is `running`; UsageError if it is wrong."""
-    known = {word.name: word for word in CLOCK_WORDS if not (running and word.name in _FROM_POWER_ON)}
-    word = known.get(name.lower())
-    if word is None:
-        raise UsageError(f"no {name[:40]!r} of a distributed clock: available: {', '.join(known)}")
-    numbers = word.parse(values)
-    return lambda clock: word.run(clock, clock.settle(), *numbers)
-
-
-def parse_clock(text: str) -> list[Callable[[DcUnit], None]]:
-    """What an option such as `32-bit+late=50` does to a clock at power-on, in this order."""
-    parsed = []
-    for item in text.split("+") if text else ():
-        name, _, values = item.partition("=")
-        parsed.append(parse_word(name, values.split("/") if values else [], running=False))
-    return parsed
+# By the names of `commands.CLOCK_WORDS`: the clock, the time, numbers.
+EFFECTS: Final[dict[str, Callable[..., Any]]] = {
+    "ok": lambda c, _: c.events.repair(),
+    "none": lambda c, _: c.remove(),
+    "32-bit": lambda c, _: c.narrow(),
+    "no-events": lambda c, _: c.events.remove(),
+    "stuck": lambda c, _: setattr(c.events, "stuck", True),
+    "late": lambda c, _, us: setattr(c.events, "shift", round(us * 1000)),
+    "at": lambda c, now, ns: c.local.set(now, round(ns)),
+    "ppm": lambda c, now, ppm: c.local.set_ppm(now, ppm),
+}

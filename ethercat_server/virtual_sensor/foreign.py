@@ -1,4 +1,4 @@
-"""Slaves of other vendors on the virtual bus, and chains as other masters leave them.
+"""Slaves of other vendors on the virtual bus, also as other masters leave them.
 
 Vendor, product code and process data of the Beckhoff slaves are public; the drive is nobody's. It has the
 objects of the CiA 402 drive profile (IEC 61800-7-201) that say whether its motor turns.
@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 from typing import Any, Final
 
 from ethercat_server.ethercat.slave import registers as reg
@@ -20,7 +19,13 @@ from ethercat_server.sensor.objects.dictionary import Access, ObjectEntry, Objec
 from ethercat_server.virtual_sensor.application import Application, VirtualSlave
 from ethercat_server.virtual_sensor.device import Device, Pdo, entries_of
 from ethercat_server.virtual_sensor.mailbox import ObjectTable
-from ethercat_server.virtual_sensor.options import ForeignOptions, SensorOptions, SlaveOptions, UsageError
+from ethercat_server.virtual_sensor.options import (
+    ANALOG_INPUTS,
+    COUPLER,
+    DIGITAL_INPUTS,
+    DRIVE,
+    ForeignOptions,
+)
 
 _RO, _RW = Access.RO, Access.RW
 _CONTROLWORD = ObjectEntry(0x6040, 0, "Controlword", ObjectType.U16, _RW)
@@ -42,25 +47,25 @@ def _channel(number: int, value: int) -> Pdo:
 
 
 _DRIVE: Final = Device(
-    "DRIVE", "Servo drives", 0x7E57, 402, 1, 0,
+    DRIVE, "Servo drives", 0x7E57, 402, 1, 0,
     (Pdo(0x1600, "Outputs", (_CONTROLWORD, _VELOCITY)),),
     (Pdo(0x1A00, "Inputs", (_STATUSWORD,)),),
     MailboxProtocol.CoE, watchdog=True, device_type=0x00020192,
 )  # fmt: skip
 _DEVICES: Final = (
-    Device("EK1100", "System couplers", 2, 0x044C2C52, 0x00110000, bus_current_ma=-2000),
+    Device(COUPLER, "System couplers", 2, 0x044C2C52, 0x00110000, bus_current_ma=-2000),
     Device(
-        "EL3102", "Analog input terminals", 2, 0x0C1E3052, 0x00100000, 0,
+        ANALOG_INPUTS, "Analog input terminals", 2, 0x0C1E3052, 0x00100000, 0,
         (), (_channel(1, 0x4000), _channel(2, -0x2000)),  # 5 V and -2.5 V, of 10 V
         MailboxProtocol.CoE, device_type=0x00001389, bus_current_ma=130,
     ),
     Device(
-        "EL1008", "Digital input terminals", 2, 0x03F03052, 0x00120000,
+        DIGITAL_INPUTS, "Digital input terminals", 2, 0x03F03052, 0x00120000,
         inputs=tuple(map(_bit, range(8))), bus_current_ma=90,
     ),
     _DRIVE,
 )  # fmt: skip
-KINDS: Final = {device.name: device for device in _DEVICES}  # by the name in `--chain`
+_BY_KIND: Final = {device.name: device for device in _DEVICES}
 
 
 _ENABLE: Final = 0x000F  # controlword in normal operation
@@ -110,7 +115,7 @@ class InputTerminal(Application):
 
     def inputs(self) -> bytes:
         ms = self.clock() // 1_000_000
-        if self.device.name == "EL1008":
+        if self.device.name == DIGITAL_INPUTS:
             return bytes([ms // 100 & 0xFF])
         sines = (round(0x4000 * math.sin(math.tau * ms * hz / 1000)) for hz in (1, 2))
         return b"".join(struct.pack("<Bh", 0, sine) for sine in sines)
@@ -134,7 +139,7 @@ class ForeignSlave(VirtualSlave):
         self.power(True)
 
     def _switched_on(self) -> Application:
-        device = KINDS[self.options.kind]
+        device = _BY_KIND[self.options.kind]
         kind = Drive if device is _DRIVE else InputTerminal if device.inputs else Application
         life = kind(device, self._clock, _objects_of(device))
         life.esc.record = self._remember
@@ -184,42 +189,3 @@ def leave_in(life: Application, state: AlState, station: int, outputs_at: int, i
         if step <= state:
             write(reg.AL_CONTROL, step.request())
     assert life.state is state
-
-
-SENSOR: Final = "BOTA"
-MOST_SLAVES: Final = 16
-_STATES: Final = ("INIT", "PREOP", "SAFEOP", "OP")
-
-
-def parse_chain(text: str) -> list[tuple[str, AlState]]:
-    """Kind and initial AL state of each slave, such as `EK1100,BOTA,DRIVE:OP`, in wire order.
-
-    UsageError if one is unknown.
-    """
-    found = []
-    for word in text.split(","):
-        kind, _, state = word.strip().upper().partition(":")
-        if kind != SENSOR and kind not in KINDS:
-            raise UsageError(f"no slave {word[:40]!r}: available: {', '.join((SENSOR, *KINDS))}")
-        if state and state not in _STATES:
-            raise UsageError(f"no AL state in {word[:40]!r}: available: {', '.join(_STATES)}")
-        found.append((kind, AlState[state or "INIT"]))
-    if len(found) > MOST_SLAVES:
-        raise UsageError(f"{len(found)} slaves in the chain: at most {MOST_SLAVES}")
-    return found
-
-
-def slaves_in(
-    chain: Iterable[tuple[str, AlState]], sensors: Sequence[SensorOptions] = ()
-) -> tuple[SlaveOptions, ...]:
-    """The options of the slaves in a parsed chain; `sensors` are its sensors, the default ones if too few."""
-    slaves: list[SlaveOptions] = []
-    given, number = iter(sensors), 0
-    for kind, state in chain:
-        if kind == SENSOR:
-            number += 1
-            sensor = next(given, SensorOptions(serial=number))
-            slaves.append(replace(sensor, state=state))
-        else:
-            slaves.append(ForeignOptions(kind, state))
-    return tuple(slaves)

@@ -1,17 +1,21 @@
-"""Options of a simulated sensor and of a foreign slave; the numbers in options and commands."""
+"""Options of a simulated sensor and of a foreign slave, and of a chain of them."""
 
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
 
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.sensor.objects.dictionary import MODELS
-from ethercat_server.virtual_sensor.world import World
+from ethercat_server.sensor.models import MODELS
+from ethercat_server.virtual_sensor.signals import World
 
+HOLD, ZERO, FAULT = LOST = ("hold", "zero", "fault")  # what a world that has stopped is taken for
+COUPLER, ANALOG_INPUTS, DIGITAL_INPUTS, DRIVE = KINDS = ("EK1100", "EL3102", "EL1008", "DRIVE")
+SENSOR: Final = "BOTA"  # in a chain with these
+MOST_SLAVES: Final = 16
+_STATES: Final = ("INIT", "PREOP", "SAFEOP", "OP")
 EEPROM_MS: Final = 2.0  # about what a real EEPROM needs for the eight bytes of a read command
 
 
@@ -29,7 +33,7 @@ class SensorOptions:
     sinc_length: int | None = None  # None: the value in flash, by default 64
     chop_divides: int = 1  # by what CHOP divides its sampling rate
     ppm: float = 0.0  # error of its clock: positive is fast
-    dc: str = ""  # its distributed clock, in `distributed_clock.CLOCK_WORDS`: `32-bit+ppm=20+late=50`
+    dc: str = ""  # its distributed clock, in `commands.CLOCK_WORDS`: `32-bit+ppm=20+late=50`
     signal: str = "scene"
     world: World | None = None  # instead of the signal
     noise: bool = True  # of a healthy sensor, in scenes and worlds
@@ -43,7 +47,7 @@ class SensorOptions:
 class ForeignOptions:
     """One slave of another vendor."""
 
-    kind: str  # one of `foreign.KINDS`
+    kind: str  # one of `KINDS`
     state: AlState = AlState.INIT  # in which another master has left it; a drive in OP turns
 
 
@@ -57,27 +61,35 @@ def model_name(text: str) -> str:
     return text
 
 
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """A fault command, or a word of a distributed clock: `run` takes what it is for, and the arguments.
+def parse_chain(text: str) -> list[tuple[str, AlState]]:
+    """Kind and initial AL state of each slave, such as `EK1100,BOTA,DRIVE:OP`, in wire order.
 
-    Each is parsed by one of `arguments`. Those in brackets in `usage` can be left out; the last one may be
-    repeated where there are dots.
+    UsageError if one is unknown.
     """
+    found = []
+    for word in text.split(","):
+        kind, _, state = word.strip().upper().partition(":")
+        if kind != SENSOR and kind not in KINDS:
+            raise UsageError(f"no slave {word[:40]!r}: available: {', '.join((SENSOR, *KINDS))}")
+        if state and state not in _STATES:
+            raise UsageError(f"no AL state in {word[:40]!r}: available: {', '.join(_STATES)}")
+        found.append((kind, AlState[state or "INIT"]))
+    if len(found) > MOST_SLAVES:
+        raise UsageError(f"{len(found)} slaves in the chain: at most {MOST_SLAVES}")
+    return found
 
-    usage: str
-    meaning: str
-    run: Callable[..., Any]
-    arguments: tuple[Callable[[str], Any], ...] = ()
 
-    @property
-    def name(self) -> str:
-        return self.usage.split()[0]
-
-    def parse(self, words: Sequence[str]) -> list[Any]:
-        least = len(self.arguments) - self.usage.replace("[@N]", "").count("[")
-        most = math.inf if "..." in self.usage else len(self.arguments)
-        if not least <= len(words) <= most:
-            raise UsageError(f"wrong number of arguments: {self.usage}")
-        parsers = (*self.arguments, *self.arguments[-1:] * len(words))
-        return [parse(word) for parse, word in zip(parsers, words, strict=False)]
+def slaves_in(
+    chain: Iterable[tuple[str, AlState]], sensors: Sequence[SensorOptions] = ()
+) -> tuple[SlaveOptions, ...]:
+    """The options of the slaves in a parsed chain; `sensors` are its sensors, the default ones if too few."""
+    slaves: list[SlaveOptions] = []
+    given, number = iter(sensors), 0
+    for kind, state in chain:
+        if kind == SENSOR:
+            number += 1
+            sensor = next(given, SensorOptions(serial=number))
+            slaves.append(replace(sensor, state=state))
+        else:
+            slaves.append(ForeignOptions(kind, state))
+    return tuple(slaves)

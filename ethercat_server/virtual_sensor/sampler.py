@@ -15,7 +15,14 @@ from bota_ethercat.sensor.warnings_register import WarningFlag
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.options import SensorOptions
-from ethercat_server.virtual_sensor.signals import FORMULAS, SCENES, Formula, Measurement, measurement_of
+from ethercat_server.virtual_sensor.signals import (
+    CHANNELS,
+    FORMULAS,
+    SCENES,
+    Formula,
+    PhysicalSample,
+    physical_sample,
+)
 from ethercat_server.virtual_sensor.world import ExternalWorld, Measured
 
 _PPM_SCALE = 10**12  # ppm in steps of one millionth
@@ -54,17 +61,12 @@ class SamplingClock:
         self._set(self.sinc_length if sinc_length is None else sinc_length, self.ppm if ppm is None else ppm)
 
 
-# As the fields of the process data are named, in their order.
-CHANNELS: Final[tuple[str, ...]] = tuple(
-    f"{vector}.{axis}" for vector in ("force", "torque", "acceleration", "angular_rate") for axis in "xyz"
-)
 # Channels that are saturated, as bits, and the warning of each of the three saturation fields.
 _SATURATION: Final = (
     (0o0077, WarningFlag.FORCE_TORQUE_SATURATED),
     (0o0700, WarningFlag.ACCELERATION_SATURATED),
     (0o7000, WarningFlag.ANGULAR_RATE_SATURATED),
 )
-MOST_SKIPPED: Final = 90.0  # %
 _SKIP_STEPS: Final = 1 << 32
 
 
@@ -175,16 +177,16 @@ class Sampler:
         warnings = self._warnings if number < self._warnings_until else 0
         return self._pack(reading, warnings, saturated)
 
-    def _with_last_bit(self, reading: Measurement, number: int) -> Measurement:
+    def _with_last_bit(self, reading: PhysicalSample, number: int) -> PhysicalSample:
         """The reading of sample `number` with up to the last bit of each converter added or subtracted."""
         values = [*reading.force_torque, *reading.acceleration, *reading.angular_rate]
         chance = _scattered(number, self._seed)
         for position, bit in enumerate(_LAST_BITS):
             values[position] += bit * ((chance % _STEPS + 0.5) / _STEPS * 2 - 1)
             chance //= _STEPS
-        return measurement_of(values, reading.temperature, reading.orientation)
+        return physical_sample(values, reading.temperature, reading.orientation)
 
-    def _disturb(self, reading: Measurement) -> tuple[Measurement, int]:
+    def _disturb(self, reading: PhysicalSample) -> tuple[PhysicalSample, int]:
         """The reading with every fault in it, and which channels are saturated, as bits."""
         if not (self.noise or self.limits or self.frozen):
             return reading, 0
@@ -198,9 +200,9 @@ class Sampler:
                 bits |= 1 << position
         for position, kept in self.frozen.items():
             self.frozen[position] = values[position] = values[position] if kept is None else kept
-        return measurement_of(values, reading.temperature, reading.orientation), bits
+        return physical_sample(values, reading.temperature, reading.orientation), bits
 
-    def _pack(self, reading: Measurement, warnings: int, saturated: int) -> bytes:
+    def _pack(self, reading: PhysicalSample, warnings: int, saturated: int) -> bytes:
         """Process data of one sample, as the settings have it.
 
         Offsets are added; values beyond the range are clipped and set the saturation fields and warnings; the

@@ -15,8 +15,14 @@ from typing import Final, NamedTuple
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.world import Felt
 
+# As the fields of the process data are named, in their order.
+CHANNELS: Final[tuple[str, ...]] = tuple(
+    f"{vector}.{axis}" for vector in ("force", "torque", "acceleration", "angular_rate") for axis in "xyz"
+)
+World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MONOTONIC if it is external
 
-class Measurement(NamedTuple):
+
+class PhysicalSample(NamedTuple):
     """One sample before settings act on it, in the units of the process data."""
 
     force_torque: tuple[float, ...]  # N, Nm
@@ -26,11 +32,13 @@ class Measurement(NamedTuple):
     orientation: tuple[float, ...]  # x, y, z, w: turns vectors of the sensor's frame into the world's
 
 
-def measurement_of(
+def physical_sample(
     values: Sequence[float], temperature: float, orientation: tuple[float, ...]
-) -> Measurement:
+) -> PhysicalSample:
     """A reading from force, torque, acceleration and angular rate one after another."""
-    return Measurement(tuple(values[:6]), tuple(values[6:9]), tuple(values[9:12]), temperature, orientation)
+    return PhysicalSample(
+        tuple(values[:6]), tuple(values[6:9]), tuple(values[9:12]), temperature, orientation
+    )
 
 
 CONSTANT: Final = (1.5, -2.25, -9.75, 0.125, -0.0625, 0.03125)  # exact in REAL32
@@ -44,9 +52,9 @@ class Formula:
     temperature: Callable[[int], float] = lambda _: 35.0
     is_exact: bool = False  # noise would make its numbers unreadable
 
-    def reading(self, number: int, instant: int, seconds: float) -> Measurement:  # noqa: ARG002
+    def reading(self, number: int, instant: int, seconds: float) -> PhysicalSample:  # noqa: ARG002
         load, temperature = tuple(self.load(number, instant)), self.temperature(number)
-        return Measurement(load, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), temperature, (0.0, 0.0, 0.0, 1.0))
+        return PhysicalSample(load, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), temperature, (0.0, 0.0, 0.0, 1.0))
 
 
 def _clock(number: int, instant: int) -> Iterable[float]:

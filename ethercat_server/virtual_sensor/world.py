@@ -16,11 +16,9 @@ from bota_ethercat.sensor.filters import ACCELERATION_FILTERS, ANGULAR_RATE_FILT
 from bota_ethercat.sensor.response import FIR_TAPS, fir_taps, healthy_noise
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
 from bota_ethercat.world import REST, Felt
-from ethercat_server.virtual_sensor.signals import Measurement, measurement_of, quaternion
+from ethercat_server.virtual_sensor.options import FAULT, ZERO
+from ethercat_server.virtual_sensor.signals import PhysicalSample, World, physical_sample, quaternion
 
-World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MONOTONIC if it is external
-
-_HOLD, ZERO, FAULT = LOST = ("hold", "zero", "fault")  # what a world that has stopped is taken for
 LOST_AFTER_S: Final = 0.1  # also by how much a time stamp may differ from the time
 _REMEMBERED: Final = 4096  # moments, of which the filters look at the last second at most
 
@@ -139,7 +137,7 @@ class Measured:
     def _load_noise(self) -> list[float]:
         return [self._gauss(0.0, deviation) if self._noise else 0.0 for deviation in self.deviations]
 
-    def reading(self, number: int, instant: int, seconds: float) -> Measurement:  # noqa: ARG002
+    def reading(self, number: int, instant: int, seconds: float) -> PhysicalSample:  # noqa: ARG002
         world = self._world
         felt = world(seconds)
         load = self._load_filter.at(number, seconds)
@@ -151,4 +149,4 @@ class Measured:
                 values[axis] += self._gauss(0.0, _ACCELERATION_NOISE)
                 values[axis + 3] += self._gauss(0.0, _ANGULAR_RATE_NOISE)
         orientation = (0.0, 0.0, 0.0, 0.0) if felt.attitude is None else quaternion(felt.attitude)
-        return measurement_of(values, felt.temperature, orientation)
+        return physical_sample(values, felt.temperature, orientation)

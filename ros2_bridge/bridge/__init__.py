@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ROS 2 node: receives the server's stream and publishes it.
+"""Deprecated name of `bota_ethercat_bridge`."""
 
-Imports `bota_ethercat` and `ft_compensation`, never the server. `client` is the program, `node` the wiring.
-A sample goes one way: `stream` decodes it; `publishing` makes the topics of what was measured;
-`compensating` takes bias and tool off, for the other topics of `publishing`.
-"""
+from bota_ethercat.renamed import forward
+
+forward(__name__, "bota_ethercat_bridge")

@@ -22,15 +22,14 @@ from scripts.benchmarks import statistics
 from scripts.benchmarks.chain import (
     PROCESSES,
     WARM_UP_S,
-    Chain,
-    Child,
     Figures,
-    ScriptError,
+    MeasuredChain,
     Setup,
     Turn,
 )
 from scripts.benchmarks.processes.masters import build
 from scripts.benchmarks.records import REAL_TIME
+from scripts.chain import Child, ScriptError
 
 _MAX_TURNS: Final = 3
 _NONE: Final = "-"
@@ -56,7 +55,7 @@ RATIOS: Final = {
 }
 
 
-def _start(name: str, chain: Chain) -> Child:
+def _start(name: str, chain: MeasuredChain) -> Child:
     """Start what is compared; the recorder of what arrives."""
     setup, yardstick = chain.setup, Path(os.environ["DEMO_DIRECTORY"]) / "yardstick"
     if name in _POLLERS:  # with the server's priority, for which they do not ask
@@ -76,12 +75,12 @@ def _start(name: str, chain: Chain) -> Child:
 
 def turn(setup: Setup, name: str) -> Turn:
     """One run of what is compared."""
-    with Chain(setup, name) as chain:
+    with MeasuredChain(setup, name) as chain:
         recorder = _start(name, chain)
         return chain.measure(recorder, (lambda: _client(chain)) if name == ROS else None)
 
 
-def _client(chain: Chain) -> Child:
+def _client(chain: MeasuredChain) -> Child:
     """The recorder of a client beside the subscriber: in C if that can be built, for less CPU time."""
     yardstick = Path(os.environ["DEMO_DIRECTORY"]) / "yardstick"
     how = ("c", yardstick, "client") if yardstick.exists() else ("tcp",)
@@ -159,7 +158,7 @@ def load(setup: Setup, loops: int) -> list[Figures]:
     rows = []
     for client in ("TCP", "wrench")[: 1 + setup.ros]:
         for how, priority in (("ordinary", 0), ("real-time", REAL_TIME))[: 1 + bool(setup.priority)]:
-            with Chain(setup, f"{client}, {how}, beside {loops} loops") as chain:
+            with MeasuredChain(setup, f"{client}, {how}, beside {loops} loops") as chain:
                 chain.server()
                 chain.settle()
                 if client == "wrench":

@@ -19,16 +19,10 @@ from typing import Any, Final
 
 from bota_ethercat.program.arguments import number
 from scripts.benchmarks import machine, path
-from scripts.benchmarks.chain import (
-    OVERSAMPLING_HZ,
-    Figures,
-    ScriptError,
-    Setup,
-    loopback_up,
-    stoppable,
-)
+from scripts.benchmarks.chain import OVERSAMPLING_HZ, Figures, Setup
 from scripts.benchmarks.modes import TABLES, answer, compare, load
 from scripts.benchmarks.records import may_be_real_time
+from scripts.chain import ScriptError, loopback_up, stoppable
 
 _RATES_HZ: Final = [OVERSAMPLING_HZ // sinc for sinc in (32, 64, 128, 256, 512)]
 _PRIORITY: Final = 80  # SCHED_FIFO of the server, or what is in its place

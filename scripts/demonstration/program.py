@@ -17,21 +17,11 @@ from typing import Any, Final
 from bota_ethercat.client import Client
 from bota_ethercat.pdo import SampleDecoder
 from bota_ethercat.program.arguments import number
-from ethercat_server.process.realtime import DEFAULT_PRIORITY
-from scripts.benchmarks.chain import (
-    Chain,
-    ScriptError,
-    Setup,
-    Stopped,
-    ignore_signals,
-    loopback_up,
-    stoppable,
-)
-from scripts.benchmarks.records import PORT, REAL_TIME, may_be_real_time
+from scripts.benchmarks.records import PORT, REAL_TIME
+from scripts.chain import Chain, ScriptError, Stopped, ignore_signals, loopback_up, stoppable
 from scripts.demonstration.measure import FULL_RATE, Measurement, Summary, verdict
 
 TOPIC: Final = "/wrench"
-_RATE_HZ: Final = 800  # the virtual sensor's
 _SHOW_S: Final = 1.0
 _VECTORS: Final = (
     ("force", "N", 2), ("torque", "Nm", 3), ("acceleration", "m/s²", 3), ("angular_rate", "rad/s", 4),
@@ -46,7 +36,7 @@ def listening(client: Client, measurement: Measurement, lock: threading.Lock) ->
     from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
 
-    from bridge.rclpy_internals import Spinner  # noqa: PLC0415
+    from bota_ethercat_bridge.rclpy_internals import Spinner  # noqa: PLC0415
 
     def receive() -> None:
         for frame in client.frames():
@@ -122,8 +112,7 @@ def run(seconds: float | None) -> int:
     loopback_up()
     lock = threading.Lock()
     binaries = Path(sys.executable).parent
-    setup = Setup(_RATE_HZ, 1, 0.0, DEFAULT_PRIORITY if may_be_real_time() else 0)
-    with Chain(setup) as chain:
+    with Chain() as chain:
         chain.start("ethercat-server", binaries / "ethercat-server", "virtual", PORT)
         chain.start("bridge-client", binaries / "bridge-client", "--ros-args", "-p", f"server_port:={PORT}",
                     "-p", f"rt_priority:={REAL_TIME}")  # fmt: skip

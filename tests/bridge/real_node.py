@@ -22,8 +22,8 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from bridge.node import BridgeNode, spin
-from bridge.rclpy_internals import Spinner
+from bota_ethercat_bridge.node import BridgeNode, spin
+from bota_ethercat_bridge.rclpy_internals import Spinner
 from tests.server.running import Program, wait_until
 
 PATIENCE_S = 45.0
@@ -172,7 +172,7 @@ class Started:
 
 
 class NodeThread(Started):
-    """The node in a thread of this process, as `bridge.node.run` runs it."""
+    """The node in a thread of this process, as `bota_ethercat_bridge.node.run` runs it."""
 
     def __init__(self, *arguments: str) -> None:
         self.node = LoggedNode.create(arguments)
@@ -200,7 +200,7 @@ class NodeProcess(Program, Started):
     """`bridge-client` in a process of its own."""
 
     def __init__(self, *arguments: str) -> None:
-        super().__init__("bridge.client", arguments)
+        super().__init__("bota_ethercat_bridge.client", arguments)
 
     @property
     def log(self) -> str:  # type: ignore[override]

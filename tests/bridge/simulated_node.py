@@ -25,15 +25,15 @@ from types import SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 
 from bota_ethercat.control import Event, event
 from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
-from bridge.diagnostics import TICK_S
-from bridge.parameters.table import PARAMETERS, gather
-from ft_compensation.quantities import NO_WRENCH, Payload, Wrench
+from bota_ethercat_bridge.diagnostics import TICK_S
+from bota_ethercat_bridge.ft_compensation.quantities import NO_WRENCH, Payload, Wrench
+from bota_ethercat_bridge.parameters.table import PARAMETERS, gather
 from tests.bridge.real_node import PATIENCE_S, Asking, LoggedNode, retire
 from tests.bridge.scripted_server import MemoryServer, ScriptedChannel
 from tests.compensation.making import TOOL, load
@@ -114,6 +114,7 @@ class Topic:
         self.handle = SimpleNamespace(publish_raw=self.publish)
         self.is_heard = False
         self.messages: list[Any] = []
+        self.serialized: list[bytes] = []
         self.turn = 0  # of the latest message, counted over all topics
 
     def __getattr__(self, name: str) -> Any:
@@ -125,10 +126,14 @@ class Topic:
     def publish(self, message: Any) -> None:
         self._publisher.get_subscription_count()  # InvalidHandle once it is destroyed
         self.turn = next(TURNS)
+        serialized = message
         if isinstance(message, bytes):
             message = deserialize_message(message, self._publisher.msg_type)
+        elif self.is_heard:
+            serialized = serialize_message(message)
         if self.is_heard:
             self.messages.append(copy.deepcopy(message))
+            self.serialized.append(serialized)
 
 
 class Guard:

@@ -17,8 +17,8 @@ from sensor_msgs.msg import Imu
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import SettingValue
-from bridge.compensating.sources import ImuSource, RobotSource
-from bridge.node import StartError
+from bota_ethercat_bridge.compensating.sources import ImuSource, RobotSource
+from bota_ethercat_bridge.node import StartError
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import (
     DEFAULTS,

@@ -14,7 +14,7 @@ import yaml
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode
 from bota_ethercat.sensor.warnings_register import WARNINGS
-from bridge.diagnostics import text_of
+from bota_ethercat_bridge.diagnostics import text_of
 from tests.bridge.simulated_node import HEALTHY, SETTINGS, Node, Server, level, status, values
 
 

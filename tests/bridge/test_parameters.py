@@ -14,9 +14,9 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
 
 from bota_ethercat.pdo import encode
-from bridge.node import StartError
-from bridge.parameters.declare import descriptor
-from bridge.parameters.table import PARAMETERS, ParameterError, gather
+from bota_ethercat_bridge.node import StartError
+from bota_ethercat_bridge.parameters.declare import descriptor
+from bota_ethercat_bridge.parameters.table import PARAMETERS, ParameterError, gather
 from tests.bridge.simulated_node import UP, Node, Server
 
 ROWS = {row.name: row for row in PARAMETERS}

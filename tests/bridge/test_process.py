@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import queue
 import re
@@ -21,8 +22,9 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.client import Scheduling
-from bridge import client, process
-from bridge.rclpy_internals import Spinner
+from bota_ethercat_bridge import client, process
+from bota_ethercat_bridge import node as program
+from bota_ethercat_bridge.rclpy_internals import Spinner
 from tests import without_ipv6
 from tests.bridge.real_node import PATIENCE_S, Log, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
@@ -38,12 +40,34 @@ def test_a_missing_module_is_named(
     missing: str, remedy: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(client, "StopSignals", lambda: None)  # which blocks them in this process
-    for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bridge"}]:
+    for name in [name for name in sys.modules if name.split(".")[0] in {missing, "bota_ethercat_bridge"}]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
     assert client.main([]) == 1
     said = capsys.readouterr().err
     assert re.match(rf"bridge-client: {missing} cannot be loaded \(.*\): {remedy}", said)
+    if missing == "rclpy":
+        assert client.check_subscription() == 1
+        assert capsys.readouterr().err == said
+
+
+def test_the_node_runs_with_what_favors_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    interval_s, found = sys.getswitchinterval(), list[object]()
+
+    def spin(_: object) -> int:
+        found.extend((sys.getswitchinterval() < interval_s, gc.get_freeze_count() > 0))
+        return 7
+
+    monkeypatch.setattr(rclpy, "init", lambda **_: None)
+    monkeypatch.setattr(rclpy, "try_shutdown", lambda: None)
+    monkeypatch.setattr(program.BridgeNode, "create", lambda: None)
+    monkeypatch.setattr(program, "spin", spin)
+    try:
+        assert program.run([]) == 7
+    finally:
+        sys.setswitchinterval(interval_s)
+        gc.unfreeze()
+    assert found == [True, True]
 
 
 @pytest.mark.parametrize(
@@ -72,7 +96,7 @@ def test_a_missing_module_is_named(
 def test_what_the_environment_makes_impossible_is_a_sentence(variables: dict[str, str], said: str) -> None:
     """Processes: at some of it the middleware ends them by itself, and ROS reads the rest once."""
     done = subprocess.run(
-        [sys.executable, "-m", "bridge.client"], env={**os.environ, **variables},
+        [sys.executable, "-m", "bota_ethercat_bridge.client"], env={**os.environ, **variables},
         capture_output=True, text=True, check=False, timeout=PATIENCE_S,
     )  # fmt: skip
     *_, line = done.stderr.splitlines()
@@ -89,7 +113,7 @@ def hang(*_, **__):
     print("hangs", flush=True)
     ctypes.PyDLL(None).sleep(600)  # with Python's lock, as rclpy calls the middleware
 {where} = hang
-from bridge import client
+from bota_ethercat_bridge import client
 sys.exit(client.main([]))
 """
 
@@ -116,7 +140,7 @@ def test_without_ipv6_it_waits_for_the_server() -> None:
     port = free_port()
     arguments = ("--ros-args", "-p", f"server_port:={port}", "-r", f"__ns:=/test_{port}")
     under = sys.executable, str(Path(without_ipv6.__file__))
-    with contextlib.closing(Program("bridge.client", arguments, under)) as node:
+    with contextlib.closing(Program("bota_ethercat_bridge.client", arguments, under)) as node:
         node.wait_for(f"no server at localhost:{port} (Connection refused)")
         with ScriptedServer(port):
             node.wait_for("connected to")

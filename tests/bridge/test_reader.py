@@ -17,10 +17,16 @@ from hypothesis import strategies as st
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import WRENCH, Values, encode
 from bota_ethercat.text.json_text import JsonObject
-from bridge.parameters.table import Parameters
-from bridge.stream.frame_selector import BACKLOG_NS, FRESH_NS, FrameCounts, FrameSelector, RateLimit
-from bridge.stream.link import NodeClock, sentence
-from bridge.stream.reader import NO_FLAGS, Outputs, Reader
+from bota_ethercat_bridge.parameters.table import Parameters
+from bota_ethercat_bridge.stream.frame_selector import (
+    BACKLOG_NS,
+    FRESH_NS,
+    FrameCounts,
+    FrameSelector,
+    RateLimit,
+)
+from bota_ethercat_bridge.stream.link import NodeClock, sentence
+from bota_ethercat_bridge.stream.reader import NO_FLAGS, Outputs, Reader
 from tests.bridge.scripted_server import MemoryServer, ScriptedChannel
 from tests.bridge.simulated_node import DEFAULTS, Node, Server, stamp_ns
 from tests.descriptions import description

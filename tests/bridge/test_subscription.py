@@ -19,8 +19,8 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 
 from bota_ethercat.pdo import encode
-from bridge import check_subscription
-from bridge.subscription import Subscription
+from bota_ethercat_bridge import check_subscription
+from bota_ethercat_bridge.subscription import Subscription
 from tests.bridge.real_node import retire
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import STEP_S, Node, Server, stamp_ns, values

@@ -12,16 +12,30 @@ from typing import Any
 
 import pytest
 import yaml
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from bota_ethercat.framing import MessageType, encode_data
 from bota_ethercat.pdo import encode
-from bridge import rclpy_internals
-from bridge.node import StartError
-from bridge.parameters.table import ParameterError, parse_frames
-from ft_compensation.outputs import WrenchFilter
+from bota_ethercat_bridge import rclpy_internals
+from bota_ethercat_bridge.ft_compensation.outputs import WrenchFilter
+from bota_ethercat_bridge.node import StartError
+from bota_ethercat_bridge.parameters.table import ParameterError, parse_frames
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.scripted_server import process_data
-from tests.bridge.simulated_node import RATE_HZ, STEP_S, UP, ZERO6, Node, Server, six, stamp_ns, values
+from tests.bridge.simulated_node import (
+    RATE_HZ,
+    STEP_S,
+    UP,
+    ZERO6,
+    Node,
+    Server,
+    six,
+    stamp_ns,
+    values,
+)
+from tests.bridge.test_contact import FACE, PARAMETERS_OF_TOOL
 from tests.public_names import listed
 
 PACKAGE = Path(__file__).parents[2] / "ros2_bridge"
@@ -508,6 +522,46 @@ def test_the_profile_of_recording_has_every_topic_of_the_sensor() -> None:
         policies = {name: value for name, value in profile.items() if name != "depth"}
         assert policies == {"reliability": "reliable", "durability": "volatile", "history": "keep_last"}
         assert profile["depth"] >= 1600, "a second of the fastest sensor"
+
+
+@pytest.mark.parametrize("store", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED])
+def test_a_bag_of_every_topic_is_read_by_other_tools(store: Stores, tmp_path: Path) -> None:
+    """Written and read by rosbags with the definitions of each distribution: the bytes as they are sent."""
+    server = Server()
+    with Node(server, **PARAMETERS_OF_TOOL, **{"filter.cutoff": 10.0, "contact.surface": FACE}) as node:
+        topics = {name: topic for name, topic in node.topics.items() if not name.endswith("transition_event")}
+        for topic in topics.values():
+            topic.is_heard = True
+        server.hold(UP, size=77, force_z=-200.0, orientation_w=1.0)
+        node.run(2.0)
+    sent = {name: topic for name, topic in topics.items() if topic.messages}
+    assert topics.keys() - sent.keys() == {"/parameter_events"}
+    types = get_typestore(store)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for name, topic in sent.items():
+            kind = topic.msg_type.__module__.split(".")[0], "msg", topic.msg_type.__name__
+            connection = writer.add_connection(name, "/".join(kind), typestore=types)
+            for number, serialized in enumerate(topic.serialized):
+                writer.write(connection, number, serialized)
+    read: dict[str, list[Any]] = {name: [] for name in sent}
+    with AnyReader([tmp_path / "bag"]) as bag:
+        for connection, _, serialized in bag.messages():
+            read[connection.topic].append(bag.deserialize(serialized, connection.msgtype))
+    for name, topic in sent.items():
+        assert len(read[name]) == len(topic.messages)
+        assert all(map(is_read_as, read[name], topic.messages)), name
+
+
+def is_read_as(part: Any, message: Any) -> bool:
+    """Whether rosbags reads all as rclpy does."""
+    if hasattr(message, "get_fields_and_field_types"):
+        fields = message.get_fields_and_field_types()
+        return all(is_read_as(getattr(part, name), getattr(message, name)) for name in fields)
+    if isinstance(message, bytes):  # a level
+        return bool(part == message[0])
+    if hasattr(message, "__iter__") and not isinstance(message, str):
+        return len(part) == len(message) and all(map(is_read_as, part, message))
+    return bool(part == message)
 
 
 def test_topics_and_services_are_those_listed() -> None:

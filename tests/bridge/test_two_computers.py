@@ -59,7 +59,9 @@ def test_topics_and_services_cross_the_network_without_multicast(there: list[str
     finding = subprocess.Popen(["fast-discovery-server", "-i", "0", "-l", HERE, "-p", str(port)])
     with served(SensorOptions(signal="rest"), sinc_length=512) as server:
         options = f"--ros-args -r __ns:=/robot -p server_port:={server.port} -p rest.duration:=0.3"
-        node = Program("bridge.client", options.split(), under=[*ENVIRONMENT, *servers * by_server])
+        node = Program(
+            "bota_ethercat_bridge.client", options.split(), under=[*ENVIRONMENT, *servers * by_server]
+        )
         try:
             asked = [*ENVIRONMENT, *(servers if by_server else [f"ROS_STATIC_PEERS={HERE}"])]
             command = [*there, *ALONE, *asked, sys.executable, "-c", ASK]

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 from rclpy.parameter import parameter_value_to_python
 
-from bridge import services
+from bota_ethercat_bridge import services
 from tests.bridge.real_node import Listener, Start
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import QUICK, SETTINGS, UP, Node, Server, Stages, sensed, six

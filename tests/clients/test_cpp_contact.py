@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bota_ethercat.pdo import Vector3
-from ft_compensation.contact import ContactDetector, Plane, Uncertainty, Why
-from ft_compensation.quantities import ZERO, Turning
-from ft_compensation.stationary import triple
+from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Plane, Uncertainty, Why
+from bota_ethercat_bridge.ft_compensation.quantities import ZERO, Turning
+from bota_ethercat_bridge.ft_compensation.stationary import triple
 from tests.clients.cpp_programs import FAST, SANITIZED, SOURCES, build, needs_gxx, patient
 from tests.compensation.making import SEED
 from tests.compensation.test_contact import NOISE, PLACES, TOOL, pushed

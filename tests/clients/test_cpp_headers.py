@@ -134,7 +134,7 @@ def test_the_conditions_are_those_of_python_and_documented_with_their_numbers() 
     ]
     assert [meaning for *_, meaning in found] == [str(c) for c in Condition]
     page = (ROOT / "docs" / "cpp.md").read_text()
-    assert re.findall(r"(?m)^\| (\d+) \| `(\w+)` \|", page) == [(number, name) for number, name, _ in found]
+    assert re.findall(r"(?m)^- (\d+) `(\w+)`: ", page) == [(number, name) for number, name, _ in found]
 
 
 @pytest.mark.long

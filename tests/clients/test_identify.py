@@ -21,13 +21,13 @@ from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
 from bota_ethercat.settings import start_up_defaults
+from bota_ethercat_bridge.ft_compensation.quantities import Payload
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor import signals
 from ethercat_server.virtual_sensor.dictionary import Flash
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
 from ethercat_server.virtual_sensor.signals import MOVE_LENGTH, POSE_LENGTH
-from ft_compensation.quantities import Payload
 from tests.clients.recordings import START_NS, describe, record, writer
 from tests.compensation import motion
 from tests.compensation.making import written_parameters

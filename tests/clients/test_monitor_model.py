@@ -10,7 +10,7 @@ from unittest import mock
 import pytest
 
 from bota_clients.monitor.model import Model, SensorView
-from bota_clients.monitor.reader import Reader
+from bota_clients.monitor.reader import MonitorReader
 from bota_clients.monitor.screen import ViewOptions, render
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
@@ -254,7 +254,7 @@ def test_an_age_is_noted_only_of_what_was_waited_for(
     )
     ages: list[int] = []
     with mock.patch.object(model, "note_age", lambda made, _: ages.append(made.sequence)):
-        Reader(Address("localhost", 1), model)._take(cast("Client", client))
+        MonitorReader(Address("localhost", 1), model)._take(cast("Client", client))
     assert ages == noted
     assert only(model, now(4)).samples >= 4
 

@@ -23,7 +23,7 @@ import pytest
 from bota_clients.monitor import cli, program
 from bota_clients.monitor.cli import parse
 from bota_clients.monitor.model import Model, State
-from bota_clients.monitor.reader import Reader
+from bota_clients.monitor.reader import MonitorReader
 from bota_clients.monitor.tare import tare
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.address import Address
@@ -218,7 +218,7 @@ def test_a_recording_ends_with_the_monitor(shared: ServedSimulation, way: str, t
 @contextlib.contextmanager
 def reading(port: int) -> Iterator[Model]:
     model = Model("server")
-    reader = Reader(Address("localhost", port), model)
+    reader = MonitorReader(Address("localhost", port), model)
     reader.start()
     try:
         yield model
@@ -310,7 +310,7 @@ def test_a_restart_of_the_server_is_seen_and_survived() -> None:
 def test_whatever_the_server_says_the_reader_goes_on() -> None:
     with ScriptedServer() as server:
         model = Model("scripted")
-        reader = Reader(Address("localhost", server.port), model, batch_s=0.01)
+        reader = MonitorReader(Address("localhost", server.port), model, batch_s=0.01)
         reader.start()
         try:
             assert server.subscribed.wait(PATIENCE_S)

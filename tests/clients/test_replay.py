@@ -25,7 +25,7 @@ from bota_ethercat.client import Client, connect
 from bota_ethercat.control import ACTIONS, ErrorCode
 from bota_ethercat.errors import RefusedError
 from bota_ethercat.framing import DataFlag, DataMessage
-from bridge.stream.link import find_sensor
+from bota_ethercat_bridge.stream.link import find_sensor
 from ethercat_server.serving.actions import Actions
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer

@@ -20,9 +20,9 @@ from bota_clients.identify.cli import main as identify
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
-from ft_compensation.bias import TareBasis
-from ft_compensation.bounds import force_bound_95, torque_bound_95
-from ft_compensation.quantities import Accelerometer, Payload
+from bota_ethercat_bridge.ft_compensation.bias import TareBasis
+from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95
+from bota_ethercat_bridge.ft_compensation.quantities import Accelerometer, Payload
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.cpp_programs import (
     FAST,

@@ -23,10 +23,17 @@ from bota_ethercat.sensor.response import (
     fir_taps,
 )
 from bota_ethercat.settings import SettingValue
-from ft_compensation.alignment import Alignment
-from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import EXACT, OFFSET_PRIOR, SCALE_PRIOR, Accelerometer, Payload, Turning
-from ft_compensation.specific_force import ImuSpecificForce
+from bota_ethercat_bridge.ft_compensation.alignment import Alignment
+from bota_ethercat_bridge.ft_compensation.compensator import Compensator
+from bota_ethercat_bridge.ft_compensation.quantities import (
+    EXACT,
+    OFFSET_PRIOR,
+    SCALE_PRIOR,
+    Accelerometer,
+    Payload,
+    Turning,
+)
+from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
 
 Array = NDArray[np.float64]
 # Times (n,), s, to position (n, 3), m, and three angles (n, 3), rad.

@@ -12,8 +12,8 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.sensor.warnings_register import WarningFlag
-from ft_compensation.bias import BiasRamp, TareBasis, check_at_rest, estimate_bias
-from ft_compensation.quantities import (
+from bota_ethercat_bridge.ft_compensation.bias import BiasRamp, TareBasis, check_at_rest, estimate_bias
+from bota_ethercat_bridge.ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
     ZERO,
@@ -22,7 +22,11 @@ from ft_compensation.quantities import (
     StationaryLimits,
     Wrench,
 )
-from ft_compensation.stationary import NotStationaryError, StationaryMeans, StationaryWindow
+from bota_ethercat_bridge.ft_compensation.stationary import (
+    NotStationaryError,
+    StationaryMeans,
+    StationaryWindow,
+)
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, noisy, sample
 
 RATE = 800

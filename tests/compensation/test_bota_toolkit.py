@@ -19,10 +19,10 @@ from bota_clients.errors import RecordingError
 from bota_clients.identify.bota_file import read_bota, write_bota
 from bota_clients.identify.cli import main
 from bota_ethercat.settings import start_up_defaults
-from ft_compensation.alignment import align
-from ft_compensation.compensator import Compensator
-from ft_compensation.quantities import Accelerometer, Payload, Wrench
-from ft_compensation.specific_force import ImuSpecificForce
+from bota_ethercat_bridge.ft_compensation.alignment import align
+from bota_ethercat_bridge.ft_compensation.compensator import Compensator
+from bota_ethercat_bridge.ft_compensation.quantities import Accelerometer, Payload, Wrench
+from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
 from tests.clients.test_identify import record_felt
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, written_parameters

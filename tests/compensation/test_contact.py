@@ -13,9 +13,9 @@ from bota_ethercat.pdo import Vector3
 from bota_ethercat.sensor.response import fir_taps, healthy_noise, imu_noise
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.world import Felt
-from ft_compensation.alignment import align
-from ft_compensation.bounds import IMU_BELOW
-from ft_compensation.contact import (
+from bota_ethercat_bridge.ft_compensation.alignment import align
+from bota_ethercat_bridge.ft_compensation.bounds import IMU_BELOW
+from bota_ethercat_bridge.ft_compensation.contact import (
     Capsule,
     ContactDetector,
     Plane,
@@ -24,8 +24,14 @@ from ft_compensation.contact import (
     Why,
     correlation,
 )
-from ft_compensation.quantities import NO_PAYLOAD, ZERO, CompensationError, Payload, length
-from ft_compensation.stationary import triple
+from bota_ethercat_bridge.ft_compensation.quantities import (
+    NO_PAYLOAD,
+    ZERO,
+    CompensationError,
+    Payload,
+    length,
+)
+from bota_ethercat_bridge.ft_compensation.stationary import triple
 from tests.compensation import motion
 from tests.compensation.making import SEED
 from tests.compensation.motion import Array

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
-from ft_compensation.alignment import align
-from ft_compensation.bounds import torque_bound_95, torque_noise_95
-from ft_compensation.compensator import Compensator
-from ft_compensation.identification.inertia import identify_inertia, turn
-from ft_compensation.identification.payload import Identified, identify
-from ft_compensation.quantities import (
+from bota_ethercat_bridge.ft_compensation.alignment import align
+from bota_ethercat_bridge.ft_compensation.bounds import torque_bound_95, torque_noise_95
+from bota_ethercat_bridge.ft_compensation.compensator import Compensator
+from bota_ethercat_bridge.ft_compensation.identification.inertia import identify_inertia, turn
+from bota_ethercat_bridge.ft_compensation.identification.payload import Identified, identify
+from bota_ethercat_bridge.ft_compensation.quantities import (
     EXACT,
     Accelerometer,
     CompensationError,
@@ -24,7 +24,7 @@ from ft_compensation.quantities import (
     Turning,
     likely_inertia,
 )
-from ft_compensation.specific_force import ImuSpecificForce
+from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
 from tests.compensation import motion
 from tests.compensation.making import AXES, BIAS, SEED, pose
 from tests.compensation.motion import IMU, Array, Felt, Path, imperfect, settings

@@ -146,7 +146,7 @@ def test_another_master_is_not_disturbed(
 ) -> None:
     for holder, level, named, commands in (
         (Holder(77, "codesys", None), Level.TROUBLE, "process 77 (codesys)", ("sudo kill 77",)),
-        (Holder(None, "", None), Level.NOT_POSSIBLE, "an EtherCAT master of another user has it", ()),
+        (Holder(None, "", None), Level.NOT_POSSIBLE, "or outside of this container, has it", ()),
     ):
         monkeypatch.setattr(bus_checks, "find_holder", lambda _, who=holder: who)
         found = examined(single, tmp_path, LOOK).of("bus")["slaves"]

@@ -27,7 +27,7 @@ SERVER_COMMAND = f"server_command:={sys.executable} -m ethercat_server.daemon.cl
 CLIENT = f"""#!{sys.executable}
 import sys
 sys.path[:0] = ["{ROOT / "protocol"}", "{PACKAGE}"]
-from bridge.client import main
+from bota_ethercat_bridge.client import main
 sys.exit(main())
 """
 LAUNCH = PACKAGE / "launch"

@@ -18,6 +18,7 @@ from catkin_pkg.packages import find_packages
 from docutils.core import publish_doctree
 
 from bota_ethercat.program.version import VERSION
+from scripts.completions import PLACES
 from scripts.ros_packages import changelog, folders, main
 from tests.ros_package.package_files import PACKAGE, PACKAGES, ROOT, SHARED_FOLDERS, shared_files
 from tests.test_architecture import imports
@@ -116,13 +117,13 @@ def test_the_urls_are_asked_for_once_and_a_placeholder_is_refused(
 
 
 def test_everything_that_is_imported_is_a_dependency_once() -> None:
-    ours = {"bridge", "ft_compensation", "bota_ethercat", "__future__", *sys.stdlib_module_names}
+    ours = {"bota_ethercat_bridge", "bota_ethercat", "__future__", *sys.stdlib_module_names}
     ours.add("bota_ethercat_msgs")  # used where it is there
     # Packages that are not named as their modules; the package tf2_ros is C++.
     packages = {"tf2_ros": "tf2_ros_py", "numpy": "python3-numpy"}
     needed = {
         packages.get(name, name)
-        for folder in ("bridge", "ft_compensation", "launch")
+        for folder in ("bota_ethercat_bridge", "bridge", "ft_compensation", "launch")
         for path in (PACKAGE / folder).rglob("*.py")
         for name in {imported.split(".")[0] for imported in imports(path)} - ours
     }
@@ -173,10 +174,12 @@ def test_both_install_the_same_everything_in_the_shared_folders() -> None:
     # colcon makes these itself, from the entry points.
     started = {name: PACKAGE / "resource" / name for name in ("client", "check_subscription")}
     expected |= {"lib/bridge": {started["client"]}, "lib/bota_ethercat_bridge": {*started.values()}}
-    assert pip == expected
+    generated = {f"share/{Path(place).parent}" for place in PLACES.values()}
+    assert {target: paths for target, paths in pip.items() if target not in generated} == expected
+    assert generated < pip.keys()
     # A new folder has to be named in both, or it is installed by neither.
     folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] not in "._"}
-    code = {"bridge", "ft_compensation", "resource"}
+    code = {"bota_ethercat_bridge", "bridge", "ft_compensation", "resource"}
     assert {name for name in folders if not name.endswith(".egg-info")} == {*SHARED_FOLDERS, *code}
 
 

@@ -8,7 +8,7 @@ import pytest
 import xacro
 import yaml
 
-from ethercat_server.sensor.objects.dictionary import MODELS
+from ethercat_server.sensor.models import MODELS
 from tests.ros_package.package_files import PACKAGE
 
 URDF = PACKAGE / "urdf"

@@ -13,8 +13,8 @@ import sys
 
 from ethercat_server.virtual_sensor import cli, faults
 from ethercat_server.virtual_sensor.application import Application
+from ethercat_server.virtual_sensor.commands import Fault
 from ethercat_server.virtual_sensor.faults import Call
-from ethercat_server.virtual_sensor.options import Fault
 
 al_control = Application.al_control
 
@@ -45,8 +45,11 @@ def report(call: Call, index: int, subindex: int, before: int, after: int) -> No
 
 
 NUMBER = functools.partial(int, base=0)
-faults.BY_NAME["ignore"] = Fault("ignore STATE", "", ignore, (NUMBER,))
-faults.BY_NAME["report"] = Fault("report INDEX SUBINDEX BEFORE AFTER", "", report, (NUMBER,) * 4)
+faults.BY_NAME["ignore"] = (Fault("ignore STATE", "", (NUMBER,)), ignore)
+faults.BY_NAME["report"] = (
+    Fault("report INDEX SUBINDEX BEFORE AFTER", "", (NUMBER,) * 4),
+    report,
+)
 
 if __name__ == "__main__":
     sys.exit(cli.main())

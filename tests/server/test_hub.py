@@ -23,8 +23,8 @@ from ethercat_server.serving.connection import (
     MAX_REQUEST_LENGTH,
     Connection,
     ConnectionState,
+    DataSubscription,
     Limits,
-    Subscription,
 )
 from ethercat_server.serving.hub import Hub
 from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
@@ -61,7 +61,7 @@ class Served:
         if request.action == "subscribe":
             values = request.values
             wanted = [number in (values["sensors"] or (0, 1)) for number in range(2)]
-            connection.subscription = Subscription(wanted, values["every"], values["fresh_only"])
+            connection.subscription = DataSubscription(wanted, values["every"], values["fresh_only"])
             self.hub.subscriptions_changed()
         return reply(request)
 
@@ -424,7 +424,7 @@ def test_an_idle_connection_of_who_has_most_goes_first(served: Served) -> None:
 
     for client in crowd[:6]:
         client.uid = 1003
-        client.subscription = Subscription([True], 1, fresh_only=True)
+        client.subscription = DataSubscription([True], 1, fresh_only=True)
     assert served.is_closed(served.connect(3000)), "none is idle"
     crowd[4].subscription = None
     served.connect(3000)

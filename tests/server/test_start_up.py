@@ -40,8 +40,8 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor import virtual_bus
 from ethercat_server.virtual_sensor.dictionary import Dictionary
-from ethercat_server.virtual_sensor.foreign import ForeignSlave, parse_chain, slaves_in
-from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.foreign import ForeignSlave
+from ethercat_server.virtual_sensor.options import SensorOptions, parse_chain, slaves_in
 from tests.ended import run_here
 from tests.rights import NET_ADMIN, NET_RAW, without
 from tests.server.running import (

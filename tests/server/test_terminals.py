@@ -20,8 +20,7 @@ from ethercat_server.ethercat.slave.al import AlState, AlStatus
 from ethercat_server.sensor.scan import Slave
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
-from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
-from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.options import SensorOptions, parse_chain, slaves_in
 from tests.server.running import server, virtual_sensor, wait_until
 from tests.simulation import (
     Asked,

@@ -191,6 +191,10 @@ before=$(everything; accounts)
 scripts/install-service ens5 13000
 echo "users $(getent passwd ethercat ethercat-bridge | grep -c nologin)"
 [ /opt/ethercat-server/bin/python -ef /usr/bin/python3 ]  # gets its updates
+cd /usr/share
+folders=$(echo {bash-completion/completions,zsh/vendor-completions,fish/vendor_completions.d,man/man1})
+for each in $folders; do ls $each/*ethercat-server*; done | wc -l
+cd "$1"
 setpriv --reuid=ethercat --regid=ethercat --clear-groups /opt/ethercat-server/bin/ethercat-server --version
 mkdir /var/lib/ethercat-sensors  # as the service does
 echo "# mine" >>$config/ens5.env
@@ -231,6 +235,7 @@ def test_packages_are_installed_updated_and_purged(tmp_path: Path, monkeypatch: 
     settings = "/etc/ethercat-server/ens{}.env:PORT={}"
     assert done.stdout.splitlines() == [
         "users 2",
+        "4",
         f"ethercat-server {VERSION}",
         settings.format(5, 13000),
         settings.format(6, 15000),

@@ -7,8 +7,8 @@ from typing import Any, Final
 
 from bota_ethercat.settings import start_up_defaults
 from bota_ethercat.world import Felt
-from ethercat_server.virtual_sensor.signals import carry, scene
-from ethercat_server.virtual_sensor.world import Measured, World
+from ethercat_server.virtual_sensor.signals import World, carry, scene
+from ethercat_server.virtual_sensor.world import Measured
 
 TURN_LENGTH: Final = 60.0  # duration of a full turn, s
 _PITCH: Final = 0.6  # rad

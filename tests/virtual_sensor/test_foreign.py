@@ -9,7 +9,8 @@ import pytest
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.faults import obey
-from ethercat_server.virtual_sensor.foreign import KINDS, ForeignSlave, parse_chain, slaves_in
+from ethercat_server.virtual_sensor.foreign import ForeignSlave
+from ethercat_server.virtual_sensor.options import KINDS, parse_chain, slaves_in
 from tests.virtual_sensor.raw_master import INIT, OP, PREOP, SAFEOP, RawMaster, do, fmmu, sync_manager
 
 MS = 1_000_000

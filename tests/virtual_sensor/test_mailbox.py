@@ -4,7 +4,7 @@ import struct
 
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.faults import obey
-from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
+from ethercat_server.virtual_sensor.options import parse_chain, slaves_in
 from tests.virtual_sensor.raw_master import INIT, MAILBOX, PREOP, RawMaster, do
 
 READ_NAME = struct.pack("<HBHBI", 0x2000, 0x40, 0x1008, 0, 0)

@@ -19,12 +19,12 @@ from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sampler import SamplingClock
 from ethercat_server.virtual_sensor.signals import (
     CONSTANT,
+    World,
     carry,
     poses,
     scene,
     sway,
 )
-from ethercat_server.virtual_sensor.world import World
 from tests.virtual_sensor.motions import measured, turning
 from tests.virtual_sensor.raw_master import OP, PREOP, RawMaster, do
 

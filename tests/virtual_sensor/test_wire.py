@@ -10,8 +10,7 @@ from ethercat_server.ethercat import wire
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.esc import Esc, execute, pass_through
-from ethercat_server.virtual_sensor.foreign import parse_chain, slaves_in
-from ethercat_server.virtual_sensor.options import SensorOptions
+from ethercat_server.virtual_sensor.options import SensorOptions, parse_chain, slaves_in
 from tests.virtual_sensor.raw_master import INIT, OP, RawMaster, do
 
 DATAGRAMS = st.lists(

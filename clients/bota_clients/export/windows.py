@@ -30,11 +30,11 @@ from bota_ethercat.replies import Delays
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import known_settings
-from ft_compensation.alignment import align
-from ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
-from ft_compensation.compensator import Compensator
-from ft_compensation.identification.parameter_file import payload_of
-from ft_compensation.quantities import (
+from bota_ethercat_bridge.ft_compensation.alignment import align
+from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
+from bota_ethercat_bridge.ft_compensation.compensator import Compensator
+from bota_ethercat_bridge.ft_compensation.identification.parameter_file import payload_of
+from bota_ethercat_bridge.ft_compensation.quantities import (
     EXACT,
     NO_WRENCH,
     STILL,
@@ -43,9 +43,9 @@ from ft_compensation.quantities import (
     Turning,
     Wrench,
 )
-from ft_compensation.specific_force import ImuSpecificForce
-from ft_compensation.stationary import BAD_WRENCH
-from ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
+from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
+from bota_ethercat_bridge.ft_compensation.stationary import BAD_WRENCH
+from bota_ethercat_bridge.ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
 
 Array = npt.NDArray[Any]
 Arrays = dict[str, Array]

@@ -18,9 +18,15 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.program import say
 from bota_ethercat.program.new_file import NewFile, refuse_existing
-from ft_compensation.identification.inertia import possible_inertia
-from ft_compensation.identification.parameter_file import payload_of, write_payload
-from ft_compensation.quantities import ELEMENTS, CompensationError, Payload, likely_inertia, vector
+from bota_ethercat_bridge.ft_compensation.identification.inertia import possible_inertia
+from bota_ethercat_bridge.ft_compensation.identification.parameter_file import payload_of, write_payload
+from bota_ethercat_bridge.ft_compensation.quantities import (
+    ELEMENTS,
+    CompensationError,
+    Payload,
+    likely_inertia,
+    vector,
+)
 
 _say = partial(say, "ethercat-identify")
 

@@ -18,8 +18,8 @@ from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, force_lag_s
 from bota_ethercat.settings import SettingValue
-from ft_compensation.identification.delay import Lag, check_held_out, find_lag
-from ft_compensation.quantities import CompensationError
+from bota_ethercat_bridge.ft_compensation.identification.delay import Lag, check_held_out, find_lag
+from bota_ethercat_bridge.ft_compensation.quantities import CompensationError
 
 
 def run(options: argparse.Namespace) -> int:

@@ -28,14 +28,14 @@ from bota_clients.recording.reader import RecordedSensor, Recording, open_record
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
-from ft_compensation.alignment import align
-from ft_compensation.identification.free_motion import identify_in_motion
-from ft_compensation.identification.inertia import Turned, identify_inertia, turn
-from ft_compensation.identification.parameter_file import write_yaml
-from ft_compensation.identification.payload import Fit, Identified, identify, summary
-from ft_compensation.identification.poses import MOST_POSES, Pose, coverage, pose_of
-from ft_compensation.identification.weighted import CONFIDENCE
-from ft_compensation.quantities import (
+from bota_ethercat_bridge.ft_compensation.alignment import align
+from bota_ethercat_bridge.ft_compensation.identification.free_motion import identify_in_motion
+from bota_ethercat_bridge.ft_compensation.identification.inertia import Turned, identify_inertia, turn
+from bota_ethercat_bridge.ft_compensation.identification.parameter_file import write_yaml
+from bota_ethercat_bridge.ft_compensation.identification.payload import Fit, Identified, identify, summary
+from bota_ethercat_bridge.ft_compensation.identification.poses import MOST_POSES, Pose, coverage, pose_of
+from bota_ethercat_bridge.ft_compensation.identification.weighted import CONFIDENCE
+from bota_ethercat_bridge.ft_compensation.quantities import (
     CROSS_AXES,
     ELEMENTS,
     EXACT,
@@ -44,7 +44,7 @@ from ft_compensation.quantities import (
     Wrench,
     length,
 )
-from ft_compensation.stream import hides_gravity, not_newtons
+from bota_ethercat_bridge.ft_compensation.stream import hides_gravity, not_newtons
 
 _WIDTH: Final = 80  # every table fits
 Poses = Sequence[tuple[StationaryPeriod, Pose]]

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bota_clients.recording.columns import Columns
-from ft_compensation.quantities import StationaryLimits
-from ft_compensation.stationary import (
+from bota_ethercat_bridge.ft_compensation.quantities import StationaryLimits
+from bota_ethercat_bridge.ft_compensation.stationary import (
     BAD_WRENCH,
     CHANCE,
     NotStationaryError,

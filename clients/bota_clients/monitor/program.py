@@ -11,7 +11,7 @@ import time
 from typing import Final
 
 from bota_clients.monitor.model import Model
-from bota_clients.monitor.reader import Reader
+from bota_clients.monitor.reader import MonitorReader
 from bota_clients.monitor.words import json_line, verdict
 from bota_clients.program import interrupt_on_signals
 from bota_ethercat.health.limits import Level
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
         import bota_clients.monitor.screen  # noqa: F401, PLC0415
     interrupt_on_signals()  # the live view replaces the handler of SIGTERM
     model = Model(str(options.address), options.imu_units)
-    reader = Reader(options.address, model)
+    reader = MonitorReader(options.address, model)
     reader.start()
     try:
         if live:

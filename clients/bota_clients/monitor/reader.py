@@ -27,7 +27,7 @@ _MOST_PILED: Final = 1000  # more were not read in time: what comes next has wai
 _ANSWER_TIMEOUT_S: Final = 10.0  # timeout for a reply of the server
 
 
-class Reader(threading.Thread):
+class MonitorReader(threading.Thread):
     def __init__(self, address: Address, model: Model, batch_s: float = BATCH_S) -> None:
         """`batch_s`: how long samples queue before they are taken."""
         super().__init__(name="reader", daemon=True)

@@ -20,21 +20,7 @@ from bota_ethercat.pdo import AXES, INPUT_OBJECT, PDO_FIELDS, PdoType
 from bota_ethercat.sensor.meaning import value_meaning
 from bota_ethercat.settings import SETTINGS, SettingValue
 from bota_ethercat.text.did_you_mean import names_with
-
-VENDOR_ID: Final = 0x0000B07A
-PRODUCT_CODE: Final = 1  # all Gen-0 EtherCAT models have product code 1; the name identifies the model
-REVISION: Final = 3
-
-# Names of the Gen-0 models, as in SII and in object 0x1008.
-MODELS: Final = (
-    "BFT-SENS-ECAT-M8",
-    "BFT-ROKS-ECAT-M8",
-    "BFT-ROKA-ECAT-M8",
-    "BFT-MEDS-ECAT-M8",
-    "BFT-MEDA-ECAT-M8",
-    "BFT-LAXS-ECAT-M8",
-    "BFT-MEGS-ECAT-M8",
-)
+from ethercat_server.sensor.models import MODELS, PRODUCT_CODE, REVISION, VENDOR_ID
 
 
 class ObjectType(Enum):

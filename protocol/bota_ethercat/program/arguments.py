@@ -45,6 +45,11 @@ ethercat-identify delay shaken.mcap                        # how late force is, 
 """
 
 
+def examples_of(program: str) -> list[str]:
+    """The rows of `EXAMPLES` that start it."""
+    return [row for row in EXAMPLES.splitlines() if program in row.removeprefix("sudo ").split()[:1]]
+
+
 class Parser(argparse.ArgumentParser):
     """The parser of a program, or of a subcommand."""
 
@@ -54,7 +59,7 @@ class Parser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         """The examples, then what argparse has."""
-        rows = [row for row in EXAMPLES.splitlines() if self.prog in row.removeprefix("sudo ").split()[:1]]
+        rows = examples_of(self.prog)
         return "\n".join([*(["examples:", *rows, ""] if rows else []), super().format_help()])
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from ethercat_server.ethercat.soem import packet_sockets
-from scripts.benchmarks.chain import ScriptError
 from scripts.benchmarks.records import PORT
+from scripts.chain import ScriptError
 
 _OP_ATTEMPTS: Final = 500
 

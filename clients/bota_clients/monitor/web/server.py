@@ -27,7 +27,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from bota_clients.arguments import is_loopback
-from bota_clients.monitor.reader import Reader
+from bota_clients.monitor.reader import MonitorReader
 from bota_clients.monitor.recording import MonitorRecording
 from bota_clients.monitor.tare import start_tare
 from bota_clients.monitor.web.pages import MOST_BYTES, TOO_MANY, Page, Pages, WebModel
@@ -90,7 +90,7 @@ async def _run(
     call_on(asyncio.get_running_loop(), stop.set, "SIGINT", "SIGTERM", "SIGHUP")
     model = WebModel(str(address), imu_units)
     pages = Pages(model, partial(start_tare, address), recorder)
-    reader = Reader(address, model, POINTS_S)
+    reader = MonitorReader(address, model, POINTS_S)
     async with serving(pages, *where) as port:
         sys.stdout.write(
             f"Open http://{Address(where.host, port)}/#token={pages.token}\n"

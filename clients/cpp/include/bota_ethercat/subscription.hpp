@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // What a subscriber of one of the ROS 2 node's topics has lost: call `receive(message->header.stamp, now_ns)` in the topic's
 // callback, `published(*report)` in that of the node's ~/published. Needs no ROS itself; for one thread; allocates.
-// The same as ros2_bridge/bridge/subscription.py, which explains it.
+// The same as ros2_bridge/bota_ethercat_bridge/subscription.py, which explains it.
 #pragma once
 
 #include <algorithm>

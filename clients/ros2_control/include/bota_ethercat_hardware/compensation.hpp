@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Weight and inertia of the tool, to be subtracted from force and torque, at their instant. docs/compensation.md has the model.
-// As ros2_bridge/ft_compensation: alignment, specific_force, compensator, stream.
+// As ros2_bridge/bota_ethercat_bridge/ft_compensation: alignment, specific_force, compensator, stream.
 #pragma once
 
 #include <algorithm>

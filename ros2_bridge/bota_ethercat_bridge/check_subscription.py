@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ros2 run bota_ethercat_bridge check_subscription TOPIC`: what a plain rclpy subscriber of a topic of the
+node loses on this machine, how old its messages are, and what to change.
+
+Exit codes: 0 nothing lost, 1 something lost or nothing received, 2 wrong arguments.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from typing import Any, Final
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
+
+from bota_ethercat.program.arguments import Parser, seconds, whole
+from bota_ethercat_bridge.subscription import Subscription
+
+_DISCOVERY_S: Final = 10.0
+_CONTROL_MS: Final = 5.0  # older samples are no good to a control loop
+_DEEP: Final = 100  # deep enough for a pause of the process, but not for a slow callback
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = Parser("check_subscription", "What a plain rclpy subscriber loses here, and what to change.", "")
+    parser.add_argument("topic", help="with stamps: wrench, imu/data_raw, ...")
+    parser.add_argument("--depth", type=whole(1, 10**6), default=10, help="of the subscriber's QoS (10)")
+    parser.add_argument("--best-effort", action="store_true", help="instead of reliable")
+    parser.add_argument("--for", type=seconds, default=10.0, dest="seconds", metavar="SECONDS", help="(10)")
+    given = parser.parse_args(remove_ros_args(["", *(sys.argv[1:] if arguments is None else arguments)])[1:])
+    rclpy.init(args=arguments)
+    node, executor, ages_ns = rclpy.create_node("check_subscription"), SingleThreadedExecutor(), list[int]()
+    executor.add_node(node)
+    try:
+        topic = node.resolve_topic_name(given.topic)
+    except RuntimeError as error:  # rclpy has no public name for it
+        parser.error(f"{given.topic!r} is no topic: {str(error).partition(', at /')[0]}")
+    counted = Subscription(topic)
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):  # what came until then is told
+        if (publisher := _find(node, executor, topic)) is not None:
+            package, _, name = publisher.topic_type.split("/")
+            kind = getattr(import_module(f"{package}.msg"), name)
+            if not hasattr(kind, "header"):
+                parser.error(
+                    f"{topic} has no stamps ({publisher.topic_type}): name wrench, imu/data_raw, ..."
+                )
+
+            def receive(message: Any) -> None:
+                counted.receive(message.header.stamp, time.time_ns())
+                ages_ns.append(counted.age_ns)
+
+            of_node = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}/published"
+            node.create_subscription(DiagnosticArray, of_node, counted.published, 10)
+            policy = ReliabilityPolicy.BEST_EFFORT if given.best_effort else ReliabilityPolicy.RELIABLE
+            profile = QoSProfile(depth=given.depth, reliability=policy)
+            node.create_subscription(kind, topic, receive, profile)
+            end_s = time.monotonic() + given.seconds
+            while time.monotonic() < end_s:
+                executor.spin_once(0.1)
+    rclpy.try_shutdown()
+    if not ages_ns:
+        sys.stderr.write(
+            f"check_subscription: nothing came on {topic}: see /diagnostics, ros2 topic info -v\n"
+        )
+        return 1
+    for line in report(counted, sorted(ages_ns), given.depth, best_effort=given.best_effort):
+        sys.stdout.write(f"{line}\n")
+    return int(counted.lost > 0)
+
+
+def _find(node: Node, executor: SingleThreadedExecutor, topic: str) -> Any:
+    """A publisher of the topic; None if there is none in time."""
+    end_s = time.monotonic() + _DISCOVERY_S
+    while time.monotonic() < end_s:
+        executor.spin_once(0.1)
+        for publisher in node.get_publishers_info_by_topic(topic):
+            if "UNKNOWN" not in publisher.node_name:  # which becomes known later
+                return publisher
+    return None
+
+
+def report(counted: Subscription, ages_ns: Sequence[int], depth: int, *, best_effort: bool) -> Iterator[str]:
+    """What was measured, with the ages in ascending order, and what to change: a sentence each."""
+    p50, p99, longest = (ages_ns[(len(ages_ns) - 1) * n // 100] / 1e6 for n in (50, 99, 100))
+    yield f"received {counted.received}, lost {counted.lost}, missing {counted.missing}"
+    yield f"age p50 {p50:.1f} ms, p99 {p99:.1f} ms, longest {longest:.1f} ms"
+    if not counted.rate_hz:
+        yield "lost is not known: the publisher has no ~/published"
+    elif counted.lost and best_effort:
+        yield "lost by best effort: subscribe reliably"
+    elif counted.lost and depth < _DEEP:
+        yield f"the queue was too short for a pause of this process: raise the depth to {_DEEP}"
+    elif counted.lost and p50 > 500 * depth / counted.rate_hz:
+        yield "the queue is always full: use an executor for this topic alone, C++, or publishing_frequency"
+    elif counted.lost:
+        yield "long pauses: raise the depth, or give this process real-time priority"
+    if p99 > _CONTROL_MS:
+        yield "too old for a control loop: use real-time priority, or the ros2_control plugin"
+    if counted.missing > counted.lost:
+        yield f"{counted.missing - counted.lost} samples were not published: see the node's /diagnostics"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

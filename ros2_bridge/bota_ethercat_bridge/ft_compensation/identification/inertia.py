@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tool's inertia tensor about its center of gravity, from a recording in which the tool turned freely.
+
+In every sample torque = center x tool's force + bias - (J alpha + omega x J omega), with angular rate and
+acceleration as the compensation has them: at the instant and with the bandwidth of the force. This is linear
+in J, the center, and a bias that drifts. What mass and center make likely of J is known before, and remains
+where the motion tells nothing. Samples in which force and accelerometer disagree, as while a hand moves the
+tool from pose to pose, are left out. The covariance is that of pieces of the recording (sandwich), and so
+covers residuals that are correlated.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bota_ethercat.pdo import Vector3
+from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, fir_taps
+from bota_ethercat_bridge.ft_compensation.alignment import Alignment, Array
+from bota_ethercat_bridge.ft_compensation.identification.delay import at_times, hann_window, smoothed
+from bota_ethercat_bridge.ft_compensation.identification.payload import Identified
+from bota_ethercat_bridge.ft_compensation.identification.weighted import students_t
+from bota_ethercat_bridge.ft_compensation.quantities import (
+    ELEMENTS,
+    NORMAL_95,
+    Accelerometer,
+    CompensationError,
+    likely_inertia,
+)
+
+_RESPONSES: Final = acceleration_response, angular_rate_response
+_WINDOW_S: Final = 0.05  # of the smoothing; a quarter of it apart are the instants that are compared
+_PIECE_S: Final = 0.5  # whose residuals are independent of those of the others
+_CONTACT_N, _CONTACT_SHARE = 1.0, 0.05  # contact: so much force, and of the weight, is not explained
+_AROUND_S: Final = 0.2  # left out before and after a contact
+_LEAST_PIECES: Final = 4
+# rad/s², rms of a piece: less is mostly noise of the gyroscope, which would pass for motion.
+_LEAST_SPIN: Final = 0.3
+# m/s²; how far from 1, also in standard errors: of a healthy IMU in motion.
+_GRAVITY, _GAIN, _CHANCE = (7.0, 13.0), 0.35, 4.0
+_CHANGES: Final = 1.0  # m/s³, rms: with less an offset of the gyroscope would be most of the turning
+_LEAST_CENTER: Final = 5e-4  # m: how well poses tell the center of gravity of what moves, at best
+_GYROSCOPE: Final = 0.01  # tolerance of its sensitivity, 95 %
+_HARDLY: Final = 0.5  # of the interval before: a moment no better known than so is not determined
+_AT_FIRST: Final = 1e6  # weights: what is measured goes first, not what was known before
+_PLACES: Final = [("xyz".index(row), "xyz".index(column)) for row, column in ELEMENTS]
+
+
+class Turned(NamedTuple):
+    """What `turn` makes of samples: n instants, smoothed alike."""
+
+    force: Array  # (n, 3)
+    torque: Array  # (n, 3)
+    felt: Array  # (n, 3): specific force at the wrench origin, m/s²
+    arm: Array  # (n, 3, 3): times a place in the sensor's frame, m: by how much it is another there
+    spun: Array  # (n, 3, 6): times the tensor: J alpha + omega x J omega
+    times: Array  # (n,) s
+    is_whole: NDArray[np.bool_]  # (n,): whether no sample is missing there
+
+
+def turn(
+    stamps: Array, samples: Array, alignment: Alignment, accelerometer: Accelerometer, imu: Vector3
+) -> Turned:
+    """Force and torque, and what the IMU at `imu`, m, felt of them, at one instant and bandwidth.
+
+    Of `samples` (n, 12): N, Nm, m/s², rad/s; taken at `stamps` (n,), s, in order.
+    """
+    if alignment.lag_s is None:
+        raise CompensationError("by the filters that were set it is not known how late the force is")
+    period, settings = alignment.period_s, alignment.settings
+    times = np.arange(stamps[0], stamps[-1], period)
+    late = [each(settings).delay_s or 0.0 for each in _RESPONSES]
+    taps = np.array(fir_taps()) if settings.get("fir") else np.ones(1)
+    lag_s = alignment.lag_s - period * (len(taps) - 1) / 2
+    load, acceleration, rate = np.split(samples, [6, 9], axis=1)
+    load = at_times(times, stamps, load)
+    acceleration, rate = (
+        smoothed(at_times(times - lag_s + delay_s - late[0], stamps, columns), taps, "full")[: len(times)]
+        for columns, delay_s in zip((acceleration, rate), late, strict=True)
+    )
+    felt = np.stack(accelerometer.correct(tuple(acceleration.T)), axis=1)
+    spin = np.gradient(rate, period, axis=0)
+    _check_imu(felt, rate, period)
+    arm = crossing(spin) + crossing(rate) @ crossing(rate)
+    spun = _elements(spin) + crossing(rate) @ _elements(rate)
+    felt = felt - arm @ np.array(imu)
+    window = hann_window(_WINDOW_S, period)
+    every = max(1, round(_WINDOW_S / period / 4))
+    columns = np.concatenate([load, felt, arm.reshape(-1, 9), spun.reshape(-1, 18)], axis=1)
+    found, times = smoothed(columns, window)[::every], times[::every]
+    reach_s = period * len(taps) + abs(lag_s) + _WINDOW_S
+    is_gap = np.diff(stamps) > max(alignment.gap_s, 2.5 * period)
+    last = np.append(stamps[:-1][is_gap], stamps[-1])
+    first = np.append(stamps[0], stamps[1:][is_gap])
+    of = np.searchsorted(first, times, "right") - 1  # the stretch without a gap
+    is_whole = (times > first[of] + reach_s) & (times < last[of] - _WINDOW_S)
+    force, torque, felt, arm, spun = np.split(found, [3, 6, 9, 18], axis=1)
+    return Turned(force, torque, felt, arm.reshape(-1, 3, 3), spun.reshape(-1, 3, 6), times, is_whole)
+
+
+def _check_imu(felt: Array, rate: Array, period: float) -> None:
+    """CompensationError if gravity does not turn as the gyroscope says."""
+    if not _GRAVITY[0] < (size := float(np.median(np.linalg.norm(felt, axis=1)))) < _GRAVITY[1]:
+        raise CompensationError(
+            f"the accelerometer reads {size:.2f} m/s² mostly, where gravity is 9.81: check imu_raw_units"
+        )
+    window = hann_window(2 * _WINDOW_S, period)
+    inner = slice(len(window), -len(window))
+    changes = np.gradient(smoothed(felt, window), period, axis=0)[inner]
+    turns = smoothed(np.cross(felt, rate), window)[inner]
+    each = float((turns**2).sum()) or 1.0
+    gain = float((turns * changes).sum()) / each
+    # What else accelerates the sensor is by chance in step with its turns: from piece to piece.
+    starts = np.arange(0, len(turns), max(1, round(2 * _PIECE_S / period)))
+    by_chance = np.add.reduceat((turns * (changes - gain * turns)).sum(axis=1), starts)
+    error = max(_GAIN, _CHANCE * float(np.linalg.norm(by_chance)) / each)
+    if abs(gain - 1.0) > error and (changes**2).sum() > _CHANGES**2 * len(changes):
+        raise CompensationError(
+            f"gravity turns {gain:.3g} times as fast as the gyroscope says, which should be 1: the "
+            "angular rate has another sign or frame, or is in °/s (0.0175): check imu_raw_units"
+        )
+
+
+def identify_inertia(turned: Turned, poses: Identified) -> Identified:
+    """`poses` with the tensor and its intervals, and a note where the motion does not tell it.
+
+    CompensationError, one sentence, if there is no such body.
+    """
+    payload, weight = poses.payload, poses.payload.mass * poses.gravity
+    felt = turned.felt + turned.arm @ np.array(payload.center)
+    beyond = np.linalg.norm(turned.force - poses.bias.force + payload.mass * felt, axis=1)
+    is_free = untouched(turned, beyond, weight)
+    minutes, pieces, spun = divided(turned)
+    if len(np.unique(pieces[is_free])) <= _LEAST_PIECES:
+        raise CompensationError("something touched the tool all the time between the poses")
+    still = np.broadcast_to(np.eye(3), (len(pieces), 3, 3))
+    force = -payload.mass * felt  # with far less noise than the measured one
+    design = np.concatenate([-spun, -crossing(force), still, still * minutes], axis=2)[is_free]
+    likely, half = (np.array(part) for part in likely_inertia(payload))
+    halves = np.concatenate([half, np.maximum(payload.center_interval, _LEAST_CENTER), np.full(6, np.inf)])
+    known, expected = (NORMAL_95 / halves) ** 2, np.concatenate([likely, payload.center, np.zeros(6)])
+    measured, pieces = turned.torque[is_free], pieces[is_free]
+    found, covariance, degrees = solve_pieces(design, measured, pieces, known, expected)
+    found, interval = found[:6], float(students_t(degrees)) * np.sqrt(np.diag(covariance)[:6])
+    interval = np.hypot(np.minimum(interval, half), _GYROSCOPE * abs(found[:3]).max())
+    vague = "".join(axis for axis, is_open in zip("xyz", interval > _HARDLY * half, strict=False) if is_open)
+    note = (
+        f"the tool hardly turned about {' and '.join(vague)}, so its inertia there is only what mass and "
+        "center of gravity make likely: turn it to and fro about each axis for some seconds, touching nothing"
+    )
+    inertia = possible_inertia(found, interval).tolist()
+    payload = payload._replace(inertia=tuple(inertia), inertia_interval=tuple(interval.tolist()))
+    return poses._replace(payload=payload, notes=(*([note] if vague else []), *poses.notes))
+
+
+def untouched(turned: Turned, beyond: Array, weight: float) -> NDArray[np.bool_]:
+    """(n,): no sample is missing, and so much force, N, that the tool does not explain is no contact."""
+    spread = max(1, round(_AROUND_S / float(np.diff(turned.times[:2])[0])))
+    is_touched = beyond > _CONTACT_N + _CONTACT_SHARE * weight
+    return turned.is_whole & (np.convolve(is_touched, np.ones(2 * spread + 1), "same") < 0.5)
+
+
+def divided(turned: Turned) -> tuple[Array, NDArray[np.int64], Array]:
+    """Minutes (n, 1, 1), numbers of the pieces (n,), and `spun` where it is more than noise."""
+    pieces = (turned.times / _PIECE_S).astype(int) - int(turned.times[0] / _PIECE_S)
+    squares, lengths = np.zeros((pieces[-1] + 1, 6)), np.maximum(np.bincount(pieces), 1)
+    np.add.at(squares, pieces, (turned.spun**2).sum(axis=1) / lengths[pieces, None])
+    spun = turned.spun * (squares > _LEAST_SPIN**2)[pieces, None]
+    return (turned.times - turned.times.mean())[:, None, None] / 60.0, pieces, spun
+
+
+def solve_pieces(
+    design: Array, measured: Array, pieces: NDArray[np.int64], known: Array, expected: Array
+) -> tuple[Array, Array, float]:
+    """The unknowns (p,) of `design` (n, k, p) times unknowns = `measured` (n, k), covariance and degrees.
+
+    `pieces` (n,) numbers those whose residuals are correlated. `known` (p,): inverse of the variance about
+    `expected` that was known before.
+    """
+    pieces = np.unique(pieces, return_inverse=True)[1]
+    (_, kinds, unknowns), count = design.shape, int(pieces[-1]) + 1
+    scale = np.sqrt((design**2).mean(axis=(0, 1)))
+    scale[scale == 0.0] = 1.0  # of what the motion does not show at all
+    design, known, expected = design / scale, known / scale**2, expected * scale
+    weights = np.full(kinds, _AT_FIRST)
+    for _ in range(3):
+        weighted = design * weights[:, None]
+        information = np.tensordot(weighted, design, ([0, 1], [0, 1])) + np.diag(known)
+        right = np.tensordot(weighted, measured, ([0, 1], [0, 1])) + known * expected
+        answer = np.linalg.lstsq(information, right, rcond=1e-12)[0]
+        residuals = measured - design @ answer
+        # Neighboring instants tell the same: so many as a piece has count as one.
+        weights = 1.0 / (np.maximum((residuals**2).mean(axis=0), 1e-12) * 2.0)
+    scores = np.zeros((count, unknowns))
+    np.add.at(scores, pieces, np.einsum("nip,ni->np", design * weights[:, None], residuals))
+    degrees = max(count - unknowns / kinds, 1.0)
+    meat = scores.T @ scores * count / degrees
+    inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
+    covariance = inverse @ (meat + np.diag(known)) @ inverse
+    return answer / scale, covariance / np.outer(scale, scale), degrees
+
+
+def possible_inertia(found: Array, interval: Array) -> Array:
+    """The nearest tensor that a body can have; CompensationError if that is beyond the interval.
+
+    Half its trace less itself is the second moment of the mass, which is nowhere negative: this is that the
+    moments are positive, and none larger than the sum of the others.
+    """
+    tensor = np.zeros((3, 3))
+    for (i, j), value in zip(_PLACES, found, strict=True):
+        tensor[i, j] = tensor[j, i] = value
+    spread, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
+    if spread[0] < -np.linalg.norm(interval):
+        moments = ", ".join(f"{moment:.2g}" for moment in np.linalg.eigvalsh(tensor))
+        raise CompensationError(
+            f"the principal moments of inertia would be {moments} kg m², which no body has: something "
+            "touched the tool, or the angular rate has another sign or unit"
+        )
+    spread = np.maximum(spread, 0.0)
+    tensor = spread.sum() * np.eye(3) - (axes * spread) @ axes.T
+    return np.array([tensor[i, j] for i, j in _PLACES])
+
+
+def crossing(vectors: Array) -> Array:
+    """(n, 3, 3): times another vector, this one's cross product with it."""
+    x, y, z = vectors.T
+    nothing = np.zeros_like(x)
+    rows = ((nothing, -z, y), (z, nothing, -x), (-y, x, nothing))
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _elements(vectors: Array) -> Array:
+    """(n, 3, 6): times the elements of a symmetric tensor, that tensor times the vector."""
+    found = np.zeros((len(vectors), 3, 6))
+    for element, (i, j) in enumerate(_PLACES):
+        found[:, i, element] = vectors[:, j]
+        found[:, j, element] = vectors[:, i]
+    return found

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Payload and bias as a YAML file in the form of ROS 2 parameters, to start the node with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bota_ethercat.pdo import Vector3
+from bota_ethercat.program.new_file import NewFile
+from bota_ethercat_bridge.ft_compensation.identification.payload import Identified
+from bota_ethercat_bridge.ft_compensation.quantities import NO_PAYLOAD, Payload, Wrench
+
+_Row = tuple[str, Sequence[float], str]  # parameter, values, comment
+
+
+def write_yaml(
+    path: Path,
+    result: Identified,
+    comment: str = "",
+    gravity: Vector3 | None = None,
+    offset: Wrench | None = None,
+) -> None:
+    """Write what was identified, or replace it, with `comment` on top; FileError if that fails.
+
+    `offset` is the sensor's own, with which the bias was measured; None: not known.
+
+    `gravity` is in the base frame, m/s²; without it the file does not say how the base stands. Where the
+    accelerometer was not identified, the file leaves it alone.
+    """
+    rows: list[_Row] = [("bias", result.bias.values, "N, Nm: Fx Fy Fz Mx My Mz, subtracted")]
+    if offset is not None:
+        rows.append(("sensor_offset", offset.values, "N, Nm: the sensor's own, part of the bias"))
+    if gravity is not None:
+        rows.append(("gravity", gravity, "m/s², in the base frame"))
+    if result.accelerometer is not None:
+        units = (
+            "m/s², subtracted", "divided by, after that", "m/s², half of 95 %", "half of 95 %",
+            "xy xz yx yz zx zy: parts of the second axis, subtracted from the first", "half of 95 %",
+        )  # fmt: skip
+        parts = zip(result.accelerometer.calibration._asdict().items(), units, strict=True)
+        rows += [(f"accelerometer.{name}", part, unit) for (name, part), unit in parts]
+    write_payload(path, result.payload, comment, rows)
+
+
+def write_payload(path: Path, payload: Payload, comment: str = "", more: Sequence[_Row] = ()) -> None:
+    """Write the tool and `more` rows, or replace it, with `comment` on top; FileError if that fails."""
+    rows: list[_Row] = [
+        ("tool_center_of_gravity", payload.center, "m, in the sensor's frame"),
+        ("tool_center_of_gravity_interval", payload.center_interval, "m, half of 95 %"),
+        ("tool_inertia", payload.inertia, "kg m²: xx yy zz xy xz yz, about that"),
+        ("tool_inertia_interval", payload.inertia_interval, "kg m², half of 95 %"),
+        *more,
+    ]
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    lines += ["/**:", "  ros__parameters:", f"    tool_mass: {_number(payload.mass)}  # kg"]
+    lines += [f"    {name}: [{', '.join(map(_number, values))}]  # {unit}" for name, values, unit in rows]
+    with NewFile(path, force=True) as file:
+        file.write("\n".join(lines) + "\n")
+        file.finish()
+
+
+def payload_of(parameters: Mapping[str, Any]) -> Payload:
+    """The tool in a node's parameters; LookupError, TypeError or ValueError if there is none."""
+    names = "inertia", "center_of_gravity_interval", "inertia_interval"
+    rows = zip(names, NO_PAYLOAD[2:], strict=True)
+    mass, center = float(parameters["tool_mass"]), tuple(parameters["tool_center_of_gravity"])
+    return Payload(mass, center, *(tuple(parameters.get(f"tool_{name}", row)) for name, row in rows))
+
+
+def _number(value: float) -> str:
+    # YAML 1.1 takes 1e-05 for text, and ROS a number without a point for an integer.
+    return f"{value + 0.0:.9f}"

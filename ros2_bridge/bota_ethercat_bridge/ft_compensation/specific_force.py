@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The specific force at the tool's center of gravity: acceleration minus gravity.
+
+An accelerometer measures it: at rest it reads minus gravity. docs/compensation.md has the model; d is from
+the IMU to the center of gravity. Nobody needs to know where gravity points.
+
+Without the accelerometer, gravity in the sensor's frame is known by the orientation that a robot tells.
+Between two orientations, and for those that come late, the gyroscope turns gravity on. It is known until the
+newest orientation is too old: nobody goes on with an old pose. Times are seconds on one clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from bota_ethercat.pdo import Vector3
+from bota_ethercat_bridge.ft_compensation.alignment import Alignment, Array, align
+from bota_ethercat_bridge.ft_compensation.outputs import WrenchTransform
+from bota_ethercat_bridge.ft_compensation.quantities import (
+    DEFAULT_GRAVITY,
+    EXACT,
+    STILL,
+    ZERO,
+    Accelerometer,
+    Quaternion,
+)
+
+_TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
+Row = tuple[float, ...]
+_MOST_RATES: Final = 4096  # remembered for orientations that come late: 2.5 s at 1600 Hz
+
+
+class ImuSpecificForce:
+    """From the sensor's accelerometer and gyroscope, sample by sample.
+
+    It keeps as many samples as the alignment needs, with those that were lost interpolated, in a ring that
+    has every row twice, so that the newest are in one piece.
+    """
+
+    def __init__(
+        self, lever: Vector3 = ZERO, accelerometer: Accelerometer = EXACT, alignment: Alignment | None = None
+    ) -> None:
+        """`lever` is d, m; `accelerometer` corrects what it reads."""
+        self.lever = lever
+        # Angular rate (rad/s) and acceleration (rad/s²) of the latest sample, at force and torque's instant.
+        self.turning = STILL
+        self._correct = accelerometer.correct
+        self.align(alignment or align({}))
+
+    def align(self, alignment: Alignment) -> None:
+        """Bring what follows to the instant of force and torque so."""
+        self.alignment = alignment
+        self._size = alignment.taps.shape[1]
+        self._ring = np.zeros((2 * self._size, 6))
+        self._at = self._filled = 0
+        self._time_s = -math.inf
+
+    def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
+        """m/s² at the center of gravity, when force and torque of this sample were (m/s², rad/s).
+
+        None if it is not finite, or if the sensor turns and what was before the sample, and so how fast it
+        spins up, is not known.
+        """
+        row = (*self._correct(acceleration), *angular_rate)
+        total = sum(row)
+        if total - total != 0.0:  # NaN or infinity
+            self._time_s = -math.inf
+            return None
+        passed_s, self._time_s = time_s - self._time_s, time_s
+        dx, dy, dz = self.lever
+        if 0.0 < passed_s <= self.alignment.gap_s:
+            if self._filled == 1 or passed_s > 1.5 * self.alignment.period_s:
+                self._bridge(row, passed_s)
+            self._append(row)
+        else:
+            self._filled = 1
+            self._ring[:] = row
+        if self._filled <= self.alignment.lead and (dx or dy or dz):
+            wx, wy, wz = angular_rate
+            if wx * wx + wy * wy + wz * wz > _TURNING * _TURNING:
+                return None
+        found = self.alignment.taps.dot(self._ring[self._at + 1 : self._at + self._size + 1]).tolist()
+        (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = found
+        self.turning = (wx, wy, wz), (tx, ty, tz)
+        vx, vy, vz = wy * dz - wz * dy, wz * dx - wx * dz, wx * dy - wy * dx
+        return (
+            ax + ty * dz - tz * dy + wy * vz - wz * vy,
+            ay + tz * dx - tx * dz + wz * vx - wx * vz,
+            az + tx * dy - ty * dx + wx * vy - wy * vx,
+        )
+
+    def _bridge(self, row: Row, passed_s: float) -> None:
+        """What precedes a sample that comes so long after the one before."""
+        ring, size = self._ring, self._size
+        periods = round(passed_s / self.alignment.period_s)
+        if self._filled == 1:  # of two samples only, the slope is that between them
+            before = ring[self._at].copy()
+            step = (np.array(row) - before)[3:] / max(periods, 1)
+            turned = before[3:] - step * np.arange(size)[::-1, np.newaxis]
+            self._at = size - 1
+            ring[:size, 3:] = ring[size:, 3:] = turned
+        if periods > 1:
+            before = ring[self._at].copy()
+            for lost in range(1, periods):
+                self._append(before + lost / periods * (row - before))
+
+    def _append(self, row: Row | Array) -> None:
+        self._filled += 1
+        self._at = at = (self._at + 1) % self._size
+        self._ring[at] = self._ring[at + self._size] = row
+
+
+class QuaternionGravity:
+    """Gravity from orientations of the sensor in a base frame."""
+
+    def __init__(self, gravity: Vector3 = DEFAULT_GRAVITY, *, stale_after_s: float = 0.1) -> None:
+        """`gravity` is in the base, m/s²."""
+        self.base_gravity, self.stale_after_s = gravity, stale_after_s
+        self._newest_s = -math.inf  # time of the newest orientation
+        self._gravity: tuple[float, Vector3] | None = None  # when, and what it was in the sensor's frame
+        self._rates: deque[tuple[float, Vector3]] = deque(maxlen=_MOST_RATES)
+
+    def reset(self) -> None:
+        self._newest_s, self._gravity = -math.inf, None
+        self._rates.clear()
+
+    def add_rate(self, angular_rate: Vector3, time_s: float) -> None:
+        rates = self._rates
+        if rates and not 0.0 <= time_s - rates[-1][0] <= self.stale_after_s:
+            rates.clear()  # a gap, or a clock that was set: the orientation is held until the next one
+        if not math.isfinite(sum(angular_rate)):
+            rates.clear()
+            return
+        rates.append((time_s, angular_rate))
+        if self._gravity is not None and len(rates) > 1:
+            self._gravity = _propagated(*self._gravity, (rates[-2], rates[-1]))
+
+    def update(self, orientation: Quaternion, time_s: float) -> bool:
+        """Take a unit quaternion x, y, z, w of time `time_s`. False: it is older than what is known."""
+        # Messages may overtake each other; a clock that was set back is another matter.
+        if 0.0 < self._newest_s - time_s <= self.stale_after_s:
+            return False
+        gravity = WrenchTransform.of(ZERO, orientation).inverse().apply(self.base_gravity, ZERO).force
+        self._newest_s = time_s
+        later = [each for each in self._rates if each[0] > time_s]
+        known = [each for each in self._rates if each[0] <= time_s][-1:]
+        self._gravity = _propagated(time_s, gravity, [*known, *later])
+        return True
+
+    def age_s(self, now_s: float) -> float:
+        """How old the latest orientation is, s; infinite if there is none."""
+        return abs(now_s - self._newest_s)
+
+    def gravity(self, now_s: float) -> Vector3 | None:
+        """Gravity in the sensor's frame, m/s²; None when the orientation is older than `stale_after_s`."""
+        if self._gravity is None or not self.age_s(now_s) <= self.stale_after_s:
+            return None
+        return self._gravity[1]
+
+
+def _propagated(
+    time_s: float, gravity: Vector3, rates: Sequence[tuple[float, Vector3]]
+) -> tuple[float, Vector3]:
+    """Gravity of `time_s` turned on by these rates (times ascending), or back, to the last of them."""
+    if rates and time_s > rates[-1][0]:
+        rates = ((time_s, rates[-1][1]), rates[-1])
+    for (before_s, before), (after_s, after) in pairwise(rates):
+        passed_s = after_s - max(before_s, time_s)
+        x, y, z = (0.5 * passed_s * (a + b) for a, b in zip(before, after, strict=True))
+        gx, gy, gz = gravity
+        # What stands still turns by minus the rotation vector in the sensor's frame; to second order.
+        cx, cy, cz = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
+        gx, gy, gz = (
+            gx + cx + 0.5 * (cy * z - cz * y),
+            gy + cy + 0.5 * (cz * x - cx * z),
+            gz + cz + 0.5 * (cx * y - cy * x),
+        )
+        size, wanted = math.sqrt(gx * gx + gy * gy + gz * gz), math.sqrt(sum(g * g for g in gravity))
+        scale = wanted / size
+        gravity, time_s = (gx * scale, gy * scale, gz * scale), after_s
+    return time_s, gravity

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The topics `contact`, the point with its region, and `contact/detected`, whether there is contact."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Final
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.node import Node
+from std_msgs.msg import Bool, Header
+
+from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.replies import SensorInfo
+from bota_ethercat.sensor.response import healthy_noise
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
+from bota_ethercat_bridge.ft_compensation.alignment import align
+from bota_ethercat_bridge.ft_compensation.bounds import (
+    IMU_BELOW,
+    force_bound_95,
+    inertia_halves,
+    off_center_95,
+)
+from bota_ethercat_bridge.ft_compensation.compensator import Stages
+from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Uncertainty, Why, correlation
+from bota_ethercat_bridge.ft_compensation.quantities import length
+from bota_ethercat_bridge.parameters.table import Parameters, parse_surface
+from bota_ethercat_bridge.publishing.messages import Stamps, Topic, create_publisher
+from bota_ethercat_bridge.publishing.wrenches import WrenchTopic
+from bota_ethercat_bridge.rclpy_internals import packing
+
+_PERIOD_NS: Final = 40_000_000  # of the point, which takes as long as two samples take to compensate
+
+
+class ContactTopic(WrenchTopic):
+    """Takes every compensated sample; publishes at each change of what is detected, and 25 times a second."""
+
+    def __init__(
+        self,
+        node: Node,
+        parameters: Parameters,
+        stamps: Stamps,
+        info: Callable[[], SensorInfo],
+        plan: Callable[[], Any],
+    ) -> None:
+        Topic.__init__(self, node, PoseWithCovarianceStamped, "contact")
+        message = PoseWithCovarianceStamped(header=Header(frame_id=parameters.frame_id))
+        self._pack = packing(message, 43)
+        self._stamps, self.index = stamps, Stages._fields.index("final")
+        self._detected = create_publisher(node, Bool, "contact/detected")
+        self._info, self._plan = info, plan
+        self.noise: tuple[float, ...] = ()  # of the latest tare, N and Nm
+        self.why = Why.NO_CONTACT  # of the latest point
+        self._detector: ContactDetector | None = None
+        self._made_of: object = None
+        self._next_ns = 0
+        self.configure(parameters)
+
+    def configure(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+
+    def is_wanted(self) -> bool:
+        wanted = super().is_wanted() or bool(self._detected.get_subscription_count())
+        if wanted and self._info().rate_hz:
+            self._follow(self._parameters, self._plan())
+        return wanted
+
+    def _follow(self, parameters: Parameters, plan: Any) -> None:
+        """Another detector where parameters, bias or settings are others."""
+        info, tool = self._info(), parameters.payload
+        made_of = parameters, plan.ramp.taken, plan.source.is_imu, info.settings, info.rate_hz, self.noise
+        if made_of == self._made_of:
+            return
+        self._made_of = made_of
+        sinc_length, fir = round(BASE_SAMPLING_RATE_HZ / info.rate_hz), bool(info.settings.get("fir"))
+        healthy = healthy_noise(sinc_length, fir=fir)
+        noise = parameters.contact_noise if any(parameters.contact_noise) else self.noise or healthy
+        weight = imu = 0.0
+        if plan.source.is_imu:
+            imu, _ = align(info.settings, info.rate_hz).noise(length(tool.center) + IMU_BELOW)
+            weight = force_bound_95(tool, parameters.accelerometer, plan.ramp.taken)
+        torque = STANDARD_GRAVITY * off_center_95(tool, plan.ramp.taken)
+        known = Uncertainty.of(
+            [a or b for a, b in zip(noise, healthy, strict=True)],
+            weight,
+            torque,
+            tool,
+            max(inertia_halves(tool)),
+            imu,
+        )
+        surface = parse_surface(parameters.contact_surface)
+        assert surface is not None  # there is no topic without one
+        self._detector = ContactDetector(
+            surface, known, info.rate_hz, correlation(info.settings), parameters.contact_false_alarms
+        )
+
+    def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
+        if (detector := self._detector) is None:
+            return
+        turning, was = self._plan().source.turning, detector.is_contact
+        if detector.update(force, torque, turning) is was and frame.monotonic_ns < self._next_ns:
+            return
+        self._next_ns = frame.monotonic_ns + _PERIOD_NS
+        self._detected.publish(Bool(data=detector.is_contact))
+        self.why, _, _, region = detector.locate(force, torque, turning)
+        if region is None:
+            return
+        x, y, z = region.normal  # the pose's z axis
+        turn = math.sqrt(0.5 + 0.5 * z)
+        pose = (-0.5 * y / turn, 0.5 * x / turn, 0.0, turn) if turn > 1e-6 else (1.0, 0.0, 0.0, 0.0)
+        a, b, c, d, e, f, g, h, i = region.covariance()
+        none = (0.0, 0.0, 0.0)
+        covariance = a, b, c, *none, d, e, f, *none, g, h, i, *none, *(0.0,) * 18
+        next(self._sends)(
+            self._pack(frame.stamp_ns - self._stamps.wrench_ns, *region.center, *pose, *covariance)
+        )
