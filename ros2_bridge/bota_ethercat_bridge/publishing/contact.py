@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -74,22 +74,18 @@ class ContactTopic(WrenchTopic):
         if made_of == self._made_of:
             return
         self._made_of = made_of
-        sinc_length, fir = round(BASE_SAMPLING_RATE_HZ / info.rate_hz), bool(info.settings.get("fir"))
-        healthy = healthy_noise(sinc_length, fir=fir)
-        noise = parameters.contact_noise if any(parameters.contact_noise) else self.noise or healthy
+        sinc_length = round(BASE_SAMPLING_RATE_HZ / info.rate_hz)
+        healthy = healthy_noise(sinc_length, fir=bool(info.settings.get("fir")))
+        noise: Sequence[float] = self.noise or healthy
+        if any(parameters.contact_noise):
+            noise = parameters.contact_noise
         weight = imu = 0.0
         if plan.source.is_imu:
             imu, _ = align(info.settings, info.rate_hz).noise(length(tool.center) + IMU_BELOW)
             weight = force_bound_95(tool, parameters.accelerometer, plan.ramp.taken)
         torque = STANDARD_GRAVITY * off_center_95(tool, plan.ramp.taken)
-        known = Uncertainty.of(
-            [a or b for a, b in zip(noise, healthy, strict=True)],
-            weight,
-            torque,
-            tool,
-            max(inertia_halves(tool)),
-            imu,
-        )
+        noise = [a or b for a, b in zip(noise, healthy, strict=True)]
+        known = Uncertainty.of(noise, weight, torque, tool, max(inertia_halves(tool)), imu)
         surface = parse_surface(parameters.contact_surface)
         assert surface is not None  # there is no topic without one
         self._detector = ContactDetector(

@@ -57,8 +57,7 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
     period = float(np.median(np.diff(times)))
     stamps, times = times, np.arange(times[0], times[-1], period)
     force, acceleration, rate = (at_times(times, stamps, columns) for columns in (force, acceleration, rate))
-    products = (rate[:, :, None] * rate[:, None]).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-    turned = np.concatenate([np.gradient(rate, period, axis=0), products], axis=1)
+    turned = np.concatenate([np.gradient(rate, period, axis=0), _products(rate)], axis=1)
     # All alike, and so long that little noise remains in what the motion is regressed on: that would pull the
     # lag. Noise would be least, and fit best, between two samples, too.
     slow = smoothed(force, hann_window(_SHORTEST_S, period))
@@ -128,11 +127,8 @@ def check_held_out(
     period = float(np.median(np.diff(stamps)))
     times = np.arange(stamps[0], stamps[-1], period)
     force, acceleration, rate = np.split(at_times(times, stamps, samples), [3, 6], axis=1)
-    plain = align({}, 1.0 / period)
-    aligned, not_aligned = (
-        _held_out(force, acceleration, rate, each)
-        for each in (align(settings, 1.0 / period, lag.seconds), plain)
-    )
+    both = align(settings, 1.0 / period, lag.seconds), align({}, 1.0 / period)
+    aligned, not_aligned = (_held_out(force, acceleration, rate, each) for each in both)
     if aligned < _AS_GOOD * not_aligned:
         return aligned, not_aligned
     raise CompensationError(
@@ -144,14 +140,17 @@ def check_held_out(
 def _held_out(force: Array, acceleration: Array, rate: Array, alignment: Alignment) -> float:
     columns = zip((acceleration, rate, rate), alignment.taps[:, ::-1], strict=True)
     felt, turned, spun = (smoothed(each, taps, "full")[: len(force)] for each, taps in columns)
-    products = (turned[:, :, None] * turned[:, None]).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-    rows = np.concatenate([felt, spun, products, np.ones((len(felt), 1))], axis=1)
+    rows = np.concatenate([felt, spun, _products(turned), np.ones((len(felt), 1))], axis=1)
     rows, force = (each[alignment.taps.shape[1] :] for each in (rows, force))
     squares = 0.0
     for part in np.array_split(np.arange(len(rows)), _PARTS):
         tool = np.linalg.lstsq(np.delete(rows, part, 0), np.delete(force, part, 0), rcond=None)[0]
         squares += float(((force[part] - rows[part] @ tool) ** 2).sum())
     return math.sqrt(squares / len(rows))
+
+
+def _products(rate: Array) -> Array:
+    return np.asarray((rate[:, :, None] * rate[:, None]).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
 
 
 def hann_window(seconds: float, period: float) -> Array:

@@ -50,7 +50,7 @@ _CHANCE: Final = 0.01  # of seeing drift, or a touch, where there is none
 _SUSPECTS: Final = 12  # poses with the largest residuals; also, of those that are left out one by one
 # Of the accelerometer's calibration, the unknowns that are fitted: the fewest whose error of a pose that is
 # left out is so near to the least. More would fit errors of the wrench.
-_MODELS: Final = {"nothing": 0, "offset": 3, "offset and scale": 6, "offset, scale and crossed axes": 12}
+_MODELS: Final = {"offset": 3, "offset and scale": 6, "offset, scale and crossed axes": 12}
 _AS_GOOD: Final = 1.05
 _SAME_POSE: Final = 0.97  # cosine
 _FEWEST_IN_TIME: Final = 6  # poses: fewer leave nothing to tell drift from a payload
@@ -204,7 +204,7 @@ class _Equations:
             assert found.shift is not None
             longer = found.mass.value * (found.excess * left_out).sum(axis=-1, keepdims=True)
             off = np.concatenate([found.shift.value[:, :3], longer], axis=1)
-            errors[name] = math.sqrt(float((off**2).sum(axis=1).mean()))
+            errors[name] = float(np.median(np.linalg.norm(off, axis=1)))  # whatever touched one of them
         every, most = self.solve(), _AS_GOOD * min(errors.values())
         chosen = next(name for name, error in errors.items() if error <= most)
         self._free = _MODELS[chosen]
