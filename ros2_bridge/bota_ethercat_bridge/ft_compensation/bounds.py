@@ -30,7 +30,6 @@ _ABOUT_THREE_AXES: Final = 2.80 / NORMAL_95
 # ... and for three times the distance between the directions of gravity in two poses, which are any.
 _BETWEEN_POSES: Final = 4.39 / NORMAL_95
 IMU_BELOW: Final = 0.026  # m: how far the IMU is behind the wrench origin
-_TWO_AXES: Final = 2.45
 _SHORTEST_SINC: Final = 51  # where the length is not known
 _TYPED: Final = 0.1  # of its largest element: half of the interval of a tensor that is given without one
 
@@ -88,7 +87,7 @@ def torque_noise_95(payload: Payload, alignment: Alignment) -> float:
     felt, spin = alignment.noise(reach + IMU_BELOW)
     healthy = healthy_noise(int(known.get("sinc_length") or _SHORTEST_SINC), fir=bool(known.get("fir")))
     parts = max(healthy[3:]), payload.mass * reach * felt, max(payload.inertia) * spin
-    return _TWO_AXES * math.hypot(*parts)
+    return _ABOUT_THREE_AXES * NORMAL_95 * math.hypot(*parts)
 
 
 def inertia_halves(payload: Payload) -> tuple[float, ...]:
