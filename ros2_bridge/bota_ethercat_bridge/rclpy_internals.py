@@ -129,7 +129,9 @@ def make_executors(node: Node, parameters: Any) -> tuple[Executor, dict[str, Exe
     the callback group `parameters` and one for all other groups.
 
     rclpy's `MultiThreadedExecutor`, which an unknown version gets, waits for all of the node's services anew
-    each time: too expensive beside the reader.
+    each time: the node takes as much CPU time as with these, but 1.15 times as much with orientations at
+    500 Hz. Its threads are made too late to have a priority of their own. `EventsExecutor` of rclpy 7.1 takes
+    no guard conditions.
     """
     if is_known():
         ordinary = node.default_callback_group
