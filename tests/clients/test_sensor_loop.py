@@ -455,15 +455,15 @@ def test_a_tare_in_any_pose_is_right_in_every_pose(running: Loop, server: Script
 
 
 def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> None:
-    """Two sample periods: the newest force is that of the acceleration two samples before."""
+    """Two sample periods: the newest force is that of the acceleration two samples before, on a line."""
     with ScriptedServer(rate_hz=100, delay_ms={"force_torque": 25.0, "acceleration": 5.0}) as server:
         loop = running.opened(server.port, tool_mass=1)
         begin_ns = time.monotonic_ns() - 50_000_000
-        for number in range(1, 5):
+        for number in range(1, 9):
             data = encode(61, {"acceleration.z": number, "force.x": number})
             server.send(encode_data(number, 5, begin_ns + number * 10_000_000, 0, 0, 3, data))
-        wait_until(lambda: loop.read()["force.x"] == 4, "the last sample")
-        assert loop.read()["compensated.force.z"] == pytest.approx(2 * STANDARD_GRAVITY)
+        wait_until(lambda: loop.read()["force.x"] == 8, "the last sample")
+        assert loop.read()["compensated.force.z"] == pytest.approx(6 * STANDARD_GRAVITY)
         loop.do("stop")
 
 

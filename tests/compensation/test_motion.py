@@ -128,7 +128,7 @@ def every_fifth_lost(time_s: float) -> bool:
     ids=["stall of 0.5 s", "24 lost in a row", "every fifth lost", "clock set back", "clock set on"],
 )
 @pytest.mark.parametrize("fir", [False, True], ids=["FIR off", "FIR on"])
-@pytest.mark.parametrize("seed", more_if_long([0], range(8)))
+@pytest.mark.parametrize("seed", more_if_long([0, 1_192_001], [*range(8), 1_192_001]))
 def test_gaps_and_clock_steps_bring_no_error_above_the_bound(
     kept: Callable[[float], bool], shift: Callable[[float], float], fir: bool, seed: int
 ) -> None:
@@ -136,7 +136,7 @@ def test_gaps_and_clock_steps_bring_no_error_above_the_bound(
     seed, chosen = seed + 1000 * SEED, settings(fir=fir)
     felt = cut(motion.filtered(motion.moves(seed)["fast"], HEAVY, 3.0, chosen), kept, shift)
     left = left_over(felt, HEAVY, align(chosen, RATE_HZ))
-    assert len(felt.times) - len(left.times) <= 2 * (11 if fir else 1)
+    assert len(felt.times) - len(left.times) <= 2 * (13 if fir else 1)
     assert left.size.max() < 1.5
     assert left.percentile(0.99) < 1.0
 

@@ -36,10 +36,10 @@ _HISTORY_S: Final = 0.014  # what precedes it tells no more
 # constant. Chosen by what is left of moves, polishing and vibration; the optimum is flat.
 _ACCELERATION, _RATE = (10.0, 9.0), (4.0, 1.5)
 _HERTZ: Final = 0.5 * 2.0 ** (np.arange(21) / 2)
-# Over lost samples the IMU's are interpolated: with FIR on, as its window is longer, for so long; else an
-# angular acceleration would be too late by half of the gap.
-_LONGEST_GAP_S: Final = 0.1
-_GAP_S, _GAP_PERIODS = 0.008, 2.5
+# Over lost samples the IMU's are interpolated: for so long, or so many periods; with FIR on, as its window is
+# longer, for longer.
+_GAP_S, _FIR_GAP_S, _GAP_PERIODS = 0.008, 0.015, 2.5
+_UNKNOWN_GAP_S: Final = 0.1  # where the rate is unknown
 
 
 class Alignment(NamedTuple):
@@ -85,8 +85,8 @@ def align(
         )
     )
     taps = np.array([np.eye(count)[0] if known_s is None else value, *turned])[:, ::-1]
-    gap_s = max(_GAP_S, _GAP_PERIODS / rate_hz) if is_known and not fir else _LONGEST_GAP_S
-    lead = 1 + math.floor(max(at_s, 0.0) * rate_hz)
+    gap_s = max(_FIR_GAP_S if fir else _GAP_S, _GAP_PERIODS / rate_hz) if is_known else _UNKNOWN_GAP_S
+    lead = 1 + math.floor(max(at_s, 0.0) * rate_hz) + 2 * fir
     return Alignment(1.0 / rate_hz, np.ascontiguousarray(taps), known_s, gap_s, lead, settings)
 
 

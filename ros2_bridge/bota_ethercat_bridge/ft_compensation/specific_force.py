@@ -32,6 +32,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
 )
 
 _TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
+_PUSHED: Final = 0.5  # m/s²: less is an accelerometer's noise
 Row = tuple[float, ...]
 _MOST_RATES: Final = 4096  # remembered for orientations that come late: 2.5 s at 1600 Hz
 
@@ -59,13 +60,14 @@ class ImuSpecificForce:
         self._size = alignment.taps.shape[1]
         self._ring = np.zeros((2 * self._size, 6))
         self._at = self._filled = 0
+        self._moved = False  # before the latest gap, or in it
         self._time_s = -math.inf
 
     def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
         """m/s² at the center of gravity, when force and torque of this sample were (m/s², rad/s).
 
-        None if it is not finite, or if the sensor turns and what was before the sample, and so how fast it
-        spins up, is not known.
+        None if it is not finite, or if the sensor moves, or did before a gap, and what was just before the
+        sample, and so how fast it spins up, is not known.
         """
         row = (*self._correct(acceleration), *angular_rate)
         total = sum(row)
@@ -79,12 +81,13 @@ class ImuSpecificForce:
                 self._bridge(row, passed_s)
             self._append(row)
         else:
+            if self._filled:
+                before = self._ring[self._at].tolist()
+                self._moved = _turns(before[3:]) or math.dist(before[:3], row[:3]) > _PUSHED
             self._filled = 1
             self._ring[:] = row
-        if self._filled <= self.alignment.lead and (dx or dy or dz):
-            wx, wy, wz = angular_rate
-            if wx * wx + wy * wy + wz * wz > _TURNING * _TURNING:
-                return None
+        if self._filled <= self.alignment.lead and (dx or dy or dz) and (self._moved or _turns(angular_rate)):
+            return None
         found = self.alignment.taps.dot(self._ring[self._at + 1 : self._at + self._size + 1]).tolist()
         (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = found
         self.turning = (wx, wy, wz), (tx, ty, tz)
@@ -114,6 +117,11 @@ class ImuSpecificForce:
         self._filled += 1
         self._at = at = (self._at + 1) % self._size
         self._ring[at] = self._ring[at + self._size] = row
+
+
+def _turns(rate: Sequence[float]) -> bool:
+    x, y, z = rate
+    return x * x + y * y + z * z > _TURNING * _TURNING
 
 
 class QuaternionGravity:

@@ -117,8 +117,8 @@ struct Alignment {
     Alignment(std::optional<double> lag_s, double gyroscope_s, bool fir, double rate_hz) : period_s(1.0 / rate_hz) {
         const double at_s = lag_s.value_or(0.0), late = std::max(at_s, 0.0) * rate_hz;
         const bool whole = fir && lag_s;  // the IMU passes the FIR filter, too
-        lead = 1 + static_cast<int>(late);
-        if (!whole) gap_s = std::max(0.008, 2.5 / rate_hz);
+        lead = 1 + static_cast<int>(late) + (whole ? 2 : 0);
+        gap_s = std::max(whole ? 0.015 : 0.008, 2.5 / rate_hz);
         const int count = static_cast<int>(std::ceil(late)) + (whole ? 13 : std::max(3, static_cast<int>(std::nearbyint(0.014 * rate_hz))));
         for (std::size_t band = 0; band < kBands; ++band) gains_[band] = lag_s ? gain(hertz(band) * period_s, whole) : 1.0;
         const double acceleration_noise = 250e-6 * 9.80665 * std::sqrt(460.0), rate_noise = 0.01 * kPi / 180.0 * std::sqrt(184.0);
@@ -126,7 +126,7 @@ struct Alignment {
         taps = {lag_s ? fitted(10.0, 9.0, acceleration_noise, at_s, count, false) : Taps{1.0}, turned(false), turned(true)};
     }
 
-    double period_s, gap_s = 0.1;  ///< samples further apart than `gap_s` do not belong together
+    double period_s, gap_s;  ///< samples further apart than `gap_s` do not belong together
     int lead;                      ///< this many samples after a gap do not yet show the instant of force and torque
     std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
 
@@ -195,17 +195,14 @@ public:
         for (const auto& taps : alignment_.taps) count_ = std::max(count_, taps.size());
     }
 
-    /// N, Nm; NaN if acceleration or angular rate are not finite, the IMU is off, or the sensor turns and what was before is not
-    /// known. `time_s` is by a clock that nobody sets.
+    /// N, Nm; NaN if acceleration or angular rate are not finite, the IMU is off, or the sensor moves, or did before a gap, and
+    /// what was just before is not known. `time_s` is by a clock that nobody sets.
     Wrench follow(const bota_ethercat::Sample& sample, double time_s) {
-        constexpr double kTurning = 0.05;  // rad/s: less is a gyroscope's offset
         if (!sample.imu_is_finite()) time_s_ = kNever;
         if (!sample.imu_is_finite() || sample.acceleration == Vector3{}) return none();
         append(row(sample), time_s - time_s_);
         time_s_ = time_s;
-        const Vector3& rate = sample.angular_rate;
-        const bool turns = rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2] > kTurning * kTurning;
-        if (known_ <= alignment_.lead && turns && lever_ != Vector3{}) return none();
+        if (known_ <= alignment_.lead && (moved_ || turns(history_.front())) && lever_ != Vector3{}) return none();
         const Vector3 omega = aligned(1, 3), alpha = aligned(2, 3), tangential = cross(alpha, lever_);
         const Vector3 centripetal = cross(omega, cross(omega, lever_)), s = aligned(0, 0);
         Vector3 force{};
@@ -219,6 +216,18 @@ public:
 private:
     using Row = std::array<double, 6>;  // true acceleration, angular rate
     static constexpr double kNever = -1e18;  // s; infinity is nothing that -ffast-math knows
+
+    static bool turns(const Row& row) noexcept {
+        constexpr double kTurning = 0.05;  // rad/s: less is a gyroscope's offset
+        return row[3] * row[3] + row[4] * row[4] + row[5] * row[5] > kTurning * kTurning;
+    }
+
+    static bool pushed(const Row& before, const Row& row) noexcept {
+        constexpr double kPushed = 0.5;  // m/s²: less is an accelerometer's noise
+        double square = 0.0;
+        for (std::size_t i = 0; i < 3; ++i) square += (row[i] - before[i]) * (row[i] - before[i]);
+        return square > kPushed * kPushed;
+    }
 
     static Wrench none() noexcept { return {NAN, NAN, NAN, NAN, NAN, NAN}; }
 
@@ -238,6 +247,7 @@ private:
     /// Append a sample that comes `passed_s` after the one before, and interpolate those that are missing between them.
     void append(const Row& row, double passed_s) {
         if (!(passed_s > 0.0 && passed_s <= alignment_.gap_s)) {
+            moved_ = !history_.empty() && (turns(history_.front()) || pushed(history_.front(), row));
             history_.assign(count_, row);
             known_ = 1;
             return;
@@ -271,6 +281,7 @@ private:
     std::size_t count_ = 0;    // of the samples that are kept
     std::deque<Row> history_;  // the newest first
     int known_ = 0;            // since the last gap
+    bool moved_ = false;       // before it, or in it
     double time_s_ = kNever;
 };
 
