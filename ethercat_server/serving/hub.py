@@ -98,12 +98,12 @@ class Hub:
             wait_s = (wake_ns - now_ns) * 1e-9 if wake_ns > now_ns else 0.0
             ready = self._transport.wait(watched.readers if reads else (), watched.writers, wait_s)
             if ready[0] or ready[1] or (reads and self._ready):
-                self._attend(*ready, last_start_ns, reads=reads, hurried=hurried)
+                self._serve_ready(*ready, last_start_ns, reads=reads, hurried=hurried)
             hurried, now_ns = False, self._monotonic_ns()
         if now_ns >= self._sweep_at_ns:
             self._sweep(now_ns)
 
-    def _attend(
+    def _serve_ready(
         self,
         readable: Sequence[int],
         writable: Sequence[int],
