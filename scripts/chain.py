@@ -136,7 +136,8 @@ def stoppable(run: Callable[[], int], program: str, sentence: str, code: int) ->
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _on_signal)
-    os.environ.setdefault("DEMO_DIRECTORY", tempfile.mkdtemp())
+    if "DEMO_DIRECTORY" not in os.environ:
+        os.environ["DEMO_DIRECTORY"] = tempfile.mkdtemp()
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
         return run()

@@ -25,8 +25,8 @@ _DOCUMENTS: Final = f"""
 # doctor: ethercat-doctor --json
 The whole examination, or the error that ended it.
 = examination, error
-examination: interface str, version str, time str, kernel str, root bool, seconds float, verdict {_VERDICT},
-    worst ok|skipped|note|warning|bad, findings [finding]
+examination: interface str, version str, time str, kernel str, root bool, seconds float,
+    verdict good|not-possible|look|trouble, worst ok|skipped|note|warning|bad, findings [finding]
 finding: subject str, check str, level ok|skipped|note|warning|bad, found str, why str, commands [str],
     values object
 error: error str

@@ -88,7 +88,7 @@ def test_without_a_namespace_nothing_is_downloaded(restricted: str, tmp_path: Pa
     nobody = "setpriv", f"--reuid={user}", f"--inh-caps={reads}", f"--ambient-caps={reads}"
     code, said = run(script + "make_owners_environment ros", tmp_path, *nobody)
     assert code == 1
-    assert said.startswith("demo: this kernel lets only root make namespaces: run it as root (sudo demo)")
+    assert said.startswith("demo: this kernel lets only root make namespaces: run it as root (sudo demo ")
     assert ("AppArmor" in said) == (restricted == "1")
     assert "downloads" not in said
 

@@ -18,7 +18,7 @@ from ethercat_server.doctor import trace
 from ethercat_server.doctor.bus_checks import examine_bus
 from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.machine_checks import examine_machine
-from ethercat_server.doctor.report import CannotLookError, CheckResult, Report, as_json, worst
+from ethercat_server.doctor.report import CannotLookError, CheckResult, Report, as_json, is_bus_unknown, worst
 from ethercat_server.errors import ServerError, UsageError
 from ethercat_server.ethercat.nic import name_trouble, own_name
 from ethercat_server.process import command_line
@@ -58,7 +58,8 @@ def run(args: argparse.Namespace) -> int:
             findings.append(finding)
             report.write(finding)
         report.summary(findings)
-    return command_line.FAILED if worst(findings) is Level.TROUBLE else 0
+    has_failed = worst(findings) is Level.TROUBLE or any(map(is_bus_unknown, findings))
+    return command_line.FAILED if has_failed else 0
 
 
 def _examined(args: argparse.Namespace, announce: Callable[[str], None]) -> Iterator[CheckResult]:

@@ -50,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def check_subscription() -> int:
     """The program `bridge-check-subscription`, in the module of that name."""
+    if problem := environment_problem():
+        return refuse(problem, 1)
     measure = _load("check_subscription", "main")
     return 1 if measure is None else int(measure())
 

@@ -167,6 +167,10 @@ def later(sent: DataMessage, ms: float) -> DataMessage:
     [
         ([frame(1), frame(2), frame(1, 1)], "nothing was lost"),
         (
+            [frame(1), RecordedEvent(0, {"event": "disconnected", "source": "recorder"}), frame(1, 1)],
+            "nothing was lost, but for 1 disconnection",
+        ),
+        (
             [frame(1), frame(2, 0, DataFlag.GAP), frame(3, 0, DataFlag.GAP), frame(1, 1)],
             "2 samples of sensor 0 lost on the bus (estimated)",
         ),

@@ -245,7 +245,9 @@ def loads(running: Loop, model: str, lag_s: float, fir: bool, rate_hz: float, *s
     return running.answer()
 
 
-@pytest.mark.parametrize("row", LOADS, ids=lambda row: f"{row['rate_hz']} Hz, FIR {row['fir']}")
+@pytest.mark.parametrize(
+    "row", LOADS, ids=lambda row: f"{row['rate_hz']} Hz, FIR {row['fir']}, {1000 * row['lag_s']:.0f} ms"
+)
 def test_the_load_of_the_tool_is_that_of_the_golden_table(running: Loop, row: dict[str, Any]) -> None:
     assert running.new(**TOOL) == ""
     found = loads(running, "SENS", row["lag_s"], row["fir"], row["rate_hz"], *moving(row["rate_hz"]))

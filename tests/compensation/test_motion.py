@@ -164,6 +164,15 @@ def test_of_a_ramp_it_gives_the_value_of_the_forces_instant() -> None:
         assert imu.turning[1] == pytest.approx((0.01, 0.0, 0.0), abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["acceleration_filter", "angular_rate_filter"])
+def test_what_a_slow_filter_shows_late_is_not_made_of_noise(name: str) -> None:
+    """Of 65 ms, 2 are extrapolated: noise at most doubles."""
+    for profile in range(1, 9) if name == "acceleration_filter" else range(3, 10):
+        alignment = align({**settings(), name: profile}, RATE_HZ)
+        assert np.linalg.norm(alignment.taps[:2], axis=1).max() < 2.0, profile
+    assert np.linalg.norm(align(settings(), RATE_HZ, lag_s=-0.05).taps[0]) < 2.0
+
+
 def test_what_is_unknown_is_used_as_it_comes() -> None:
     for chosen in ({}, settings(64, fir=True, fast=True), settings(128, chop=True)):
         alignment = align(chosen, RATE_HZ)

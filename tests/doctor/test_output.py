@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,7 +81,9 @@ def test_virtual_where_there_is_no_virtual_bus_is_a_finding(monkeypatch: pytest.
 
     monkeypatch.setattr(VirtualBus, "__enter__", refuse)
     ended = doctor_here("virtual", "--json", "--seconds", 0)
-    assert ended.code == 0
+    assert (ended.code, json.loads(ended.out)["verdict"]) == (1, "not-possible"), (
+        "nothing is known to be good"
+    )
     assert "there is no virtual bus: no namespaces" in ended.findings("bus")["slaves"]["found"]
 
 

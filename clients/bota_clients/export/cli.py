@@ -62,6 +62,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         made.error(
             "--mcap writes the messages as they are: omit the other output, --all, --tool, --at, --fps"
         )
+    if not options.recording.name:
+        made.error(f"{options.recording} is no recording: name an .mcap file")
     options.output = (
         options.mcap or options.output or options.recording.with_suffix(DATASETS[0] if has_frames else ".csv")
     )

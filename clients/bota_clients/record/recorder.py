@@ -125,13 +125,14 @@ class Recorder:
 
     Attributes:
         dropped: frames that came but could not be written.
+        disconnections: of the server; what it sent meanwhile is not counted as lost.
         error: why nothing more can be written, or None.
         saved: number of frames in the file, including the next flush.
     """
 
     def __init__(self, path: Path, library: str, notes: Mapping[str, str], *, overwrite: bool) -> None:
         """Create the file; RecordingError. `notes` become its metadata."""
-        self.dropped = 0
+        self.dropped = self.disconnections = 0
         self._streams: dict[int, StreamAccounting] = {}  # by position on the bus
         self.error: RecordingError | None = None
         self.saved = 0
@@ -169,7 +170,8 @@ class Recorder:
             ):
                 if number:
                     found.append(f"{count(number, thing)} of sensor {position} {what}")
-        return f"{frames}, {decimal(self._disk.tell())}; {', '.join(found) or 'nothing was lost'}"
+        gone = f", but for {count(self.disconnections, 'disconnection')}" if self.disconnections else ""
+        return f"{frames}, {decimal(self._disk.tell())}; {', '.join(found) or 'nothing was lost'}{gone}"
 
     def _counts(self) -> dict[int, StreamCounts]:
         counts = {position: stream.counts for position, stream in sorted(dict(self._streams).items())}
@@ -260,6 +262,7 @@ class Recorder:
             if item.by_recorder and item.name == "lost":
                 self.dropped += int(item.event["frames"])
             elif item.by_recorder:  # the server may have been restarted, and its numbering with it
+                self.disconnections += item.name == "disconnected"
                 for stream in self._streams.values():
                     stream.begin()
             else:

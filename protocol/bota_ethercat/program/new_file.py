@@ -17,7 +17,11 @@ EXISTS: Final = "exists: choose another name, or use --force to replace it"
 
 def refuse_existing(path: Path, *, force: bool) -> None:
     """FileError if `path` is a file and not to be replaced; a device or a pipe may be written to."""
-    if path.is_file() and not force:
+    try:
+        exists = path.is_file()
+    except OSError as error:  # of a folder that may not be searched, before Python 3.14
+        raise FileError(f"{path} cannot be written: {error.strerror or error}") from None
+    if exists and not force:
         raise FileError(f"{path} {EXISTS}")
 
 

@@ -36,6 +36,8 @@ _HISTORY_S: Final = 0.014  # what precedes it tells no more
 # constant. Chosen by what is left of moves, polishing and vibration; the optimum is flat.
 _ACCELERATION, _RATE = (10.0, 9.0), (4.0, 1.5)
 _HERTZ: Final = 0.5 * 2.0 ** (np.arange(21) / 2)
+# Extrapolation goes no further, though slow filters of the IMU ask for up to 65 ms: its noise grows with it.
+_FURTHEST_S: Final = 0.002
 # Over lost samples the IMU's are interpolated: for so long, or so many periods; with FIR on, as its window is
 # longer, for longer.
 _GAP_S, _FIR_GAP_S, _GAP_PERIODS = 0.008, 0.015, 2.5
@@ -71,6 +73,7 @@ def align(
     accelerometer, gyroscope = (each(settings) for each in (acceleration_response, angular_rate_response))
     later_s = (gyroscope.delay_s or 0.0) - (accelerometer.delay_s or 0.0)
     at_s, fir = known_s or 0.0, bool(settings.get("fir")) and known_s is not None
+    lags_s = (max(lag_s, -_FURTHEST_S) for lag_s in (at_s, at_s - later_s))
     gains = [
         1.0 if known_s is None else sinc_gain(share) * (fir_gain(share) if fir else 1.0)
         for share in (_HERTZ / rate_hz).tolist()
@@ -80,9 +83,7 @@ def align(
     ages, given = np.arange(count) / rate_hz, np.array(gains)
     (value, _), turned = (
         _weights(motion, noise, ages, lag, given)
-        for motion, noise, lag in zip(
-            (_ACCELERATION, _RATE), imu_noise({}), (at_s, at_s - later_s), strict=True
-        )
+        for motion, noise, lag in zip((_ACCELERATION, _RATE), imu_noise({}), lags_s, strict=True)
     )
     taps = np.array([np.eye(count)[0] if known_s is None else value, *turned])[:, ::-1]
     gap_s = max(_FIR_GAP_S if fir else _GAP_S, _GAP_PERIODS / rate_hz) if is_known else _UNKNOWN_GAP_S

@@ -122,8 +122,8 @@ struct Alignment {
         const int count = static_cast<int>(std::ceil(late)) + (whole ? 13 : std::max(3, static_cast<int>(std::nearbyint(0.014 * rate_hz))));
         for (std::size_t band = 0; band < kBands; ++band) gains_[band] = lag_s ? gain(hertz(band) * period_s, whole) : 1.0;
         const double acceleration_noise = 250e-6 * 9.80665 * std::sqrt(460.0), rate_noise = 0.01 * kPi / 180.0 * std::sqrt(184.0);
-        const auto turned = [&](bool slope) { return fitted(4.0, 1.5, rate_noise, at_s - gyroscope_s, count, slope); };
-        taps = {lag_s ? fitted(10.0, 9.0, acceleration_noise, at_s, count, false) : Taps{1.0}, turned(false), turned(true)};
+        const auto turned = [&](bool slope) { return fitted(4.0, 1.5, rate_noise, std::max(at_s - gyroscope_s, -kFurthest), count, slope); };
+        taps = {lag_s ? fitted(10.0, 9.0, acceleration_noise, std::max(at_s, -kFurthest), count, false) : Taps{1.0}, turned(false), turned(true)};
     }
 
     double period_s, gap_s;  ///< samples further apart than `gap_s` do not belong together
@@ -132,6 +132,7 @@ struct Alignment {
 
 private:
     static constexpr std::size_t kBands = 21;
+    static constexpr double kFurthest = 0.002;  // s: extrapolation goes no further
     static constexpr double kPi = 3.14159265358979323846;
 
     static double hertz(std::size_t band) { return 0.5 * std::pow(2.0, 0.5 * static_cast<double>(band)); }
