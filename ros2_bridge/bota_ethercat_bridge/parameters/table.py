@@ -314,7 +314,7 @@ def parse_surface(text: str) -> Surface | None:
         return None
     kind, *words = text.split()
     try:
-        *numbers, radius = map(float, words)
+        *numbers, radius = map(float, words or ["nan"])
         if not (radius > 0.0 and all(abs(number) <= _FARTHEST_M for number in (*numbers, radius))):
             raise ValueError("a number is out of range")
         x, y, z, *more = numbers
