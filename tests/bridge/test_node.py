@@ -238,7 +238,7 @@ def test_a_wrong_parameter_is_one_sentence(start_process: StartProcess) -> None:
         ({"qos_overrides./NAME.publisher.depth": -1}, "check qos_overrides"),
         (
             {"gravity_source": "topic_pose", "orientation.topic": "imu/data_raw"},
-            "parameter orientation.topic is 'imu/data_raw': ROS refuses to listen there",
+            "parameter orientation.topic is 'imu/data_raw', which this node publishes: name the robot's",
         ),
     ],
 )

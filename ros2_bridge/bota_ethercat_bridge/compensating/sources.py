@@ -193,6 +193,9 @@ def _open_topic(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSo
     def on_message(message: Any) -> None:
         source.update(lambda: read_message(message, wanted))
 
+    if topic in {publisher.topic_name for publisher in node.publishers}:  # ROS would print a hundred lines
+        wrong = f"parameter orientation.topic is {wanted.orientation_topic!r}, which this node publishes"
+        raise ParameterError(f"{wrong}: name the robot's")
     deadline_s = time.monotonic() + _RELEASE_S
     while True:
         try:
