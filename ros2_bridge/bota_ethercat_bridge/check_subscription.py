@@ -36,14 +36,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--best-effort", action="store_true", help="instead of reliable")
     parser.add_argument("--for", type=seconds, default=10.0, dest="seconds", metavar="SECONDS", help="(10)")
     given = parser.parse_args(remove_ros_args(["", *(sys.argv[1:] if arguments is None else arguments)])[1:])
-    rclpy.init(args=arguments)
+    try:
+        rclpy.init(args=arguments)
+    except RuntimeError as error:  # RCLError, which has no public name
+        parser.error(f"ROS cannot start: {str(error).partition(', at /')[0]}")
     node, executor, ages_ns = rclpy.create_node("check_subscription"), SingleThreadedExecutor(), list[int]()
     executor.add_node(node)
     try:
         topic = node.resolve_topic_name(given.topic)
     except RuntimeError as error:  # rclpy has no public name for it
         parser.error(f"{given.topic!r} is no topic: {str(error).partition(', at /')[0]}")
-    counted = Subscription(topic)
+    counted, publishers = Subscription(topic), 0
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):  # what came until then is told
         if (publisher := _find(node, executor, topic)) is not None:
             package, _, name = publisher.topic_type.split("/")
@@ -65,12 +68,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             end_s = time.monotonic() + given.seconds
             while time.monotonic() < end_s:
                 executor.spin_once(0.1)
+            publishers = node.count_publishers(topic)
     rclpy.try_shutdown()
     if not ages_ns:
         sys.stderr.write(
             f"check_subscription: nothing came on {topic}: see /diagnostics, ros2 topic info -v\n"
         )
         return 1
+    if publishers > 1:
+        sys.stdout.write(f"{topic} has {publishers} publishers, which falsifies the rest: stop all but one\n")
     for line in report(counted, sorted(ages_ns), given.depth, best_effort=given.best_effort):
         sys.stdout.write(f"{line}\n")
     return int(counted.lost > 0)

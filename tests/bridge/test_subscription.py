@@ -251,6 +251,19 @@ def test_wrong_arguments_are_one_sentence(
     assert words in capsys.readouterr().err
 
 
+def test_without_ros_it_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def init(**_: object) -> None:
+        raise RuntimeError("failed to initialize rcl: ROS_DOMAIN_ID is not an integral number, at /a/b.c:49")
+
+    monkeypatch.setattr(rclpy, "init", init)
+    with pytest.raises(SystemExit) as ended:
+        check_subscription.main(["wrench"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.endswith("rcl: ROS_DOMAIN_ID is not an integral number\n")
+
+
 @pytest.mark.long
 def test_over_dds_what_a_slow_subscriber_loses_is_counted(start: Any, listener: Any) -> None:
     with ScriptedServer() as server:
