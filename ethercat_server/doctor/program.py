@@ -38,6 +38,8 @@ def run(args: argparse.Namespace) -> int:
             _, args.iface = server_here()
         except ServerError as error:
             raise UsageError(f"{error}: name the interface, or start ethercat-server on it") from None
+    if args.iface.endswith(".mcap"):
+        raise UsageError(f"{args.iface} is a recording: ethercat-report shows it")
     if problem := name_trouble(args.iface):
         raise UsageError(problem)
     args.iface = own_name(args.iface)

@@ -494,6 +494,7 @@ def test_every_type_that_a_table_can_hold(tmp_path: Path, empty: int | None) -> 
         ([0.1, ""], (), "row 1 (counted from 0) is empty"),
         ([1.0], ("--column", "t"), "{} has no times in a column t (choose"),
         ([1.0], ("--tool", "{}"), "{} does not have a tool's parameters"),
+        ([1.0], ("--tool", "/no/tool.yaml"), "/no/tool.yaml cannot be read: No such file"),
         ([1.0], ("--clock", "{}"), "{} is not what 'ethercat-export align' prints"),
     ],
 )  # fmt: skip

@@ -220,6 +220,8 @@ def _read_column(path: Path, column: str) -> Ints:
             found = table[column].combine_chunks()[:ends]
         if pa.types.is_dictionary(found.type):
             found = found.dictionary_decode()
+    except FileNotFoundError:
+        raise RecordingError(f"{path} does not exist") from None
     except (OSError, KeyError, ValueError) as error:  # ArrowInvalid among them
         raise refused(error) from None
     kind, types = found.type, pa.types
@@ -410,7 +412,7 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         else:
             blocks = _in_chunks(samples_of(recording, windows, sensor.sensor), _GROUP)
             blocks = _tallied(blocks, valid)
-        _WRITERS[path.suffix](made, json.dumps(about, default=str), blocks)
+        _WRITERS[path.suffix.lower()](made, json.dumps(about, default=str), blocks)
         if path.is_dir():
             shutil.rmtree(path)
         made.replace(path)

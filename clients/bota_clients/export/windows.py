@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
+from bota_clients.identify.tool_file import tool_parameters
 from bota_clients.recording.columns import Columns, Ints, columns
 from bota_clients.recording.own_offset import DOUBT_AFTER, doubt_ns
 from bota_ethercat.accounting import NOT_NEW
@@ -77,17 +78,9 @@ def offset_of(tool: Mapping[str, Any]) -> Wrench | None:
 
 def read_tool(path: Path) -> Mapping[str, Any]:
     """Parameters of the ROS 2 node, as `ethercat-identify --yaml` writes them; RecordingError."""
-    import yaml  # noqa: PLC0415 - of the extra `dataset`
-
-    try:
-        found: Mapping[str, Any] = yaml.safe_load(path.read_bytes())["/**"]["ros__parameters"]
+    with tool_parameters(path) as found:
         Windows(1, tool=found)
-    except (OSError, yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError) as error:
-        why = " ".join(str(error).split())
-        raise RecordingError(
-            f"{path} does not have a tool's parameters, as ethercat-identify --yaml writes them: {why}"
-        ) from None
-    return found
+        return found
 
 
 class Windows:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from bota_clients.errors import RecordingError
+from bota_clients.identify.tool_file import tool_parameters
 from bota_clients.program import say
 from bota_ethercat.program.new_file import NewFile, refuse_existing
 from bota_ethercat_bridge.ft_compensation.identification.inertia import possible_inertia
@@ -74,16 +75,11 @@ def read_bota(path: Path) -> tuple[Payload, str]:
 
 
 def _read_yaml(path: Path) -> Payload:
-    import yaml  # noqa: PLC0415 - of the extra `dataset`
-
-    try:
-        payload = payload_of(yaml.safe_load(path.read_bytes())["/**"]["ros__parameters"])
+    with tool_parameters(path) as found:
+        payload = payload_of(found)
         if not 0.0 < payload.mass < np.inf:
             raise ValueError(f"tool_mass is {payload.mass:g}")
-    except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError) as error:
-        why = " ".join(str(error).split())
-        raise RecordingError(f"{path} does not have a tool's parameters: {why}") from None
-    return payload
+        return payload
 
 
 def _of_the_center(payload: Payload) -> np.ndarray[Any, np.dtype[np.float64]]:
