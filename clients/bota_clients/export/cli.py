@@ -56,7 +56,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="refuse frames outside of the recording (default: their windows are not valid)")  # fmt: skip
     options = made.parse_args(argv)
     has_frames = options.at is not None or options.fps is not None
-    if options.output and options.output.suffix == ".mcap" and not options.mcap:
+    if options.output and options.output.suffix.lower() == ".mcap" and not options.mcap:
         options.mcap, options.output = options.output, None
     if options.mcap and (options.output or options.all or options.tool or has_frames):
         made.error(
@@ -69,7 +69,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     if options.output.absolute() == options.recording.absolute():
         made.error("the output would overwrite the recording: give another name")
-    suffix = "" if options.mcap else options.output.suffix.lower()
+    suffix = options.suffix = "" if options.mcap else options.output.suffix.lower()
     if has_frames and suffix not in DATASETS:
         made.error(f"windows of samples, with --at or --fps, are written as {', '.join(DATASETS)} only")
     if suffix == ".zarr" and not has_frames:
@@ -114,7 +114,7 @@ def run(options: argparse.Namespace) -> int:
     """
     from bota_clients.recording.reader import open_recording  # noqa: PLC0415 - needs the extra
 
-    module = "whole" if options.mcap else "dataset" if options.output.suffix.lower() in DATASETS else "table"
+    module = "whole" if options.mcap else "dataset" if options.suffix in DATASETS else "table"
     write = import_module(f"bota_clients.export.{module}").write
     interrupt_on_signals()
     try:

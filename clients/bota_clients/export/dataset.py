@@ -18,6 +18,7 @@ import contextlib
 import itertools
 import json
 import math
+import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -220,8 +221,8 @@ def _read_column(path: Path, column: str) -> Ints:
             found = table[column].combine_chunks()[:ends]
         if pa.types.is_dictionary(found.type):
             found = found.dictionary_decode()
-    except FileNotFoundError:
-        raise RecordingError(f"{path} does not exist") from None
+    except (FileNotFoundError, PermissionError) as error:
+        raise RecordingError(f"{path} cannot be read: {os.strerror(error.errno or 0)}") from None
     except (OSError, KeyError, ValueError) as error:  # ArrowInvalid among them
         raise refused(error) from None
     kind, types = found.type, pa.types
@@ -412,7 +413,7 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         else:
             blocks = _in_chunks(samples_of(recording, windows, sensor.sensor), _GROUP)
             blocks = _tallied(blocks, valid)
-        _WRITERS[path.suffix.lower()](made, json.dumps(about, default=str), blocks)
+        _WRITERS[options.suffix](made, json.dumps(about, default=str), blocks)
         if path.is_dir():
             shutil.rmtree(path)
         made.replace(path)

@@ -16,8 +16,9 @@ from bota_clients.program import say
 from bota_clients.recording.columns import Columns
 from bota_clients.recording.own_offset import at_last_offset
 from bota_clients.recording.reader import open_recording
-from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, force_lag_s
+from bota_ethercat.sensor.response import force_lag_s
 from bota_ethercat.settings import SettingValue
+from bota_ethercat_bridge.ft_compensation.alignment import gyroscope_later_s
 from bota_ethercat_bridge.ft_compensation.identification.delay import Lag, check_held_out, find_lag
 from bota_ethercat_bridge.ft_compensation.quantities import CompensationError
 
@@ -51,13 +52,12 @@ def run(options: argparse.Namespace) -> int:
 
 def _find(data: Columns, settings: Mapping[str, SettingValue]) -> tuple[Lag, tuple[float, float]]:
     data = data.where(data.fresh)
-    force, acceleration, rate = data.force, data.acceleration, data.angular_rate
-    usable = np.isfinite(np.concatenate([force, acceleration, rate], axis=1)).all(axis=1)
+    samples = np.concatenate([data.force, data.acceleration, data.angular_rate], axis=1)
+    usable = np.isfinite(samples).all(axis=1)
     times = (data.monotonic_ns - data.monotonic_ns[:1])[usable] * 1e-9
-    imu, gyroscope = acceleration_response(settings), angular_rate_response(settings)
-    later_s = (gyroscope.delay_s or 0.0) - (imu.delay_s or 0.0)
-    samples = np.concatenate([force, acceleration, rate], axis=1)[usable]
-    lag = find_lag(times, force[usable], acceleration[usable], rate[usable], later_s)
+    samples = samples[usable]
+    force, acceleration, rate = np.split(samples, 3, axis=1)
+    lag = find_lag(times, force, acceleration, rate, gyroscope_later_s(settings))
     return lag, check_held_out(times, samples, settings, lag)
 
 

@@ -19,9 +19,8 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
 from bota_ethercat_bridge.compensating.compensation import Compensation, Plan
-from bota_ethercat_bridge.compensating.sources import Source, check_source, open_source
+from bota_ethercat_bridge.compensating.sources import ImuSource, Source, check_source, open_source
 from bota_ethercat_bridge.diagnostics import CompensationState
-from bota_ethercat_bridge.ft_compensation.alignment import align
 from bota_ethercat_bridge.ft_compensation.bias import BiasRamp, TareBasis
 from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
 from bota_ethercat_bridge.ft_compensation.compensator import Compensator
@@ -143,10 +142,10 @@ class CompensationControl:
     def _values(self) -> dict[str, object]:
         output, source, payload = self.output, self.source, self.parameters.payload
         has_subscribers, bounds = output.has_subscribers, ["", ""]
-        if source.is_imu:
+        if isinstance(source, ImuSource):
             known = payload, self.parameters.accelerometer, self._ramp.taken
             turning = source.turning if has_subscribers else STILL
-            noise = torque_noise_95(payload, align(self.link.info.settings, self.link.info.rate_hz))
+            noise = torque_noise_95(payload, source.alignment)
             torque = torque_bound_95(*known, turning=turning, noise=noise)
             bounds = [f"{force_bound_95(*known):.3f}", f"{torque:.4f}"]
         age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf

@@ -22,7 +22,7 @@ from sensor_msgs.msg import Imu
 from bota_ethercat.pdo import Sample, Vector3
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.settings import SettingValue
-from bota_ethercat_bridge.ft_compensation.alignment import align
+from bota_ethercat_bridge.ft_compensation.alignment import Alignment, align
 from bota_ethercat_bridge.ft_compensation.quantities import STILL, Quaternion, Turning, unit_quaternion
 from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
 from bota_ethercat_bridge.ft_compensation.stream import IMU_IS_OFF
@@ -85,6 +85,14 @@ class ImuSource(Source):
         self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), parameters.accelerometer)
         self._link = link
         self._settings: Mapping[str, SettingValue] | None = None  # those of the alignment
+
+    @property
+    def alignment(self) -> Alignment:
+        """With the settings as they are, whether samples have come with them or not."""
+        info = self._link.info
+        if info.settings is self._settings:
+            return self._imu.alignment
+        return align(info.settings, info.rate_hz)
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
         if self._link.info.settings is not self._settings:

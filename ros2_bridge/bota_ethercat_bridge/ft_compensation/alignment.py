@@ -70,10 +70,8 @@ def align(
     """
     known_s = force_lag_s(settings, rate_hz or None) if lag_s is None else lag_s
     is_known, rate_hz = rate_hz > 0.0, rate_hz or _UNKNOWN_HZ
-    accelerometer, gyroscope = (each(settings) for each in (acceleration_response, angular_rate_response))
-    later_s = (gyroscope.delay_s or 0.0) - (accelerometer.delay_s or 0.0)
     at_s, fir = known_s or 0.0, bool(settings.get("fir")) and known_s is not None
-    lags_s = (max(lag_s, -_FURTHEST_S) for lag_s in (at_s, at_s - later_s))
+    lags_s = (max(lag_s, -_FURTHEST_S) for lag_s in (at_s, at_s - gyroscope_later_s(settings)))
     gains = [
         1.0 if known_s is None else sinc_gain(share) * (fir_gain(share) if fir else 1.0)
         for share in (_HERTZ / rate_hz).tolist()
@@ -89,6 +87,12 @@ def align(
     gap_s = max(_FIR_GAP_S if fir else _GAP_S, _GAP_PERIODS / rate_hz) if is_known else _UNKNOWN_GAP_S
     lead = 1 + math.floor(max(at_s, 0.0) * rate_hz) + 2 * fir
     return Alignment(1.0 / rate_hz, np.ascontiguousarray(taps), known_s, gap_s, lead, settings)
+
+
+def gyroscope_later_s(settings: Mapping[str, SettingValue]) -> float:
+    """By how much the gyroscope is later than the accelerometer; a delay that is unknown counts as 0."""
+    accelerometer, gyroscope = (each(settings) for each in (acceleration_response, angular_rate_response))
+    return (gyroscope.delay_s or 0.0) - (accelerometer.delay_s or 0.0)
 
 
 def _weights(motion: tuple[float, float], noise: float, ages: Array, lag_s: float, gains: Array) -> Array:
