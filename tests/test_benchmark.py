@@ -163,11 +163,11 @@ def test_the_page_is_renewed_between_its_comments(tmp_path: Path) -> None:
         assert "A bare C program: 40 µs (p99 60)." in text
         assert "are of one run: 2026-11-23, 2 CPUs, Linux 6.1.0, Python 3.11.2, with idle states. A" in text
         assert "woke 20 µs (p99 61) late before the measurements, 1,200 µs (p99 4,000) after them." in text
-        figures = "1 of 200 | 0 | 80.0 (2.00) | 120 (3.00) | 150 (4.00) | - | - (5.00) | 0.5 s, 4 lost |"
-        assert f"| 800 Hz, 1: this, C client | {figures}\n" in text
-        assert "| 800 Hz, 1: this, ROS | 1 of 200 (3 after the server) | 0 |" in text
-        assert "| 800 Hz, 1: Bota's driver | it cannot be had | - | - |" in text
-        row = "| 800 Hz, 4 loops: TCP, ordinary | 1 | 80 / 120 / 150 | 80 / 120 / 150 |"
+        figures = "1 of 200|0|80.0 (2.00)|120 (3.00)|150 (4.00)|-|- (5.00)|0.5 s, 4 lost|"
+        assert f"|800 Hz, 1: this, C client|{figures}\n" in text
+        assert "|800 Hz, 1: this, ROS|1 of 200 (3 after the server)|0|" in text
+        assert "|800 Hz, 1: Bota's driver|it cannot be had|-|-|" in text
+        row = "|800 Hz, 4 loops: TCP, ordinary|1|80 / 120 / 150|80 / 120 / 150|"
         assert text.endswith(f"{row}\n<!-- end -->\nbelow\n")
     for wrong in ("no place", text * 2, text.replace("load", "others")):
         page.write_text(wrong)
@@ -206,7 +206,7 @@ def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     text = Path(page).read_text()
     for what in ("400 Hz, 2: this, ROS", "400 Hz, 4 loops: wrench, "):
-        assert f"| {what}" in text, what
+        assert f"|{what}" in text, what
     written = (tmp_path / "b.json").read_text()
     assert not re.search("NaN|Infinity", written)
     content = json.loads(written)

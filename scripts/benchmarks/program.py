@@ -93,7 +93,7 @@ def measure(name: str, options: argparse.Namespace, priority: int, *, ros: bool)
 def markdown(name: str, rows: Sequence[Figures]) -> str:
     shown = TABLES[name].values()
     lines = [list(TABLES[name]), ["---"] * len(shown), *([show(row) for show in shown] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(f"|{'|'.join(line)}|" for line in lines)
 
 
 def check(path: Path) -> None:
