@@ -55,10 +55,13 @@ def interrupted(name: str, number: int, at: str, arguments: str) -> tuple[int, s
     return done.returncode, done.stderr, done.stdout
 
 
-def unread(name: str, *arguments: str) -> tuple[int, str]:
-    """Exit code and standard error of a program whose output nobody reads any more."""
+def unread(name: str, *arguments: str, full: bool = False) -> tuple[int, str]:
+    """Exit code and standard error of a program whose output nobody reads any more, or no disk takes."""
     read, write = os.pipe()
     os.close(read)
+    if full:
+        os.close(write)
+        write = os.open("/dev/full", os.O_WRONLY)
     package, _, entry = PROGRAMS[name].partition(":")
     script = f"import sys; sys.argv[0] = {name!r}; from {package} import {entry}; sys.exit({entry}())"
     try:
@@ -75,6 +78,16 @@ def unread(name: str, *arguments: str) -> tuple[int, str]:
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_nobody_reads_the_output(name: str) -> None:
     assert unread(name, "--help") == (1, "")
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [("ethercat-server", "--help"), ("ethercat-sensor", "filters --loop 500"),
+     ("ethercat-sensor", "filters --loop 500 --json")],
+)  # fmt: skip
+def test_a_full_disk_is_one_sentence(name: str, arguments: str) -> None:
+    said = f"{name}: the output cannot be written: No space left on device\n"
+    assert unread(name, *arguments.split(), full=True) == (1, said)
 
 
 def test_nobody_reads_what_the_virtual_sensor_answers(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Final
 
 from bota_ethercat.errors import ProtocolError
+from bota_ethercat.program.output import is_of_output
 from bota_ethercat.program.signals import interrupt_on_signals
 from ethercat_server.errors import ServerError
 from ethercat_server.process.logs import OneLine
@@ -34,9 +35,9 @@ def run(program: str, work: Callable[[], int], *, as_json: bool) -> int:
         return work()
     except (ServerError, ProtocolError) as error:
         text, exit_code = str(error), getattr(error, "exit_code", FAILED)
-    except BrokenPipeError:  # for `ends_with_its_reader`
-        raise
     except OSError as error:
+        if is_of_output(error):  # for `ends_with_its_reader`
+            raise
         text = f"{error.filename or 'the operating system'}: {error.strerror or error}"
         exit_code = FAILED
     except KeyboardInterrupt:

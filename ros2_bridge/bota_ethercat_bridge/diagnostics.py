@@ -71,6 +71,7 @@ class DiagnosticsPublisher:
         self._compensation, self._outputs, self._stamps = compensation, outputs, stamps
         self._log = node.get_logger()
         self._prefix = node.get_fully_qualified_name().lstrip("/") + ": "
+        self._count_publishers, self._shared = node.count_publishers, ""
         self._publisher = create_publisher(node, DiagnosticArray, "/diagnostics")
         self._counts_publisher = create_publisher(node, DiagnosticArray, "~/published")
         self._noted: list[tuple[str, int, int, float]] = []
@@ -109,6 +110,7 @@ class DiagnosticsPublisher:
         regular = now_s - self._published_s >= _REPORT_S
         if regular:
             self._measure(now_s)
+            self._find_other_publishers()
         self._collect()
         compensation = self._compensation()
         self._observe(now_s, compensation.withheld)
@@ -146,6 +148,20 @@ class DiagnosticsPublisher:
             for topic in output.topics
             if topic.published
         ]
+
+    def _find_other_publishers(self) -> None:
+        """Log, and keep for the diagnostics, that somebody else publishes one of this node's topics."""
+        names = (topic.name for output in self._outputs.all for topic in output.topics)
+        shared, before = [name for name in names if self._count_publishers(name) > 1], self._shared
+        self._shared = ""
+        if shared:
+            others = f" and {len(shared) - 1} more" if len(shared) > 1 else ""
+            self._shared = (
+                f"another node, or one that was just killed, publishes {shared[0]}{others} too: give "
+            )
+            self._shared += "one of them a namespace (--ros-args -r __ns:=/NAME)"
+        if self._shared and not before:
+            self._log.warning(self._shared)
 
     def _stamp(self, message: DiagnosticArray) -> None:
         stamp = message.header.stamp
@@ -299,6 +315,8 @@ class DiagnosticsPublisher:
         link, counts, server = self._link, self._counts, self._server
         if not link.is_connected:
             problems = [(Level.NOT_POSSIBLE, f"no samples: {_NO_CONNECTION}")]
+        elif self._shared:
+            problems = [*problems, (Level.LOOK, self._shared)]
         recent, row, age = server.last_10s, self._said.status, server.recent_age_us(link.sensor)
         ages_us = [None, None] if self._age_us is None else map(round, self._age_us)
         values = {

@@ -360,7 +360,7 @@ def test_a_wrench_in_a_configured_frame(weighed: Node, fresh: Server) -> None:
     [
         ({"gravity_source": "none"}, {}, "gravity_source is none"),
         ({}, {"acceleration_z": -1.0}, "the accelerometer reads zero: switch the IMU on"),
-        ({"gravity_source": "topic_pose"}, {}, "nothing has come on it yet"),
+        ({"gravity_source": "topic_pose"}, {}, "orientation: nobody publishes it"),
     ],
 )
 def test_a_check_at_start_sees_that_nothing_could_be_published(

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import rclpy
 from geometry_msgs.msg import PoseStamped, QuaternionStamped
 from sensor_msgs.msg import Imu
 
@@ -35,6 +36,7 @@ from tests.bridge.simulated_node import (
     weight,
 )
 from tests.compensation.making import BIAS, TOOL, sample
+from tests.server.running import wait_until
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 ROLLED = (1.0, 0.0, 0.0, 0.0)  # half a turn about x: what was up is down
@@ -169,6 +171,25 @@ def test_an_imu_without_orientation(robot: Robot, stages: Stages, node: Node) ->
     )
     robot.sending = True
     stages.settle(ZERO6)
+
+
+def test_an_orientation_of_another_type_is_named(robot: Robot, stages: Stages, node: Node) -> None:
+    """A participant of its own: in one process a topic has one type."""
+    robot.sending = False
+    topic = node.name.replace("bridge", "arm/other")
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context)
+    try:
+        other = rclpy.create_node("arm", context=context, start_parameter_services=False)
+        other.create_publisher(Imu, topic, 1)
+        wait_until(lambda: node.node.count_publishers(topic), "the other's publisher")
+        node.set("orientation.topic", "arm/other")
+        words = "its publisher sends sensor_msgs/msg/Imu, not geometry_msgs/msg/PoseStamped: set "
+        node.until(words + "gravity_source to topic_imu", compensation="error")
+        assert stages.are_silent()
+        other.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)
 
 
 def test_what_is_mounted_askew(robot: Robot, stages: Stages, node: Node) -> None:

@@ -9,13 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import rclpy
 import yaml
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode
 from bota_ethercat.sensor.warnings_register import WARNINGS
 from bota_ethercat_bridge.diagnostics import text_of
+from tests.bridge.real_node import retire
 from tests.bridge.simulated_node import HEALTHY, SETTINGS, Node, Server, level, status, values
+from tests.server.running import wait_until
 
 
 @pytest.fixture
@@ -110,6 +113,24 @@ def test_saturation_and_heat(node: Node, server: Server) -> None:
     node.until(sensor="ok")
     server.changes = {"process_data": encode(61, {"temperature": 85.0})}
     node.until("85.0 °C", sensor="error")
+
+
+def test_another_node_with_the_same_topics_is_told_once(node: Node) -> None:
+    topics = [node.name.replace("bridge", name) for name in ("wrench", "temperature")]
+    other = rclpy.create_node("other", start_parameter_services=False)
+    publishers = [other.create_publisher(node.topics[topic].msg_type, topic, 1) for topic in topics]
+    wait_until(
+        lambda: all(node.node.count_publishers(topic) == 2 for topic in topics), "the other publishers"
+    )
+    said = f"publishes {topics[0]} and 1 more too: give one of them a namespace"
+    node.until(said, stream="warn")
+    node.run(3.0)
+    for publisher in publishers:
+        other.destroy_publisher(publisher)
+    wait_until(lambda: all(node.node.count_publishers(topic) == 1 for topic in topics), "that they are gone")
+    node.until(**HEALTHY)
+    assert node.log.count("another node") == 1
+    retire(other)
 
 
 def test_lost_samples_are_counted(node: Node, server: Server) -> None:

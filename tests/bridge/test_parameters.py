@@ -189,12 +189,12 @@ def test_limits_and_covariances_can_be_set_while_it_runs() -> None:
 
 
 def test_what_is_warned_of_at_start() -> None:
-    given = {"publish_frequency": 100.0, "settings.sinc_lenght": 64, "zzz": 1, "use_sim_time": True}
+    given = {"publish_frequency": 100.0, "settings.sinc_lenght": 64, "tool_frame": 1, "use_sim_time": True}
     with Node(Server(), **given) as node:
         assert "unknown parameter publish_frequency" in node.log
         assert "did you mean 'publishing_frequency'?" in node.log
         assert "did you mean 'settings.sinc_length'?" in node.log
-        assert "unknown parameter zzz" in node.log
+        assert "unknown parameter tool_frame is ignored; ros2 param list" in node.log  # no guess at tool_mass
         assert "use_sim_time is true, but a real sensor has no simulation time" in node.log
         assert node.log.count("unknown parameter") == 3
     with Node(Server(), sensor=0, **{"qos_overrides./wrench.publisher.depth": 3}) as node:

@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Standard output whose reader may go at any moment, as that of `PROGRAM | head` does."""
+"""Standard output that cannot be written: its reader is gone, as in `PROGRAM | head`, or the disk is full."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import sys
 from collections.abc import Callable
-from typing import ParamSpec
+from typing import Final, ParamSpec
 
 _P = ParamSpec("_P")
+_NOT_WRITTEN: Final = frozenset({errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
 def ends_with_its_reader(main: Callable[_P, int]) -> Callable[_P, int]:
-    """A program's `main`, whose exit code is 1 once nobody reads its output; nothing is said of it."""
+    """A program's `main`, whose exit code is 1 once its output cannot be written: that nobody reads it is not
+    told, a full disk is."""
 
     @functools.wraps(main)
     def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> int:
@@ -24,11 +27,21 @@ def ends_with_its_reader(main: Callable[_P, int]) -> Callable[_P, int]:
             finally:  # argparse exits when it has printed its help
                 if sys.stdout is not None:
                     sys.stdout.flush()
-        except BrokenPipeError:
+        except OSError as error:
+            if not is_of_output(error):
+                raise
             discard_output()
+            if not isinstance(error, BrokenPipeError):
+                program = sys.argv[0].rpartition(os.sep)[2]
+                sys.stderr.write(f"{program}: the output cannot be written: {error.strerror}\n")
             return 1
 
     return wrapped
+
+
+def is_of_output(error: OSError) -> bool:
+    """Whether a program that opens its files by name failed to write its standard output."""
+    return error.errno in _NOT_WRITTEN and error.filename is None
 
 
 def discard_output() -> None:

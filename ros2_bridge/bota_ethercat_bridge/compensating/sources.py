@@ -119,7 +119,8 @@ class RobotSource(Source):
         self.name = name
         # The rotation that takes the sensor's vectors to the base frame, and its stamp, ns since 1970.
         self.latest: tuple[Quaternion, int] | None = None
-        self.problem = "nothing has come yet"  # why the latest message is unusable; empty if it is not
+        self.problem = ""  # why the latest message is unusable; empty if it is not
+        self.why_silent: Callable[[], str] = lambda: "nothing has come yet"
         self._limit_s = parameters.orientation_stale_after
         self._gravity = QuaternionGravity(parameters.gravity, stale_after_s=self._limit_s)
         self._used: object = None
@@ -147,7 +148,7 @@ class RobotSource(Source):
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         if self.latest is None:
-            return f"no orientation from {self.name}: {self.problem}"
+            return f"no orientation from {self.name}: {self.problem or self.why_silent()}"
         stale = stale_text(stamp_s - self.latest[1] * 1e-9, self._limit_s)
         why = self.problem or "it has stopped, is slow, or has another clock"
         return stale and f"the latest orientation from {self.name} {stale}: {why}"
@@ -195,7 +196,7 @@ def _open_topic(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSo
     kind, _ = TOPIC_KINDS[wanted.gravity_source]
     topic = node.resolve_topic_name(wanted.orientation_topic)
     source = RobotSource(wanted, f"topic {topic}")
-    source.problem = "nothing has come on it yet"
+    source.why_silent = lambda: _why_silent(node, topic, kind)
     profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
     def on_message(message: Any) -> None:
@@ -219,6 +220,24 @@ def _open_topic(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSo
             ) from None
     source.close = lambda: node.destroy_subscription(listening)
     return source
+
+
+def _why_silent(node: Node, topic: str, kind: Any) -> str:
+    """Why nothing has come on a topic, by who publishes there."""
+    sent = {publisher.topic_type for publisher in node.get_publishers_info_by_topic(topic)}
+    types = {_type_name(kind): name for name, (kind, _) in TOPIC_KINDS.items()}
+    if not sent:
+        return "nobody publishes it"
+    if (expected := _type_name(kind)) in sent:
+        return "nothing has come on it yet"
+    sends, remedy = sent.pop(), ""
+    if (name := types.get(sends)) is not None:
+        remedy = f": set gravity_source to {name}"
+    return f"its publisher sends {sends}, not {expected}{remedy}"
+
+
+def _type_name(kind: Any) -> str:
+    return f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
 
 
 def read_message(message: Any, wanted: Parameters) -> tuple[Quaternion, int]:
