@@ -177,6 +177,7 @@ def test_ordinary_moves_are_no_contact(name: str, seed: int) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(900)
 def test_in_an_hour_of_a_wrist_that_turns_fast_it_is_contact_at_most_once() -> None:
     """At 3 rad/s and 20 rad/s²; another tool and another motion each minute."""
     assert sum(alarms_in("turned", 1000 * SEED + 400 + minute, 61.0) for minute in range(60)) <= 1

@@ -39,13 +39,28 @@ _FLOOR_ALONE: Final = 1e-12
 _LEAST_SHARE: Final = 0.3
 _MOUNTING: Final = 0.01  # rad: standard deviation of the mounting about each axis
 _NOTHING: Final = 1e-9  # kg: no mass at all has its center anywhere
-OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
-_PRIOR: Final = np.array([OFFSET_PRIOR] * 3 + [SCALE_PRIOR] * 9)
+_OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
 _FIXED: Final = 1e-7  # standard deviation of what is not free
 CROSS_ROW, CROSS_COLUMN = np.nonzero(~np.eye(3, dtype=bool))  # of the cross-axis terms, as CROSS_AXES
+_TRANSPOSED: Final = [2, 4, 0, 5, 1, 3]  # of each, the one that a rotation makes its opposite
 _LENGTH_ROUNDS: Final = 3
 _ROUNDS: Final = 9
 _CONVERGED: Final = 1e-7
+
+
+def calibration_prior(*, scale: bool = False, turn: bool = False, crossed: bool = False) -> Array:
+    """(12, 12), the information that is assumed in advance of the calibration, of which the offset is fitted,
+    and what is given here; `turn`: the accelerometer as a whole, about each axis.
+    """
+    deviations = [OFFSET_PRIOR] * 3 + [SCALE_PRIOR if scale else _FIXED] * 3
+    prior = np.diag(np.array(deviations + [SCALE_PRIOR if crossed else _FIXED] * 6) ** -2)
+    if turn and not crossed:
+        even, odd = np.eye(6) + np.eye(6)[_TRANSPOSED], np.eye(6) - np.eye(6)[_TRANSPOSED]
+        prior[6:, 6:] = 0.5 * _FIXED**-2 * even + 0.25 * _MOUNTING**-2 * odd
+    return prior
+
+
+EVERYTHING: Final = calibration_prior(scale=True, crossed=True)
 
 
 class Value(NamedTuple):
@@ -78,13 +93,13 @@ def estimate(
     regressor: Array | None = None,
     *,
     is_turned: bool = False,
-    free: int = OF_CALIBRATION,
+    prior: Array = EVERYTHING,
 ) -> Estimate:
     """Solve the poses: wrench (..., n, 6), N and Nm, and gravity (..., n, 3), in the sensor's frame, m/s².
 
     Also `acceleration` (..., n, 3), m/s², if gravity is from it, with `acceleration_variance` (...,) of its
-    means by the sensor's noise, (m/s²)², of whose calibration the first `free` unknowns are fitted; or
-    `is_turned` to have the mounting found; and the `regressor` (..., n). LinAlgError if an unknown is open.
+    means by the sensor's noise, (m/s²)², of whose calibration `prior` is assumed; or `is_turned` to have the
+    mounting found; and the `regressor` (..., n). LinAlgError if an unknown is open.
     """
     if regressor is not None:  # of several regressors, each is a problem
         many = regressor.shape[:-1]
@@ -101,7 +116,7 @@ def estimate(
             solution = _alone(gravity, measured, regressor)
     else:
         gravity, solution, excess = _with_accelerometer(
-            measured, acceleration, gravity, acceleration_variance, regressor, free
+            measured, acceleration, gravity, acceleration_variance, regressor, prior
         )
     answer, unknowns = solution.answer, solution.answer.shape[-1]
     mass = answer[..., :1]
@@ -193,7 +208,7 @@ def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:
     u = (straight @ v[..., np.newaxis])[..., 0]
     length = np.linalg.norm(u, axis=-1)
     up = u / length[..., np.newaxis]
-    change = np.zeros((*u.shape, OF_CALIBRATION))
+    change = np.zeros((*u.shape, _OF_CALIBRATION))
     change[..., :3] = -straight / scale[..., np.newaxis, :]
     change[..., 3:6] = -straight * (v / scale)[..., np.newaxis, :]
     change[..., CROSS_ROW, 6 + np.arange(6)] = -v[..., CROSS_COLUMN]
@@ -213,19 +228,18 @@ def _with_accelerometer(
     gravity: Array,
     noise: Array | float,
     regressor: Array | None,
-    free: int,
+    prior: Array,
 ) -> tuple[Array, Solution, Array]:
     """Gravity (..., n, 3), the unknowns, those of the calibration last, and `excess`; by Gauss and Newton.
 
     The lengths alone come first: the errors of an uncorrected direction would pass for noise.
     """
     size = np.linalg.norm(gravity, axis=-1)
-    prior = np.diag(np.where(np.arange(OF_CALIBRATION) < free, _PRIOR, _FIXED) ** -2)
     assumed = np.zeros((*measured.shape[:-2], 7))
     assumed[..., 6] = _LENGTH_DEVIATION**2 + noise
     degrees = np.array([0.0] * 6 + [_LENGTH_DEGREES])
     lengths = Known(prior, _FLOOR[6:] ** 2, degrees[6:], assumed[..., 6:])
-    calibration = np.zeros((*measured.shape[:-2], OF_CALIBRATION))
+    calibration = np.zeros((*measured.shape[:-2], _OF_CALIBRATION))
     for _ in range(_LENGTH_ROUNDS):
         at = _linearize(acceleration, size, calibration)
         only = solve(at.stretch, at.excess + _times(at.stretch, calibration), lengths)

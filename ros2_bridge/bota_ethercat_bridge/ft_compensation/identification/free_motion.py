@@ -102,11 +102,11 @@ def identify_in_motion(turned: Turned, imu: Vector3) -> Identified:
         beyond[beyond < _TYPICAL * np.median(beyond[is_free])] = 0.0
         used, is_free = is_free, untouched(turned, beyond, abs(answer[0]) * STANDARD_GRAVITY)
     share = float(used.sum() / turned.is_whole.sum())
-    _check_free(answer, left[used], share)
     rows = np.eye(_UNKNOWNS)
     rows[1:4] /= answer[0]  # the center is moment / mass: to first order
     rows[1:4, 0] = -answer[1:4] / answer[0] ** 2
     half = float(students_t(degrees)) * np.sqrt(np.einsum("qi,ij,qj->q", rows, covariance, rows))
+    _check_free(answer, float(half[0]), left[used], share)
     check_mass(float(answer[0]), float(half[0]))
     payload = _payload(answer)._replace(center_interval=triple(half[1:4]))
     check_center(payload)
@@ -139,9 +139,10 @@ def identify_in_motion(turned: Turned, imu: Vector3) -> Identified:
     )
 
 
-def _check_free(answer: Array, left: Array, share: float) -> None:
+def _check_free(answer: Array, mass_interval: float, left: Array, share: float) -> None:
     """CompensationError if what is `left` (n, 6) of a `share` of the recording is not that of free motion."""
-    check_mass(float(answer[0]), 0.0)
+    if answer[0] < 0.0:
+        check_mass(float(answer[0]), mass_interval)
     weight = float(answer[0]) * STANDARD_GRAVITY
     moment = max(ARM * weight, float(np.linalg.norm(answer[1:4])) * STANDARD_GRAVITY)
     force, torque = (float(np.sqrt((part**2).sum(axis=1).mean())) for part in np.split(left, 2, axis=1))

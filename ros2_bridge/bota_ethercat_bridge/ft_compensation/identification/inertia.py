@@ -82,8 +82,8 @@ def turn(
     )
     felt = np.stack(accelerometer.correct(tuple(acceleration.T)), axis=1)
     spin = np.gradient(rate, period, axis=0)
-    _check_imu(felt, rate, period)
     arm = crossing(spin) + crossing(rate) @ crossing(rate)
+    _check_imu(felt, rate, arm, period)
     spun = _elements(spin) + crossing(rate) @ _elements(rate)
     felt = felt - arm @ np.array(imu)
     window = hann_window(_WINDOW_S, period)
@@ -100,7 +100,7 @@ def turn(
     return Turned(force, torque, felt, arm.reshape(-1, 3, 3), spun.reshape(-1, 3, 6), times, is_whole)
 
 
-def _check_imu(felt: Array, rate: Array, period: float) -> None:
+def _check_imu(felt: Array, rate: Array, arm: Array, period: float) -> None:
     """CompensationError if gravity does not turn as the gyroscope says."""
     if not _GRAVITY[0] < (size := float(np.median(np.linalg.norm(felt, axis=1)))) < _GRAVITY[1]:
         raise CompensationError(
@@ -110,6 +110,12 @@ def _check_imu(felt: Array, rate: Array, period: float) -> None:
     inner = slice(len(window), -len(window))
     changes = np.gradient(smoothed(felt, window), period, axis=0)[inner]
     turns = smoothed(np.cross(felt, rate), window)[inner]
+    # Less what the IMU feels on the arm about which it turns, which is as regular.
+    swung = np.gradient(smoothed(arm.reshape(-1, 9), window), period, axis=0)[inner].reshape(-1, 3)
+    found = np.linalg.lstsq(swung, np.stack([changes.ravel(), turns.ravel()], axis=1), rcond=None)[0]
+    changes, turns = (
+        each - (swung @ at).reshape(-1, 3) for each, at in zip((changes, turns), found.T, strict=True)
+    )
     each = float((turns**2).sum()) or 1.0
     gain = float((turns * changes).sum()) / each
     # What else accelerates the sensor is by chance in step with its turns: from piece to piece.

@@ -17,9 +17,10 @@ import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat_bridge.ft_compensation.identification.estimation import (
-    OF_CALIBRATION,
+    EVERYTHING,
     Estimate,
     Value,
+    calibration_prior,
     estimate,
 )
 from bota_ethercat_bridge.ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
@@ -47,11 +48,17 @@ _UNKNOWN: Final = 0.5
 
 ARM: Final = 0.05  # m: what makes a torque of a force where the center of gravity is nearer
 _CHANCE: Final = 0.01  # of seeing drift, or a touch, where there is none
-_SUSPECTS: Final = 12  # poses with the largest residuals; also, of those that are left out one by one
-# Of the accelerometer's calibration, the unknowns that are fitted: the fewest whose error of a pose that is
-# left out is so near to the least. More would fit errors of the wrench.
-_MODELS: Final = {"offset": 3, "offset and scale": 6, "offset, scale and crossed axes": 12}
+_SUSPECTS: Final = 12  # poses with the largest residuals
+# What is fitted of the accelerometer: the fewest unknowns whose error of poses that are left out is so near
+# to the least. More would fit errors of the wrench.
+_MODELS: Final = {
+    "offset": calibration_prior(),
+    "offset and scale": calibration_prior(scale=True),
+    "offset, scale and rotation": calibration_prior(scale=True, turn=True),
+    "offset, scale and crossed axes": EVERYTHING,
+}
 _AS_GOOD: Final = 1.05
+_LEFT_OUT: Final = 24  # poses, one by one
 _SAME_POSE: Final = 0.97  # cosine
 _FEWEST_IN_TIME: Final = 6  # poses: fewer leave nothing to tell drift from a payload
 _SECONDS_A_MINUTE: Final = 60.0
@@ -191,29 +198,30 @@ class _Equations:
         if len(times) == len(poses) >= _FEWEST_IN_TIME and np.ptp(times) > 0.0:
             self.minutes = (np.array(times) - times[-1]) / _SECONDS_A_MINUTE
 
-        self._is_turned, self._free = False, OF_CALIBRATION
+        self._is_turned, self._prior = False, EVERYTHING
 
     def choose(self) -> tuple[str, Estimate | None]:
         """Fit as much of the accelerometer as the poses tell: what that is, and the answer with all of it."""
         count = len(self.wrench)
         if self._acceleration is None or count < _FEWEST_IN_TIME:
             return "", None
-        left_out, errors = np.eye(count)[:: math.ceil(count / _SUSPECTS)], {}
-        for name, self._free in _MODELS.items():
+        left_out, errors = np.eye(count)[:: math.ceil(count / _LEFT_OUT)], {}
+        for name, self._prior in _MODELS.items():
             found = self.solve(left_out)
             assert found.shift is not None
             longer = found.mass.value * (found.excess * left_out).sum(axis=-1, keepdims=True)
             off = np.concatenate([found.shift.value[:, :3], longer], axis=1)
-            errors[name] = float(np.median(np.linalg.norm(off, axis=1)))  # whatever touched one of them
+            squares = np.sort((off**2).sum(axis=1))[: -max(1, len(left_out) // 8)]  # something touched these
+            errors[name] = math.sqrt(squares.mean())
         every, most = self.solve(), _AS_GOOD * min(errors.values())
         chosen = next(name for name, error in errors.items() if error <= most)
-        self._free = _MODELS[chosen]
+        self._prior = _MODELS[chosen]
         rest = ", ".join(f"{error:.3g} N with {name}" for name, error in errors.items() if name != chosen)
         return f"{chosen} fitted: a pose that is left out is off by {errors[chosen]:.3g} N ({rest})", every
 
     def solve(self, regressor: Array | None = None) -> Estimate:
         given = self.wrench, self.gravity, self._acceleration, self._noise, regressor
-        return estimate(*given, is_turned=self._is_turned, free=self._free)
+        return estimate(*given, is_turned=self._is_turned, prior=self._prior)
 
     def look_for_mounting(self, found: Estimate) -> Estimate:
         """With the rotation between robot and sensor from here on, if that explains what is left."""
