@@ -20,9 +20,13 @@ from bota_clients.identify.cli import main as identify
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
+from bota_ethercat.sensor.frames import IMU_HEIGHTS
+from bota_ethercat_bridge.ft_compensation.alignment import align
 from bota_ethercat_bridge.ft_compensation.bias import TareBasis
 from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95
-from bota_ethercat_bridge.ft_compensation.quantities import Accelerometer, Payload
+from bota_ethercat_bridge.ft_compensation.compensator import Compensator
+from bota_ethercat_bridge.ft_compensation.quantities import ZERO, Accelerometer, Payload
+from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.cpp_programs import (
     FAST,
@@ -38,6 +42,7 @@ from tests.clients.cpp_programs import (
 )
 from tests.clients.recordings import record
 from tests.clients.test_identify import posed
+from tests.compensation.motion import settings
 from tests.descriptions import sensor_row
 from tests.ended import run_here
 from tests.server.running import PATIENCE_S, free_port, wait_until
@@ -223,8 +228,6 @@ HEIGHTS = {
     "SENS": (35, 9.3), "ROKS": (32, 9.8), "ROKA": (32, 9.8), "MEDS": (32, 9.8), "MEDA": (32, 9.8),
     "LAXS": (44.5, 11.95), "MEGS": (59, 13.4), "NONE": (0, 0),
 }  # fmt: skip
-# By ft_compensation for `TOOL` on a SENS, of the samples of `moving`: alignment, specific force, compensator.
-LOADS = json.loads((Path(__file__).parent / "golden_loads.json").read_text())
 
 
 def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
@@ -246,14 +249,38 @@ def loads(running: Loop, model: str, lag_s: float, fir: bool, rate_hz: float, *s
 
 
 @pytest.mark.parametrize(
-    "row", LOADS, ids=lambda row: f"{row['rate_hz']} Hz, FIR {row['fir']}, {1000 * row['lag_s']:.0f} ms"
+    ("rate_hz", "fir", "lag_ms"),
+    [
+        (1600, 0, -1.0025),
+        (800, 0, -0.065),
+        (100, 0, 13.06),
+        (800, 1, 13.06),
+        (250, 1, 46.06),
+        (800, 0, -33.0),
+    ],
 )
-def test_the_load_of_the_tool_is_that_of_the_golden_table(running: Loop, row: dict[str, Any]) -> None:
+def test_the_load_of_the_tool_is_that_of_python(
+    running: Loop, rate_hz: float, fir: int, lag_ms: float
+) -> None:
     assert running.new(**TOOL) == ""
-    found = loads(running, "SENS", row["lag_s"], row["fir"], row["rate_hz"], *moving(row["rate_hz"]))
-    for number, (load, expected) in enumerate(zip(found, row["loads"], strict=True)):
-        assert (load is None) == (expected is None), number
-        assert load is None or load == pytest.approx(expected, abs=1e-9), number
+    samples = list(moving(rate_hz))
+    found = loads(running, "SENS", lag_ms / 1e3, bool(fir), rate_hz, *samples)
+    rows = [tuple(yaml.safe_load(f"[{str(row).strip('[]')}]")) for row in TOOL.values()]
+    tool = Payload(rows[0][0], *rows[1:3])
+    x, y, z = tool.center
+    aligned = align({**settings(), "fir": bool(fir)}, rate_hz, lag_ms / 1e3)
+    imu = ImuSpecificForce(
+        (x, y, z - IMU_HEIGHTS["SENS"]), Accelerometer(rows[3], rows[4], cross_axis=rows[5]), aligned
+    )
+    for number, (time_s, values) in enumerate(samples):
+        ax, ay, az, wx, wy, wz = values
+        felt = imu.follow((ax, ay, az), (wx, wy, wz), time_s)
+        load = found[6 * number : 6 * number + 6]
+        if felt is None:
+            assert load == [None] * 6, number
+        else:
+            expected = Compensator(tool).compensate(ZERO, ZERO, felt, imu.turning).tool
+            assert load == pytest.approx(expected.values, abs=1e-9), number
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -287,7 +314,7 @@ def test_the_bounds_are_those_of_python(running: Loop, seed: int) -> None:
 @pytest.mark.parametrize(("model", "heights"), HEIGHTS.items())
 def test_the_imu_is_where_the_model_has_it(running: Loop, model: str, heights: tuple[float, float]) -> None:
     running.new(tool_mass=2)
-    turning = [(1 + number / 800, (0.0, 0.0, 9.0, 3.0, 0.0, 0.0)) for number in range(4)]
+    turning = [(1 + number / 800, (0.0, 0.0, 9.0, 3.0, 0.0, 0.0)) for number in range(6)]
     force = loads(running, model, 0, False, 800, *turning)[-4]
     origin, imu_at = heights
     assert force == pytest.approx(-2 * (9.0 - 3.0**2 * (origin - imu_at) / 1000))
@@ -469,16 +496,16 @@ def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> Non
         loop.do("stop")
 
 
-def test_the_first_sample_while_the_sensor_turns(running: Loop, server: ScriptedServer) -> None:
+def test_the_first_samples_while_the_sensor_turns(running: Loop, server: ScriptedServer) -> None:
     """How fast it spins up, and so the inertia of the tool, is not known yet."""
     loop = running.opened(server.port, "compensated", tool_mass=1, on_invalid="hold")
     begin_ns = time.monotonic_ns()
-    for number, condition in ((1, NOT_FINITE), (2, FRESH)):
+    for number, condition in (*((early, NOT_FINITE) for early in range(1, 5)), (5, FRESH)):
         data = encode(61, {"acceleration.z": 1.0, "angular_rate.x": 100.0, "force.x": number})
         server.send(encode_data(number, 5, begin_ns + number * 1_250_000, 0, 0, 3, data))
         seen = loop.until(condition)
-    assert seen["force.x"] == 2
-    assert seen["compensated.force.x"] == pytest.approx(2)
+    assert seen["force.x"] == 5
+    assert seen["compensated.force.x"] == pytest.approx(5)
 
 
 def test_a_tare_without_a_payload_and_one_that_is_refused(running: Loop, server: ScriptedServer) -> None:

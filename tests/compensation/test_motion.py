@@ -136,9 +136,30 @@ def test_gaps_and_clock_steps_bring_no_error_above_the_bound(
     seed, chosen = seed + 1000 * SEED, settings(fir=fir)
     felt = cut(motion.filtered(motion.moves(seed)["fast"], HEAVY, 3.0, chosen), kept, shift)
     left = left_over(felt, HEAVY, align(chosen, RATE_HZ))
-    assert len(felt.times) - len(left.times) <= 2 * (13 if fir else 1)
-    assert left.size.max() < 1.5
+    assert len(felt.times) - len(left.times) <= 2 * (16 if fir else 4)
+    assert left.size.max() < 1.0
     assert left.percentile(0.99) < 1.0
+
+
+@pytest.mark.parametrize("fir", [False, True], ids=["FIR off", "FIR on"])
+@pytest.mark.parametrize("seed", more_if_long([0], range(4)))
+@pytest.mark.parametrize("sinc_length", more_if_long([32, 64], [32, 64, 128]))
+def test_after_a_gap_noise_is_not_taken_for_spinning_up(sinc_length: int, seed: int, fir: bool) -> None:
+    """By the IMU's own noise: of two samples it made 4 N. Beside what is there without a gap."""
+    rate_hz, chosen = 51200 / sinc_length, settings(sinc_length, fir)
+    imu, aligned = Imperfection(*imu_noise(chosen)), align(chosen, rate_hz)
+    for path in (motion.moves(seed)["fast"], motion.turned(seed)):
+        felt = motion.filtered(path, HEAVY, 2.0, chosen, seed=seed, imu=imu)
+        usual = left_over(felt, HEAVY, aligned)
+        for at_s in np.arange(0.3, 1.9, 0.2).tolist():
+            for lost_s in (0.012, 0.03, 0.06):
+                end_s = at_s + lost_s
+                near = (felt.times > at_s - 0.1) & (felt.times < end_s + 0.06)
+                near &= (felt.times < at_s) | (felt.times > end_s)
+                kept = Felt(*(part[near] for part in felt))
+                left = left_over(kept, HEAVY, aligned, settling_s=end_s)
+                beside = np.isin(usual.times, left.times)
+                assert (left.size - usual.size[beside]).max() < 0.8
 
 
 def test_another_rate_and_another_sensor_begin_anew() -> None:
@@ -184,12 +205,12 @@ def test_what_is_unknown_is_used_as_it_comes() -> None:
 
 
 def test_a_mass_off_the_axis_is_spun_up() -> None:
-    """0.1 m off the axis, with 20 rad/s²: 4 N on 2 kg; from the second sample on."""
+    """0.1 m off the axis, with 20 rad/s²: 4 N on 2 kg; after 4 ms."""
     imu, spin = ImuSpecificForce((0.1, 0.0, 0.0), alignment=align({}, RATE_HZ)), 20.0
     for number in range(80):
         t = 0.1 + number / RATE_HZ
         found = imu.follow((0.0, 0.0, STANDARD_GRAVITY), (0.0, 0.0, spin * t), t)
-        assert (found is None) == (number == 0)
+        assert (found is None) == (number < 4)
         assert found is None or found[1] == pytest.approx(spin * 0.1, rel=1e-3)
     assert found is not None
     assert found[0] == pytest.approx(-((spin * t) ** 2) * 0.1, rel=1e-3)

@@ -42,6 +42,8 @@ _FURTHEST_S: Final = 0.002
 # longer, for longer.
 _GAP_S, _FIR_GAP_S, _GAP_PERIODS = 0.008, 0.015, 2.5
 _UNKNOWN_GAP_S: Final = 0.1  # where the rate is unknown
+# What was before a gap's end is on the line through as much of the motion after it: of less, noise is most.
+_LINE_S: Final = 0.004
 
 
 class Alignment(NamedTuple):
@@ -51,7 +53,7 @@ class Alignment(NamedTuple):
     taps: Array  # (3, n): to acceleration, angular rate and angular acceleration
     lag_s: float | None  # by which force and torque are later than the accelerometer; None: unknown
     gap_s: float  # samples further apart do not belong together
-    lead: int  # so many samples after a gap tell nothing of the instant that force and torque are of
+    lead: int  # so many samples after a gap tell what was before them, at the instant of force and torque
     settings: Mapping[str, SettingValue]
 
     def noise(self, lever_m: float = 0.0) -> tuple[float, float]:
@@ -86,6 +88,7 @@ def align(
     taps = np.array([np.eye(count)[0] if known_s is None else value, *turned])[:, ::-1]
     gap_s = max(_FIR_GAP_S if fir else _GAP_S, _GAP_PERIODS / rate_hz) if is_known else _UNKNOWN_GAP_S
     lead = 1 + math.floor(max(at_s, 0.0) * rate_hz) + 2 * fir
+    lead = min(lead + max(1, math.ceil(_LINE_S * rate_hz)), count)
     return Alignment(1.0 / rate_hz, np.ascontiguousarray(taps), known_s, gap_s, lead, settings)
 
 

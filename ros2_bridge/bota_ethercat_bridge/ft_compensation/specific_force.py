@@ -76,17 +76,21 @@ class ImuSpecificForce:
             return None
         passed_s, self._time_s = time_s - self._time_s, time_s
         dx, dy, dz = self.lever
+        lead, filled = self.alignment.lead, self._filled
         if 0.0 < passed_s <= self.alignment.gap_s:
-            if self._filled == 1 or passed_s > 1.5 * self.alignment.period_s:
+            if passed_s > 1.5 * self.alignment.period_s:
                 self._bridge(row, passed_s)
             self._append(row)
+            if filled < lead <= self._filled:
+                self._continue_back()
         else:
-            if self._filled:
-                before = self._ring[self._at].tolist()
-                self._moved = _turns(before[3:]) or math.dist(before[:3], row[:3]) > _PUSHED
+            if filled:
+                before = self._ring[self._at + 1 : self._at + self._size + 1]
+                turned, pushed = (before[:, 3:] ** 2).sum(axis=1), math.dist(before[-1, :3], row[:3])
+                self._moved = bool(turned.max() > _TURNING**2) or pushed > _PUSHED
             self._filled = 1
             self._ring[:] = row
-        if self._filled <= self.alignment.lead and (dx or dy or dz) and (self._moved or _turns(angular_rate)):
+        if self._filled < lead and (dx or dy or dz) and (self._moved or _turns(angular_rate)):
             return None
         found = self.alignment.taps.dot(self._ring[self._at + 1 : self._at + self._size + 1]).tolist()
         (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = found
@@ -99,19 +103,21 @@ class ImuSpecificForce:
         )
 
     def _bridge(self, row: Row, passed_s: float) -> None:
-        """What precedes a sample that comes so long after the one before."""
+        """The samples that were lost before one that comes so long after the one before."""
+        periods, before = round(passed_s / self.alignment.period_s), self._ring[self._at].copy()
+        for lost in range(1, periods):
+            self._append(before + lost / periods * (row - before))
+
+    def _continue_back(self) -> None:
+        """What precedes the samples since a gap, on the line through them."""
         ring, size = self._ring, self._size
-        periods = round(passed_s / self.alignment.period_s)
-        if self._filled == 1:  # of two samples only, the slope is that between them
-            before = ring[self._at].copy()
-            step = (np.array(row) - before)[3:] / max(periods, 1)
-            turned = before[3:] - step * np.arange(size)[::-1, np.newaxis]
-            self._at = size - 1
-            ring[:size, 3:] = ring[size:, 3:] = turned
-        if periods > 1:
-            before = ring[self._at].copy()
-            for lost in range(1, periods):
-                self._append(before + lost / periods * (row - before))
+        known = min(self._filled, size)
+        since = ring[self._at + size - known + 1 : self._at + size + 1].copy()
+        steps = np.arange(known) - 0.5 * (known - 1)
+        slope = steps @ since / (steps @ steps)
+        before = since.mean(axis=0) + (steps[0] - np.arange(size - known, 0, -1)[:, np.newaxis]) * slope
+        ring[:size] = ring[size:] = np.concatenate([before, since])
+        self._at = size - 1
 
     def _append(self, row: Row | Array) -> None:
         self._filled += 1

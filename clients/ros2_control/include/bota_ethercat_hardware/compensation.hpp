@@ -123,11 +123,12 @@ struct Alignment {
         for (std::size_t band = 0; band < kBands; ++band) gains_[band] = lag_s ? gain(hertz(band) * period_s, whole) : 1.0;
         const double acceleration_noise = 250e-6 * 9.80665 * std::sqrt(460.0), rate_noise = 0.01 * kPi / 180.0 * std::sqrt(184.0);
         const auto turned = [&](bool slope) { return fitted(4.0, 1.5, rate_noise, std::max(at_s - gyroscope_s, -kFurthest), count, slope); };
+        lead = std::min(lead + std::max(1, static_cast<int>(std::ceil(0.004 * rate_hz))), count);
         taps = {lag_s ? fitted(10.0, 9.0, acceleration_noise, std::max(at_s, -kFurthest), count, false) : Taps{1.0}, turned(false), turned(true)};
     }
 
     double period_s, gap_s;  ///< samples further apart than `gap_s` do not belong together
-    int lead;                      ///< this many samples after a gap do not yet show the instant of force and torque
+    int lead;                      ///< this many samples after a gap tell what was before them
     std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
 
 private:
@@ -203,7 +204,7 @@ public:
         if (!sample.imu_is_finite() || sample.acceleration == Vector3{}) return none();
         append(row(sample), time_s - time_s_);
         time_s_ = time_s;
-        if (known_ <= alignment_.lead && (moved_ || turns(history_.front())) && lever_ != Vector3{}) return none();
+        if (known_ < alignment_.lead && (moved_ || turns(history_.front())) && lever_ != Vector3{}) return none();
         const Vector3 omega = aligned(1, 3), alpha = aligned(2, 3), tangential = cross(alpha, lever_);
         const Vector3 centripetal = cross(omega, cross(omega, lever_)), s = aligned(0, 0);
         Vector3 force{};
@@ -248,24 +249,36 @@ private:
     /// Append a sample that comes `passed_s` after the one before, and interpolate those that are missing between them.
     void append(const Row& row, double passed_s) {
         if (!(passed_s > 0.0 && passed_s <= alignment_.gap_s)) {
-            moved_ = !history_.empty() && (turns(history_.front()) || pushed(history_.front(), row));
+            moved_ = !history_.empty() && (std::any_of(history_.begin(), history_.end(), turns) || pushed(history_.front(), row));
             history_.assign(count_, row);
             known_ = 1;
             return;
         }
         const int periods = static_cast<int>(std::nearbyint(passed_s / alignment_.period_s));
         const Row before = history_.front();
-        if (known_ == 1)  // of two samples only, the slope is that between them
-            for (std::size_t k = 0; k < count_; ++k)
-                for (std::size_t i = 3; i < 6; ++i)
-                    history_[k][i] = before[i] - (row[i] - before[i]) / std::max(periods, 1) * static_cast<double>(k);
         for (int lost = 1; lost < periods; ++lost) {
             history_.push_front(row);
             for (std::size_t i = 0; i < 6; ++i) history_.front()[i] = before[i] + (row[i] - before[i]) * lost / periods;
         }
         history_.push_front(row);
         history_.resize(count_);
+        const int before_it = known_;
         known_ += std::max(periods, 1);
+        if (before_it < alignment_.lead && known_ >= alignment_.lead) continue_back();
+    }
+
+    /// What precedes the samples since a gap, on the line through them.
+    void continue_back() {
+        const std::size_t known = std::min(static_cast<std::size_t>(known_), count_);
+        const double middle = 0.5 * static_cast<double>(known - 1), squares = static_cast<double>(known * (known * known - 1)) / 12.0;
+        for (std::size_t i = 0; i < 6; ++i) {
+            double mean = 0.0, slope = 0.0;  // a sample of greater age
+            for (std::size_t k = 0; k < known; ++k) {
+                mean += history_[k][i] / static_cast<double>(known);
+                slope += history_[k][i] * (static_cast<double>(k) - middle) / squares;
+            }
+            for (std::size_t k = known; k < count_; ++k) history_[k][i] = mean + slope * (static_cast<double>(k) - middle);
+        }
     }
 
     /// Three of the columns from `first` on, with these weights.
