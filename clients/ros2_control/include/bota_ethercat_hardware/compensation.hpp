@@ -6,7 +6,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <deque>
 #include <optional>
 #include <string_view>
 #include <utility>
@@ -195,6 +194,7 @@ public:
         : payload_(payload), alignment_(std::move(alignment)), lever_(payload.center) {
         lever_[2] -= imu_height(model);
         for (const auto& taps : alignment_.taps) count_ = std::max(count_, taps.size());
+        ring_.resize(2 * count_);
     }
 
     /// N, Nm; NaN if acceleration or angular rate are not finite, the IMU is off, or the sensor moves, or did before a gap, and
@@ -204,7 +204,7 @@ public:
         if (!sample.imu_is_finite() || sample.acceleration == Vector3{}) return none();
         append(row(sample), time_s - time_s_);
         time_s_ = time_s;
-        if (known_ < alignment_.lead && (moved_ || turns(history_.front())) && lever_ != Vector3{}) return none();
+        if (known_ < alignment_.lead && (moved_ || turns(ring_[at_])) && lever_ != Vector3{}) return none();
         const Vector3 omega = aligned(1, 3), alpha = aligned(2, 3), tangential = cross(alpha, lever_);
         const Vector3 centripetal = cross(omega, cross(omega, lever_)), s = aligned(0, 0);
         Vector3 force{};
@@ -249,35 +249,43 @@ private:
     /// Append a sample that comes `passed_s` after the one before, and interpolate those that are missing between them.
     void append(const Row& row, double passed_s) {
         if (!(passed_s > 0.0 && passed_s <= alignment_.gap_s)) {
-            moved_ = !history_.empty() && (std::any_of(history_.begin(), history_.end(), turns) || pushed(history_.front(), row));
-            history_.assign(count_, row);
+            const auto newest = ring_.begin() + static_cast<std::ptrdiff_t>(at_), end = newest + static_cast<std::ptrdiff_t>(count_);
+            moved_ = known_ > 0 && (std::any_of(newest, end, turns) || pushed(*newest, row));
+            ring_.assign(2 * count_, row);
             known_ = 1;
             return;
         }
-        const int periods = static_cast<int>(std::nearbyint(passed_s / alignment_.period_s));
-        const Row before = history_.front();
+        const int periods = static_cast<int>(std::nearbyint(passed_s / alignment_.period_s)), before_it = known_;
+        const Row before = ring_[at_];
         for (int lost = 1; lost < periods; ++lost) {
-            history_.push_front(row);
-            for (std::size_t i = 0; i < 6; ++i) history_.front()[i] = before[i] + (row[i] - before[i]) * lost / periods;
+            Row between = row;
+            for (std::size_t i = 0; i < 6; ++i) between[i] = before[i] + (row[i] - before[i]) * lost / periods;
+            push(between);
         }
-        history_.push_front(row);
-        history_.resize(count_);
-        const int before_it = known_;
+        push(row);
         known_ += std::max(periods, 1);
         if (before_it < alignment_.lead && known_ >= alignment_.lead) continue_back();
     }
 
+    void push(const Row& row) noexcept {
+        at_ = (at_ == 0 ? count_ : at_) - 1;
+        ring_[at_] = ring_[at_ + count_] = row;
+    }
+
     /// What precedes the samples since a gap, on the line through them.
-    void continue_back() {
+    void continue_back() noexcept {
         const std::size_t known = std::min(static_cast<std::size_t>(known_), count_);
         const double middle = 0.5 * static_cast<double>(known - 1), squares = static_cast<double>(known * (known * known - 1)) / 12.0;
-        for (std::size_t i = 0; i < 6; ++i) {
-            double mean = 0.0, slope = 0.0;  // a sample of greater age
-            for (std::size_t k = 0; k < known; ++k) {
-                mean += history_[k][i] / static_cast<double>(known);
-                slope += history_[k][i] * (static_cast<double>(k) - middle) / squares;
+        Row mean{}, slope{};  // of the slope the sign is that of greater ages
+        for (std::size_t k = 0; k < known; ++k)
+            for (std::size_t i = 0; i < 6; ++i) {
+                mean[i] += ring_[at_ + k][i] / static_cast<double>(known);
+                slope[i] += ring_[at_ + k][i] * (static_cast<double>(k) - middle) / squares;
             }
-            for (std::size_t k = known; k < count_; ++k) history_[k][i] = mean + slope * (static_cast<double>(k) - middle);
+        for (std::size_t k = known; k < count_; ++k) {
+            Row& then = ring_[(at_ + k) % count_];
+            for (std::size_t i = 0; i < 6; ++i) then[i] = mean[i] + slope[i] * (static_cast<double>(k) - middle);
+            ring_[(at_ + k) % count_ + count_] = then;
         }
     }
 
@@ -285,7 +293,7 @@ private:
     Vector3 aligned(std::size_t taps, std::size_t first) const noexcept {
         Vector3 sum{};
         for (std::size_t k = 0; k < alignment_.taps[taps].size(); ++k)
-            for (std::size_t i = 0; i < 3; ++i) sum[i] += alignment_.taps[taps][k] * history_[k][first + i];
+            for (std::size_t i = 0; i < 3; ++i) sum[i] += alignment_.taps[taps][k] * ring_[at_ + k][first + i];
         return sum;
     }
 
@@ -293,7 +301,8 @@ private:
     Alignment alignment_;
     Vector3 lever_;            // from the IMU to the center of gravity
     std::size_t count_ = 0;    // of the samples that are kept
-    std::deque<Row> history_;  // the newest first
+    std::vector<Row> ring_;    // twice, from `at_` on the newest first
+    std::size_t at_ = 0;
     int known_ = 0;            // since the last gap
     bool moved_ = false;       // before it, or in it
     double time_s_ = kNever;
