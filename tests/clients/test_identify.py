@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import json
 import math
-import re
 import random
+import re
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
