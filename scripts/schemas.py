@@ -77,21 +77,26 @@ age: p50 float, worst float
 delays: force_torque float?, acceleration float?, angular_rate float?
 alert: severity {_VERDICT}, text str, remedy str
 clock: *ClockStatus(mode offset_ppm uncertainty_us)
+compensated: force [float] "Newest sample, N.", torque [float] "Nm.", force_bound float "95 %, N.",
+    torque_bound float "95 %, Nm.", contact contact? "With contact.surface."
+contact: detected bool, point [float]? "In the sensor's frame, m.", press bool? "False: a pull.", region_m
+    float? "The longer semi-axis of the 95 % region."
 sensor: sensor int "Position on the bus, from 0.", *SensorInfo(name serial firmware), state str "AL state,
     or LOST.", nominal_hz float?, delay_ms delays "Group delay of the filters.", units [str] "Of force and
     torque: N and Nm, or counts without the calibration matrix.", force [float?]? "Newest sample: x, y, z.",
     torque [float?]? "Newest sample: x, y, z.", force_min_max [[float?]]? "Of each axis, in this second.",
     torque_min_max [[float?]]? "Of each axis, in this second.", acceleration [float?]? "Newest sample:
     m/s².", angular_rate [float?]? "Newest sample: rad/s.", temperature float? "Newest sample: °C.",
-    orientation [float?]? "Newest sample: x, y, z, w.", saturated [str] "Names of axes: Fx to Mz, ax, ωx and
-    so on.", verdict {_VERDICT}, alerts [alert] "Findings of this second.", samples int "New samples since
-    connecting.", rate_hz float? "In the last 5 s.", age_us age? "On arrival, in the last 5 s; on the
-    server's machine only.", jitter_us float? "Of the intervals between stamps, in the last 5 s.",
-    jitter_worst_us float? "In the last 5 s.", missed int? "Missing frames since connecting.", gaps int?
-    "Frames with GAP since connecting.", repeated int? "Frames with REPEATED since connecting.", invalid
-    int? "Frames with INVALID since connecting.", silent_s float? "Since the last new sample.", lost_on_bus
-    SensorStatus.lost_samples "As the server counts.", recoveries SensorStatus.recoveries "As the server
-    counts.", clock clock? "As in status.", hand_out_us times? "Age when sent."
+    orientation [float?]? "Newest sample: x, y, z, w.", compensated compensated? "With --tool.",
+    saturated [str] "Names of axes: Fx to Mz, ax, ωx and so on.", verdict {_VERDICT}, alerts [alert]
+    "Findings of this second.", samples int "New samples since connecting.", rate_hz float? "In the last
+    5 s.", age_us age? "On arrival, in the last 5 s; on the server's machine only.", jitter_us float?
+    "Of the intervals between stamps, in the last 5 s.", jitter_worst_us float? "In the last 5 s.",
+    missed int? "Missing frames since connecting.", gaps int? "Frames with GAP since connecting.",
+    repeated int? "Frames with REPEATED since connecting.", invalid int? "Frames with INVALID since
+    connecting.", silent_s float? "Since the last new sample.", lost_on_bus SensorStatus.lost_samples
+    "As the server counts.", recoveries SensorStatus.recoveries "As the server counts.", clock clock?
+    "As in status.", hand_out_us times? "Age when sent."
 
 # report: ethercat-report --json
 One object per sensor; nothing if there is no report.

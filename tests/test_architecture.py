@@ -76,7 +76,8 @@ ROOMS: Final[dict[str, set[str]]] = {
     "bota_clients.export": CLIENTS | {"bota_clients.export", "bota_clients.identify", f"{B}.ft_compensation"},
     "bota_clients.record": CLIENTS | {"bota_clients.record"},
     "bota_clients.report": CLIENTS | {"bota_clients.report", "bota_clients.record"},
-    "bota_clients.monitor": CLIENTS | {"bota_clients.monitor", "bota_clients.record"},
+    "bota_clients.monitor": CLIENTS
+    | {"bota_clients.monitor", "bota_clients.record", "bota_clients.export", f"{B}.ft_compensation"},
     "bota_clients.replay": CLIENTS | {"bota_clients.replay", f"{S}.serving", S},
     "bota_clients.identify": CLIENTS | {"bota_clients.identify", f"{B}.ft_compensation"},
 }

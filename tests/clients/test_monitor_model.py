@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import math
+from functools import partial
 from types import SimpleNamespace
 from typing import cast
 from unittest import mock
 
 import pytest
 
+from bota_clients.errors import RecordingError
+from bota_clients.monitor.compensated import CompensatedStream
 from bota_clients.monitor.model import Model, SensorView
 from bota_clients.monitor.reader import MonitorReader
-from bota_clients.monitor.screen import ViewOptions, render
+from bota_clients.monitor.screen import ViewOptions, render, table
+from bota_clients.monitor.words import json_line, json_object
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.limits import Level
+from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S, description, frame, now, status
+from tests.json_schema import problems
 
 REST = {"force.z": -8.0, "acceleration.z": 1.0, "temperature": 30.0}
 
@@ -275,3 +282,60 @@ def test_a_message_goes_after_half_a_minute(model: Model) -> None:
     assert [bool(model.state(now(k * 1000)).message) for k in (0, 20, 40)] == [True, True, False]
     model.say("Not tared")
     assert model.state(now(41 * 1000)).message is not None
+
+
+TOOL = {
+    "tool_mass": 0.8, "tool_center_of_gravity": [0.0, 0.0, 0.05], "bias": [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    "sensor_offset": [0.0] * 6, "contact.surface": "plane 0 0 0.1 0 0 1 0.03",
+}  # fmt: skip
+
+
+def test_with_a_tool_the_newest_sample_is_without_it_and_contact_is_told() -> None:
+    model = Model(made.ADDRESS, compensated=partial(CompensatedStream, TOOL, ImuUnits.G_DPS))
+    model.connected(description(offset=[0.0] * 6), made.OWN_PEER, START_S)
+    still = {"force.x": 1.0, "force.z": -0.8 * STANDARD_GRAVITY, "acceleration.z": 1.0}
+    pressed = still | {"force.z": still["force.z"] - 20.0, "torque.y": 0.2}  # 10 mm off the axis
+    turned = pressed | {"torque.z": 3.0}
+    for first, values, words, point in (
+        (0, still, "none", None),
+        (40, pressed, "press at x 10, y 0, z 100 mm, 95 % region up to", (0.01, 0.0, 0.1)),
+        (80, turned, "yes, but not known where: a free moment acts", None),
+    ):
+        found = take(model, *(frame(k, values) for k in range(first, first + 40))).compensated
+        assert found is not None
+        assert found.force == pytest.approx((0.0, 0.0, values["force.z"] - still["force.z"]), abs=1e-4)
+        assert found.torque == pytest.approx(
+            (0.0, values.get("torque.y", 0.0), values.get("torque.z", 0.0)), abs=1e-4
+        )
+        assert (0.0 < found.force_bound < 2.0, 0.0 < found.torque_bound < 0.2) == (True, True)
+        state = model.state(now(first + 40))
+        rows = table(state)
+        assert any(row.startswith(f"Contact  {words}") for row in rows), rows
+        (sensor,) = json_object(state, 0.0)["sensors"]
+        contact = sensor["compensated"]["contact"]
+        assert (contact["detected"], contact["point"]) == (
+            words != "none",
+            point and pytest.approx(point, abs=1e-4),
+        )
+        assert problems("monitor", json.loads(json_line(state, 0.0))) == []
+    model.add_event({"event": Event.OFFSET_CHANGED, "sensor": 0, "offset": [2.0, *[0.0] * 5]}, now(120))
+    found = take(model, *(frame(k, still | {"force.x": 3.0}) for k in range(120, 200))).compensated
+    assert found is not None
+    assert found.force == pytest.approx((0.0, 0.0, 0.0), abs=1e-4), "the bias follows the sensor's own offset"
+    assert (
+        take(model, *(frame(k, still | {"force.y": math.nan}) for k in range(200, 240))).compensated is None
+    )
+    rows = table(model.state(now(240)))
+    assert any(row.startswith("Compensated  not known of the newest sample") for row in rows), rows
+
+
+def test_what_cannot_be_compensated_is_told() -> None:
+    model = Model(made.ADDRESS, compensated=partial(CompensatedStream, TOOL, ImuUnits.G_DPS))
+    model.connected(description(calibration_matrix=False), made.OWN_PEER, START_S)
+    sensor = take(model, *run(0, 40))
+    assert sensor.compensated is None
+    assert sensor.not_compensated.startswith(
+        "the wrench cannot be compensated: settings.calibration_matrix is off"
+    )
+    with pytest.raises(RecordingError, match=r"contact.surface is 'box'"):
+        CompensatedStream(TOOL | {"contact.surface": "box"}, ImuUnits.G_DPS)

@@ -166,6 +166,11 @@ class Windows:
         return self._compensator is not None
 
     @property
+    def turning(self) -> Turning:
+        """Of the newest sample, rad/s and rad/s²; with a tool."""
+        return self._imu.turning
+
+    @property
     def doubt_ns(self) -> int:
         """How long before an offset was reported samples may have part of it; 0 without a tool."""
         if self._compensator is None or self._in_force is None:

@@ -6,10 +6,12 @@ import argparse
 import errno
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 from bota_clients.arguments import add_imu_units, add_server, address, is_loopback, server_of
-from bota_clients.program import not_installed
+from bota_clients.errors import ClientError
+from bota_clients.program import not_installed, say
 from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.program.arguments import Parser, seconds
 from bota_ethercat.program.output import discard_output, ends_with_its_reader
@@ -31,6 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except KeyboardInterrupt:
         return 1 if options.once else 0
+    except ClientError as error:
+        say("ethercat-monitor", str(error))
+        return 1
     except ImportError as error:  # of rich, textual, websockets, which are imported where they are used
         return not_installed("ethercat-monitor", error)
 
@@ -48,6 +53,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="observe for a second, print a table and exit, as it does without a terminal")  # fmt: skip
     add("--json", action="store_true", help="print one JSON object per second; with --once, just one")
     add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
+    add("--tool", type=Path, metavar="YAML",
+        help="show the wrench without this tool, too, and contact on its contact.surface: parameters, as "
+             "ethercat-identify --yaml writes them")  # fmt: skip
     add_imu_units(made)
     add(
         "--web", type=_loopback, nargs="?", const=DEFAULT_WEB, metavar="PORT",
@@ -57,8 +65,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     options.address = server_of(made, options.server)
     if options.once and options.seconds is not None:
         made.error("--seconds cannot be combined with --once")
-    if options.web is not None and (options.once or options.json):
-        made.error("--web cannot be combined with --once or --json")
+    if options.web is not None and (options.once or options.json or options.tool):
+        made.error("--web cannot be combined with --once, --json or --tool")
     return options
 
 

@@ -10,9 +10,9 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
@@ -33,6 +33,9 @@ from bota_ethercat.replies import (
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import mapping, text
+
+if TYPE_CHECKING:  # NumPy is loaded only where there is a tool
+    from bota_clients.monitor.compensated import Compensated, CompensatedStream
 
 SILENT_S: Final = LIMITS.stale_after  # a server normally sends a frame per sample period
 _WRENCH: Final = tuple(COMMON.index(f.name) for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
@@ -104,6 +107,8 @@ class SensorView:
     silent_s: float | None = None  # since the last new sample
     hand_out_us: Percentiles | None = None  # age when the server hands them out
     zero: str = ""  # its drift, in words
+    compensated: Compensated | None = None  # of the newest sample, with a tool
+    not_compensated: str = ""  # why not, a sentence
 
     @property
     def units(self) -> tuple[str, str]:
@@ -154,8 +159,8 @@ class State:
 class _Sensor:
     """One sensor, judged whenever something arrives: no finding between two refreshes is missed."""
 
-    def __init__(self, position: int, imu_units: ImuUnits) -> None:
-        self.position = position
+    def __init__(self, position: int, imu_units: ImuUnits, compensated: CompensatedStream | None) -> None:
+        self.position, self.compensated = position, compensated
         self.peaks: tuple[Range, ...] | None = None
         self._imu_units = imu_units
         self.observer = StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
@@ -175,6 +180,8 @@ class _Sensor:
         before, now_ns = self.observer.info, _ns(now_s)
         if anew:
             self.observer.connected(now_ns)
+        if self.compensated is not None and (anew or info.serial != before.serial):
+            self.compensated.begin()
         self.observer.info = info
         if info.serial != before.serial and before != SensorInfo():
             self.reset()
@@ -188,6 +195,8 @@ class _Sensor:
 
     def add_frames(self, frames: Sequence[DataMessage], now_s: float) -> None:
         samples = self.observer.add_frames(frames, _ns(now_s))
+        if self.compensated is not None:
+            self.compensated.add(frames, self.observer.info)
         self._judge(now_s)
         if not samples:
             return
@@ -238,6 +247,8 @@ class _Sensor:
             alerts=tuple(alerts),
             hand_out_us=_percentiles(self._hand_out),
             zero=sentences.drift(status),
+            compensated=None if self.compensated is None else self.compensated.latest,
+            not_compensated=self.compensated.problem if self.compensated else "",
             **self._stream(_ns(now_s)),
         )
 
@@ -264,9 +275,13 @@ class _Sensor:
 class Model:
     """Takes everything that the server sends."""
 
-    def __init__(self, address: str, imu_units: ImuUnits = ImuUnits.G_DPS) -> None:
+    def __init__(
+        self, address: str, imu_units: ImuUnits = ImuUnits.G_DPS,
+        compensated: Callable[[], CompensatedStream] | None = None,
+    ) -> None:  # fmt: skip
+        """`compensated` makes what compensates the samples of a sensor."""
         self._lock = threading.Lock()
-        self._imu_units = imu_units
+        self._imu_units, self._compensated = imu_units, compensated
         self._sensors: dict[int, _Sensor] = {}
         self._server = ServerState(address=address)  # what does not depend on the time
         self._since_s: float | None = None
@@ -392,7 +407,8 @@ class Model:
         self._server = replace(self._server, version=known.version, replay=replayed)
         before, self._sensors = self._sensors, {}
         for info in known.sensors:
-            sensor = before.get(info.sensor) or _Sensor(info.sensor, self._imu_units)
+            stream = self._compensated and self._compensated()
+            sensor = before.get(info.sensor) or _Sensor(info.sensor, self._imu_units, stream)
             self._sensors[info.sensor] = sensor
             sensor.describe(info, now_s, anew=anew)
 

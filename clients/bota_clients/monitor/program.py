@@ -8,7 +8,9 @@ import math
 import os
 import sys
 import time
-from typing import Final
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Final
 
 from bota_clients.monitor.model import Model
 from bota_clients.monitor.reader import MonitorReader
@@ -16,6 +18,9 @@ from bota_clients.monitor.words import json_line, verdict
 from bota_clients.program import interrupt_on_signals
 from bota_ethercat.health.limits import Level
 from bota_ethercat.health.sentences import no_server
+
+if TYPE_CHECKING:
+    from bota_clients.monitor.compensated import CompensatedStream
 
 _PERIOD_S: Final = 1.0
 _ONCE_S: Final = 1.0
@@ -38,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         import bota_clients.monitor.screen  # noqa: F401, PLC0415
     interrupt_on_signals()  # the live view replaces the handler of SIGTERM
-    model = Model(str(options.address), options.imu_units)
+    model = Model(str(options.address), options.imu_units, _compensating(options))
     reader = MonitorReader(options.address, model)
     reader.start()
     try:
@@ -50,6 +55,18 @@ def run(options: argparse.Namespace) -> int:
         return _each_second(options, model)
     finally:
         reader.close()
+
+
+def _compensating(options: argparse.Namespace) -> Callable[[], CompensatedStream] | None:
+    """What makes what compensates a sensor's samples; RecordingError."""
+    if options.tool is None:
+        return None
+    from bota_clients.export.windows import read_tool  # noqa: PLC0415
+    from bota_clients.monitor.compensated import CompensatedStream  # noqa: PLC0415
+
+    make = partial(CompensatedStream, read_tool(options.tool), options.imu_units)
+    make()  # whether it can be
+    return make
 
 
 def _once(options: argparse.Namespace, model: Model, *, answered: bool) -> int:

@@ -177,6 +177,7 @@ def _panel(sensor: SensorView, width: int, *, bars: bool = True) -> list[Text]:
         identity,
         *_axes(sensor, 0, width, bars=bars),
         *_axes(sensor, 1, width, bars=bars),
+        *_compensated(sensor),
         *_alerts(sensor, width),
         *_imu(sensor),
         _field("Stream", stream),
@@ -235,6 +236,20 @@ def _axes(sensor: SensorView, which: int, width: int, *, bars: bool) -> list[Tex
         for extreme in (peak or ()) if with_peaks else ():
             row.append(numbers.quantity(extreme, digits, _VALUE_WIDTH - 1).rjust(_VALUE_WIDTH), PEAK)
     return rows
+
+
+def _compensated(sensor: SensorView) -> list[Text]:
+    row, found = Text.assemble(("Compensated".ljust(13), LABEL)), sensor.compensated
+    if found is None:
+        return [row.append(sensor.not_compensated, BAD)] if sensor.not_compensated else []
+    for values, unit, bound in (
+        (found.force, "N", found.force_bound),
+        (found.torque, "Nm", found.torque_bound),
+    ):
+        digits = words.DIGITS[unit]
+        row.append("".join(numbers.quantity(value, digits, 8) for value in values), VALUE)
+        row.append(f" {unit} ±{bound:.{digits}f}", LABEL)
+    return [row, *([_field("Contact", words.contact(found.contact))] if found.contact else [])]
 
 
 def _imu(sensor: SensorView) -> list[Text]:

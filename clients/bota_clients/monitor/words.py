@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bota_clients.monitor.model import Alert, Percentiles, SensorView, ServerClient, ServerState, State
 from bota_clients.numbers import duration, milliseconds
 from bota_ethercat.health.limits import Level
 from bota_ethercat.text.json_text import finite
+
+if TYPE_CHECKING:
+    from bota_clients.monitor.compensated import Compensated
+    from bota_ethercat_bridge.ft_compensation.contact import Contact
 
 DIGITS = {"N": 2, "Nm": 3, "counts": 0, "m/s²": 2, "rad/s": 3}  # decimals by unit
 
@@ -124,6 +128,15 @@ def client(one: ServerClient) -> str:
     return f"{text}, {one.withheld} withheld" if one.withheld else text
 
 
+def contact(one: Contact) -> str:
+    """Whether something touches the tool, and where."""
+    if one.region is None:
+        return "none" if one.why.name == "NO_CONTACT" else f"yes, but not known where: {one.why.value}"
+    x, y, z = (1e3 * each for each in one.point)
+    how = "press" if one.is_press else "pull"
+    return f"{how} at x {x:.0f}, y {y:.0f}, z {z:.0f} mm, 95 % region up to {1e3 * one.region.largest:.0f} mm"
+
+
 def times(spread: Percentiles | None) -> str:
     """Median and p99 or worst of a distribution."""
     if spread is None:
@@ -186,6 +199,7 @@ def _sensor(sensor: SensorView) -> dict[str, Any]:
         "angular_rate": imu and imu.angular_rate,
         "temperature": sample and sample.temperature,
         "orientation": sample and sample.orientation,
+        "compensated": sensor.compensated and _compensated(sensor.compensated),
         "saturated": sorted(sensor.saturated),
         "verdict": sensor.verdict.level.key,
         "alerts": [alert(one) for one in sensor.alerts],
@@ -196,6 +210,19 @@ def _sensor(sensor: SensorView) -> dict[str, Any]:
         "clock": _plain(status.clock, "mode offset_ppm uncertainty_us") if status.clock.mode else None,
         "hand_out_us": _percentiles(sensor.hand_out_us),
     }
+
+
+def _compensated(found: Compensated) -> dict[str, Any]:
+    contact = found.contact
+    return {
+        **_plain(found, "force torque force_bound torque_bound"),
+        "contact": contact and {
+            "detected": contact.why.name != "NO_CONTACT",
+            "point": contact.region and contact.point,
+            "press": None if contact.region is None else contact.is_press,
+            "region_m": contact.region and contact.region.largest,
+        },
+    }  # fmt: skip
 
 
 def _plain(thing: object, names: str) -> dict[str, Any]:

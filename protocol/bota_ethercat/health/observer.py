@@ -98,6 +98,8 @@ class SensorObserver:
             self.lost = event_sentence(event)
         elif kind in (Event.SENSOR_BACK, Event.RECONFIGURED):
             self.lost = None
+        elif kind == Event.OFFSET_CHANGED:
+            self.info = self.info.changed_by(event)
 
     def add_status(self, status: Status, position: int, now_ns: int) -> None:
         """A reply to `status`, in which it is the sensor at `position`."""

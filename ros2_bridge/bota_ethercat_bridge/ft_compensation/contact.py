@@ -14,12 +14,22 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
-from bota_ethercat.pdo import Vector3
-from bota_ethercat.sensor.response import fir_taps, imu_noise
-from bota_ethercat.settings import SettingValue
+from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.sensor.response import fir_taps, healthy_noise, imu_noise
+from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
+from bota_ethercat_bridge.ft_compensation.alignment import align
+from bota_ethercat_bridge.ft_compensation.bias import TareBasis
+from bota_ethercat_bridge.ft_compensation.bounds import (
+    IMU_BELOW,
+    force_bound_95,
+    inertia_halves,
+    off_center_95,
+)
 from bota_ethercat_bridge.ft_compensation.quantities import (
+    EXACT,
     STILL,
     ZERO,
+    Accelerometer,
     CompensationError,
     Payload,
     Turning,
@@ -28,6 +38,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
 
 # Chi squared that 95 % keep to, with 6 and with 2 degrees of freedom, and the root of that with 3.
 _RELEASE, _REGION, _CHI_3 = 12.592, 5.991, 2.795
+_FARTHEST_M: Final = 10.0
 _IMU_MOTION: Final = 0.12  # m/s² on each axis: deviation of what alignment leaves of motion, by its extremes
 _SINC: Final = (66.0, 26.0, 1.0)  # autocorrelation of the third-order sinc filter, from lag 0
 
@@ -87,6 +98,51 @@ class Uncertainty(NamedTuple):
         x, y, z = (math.hypot(each, torque_95 / _CHI_3) for each in noise[3:])
         force = math.hypot(*noise[:3]) / math.sqrt(3.0)
         return cls(force, (x, y, z), weight, tool.center, spin_95 / _CHI_3, motion)
+
+
+def surface_of(text: str) -> Surface | None:
+    """The surface of the parameter `contact.surface`, None of an empty one; CompensationError."""
+    if not text.strip():
+        return None
+    kind, *words = text.split()
+    try:
+        *numbers, radius = map(float, words or ["nan"])
+        if not (radius > 0.0 and all(abs(number) <= _FARTHEST_M for number in (*numbers, radius))):
+            raise ValueError("a number is out of range")
+        x, y, z, *more = numbers
+        a, b, c = more if kind in {"plane", "capsule"} else (x, y, z)
+        size = math.hypot(a, b, c)
+        if kind == "plane":
+            return Plane((x, y, z), (a / size, b / size, c / size), radius)
+        if kind == "capsule" or (kind == "sphere" and not more):
+            return Capsule((x, y, z), (a, b, c), radius)
+        raise ValueError(f"{kind!r} is no surface")
+    except (ValueError, ZeroDivisionError) as error:
+        raise CompensationError(
+            f"parameter contact.surface is {text!r}: it must be plane X Y Z NX NY NZ RADIUS, sphere X Y Z "
+            f"RADIUS or capsule X Y Z X Y Z RADIUS, in m ({error})"
+        ) from None
+
+
+def detector_of(
+    surface: Surface, tool: Payload, settings: Mapping[str, SettingValue], rate_hz: float, *,
+    noise: Sequence[float] = (), accelerometer: Accelerometer | None = EXACT, taken: TareBasis | None = None,
+    alarms_per_hour: float = 1.0,
+) -> ContactDetector:  # fmt: skip
+    """For a sensor with these settings; CompensationError.
+
+    `noise` (6), N and Nm, is what it is where that is not measured. `accelerometer`: None where gravity is
+    not from the IMU; `taken`: the pose that the bias is from.
+    """
+    healthy = healthy_noise(round(BASE_SAMPLING_RATE_HZ / rate_hz), fir=bool(settings.get("fir")))
+    noise = [a or b for a, b in zip(noise or healthy, healthy, strict=True)]
+    weight = imu = 0.0
+    if accelerometer is not None:
+        imu, _ = align(settings, rate_hz).noise(length(tool.center) + IMU_BELOW)
+        weight = force_bound_95(tool, accelerometer, taken)
+    torque = STANDARD_GRAVITY * off_center_95(tool, taken)
+    known = Uncertainty.of(noise, weight, torque, tool, max(inertia_halves(tool)), imu)
+    return ContactDetector(surface, known, rate_hz, correlation(settings), alarms_per_hour)
 
 
 def correlation(settings: Mapping[str, SettingValue]) -> float:

@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.program.real_time import HIGHEST_PRIORITY
-from bota_ethercat_bridge.ft_compensation.contact import Capsule, Plane, Surface
+from bota_ethercat_bridge.ft_compensation.contact import Surface, surface_of
 from bota_ethercat_bridge.ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
 from bota_ethercat_bridge.ft_compensation.quantities import (
     DEFAULT_GRAVITY,
@@ -25,6 +25,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     NO_PAYLOAD,
     ZERO,
     Accelerometer,
+    CompensationError,
     Payload,
     Quaternion,
     StationaryLimits,
@@ -310,26 +311,10 @@ def gather(given: Mapping[str, Any]) -> Parameters:
 
 def parse_surface(text: str) -> Surface | None:
     """The surface of `contact.surface`, None of an empty one; ParameterError."""
-    if not text.strip():
-        return None
-    kind, *words = text.split()
     try:
-        *numbers, radius = map(float, words or ["nan"])
-        if not (radius > 0.0 and all(abs(number) <= _FARTHEST_M for number in (*numbers, radius))):
-            raise ValueError("a number is out of range")
-        x, y, z, *more = numbers
-        a, b, c = more if kind in {"plane", "capsule"} else (x, y, z)
-        size = math.hypot(a, b, c)
-        if kind == "plane":
-            return Plane((x, y, z), (a / size, b / size, c / size), radius)
-        if kind == "capsule" or (kind == "sphere" and not more):
-            return Capsule((x, y, z), (a, b, c), radius)
-        raise ValueError(f"{kind!r} is no surface")
-    except (ValueError, ZeroDivisionError) as error:
-        raise ParameterError(
-            f"parameter contact.surface is {text!r}: it must be plane X Y Z NX NY NZ RADIUS, sphere X Y Z "
-            f"RADIUS or capsule X Y Z X Y Z RADIUS, in m ({error})"
-        ) from None
+        return surface_of(text)
+    except CompensationError as error:
+        raise ParameterError(str(error)) from None
 
 
 def _refuse_slash(what: str, frame: str) -> None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Final
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -12,20 +12,10 @@ from rclpy.node import Node
 from std_msgs.msg import Bool, Header
 
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.pdo import Vector3
 from bota_ethercat.replies import SensorInfo
-from bota_ethercat.sensor.response import healthy_noise
-from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.bounds import (
-    IMU_BELOW,
-    force_bound_95,
-    inertia_halves,
-    off_center_95,
-)
 from bota_ethercat_bridge.ft_compensation.compensator import Stages
-from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Uncertainty, Why, correlation
-from bota_ethercat_bridge.ft_compensation.quantities import length
+from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Why, detector_of
 from bota_ethercat_bridge.parameters.table import Parameters, parse_surface
 from bota_ethercat_bridge.publishing.messages import Stamps, Topic, create_publisher
 from bota_ethercat_bridge.publishing.wrenches import WrenchTopic
@@ -74,23 +64,14 @@ class ContactTopic(WrenchTopic):
         if made_of == self._made_of:
             return
         self._made_of = made_of
-        sinc_length = round(BASE_SAMPLING_RATE_HZ / info.rate_hz)
-        healthy = healthy_noise(sinc_length, fir=bool(info.settings.get("fir")))
-        noise: Sequence[float] = self.noise or healthy
-        if any(parameters.contact_noise):
-            noise = parameters.contact_noise
-        weight = imu = 0.0
-        if plan.source.is_imu:
-            imu, _ = align(info.settings, info.rate_hz).noise(length(tool.center) + IMU_BELOW)
-            weight = force_bound_95(tool, parameters.accelerometer, plan.ramp.taken)
-        torque = STANDARD_GRAVITY * off_center_95(tool, plan.ramp.taken)
-        noise = [a or b for a, b in zip(noise, healthy, strict=True)]
-        known = Uncertainty.of(noise, weight, torque, tool, max(inertia_halves(tool)), imu)
         surface = parse_surface(parameters.contact_surface)
         assert surface is not None  # there is no topic without one
-        self._detector = ContactDetector(
-            surface, known, info.rate_hz, correlation(info.settings), parameters.contact_false_alarms
-        )
+        self._detector = detector_of(
+            surface, tool, info.settings, info.rate_hz,
+            noise=parameters.contact_noise if any(parameters.contact_noise) else self.noise,
+            accelerometer=parameters.accelerometer if plan.source.is_imu else None, taken=plan.ramp.taken,
+            alarms_per_hour=parameters.contact_false_alarms,
+        )  # fmt: skip
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         if (detector := self._detector) is None:
