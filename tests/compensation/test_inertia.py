@@ -60,6 +60,7 @@ def path_of(name: str, seed: int) -> Path:
 
 
 @functools.cache
+@functools.lru_cache(maxsize=4)
 def recorded(name: str, seed: int, tool: Payload, seconds: float = 20.0, *, fir: bool = False) -> Felt:
     """With the sensor's noise and bias."""
     felt = motion.filtered(
