@@ -67,7 +67,8 @@ ROOMS: Final[dict[str, set[str]]] = {
     f"{S}.doctor": ACCESS | {f"{S}.daemon", f"{S}.doctor"},
     # ROS 2.
     f"{B}.ft_compensation": {f"{B}.ft_compensation"} | PROTOCOL,
-    B: {B, f"{B}.ft_compensation", "bota_ethercat.client"} | PROTOCOL,
+    f"{B}.parameters.table": {f"{B}.ft_compensation"} | PROTOCOL,
+    B: {B, f"{B}.ft_compensation", f"{B}.parameters.table", "bota_ethercat.client"} | PROTOCOL,
     "bridge": {"bota_ethercat.renamed"},  # the old names
     "ft_compensation": {"bota_ethercat.renamed"},
     # Programs that are ordinary clients of the server.
@@ -79,7 +80,8 @@ ROOMS: Final[dict[str, set[str]]] = {
     "bota_clients.monitor": CLIENTS
     | {"bota_clients.monitor", "bota_clients.record", "bota_clients.export", f"{B}.ft_compensation"},
     "bota_clients.replay": CLIENTS | {"bota_clients.replay", f"{S}.serving", S},
-    "bota_clients.identify": CLIENTS | {"bota_clients.identify", f"{B}.ft_compensation"},
+    "bota_clients.identify": CLIENTS
+    | {"bota_clients.identify", f"{B}.ft_compensation", f"{B}.parameters.table"},
 }
 """A room, and the rooms it may import. A room without a line of its own belongs to the one above it."""
 

@@ -16,9 +16,10 @@ from typing import Any, Final
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from bota_ethercat.program.arguments import Parser, seconds, whole
@@ -37,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--for", type=seconds, default=10.0, dest="seconds", metavar="SECONDS", help="(10)")
     given = parser.parse_args(remove_ros_args(["", *(sys.argv[1:] if arguments is None else arguments)])[1:])
     try:
-        rclpy.init(args=arguments)
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # RCLError, which has no public name
         parser.error(f"ROS cannot start: {str(error).partition(', at /')[0]}")
     node, executor, ages_ns = rclpy.create_node("check_subscription"), SingleThreadedExecutor(), list[int]()
@@ -46,8 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         topic = node.resolve_topic_name(given.topic)
     except RuntimeError as error:  # rclpy has no public name for it
         parser.error(f"{given.topic!r} is no topic: {str(error).partition(', at /')[0]}")
-    counted, publishers = Subscription(topic), 0
-    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):  # what came until then is told
+    counted, publishers, is_stopped = Subscription(topic), 0, True
+    with contextlib.suppress(KeyboardInterrupt):  # what came until then is told
         if (publisher := _find(node, executor, topic)) is not None:
             package, _, name = publisher.topic_type.split("/")
             kind = getattr(import_module(f"{package}.msg"), name)
@@ -69,11 +70,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             while time.monotonic() < end_s:
                 executor.spin_once(0.1)
             publishers = node.count_publishers(topic)
+        is_stopped = False
     rclpy.try_shutdown()
     if not ages_ns:
-        sys.stderr.write(
-            f"check_subscription: nothing came on {topic}: see /diagnostics, ros2 topic info -v\n"
-        )
+        why = "stopped" if is_stopped else f"nothing came on {topic}: see /diagnostics, ros2 topic info -v"
+        sys.stderr.write(f"check_subscription: {why}\n")
         return 1
     if publishers > 1:
         sys.stdout.write(f"{topic} has {publishers} publishers, which falsifies the rest: stop all but one\n")

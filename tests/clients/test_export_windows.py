@@ -201,8 +201,24 @@ def test_a_bias_is_not_guessed(tmp_path: Path) -> None:
     assert f"{path} does not say with which offset of the sensor its bias was measured" in said(0.0, bias)
     assert f"{run} does not have the sensor's own offset" in said(None, bias, offset)
     assert "does not have a tool's parameters" in said(0.0, bias, "sensor_offset: [1, 2]")
-    for fine in ([0.0, bias, offset], [None]):
+    for wrong, why in (
+        ("tool_mass: -0.8", "parameter tool_mass is -0.8: it must be a number from 0 to"),
+        ("tool_mass: .nan", "parameter tool_mass is nan: it must be"),
+        (
+            "tool_center_of_gravity: [4, -6, 55]",
+            "parameter tool_center_of_gravity is [4, -6, 55]: it must be",
+        ),
+        ("tool_center_of_gravity: [0, 0]", "it must be 3 numbers"),
+    ):
+        assert why in said(None, wrong)
+    for fine in ([0.0, bias, offset], [None], [None, "accelerometer: {offset: [0, 0, 0]}"]):
         assert "out.npz: windows" in said(*fine)
+    path.write_text(path.read_text().replace("/**", "/bridge"))
+    assert run_here(main, run, tmp_path / "out.npz", "--at", frames, "--tool", path, "--force").code == 0
+    for text in ("", "a, b", "/a: {ros__parameters: {}}\n/b: {ros__parameters: {}}"):
+        path.write_text(text)
+        ended = run_here(main, run, tmp_path / "out.npz", "--at", frames, "--tool", path, "--force")
+        assert "it has no ros__parameters, or those of several nodes" in ended.err
 
 
 @pytest.mark.parametrize("way", ["stamps", "latency", "clock", "clock set back"])
@@ -522,6 +538,7 @@ def test_what_cannot_be_done_is_said_and_leaves_nothing(
         "out.csv --tool x",
         "out.npz --fps 30 --at x",
         "out.npz --fps 30 --window 0",
+        "out.xlsx",
     ],
 )
 def test_wrong_usage(arguments: str) -> None:

@@ -63,6 +63,15 @@ def test_a_lag_is_tried_on_parts_that_did_not_choose_it(sinc_length: int, seed: 
         check_held_out(felt.times, samples, chosen, found._replace(seconds=-0.012))
 
 
+def test_motion_that_does_not_tell_the_force_elsewhere_is_refused() -> None:
+    """Whatever lag fits best: of two poses 630 N were left in the other parts, and it was a result."""
+    felt = motion.filtered(shaken(1), TOOL, 10.0, settings())
+    pulled = np.random.default_rng(SEED).normal(0.0, 0.5, felt.force.shape).cumsum(axis=0)
+    samples = np.concatenate([felt.force + pulled, felt.acceleration, felt.rate], axis=1)
+    with pytest.raises(CompensationError, match="does not tell the force in the others"):
+        check_held_out(felt.times, samples, settings(), Lag(0.0, 1e-4, 0.999))
+
+
 def other_make(path: motion.Path, rate_hz: float, lag_s: float, seed: int) -> Lag:
     """A sensor with axes of its own, gains 2 % off, a drift of 1 N, and stamps that jitter by 0.5 ms."""
     draw = np.random.default_rng(seed)

@@ -54,7 +54,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="clock of the stamps, by 'ethercat-export align' (default: the server's)")  # fmt: skip
     add("--strict", action="store_true",
         help="refuse frames outside of the recording (default: their windows are not valid)")  # fmt: skip
-    options = made.parse_args(argv)
+    options = made.parse_intermixed_args(argv)
     has_frames = options.at is not None or options.fps is not None
     if options.output and options.output.suffix.lower() == ".mcap" and not options.mcap:
         options.mcap, options.output = options.output, None
@@ -76,6 +76,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         made.error(
             "all samples are written as CSV, .parquet or .npz: choose one of these, or use --at or --fps"
         )
+    if not options.mcap and suffix not in {".csv", *DATASETS}:
+        made.error(f"{options.output}: the name must end in .csv, .mcap or {', '.join(DATASETS)}")
     if options.tool and suffix not in DATASETS:
         made.error("CSV has no compensated wrench: omit --tool, or write .parquet or .npz")
     if options.all and suffix in DATASETS:

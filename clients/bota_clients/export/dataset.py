@@ -388,7 +388,7 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     windows = Windows(length if frames else MOST_LOST, tool=tool, imu_units=options.imu_units)
     about = {
         "program": f"{PROGRAM} {VERSION}",
-        "options": vars(options),
+        "options": vars(options) | {"imu_units": options.imu_units.value},
         "recording": recording.metadata,
         # In force from `stamp_ns` on, with delays of the filters; null: unknown, and taken to be 0.
         "settings": [

@@ -5,22 +5,41 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from bota_clients.errors import RecordingError
+from bota_ethercat_bridge.parameters.table import PARAMETERS, ParameterError
+
+_ROWS: Final = {row.name: row for row in PARAMETERS}
 
 
 @contextlib.contextmanager
 def tool_parameters(path: Path) -> Iterator[Mapping[str, Any]]:
-    """Read the file; RecordingError, also for what is found wrong with its parameters inside."""
+    """Read the file, of whatever node; RecordingError, also for what is found wrong with it inside."""
     import yaml  # noqa: PLC0415 - of the extra `dataset`
 
     try:
-        yield yaml.safe_load(path.read_bytes())["/**"]["ros__parameters"]
+        read = yaml.safe_load(path.read_bytes())
+        nodes = (
+            [node for node in read.values() if "ros__parameters" in node] if isinstance(read, dict) else []
+        )
+        if len(nodes) != 1 or not isinstance(found := nodes[0]["ros__parameters"], dict):
+            raise ValueError("it has no ros__parameters, or those of several nodes")
+        found = dict(_flat(found))
+        yield {name: _ROWS[name].check(value) if name in _ROWS else value for name, value in found.items()}
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from None
-    except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError) as error:
+    except (yaml.YAMLError, AttributeError, LookupError, ParameterError, TypeError, ValueError) as error:
         why = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
         raise RecordingError(
             f"{path} does not have a tool's parameters, as ethercat-identify --yaml writes them: {why}"
         ) from None
+
+
+def _flat(parameters: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """`accelerometer.offset` for `offset` below `accelerometer`, as ROS reads it."""
+    for name, value in parameters.items():
+        if isinstance(value, dict):
+            yield from ((f"{name}.{rest}", each) for rest, each in _flat(value))
+        else:
+            yield str(name), value

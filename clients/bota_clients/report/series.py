@@ -164,7 +164,9 @@ class Series:
         self.is_irregular = self.usual_deviation > LIMITS.irregular * self.period
         moved = np.diff(samples.stamp_ns - samples.monotonic_ns)
         self.clock_steps: Floats = moved[np.abs(moved) > _STEP_NS] * 1e-9  # adjustments of CLOCK_REALTIME, s
+        # Nobody counts what was missing while there was no connection.
         kept = ~self.silent & (self.intervals > 0)
+        kept &= (self.missing > 0) | (self.intervals <= _LONG * self.period)
         periods = float(np.sum(1 + self.missing[kept]))
         # s, over everything but silences.
         self.mean_period = float(self.intervals[kept].sum() / periods) if periods else self.period

@@ -40,6 +40,7 @@ from bota_ethercat_bridge.stream.reader import Reader
 
 _FROM_PARAMETER: Final = "parameter"
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
+_SHOWN: Final = 5e-5  # N, Nm: less is that a file has fewer digits than the sensor
 _NOTHING_CURRENT: Final = "no current orientation"
 # What a source depends on, besides the sensor's model.
 _DEPENDS_ON: Final = (
@@ -361,9 +362,9 @@ class CompensationControl:
         change = self.own_offset.follow(self.offset)
         if change is not None:
             self._change(lambda ramp: ramp.shifted(change))
-            self._log.info(
-                f"the sensor's own offset was changed by {wrench_text(change)}: the bias is shifted by that"
-            )
+            if max(map(abs, change.values)) > _SHOWN:
+                text = f"the sensor's own offset was changed by {wrench_text(change)}"
+                self._log.info(f"{text}: the bias is shifted by that")
             self._guard.trigger()
 
 

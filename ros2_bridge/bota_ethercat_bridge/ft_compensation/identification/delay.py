@@ -34,6 +34,7 @@ _LEAST_S: Final = 4.0
 _SHORTEST_S, _LONGEST_S = 0.04, 0.5  # of the window that smooths
 _TREND: Final = 3  # coefficients of the polynomial that the bias may follow
 _AS_GOOD: Final = 1.05  # noise alone makes them differ so much, where there is little to align
+_LEFT: Final = 0.7  # of the force's rms: more is no model of it
 _SMOOTHED: Final = 1.0  # times the ratio of the force's motion to its rate of change
 
 
@@ -110,8 +111,8 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
     )
     if not interval < _WIDEST_S:
         raise CompensationError(
-            f"the motion is too slow to tell ({best * 1e3:.0f} ± {interval * 1e3:.0f} ms): shake the sensor "
-            "faster, two to five times a second in all directions"
+            f"the motion is too slow to tell ({best * 1e3:.0f} ± {min(interval, 10.0) * 1e3:.0f} ms): shake "
+            "the sensor faster, two to five times a second in all directions"
         )
     return Lag(best, interval, explained)
 
@@ -129,6 +130,13 @@ def check_held_out(
     force, acceleration, rate = np.split(at_times(times, stamps, samples), [3, 6], axis=1)
     both = align(settings, 1.0 / period, lag.seconds), align({}, 1.0 / period)
     aligned, not_aligned = (_held_out(force, acceleration, rate, each) for each in both)
+    if not min(aligned, not_aligned) < _LEFT * float(np.linalg.norm(force - force.mean(axis=0))) / math.sqrt(
+        len(force)
+    ):
+        raise CompensationError(
+            "the motion in parts of the recording does not tell the force in the others: shake the sensor "
+            "all the time, in all directions, and let nothing touch the tool"
+        )
     if aligned < _AS_GOOD * not_aligned:
         return aligned, not_aligned
     raise CompensationError(
