@@ -23,10 +23,12 @@ from bota_ethercat_bridge.ft_compensation.contact import (
     Uncertainty,
     Why,
     correlation,
+    detector_of,
 )
 from bota_ethercat_bridge.ft_compensation.quantities import (
     NO_PAYLOAD,
     ZERO,
+    Accelerometer,
     CompensationError,
     Payload,
     length,
@@ -34,7 +36,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
 from bota_ethercat_bridge.ft_compensation.stationary import triple
 from tests.compensation import motion
 from tests.compensation.making import SEED
-from tests.compensation.motion import Array
+from tests.compensation.motion import Array, Imperfection
 from tests.simulation import MemoryChannel, Simulation, more_if_long
 
 RATE_HZ = 800.0
@@ -57,6 +59,7 @@ PLACES: dict[str, tuple[Surface, Vector3, Vector3]] = {
 
 
 FORCES = (1.0, 5.0, 20.0)
+EXACTLY = Accelerometer(scale_interval=(5e-4,) * 3, cross_axis_interval=(5e-4,) * 6)
 # A ball of 40 mm is small for what 1 N tells.
 CASES = [(place, force) for place in PLACES for force in FORCES[place in {"ball", "end"} :]]
 
@@ -168,6 +171,30 @@ def test_noise_alone_is_contact_as_often_as_stated(fir: bool) -> None:
 def test_in_an_hour_it_is_contact_at_most_once() -> None:
     rows = noise_of(motion.settings(), int(3600 * RATE_HZ)) * NOISE
     assert alarms(ContactDetector(FACE, EXACT, RATE_HZ, correlation(motion.settings())), rows) <= 3
+
+
+@pytest.mark.parametrize("minutes", more_if_long([1], [1, 60]))
+def test_the_noise_of_the_gyroscope_on_an_identified_bar_is_no_contact(minutes: int) -> None:
+    """At rest, with the noise that a healthy sensor may have: what the tensor makes of it was 80 an hour."""
+    tensor, half = (0.015, 0.015, 0.001, 0.0, 0.0, 0.0), (1.5e-4,) * 6
+    bar = Payload(2.0, (0.004, -0.006, 0.08), tensor, (1e-5,) * 3, half)
+    chosen, (acceleration, rate) = motion.settings(), imu_noise(motion.settings())
+    imu, alarms, beyond = Imperfection(acceleration, rate), 0, []
+    known = EXACTLY._replace(offset_interval=(0.003,) * 3)
+    noise = noise_of(chosen, round(60 * minutes * RATE_HZ)) * healthy_noise(64)
+    for minute, beside in enumerate(np.split(noise, minutes)):
+        felt = motion.filtered(motion.shaken(1.0, 0.0), bar, 61.0, chosen, seed=1000 * SEED + minute, imu=imu)
+        left = motion.left_over(felt, bar, align(chosen, RATE_HZ), settling_s=1.0)
+        rows = (np.concatenate([left.force, left.torque], axis=1)[: len(beside)] + beside).tolist()
+        contact, was = detector_of(FACE, bar, chosen, RATE_HZ, accelerometer=known), False
+        for row, turning in zip(rows, left.turning, strict=False):
+            contact.is_contact = True  # which it then is as long as it is not within what 95 % keep to
+            beyond.append(contact.update((*row[:3],), (*row[3:],), turning))
+            contact.is_contact = was
+            now = contact.update((*row[:3],), (*row[3:],), turning)
+            alarms, was = alarms + (now and not was), now
+    assert np.mean(beyond) < 0.02
+    assert alarms <= 1
 
 
 @pytest.mark.parametrize("seed", more_if_long([0], range(6)))

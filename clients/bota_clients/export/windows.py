@@ -88,6 +88,7 @@ class Windows:
 
     Attributes:
         begin_ns: stamp of the first sample; -1 before it.
+        accelerometer: what the tool's parameters know of it.
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class Windows:
         self._own_offset.begin(self._bias, offset, is_measured=offset is not None)
         self._offset: Wrench | None = None
         imu = {name: tool.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
-        self._accelerometer = Accelerometer(**{name: tuple(row) for name, row in imu.items()})
+        self.accelerometer = Accelerometer(**{name: tuple(row) for name, row in imu.items()})
         self._imu_position: Vector3 = tuple(tool.get("imu_position", ZERO))
 
     def configure(
@@ -142,7 +143,7 @@ class Windows:
         (cx, cy, cz), position = self._payload.center, self._imu_position
         x, y, z = position if any(position) else (0.0, 0.0, IMU_HEIGHTS.get(name[4:8], 0.0))
         alignment = align(self._known, rate_hz)
-        self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), self._accelerometer, alignment)
+        self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), self.accelerometer, alignment)
         has_tool = self._payload.mass > 0
         why = not_newtons(self._known, has_tool=has_tool) or (has_tool and hides_gravity(self._known))
         if why:
@@ -248,10 +249,10 @@ class Windows:
             return math.nan, math.nan
         found[samples.monotonic_ns <= self._doubted_until_ns] = math.nan
         torque = torque_bound_95(
-            self._payload, self._accelerometer, None, cast(Any, felt.T), turning,
+            self._payload, self.accelerometer, None, cast(Any, felt.T), turning,
             torque_noise_95(self._payload, self._imu.alignment),
         )  # fmt: skip
-        force = force_bound_95(self._payload, self._accelerometer)
+        force = force_bound_95(self._payload, self.accelerometer)
         return found, np.stack([np.full(len(found), force), np.broadcast_to(torque, len(found))], axis=1)
 
     def at(self, instants_ns: Ints) -> Arrays:

@@ -72,7 +72,11 @@ class CompensatedStream:
             return None
         if self._detector is None or (info.settings, info.rate_hz) != self._made_of:
             self._made_of = info.settings, info.rate_hz
-            tool = payload_of(self._tool)
-            self._detector = detector_of(self._surface, tool, info.settings, info.rate_hz)
+            noise = self._tool.get("contact.noise", ())
+            self._detector = detector_of(
+                self._surface, payload_of(self._tool), info.settings, info.rate_hz,
+                noise=noise if any(noise) else (), accelerometer=self._windows.accelerometer,
+                alarms_per_hour=self._tool.get("contact.false_alarms", 1.0),
+            )  # fmt: skip
         self._detector.update(force, torque, self._windows.turning)
         return self._detector.locate(force, torque, self._windows.turning)

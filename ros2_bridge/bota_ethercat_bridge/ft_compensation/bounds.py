@@ -84,10 +84,20 @@ def off_center_95(payload: Payload, taken: TareBasis | None = None) -> float:
 def torque_noise_95(payload: Payload, alignment: Alignment) -> float:
     """Nm: what the noise of a healthy sensor and its IMU keeps to in 95 % of samples."""
     reach, known = length(payload.center), alignment.settings
-    felt, spin = alignment.noise(reach + IMU_BELOW)
+    felt, _ = alignment.noise(reach + IMU_BELOW)
     healthy = healthy_noise(int(known.get("sinc_length") or _SHORTEST_SINC), fir=bool(known.get("fir")))
-    parts = max(healthy[3:]), payload.mass * reach * felt, max(payload.inertia) * spin
+    parts = max(healthy[3:]), payload.mass * reach * felt, inertia_noise(payload, alignment)
     return _ABOUT_THREE_AXES * NORMAL_95 * math.hypot(*parts)
+
+
+def inertia_noise(payload: Payload, alignment: Alignment) -> float:
+    """Nm: deviation on an axis that the tensor adds to what the noise of the specific force makes of torque.
+
+    Both are of one gyroscope: the tensor's part adds to that of the lever, not to its square.
+    """
+    reach = length(payload.center)
+    lever, spin = payload.mass * reach * (reach + IMU_BELOW), alignment.noise()[1]
+    return spin * math.sqrt((lever + max(payload.inertia[:3])) ** 2 - lever**2)
 
 
 def inertia_halves(payload: Payload) -> tuple[float, ...]:

@@ -23,6 +23,7 @@ from bota_ethercat_bridge.ft_compensation.bounds import (
     IMU_BELOW,
     force_bound_95,
     inertia_halves,
+    inertia_noise,
     off_center_95,
 )
 from bota_ethercat_bridge.ft_compensation.quantities import (
@@ -136,10 +137,12 @@ def detector_of(
     """
     healthy = healthy_noise(round(BASE_SAMPLING_RATE_HZ / rate_hz), fir=bool(settings.get("fir")))
     noise = [a or b for a, b in zip(noise or healthy, healthy, strict=True)]
-    weight = imu = 0.0
+    weight = imu = spun = 0.0
     if accelerometer is not None:
-        imu, _ = align(settings, rate_hz).noise(length(tool.center) + IMU_BELOW)
-        weight = force_bound_95(tool, accelerometer, taken)
+        alignment = align(settings, rate_hz)
+        imu, _ = alignment.noise(length(tool.center) + IMU_BELOW)
+        weight, spun = force_bound_95(tool, accelerometer, taken), inertia_noise(tool, alignment)
+    noise = [*noise[:3], *(math.hypot(each, spun) for each in noise[3:])]
     torque = STANDARD_GRAVITY * off_center_95(tool, taken)
     known = Uncertainty.of(noise, weight, torque, tool, max(inertia_halves(tool)), imu)
     return ContactDetector(surface, known, rate_hz, correlation(settings), alarms_per_hour)
