@@ -81,6 +81,9 @@ def test_drift_since_the_tare_is_told_with_the_axis_the_time_and_the_temperature
     told = words.drift(arm.row, LIMITS)
     assert told == "Fz has drifted 1.2 N since the tare 10 min ago, 10 K warmer"
     assert str(judge(Observation(drift=told))) == f"Worth a look: {told}: re-tare advised"
+    hardly = Arm()
+    hardly.warm_up(-0.003)
+    assert words.drift(hardly.row).startswith("Fz has drifted 0.0 N since")
     arm.drift.begin("tare")
     arm.rest(80)
     assert words.drift(arm.row, LIMITS) == ""

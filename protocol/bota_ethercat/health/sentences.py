@@ -71,7 +71,8 @@ def drift(row: SensorStatus, limits: StreamLimits | None = None) -> str:
     since = _SINCE.get(cause, "the start")
     ago = f"{ago_s / 60:.0f} min" if ago_s < 7200 else f"{ago_s / 3600:.0f} h"
     warmer = f", {abs(kelvin):.0f} K {'warmer' if kelvin > 0 else 'colder'}" if abs(kelvin) >= 0.5 else ""
-    size = f"{wrench[axis]:.1f} N" if axis < 3 else f"{wrench[axis]:.3f} Nm"
+    digits, unit = (1, "N") if axis < 3 else (3, "Nm")
+    size = f"{round(wrench[axis], digits) + 0.0:.{digits}f} {unit}"  # never -0.0
     return f"{AXES[axis]} has drifted {size} since {since} {ago} ago{warmer}"
 
 
