@@ -170,10 +170,11 @@ def test_both_find_the_tool_and_what_each_refuses(
     assert [is_found for is_found, _ in said.values()] == [True, False, False, True]
     assert "the mass would be negative" in said["sign of the force"][1]
     assert "times what the noise explains" in said["pushed with 4 N in 2 s of 5"][1]
-    for name in ("right", "pushed with 4 N in 2 s of 5"):
+    # Of the pushed one, whose poses are touched, how near is a draw: it is told by what is left.
+    for name, share, away in (("right", 0.002, 0.0005), ("pushed with 4 N in 2 s of 5", 0.02, 0.005)):
         found = written_parameters(tmp_path / f"{name}.yaml")
-        assert found["tool_mass"] == pytest.approx(tool.mass, rel=0.002)
-        assert found["tool_center_of_gravity"] == pytest.approx(tool.center, abs=0.0005)
+        assert found["tool_mass"] == pytest.approx(tool.mass, rel=share)
+        assert found["tool_center_of_gravity"] == pytest.approx(tool.center, abs=away)
 
 
 def test_force_and_torque_left_by_both(

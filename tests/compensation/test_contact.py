@@ -173,6 +173,7 @@ def test_in_an_hour_it_is_contact_at_most_once() -> None:
     assert alarms(ContactDetector(FACE, EXACT, RATE_HZ, correlation(motion.settings())), rows) <= 3
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("minutes", more_if_long([1], [1, 60]))
 def test_the_noise_of_the_gyroscope_on_an_identified_bar_is_no_contact(minutes: int) -> None:
     """At rest, with the noise that a healthy sensor may have: what the tensor makes of it was 80 an hour."""

@@ -126,6 +126,9 @@ def test_its_intervals_cover_95_percent(count: int) -> None:
     assert np.mean(held) > 0.9
 
 
+RMS_OF_95 = math.sqrt(3) / 2.80  # of three axes alike
+
+
 @pytest.mark.parametrize("seed", more_if_long([3], range(3, 9)))
 @pytest.mark.parametrize("name", ["turned", "pick and place", "hand-guiding", "mobile base"])
 def test_the_bound_covers_95_percent_of_the_torque_that_is_left(name: str, seed: int) -> None:
@@ -143,7 +146,7 @@ def test_the_bound_covers_95_percent_of_the_torque_that_is_left(name: str, seed:
         ])  # fmt: skip
         assert (np.linalg.norm(torque, axis=1) <= bounds).mean() > 0.95
         assert np.median(bounds) < most
-    assert rms(torque) < (0.03 if name == "turned" else 0.015)
+    assert rms(torque) < (0.03 if name == "turned" else max(0.015, RMS_OF_95 * noise))
 
 
 def test_where_it_hardly_turns_only_what_mass_and_center_make_likely_is_known() -> None:

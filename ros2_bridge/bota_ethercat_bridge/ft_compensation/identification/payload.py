@@ -211,8 +211,7 @@ class _Equations:
             assert found.shift is not None
             longer = found.mass.value * (found.excess * left_out).sum(axis=-1, keepdims=True)
             off = np.concatenate([found.shift.value[:, :3], longer], axis=1)
-            squares = np.sort((off**2).sum(axis=1))[: -max(1, len(left_out) // 8)]  # something touched these
-            errors[name] = math.sqrt(squares.mean())
+            errors[name] = float(np.median(np.linalg.norm(off, axis=1)))  # whatever touched some of them
         every, most = self.solve(), _AS_GOOD * min(errors.values())
         chosen = next(name for name, error in errors.items() if error <= most)
         self._prior = _MODELS[chosen]
