@@ -50,6 +50,21 @@ def test_an_activated_environment_does_not_make_the_next_one(tmp_path: Path) -> 
     assert (code, said) == (0, f"{Path(sys.executable).resolve()}\n")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("--seconds abc", "--seconds: 'abc': it must be a number of seconds"),
+        ("--no-ros --seconds=", "--seconds: '': it must be a number of seconds"),
+        ("--seconds 2 --colour", "unknown argument '--colour': see --help"),
+    ],
+)
+def test_the_demo_knows_its_arguments_before_it_installs(arguments: str, words: str) -> None:
+    done = subprocess.run(
+        [ROOT / "scripts/demo", *arguments.split()], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", f"demo: {words}\n")
+
+
 def test_without_a_network_it_is_one_sentence(tmp_path: Path) -> None:
     """Nothing listens at that port; pip tries once more, in place of five times."""
     pip = '"$venv/bin/python" -m pip install --retries 1 --index-url http://127.0.0.1:9 --target "$1" no-such'

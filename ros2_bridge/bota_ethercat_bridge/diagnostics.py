@@ -157,9 +157,9 @@ class DiagnosticsPublisher:
         if shared:
             others = f" and {len(shared) - 1} more" if len(shared) > 1 else ""
             self._shared = (
-                f"another node, or one that was just killed, publishes {shared[0]}{others} too: give "
+                f"another node, or one that was just killed, publishes {shared[0]}{others} too: give one of "
+                "them a namespace (--ros-args -r __ns:=/NAME)"
             )
-            self._shared += "one of them a namespace (--ros-args -r __ns:=/NAME)"
         if self._shared and not before:
             self._log.warning(self._shared)
 

@@ -251,6 +251,19 @@ def test_wrong_arguments_are_one_sentence(
     assert words in capsys.readouterr().err
 
 
+def test_ctrl_c_before_the_first_message_blames_nobody(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(rclpy, "init", lambda **_: None)  # it is up, and stays so
+    monkeypatch.setattr(rclpy, "try_shutdown", lambda: None)
+    monkeypatch.setattr(check_subscription, "_find", interrupt)
+    assert check_subscription.main(["wrench"]) == 1
+    assert capsys.readouterr() == ("", "check_subscription: stopped\n")
+
+
 def test_without_ros_it_is_one_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.cli import main
+from bota_clients.export.cli import main, parse_options
 from bota_clients.export.dataset import Periodic, Stamped, messages, read_stamps, windows_of
 from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.reader import open_recording
@@ -215,7 +215,13 @@ def test_a_bias_is_not_guessed(tmp_path: Path) -> None:
         assert "out.npz: windows" in said(*fine)
     path.write_text(path.read_text().replace("/**", "/bridge"))
     assert run_here(main, run, tmp_path / "out.npz", "--at", frames, "--tool", path, "--force").code == 0
-    for text in ("", "a, b", "/a: {ros__parameters: {}}\n/b: {ros__parameters: {}}"):
+    for text in (
+        "",
+        "a, b",
+        "a: 1",
+        "/a: {ros__parameters: 1}",
+        "/a: {ros__parameters: {}}\n/b: {ros__parameters: {}}",
+    ):
         path.write_text(text)
         ended = run_here(main, run, tmp_path / "out.npz", "--at", frames, "--tool", path, "--force")
         assert "it has no ros__parameters, or those of several nodes" in ended.err
@@ -543,3 +549,9 @@ def test_what_cannot_be_done_is_said_and_leaves_nothing(
 )
 def test_wrong_usage(arguments: str) -> None:
     assert run_here(main, "run.mcap", *arguments.split()).code == 2
+
+
+@pytest.mark.parametrize("arguments", ["run.mcap --fps 10 OUT.NPZ", "--fps 10 run.mcap OUT.NPZ"])
+def test_options_may_stand_between_the_files(arguments: str) -> None:
+    options = parse_options(arguments.split())
+    assert (options.recording, options.output, options.suffix) == (Path("run.mcap"), Path("OUT.NPZ"), ".npz")

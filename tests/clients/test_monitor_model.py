@@ -326,7 +326,12 @@ def test_with_a_tool_the_newest_sample_is_without_it_and_contact_is_told() -> No
         take(model, *(frame(k, still | {"force.y": math.nan}) for k in range(200, 240))).compensated is None
     )
     rows = table(model.state(now(240)))
-    assert any(row.startswith("Compensated  not known of the newest sample") for row in rows), rows
+    assert any(
+        row.startswith("Compensated  not known of the newest sample: it is not finite") for row in rows
+    )
+    model.connected(description(), made.OWN_PEER, START_S)  # a server that does not tell the offset
+    sensor = take(model, *(frame(k, still) for k in range(240, 280)))
+    assert sensor.not_compensated.endswith("is no longer known: the bias may be wrong, tare")
 
 
 def test_what_cannot_be_compensated_is_told() -> None:

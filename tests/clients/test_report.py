@@ -222,6 +222,14 @@ def test_invalid_frames_are_a_silence(frames: tuple[DataMessage, ...]) -> None:
     assert expect(subject_of(kept, ROW), {SILENT: (TROUBLE, "25 frames were invalid")}).series.lost == 0
 
 
+def test_the_time_without_a_connection_is_not_in_the_sampling_rate(frames: tuple[DataMessage, ...]) -> None:
+    """The server was restarted for 2 s: its numbers begin again."""
+    kept = [*frames[:1000], *renumbered(frames[1800:])]
+    series = Examination(subject_of(kept, ROW)).series
+    assert 1 / series.mean_period == pytest.approx(1 / series.period, rel=1e-3)
+    assert series.intervals.max() == pytest.approx(801 * series.period, rel=0.01)
+
+
 @pytest.mark.parametrize("flag", [DataFlag.INVALID, DataFlag.REPEATED])
 @pytest.mark.parametrize("withheld", [True, False])
 def test_one_frame_of_a_silence_hides_no_loss(

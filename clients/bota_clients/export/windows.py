@@ -172,6 +172,11 @@ class Windows:
         return self._imu.turning
 
     @property
+    def doubt(self) -> str:
+        """Why the bias may not fit, a sentence, and nothing is compensated; empty if it does; with a tool."""
+        return self._own_offset.doubt(self._offset)
+
+    @property
     def doubt_ns(self) -> int:
         """How long before an offset was reported samples may have part of it; 0 without a tool."""
         if self._compensator is None or self._in_force is None:
@@ -245,7 +250,7 @@ class Windows:
         self._compensator.bias = self._bias
         compensate = cast(Any, self._compensator.compensate)  # of arrays as of numbers
         found = np.vstack(compensate(samples.force.T, samples.torque.T, felt.T, turning).final).T
-        if self._own_offset.doubt(self._offset):
+        if self.doubt:
             return math.nan, math.nan
         found[samples.monotonic_ns <= self._doubted_until_ns] = math.nan
         torque = torque_bound_95(

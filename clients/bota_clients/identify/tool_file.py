@@ -20,13 +20,14 @@ def tool_parameters(path: Path) -> Iterator[Mapping[str, Any]]:
 
     try:
         read = yaml.safe_load(path.read_bytes())
-        nodes = (
-            [node for node in read.values() if "ros__parameters" in node] if isinstance(read, dict) else []
-        )
-        if len(nodes) != 1 or not isinstance(found := nodes[0]["ros__parameters"], dict):
+        nodes = read.values() if isinstance(read, dict) else ()
+        given = [
+            node["ros__parameters"] for node in nodes if isinstance(node, dict) and "ros__parameters" in node
+        ]
+        if len(given) != 1 or not isinstance(given[0], dict):
             raise ValueError("it has no ros__parameters, or those of several nodes")
-        found = dict(_flat(found))
-        yield {name: _ROWS[name].check(value) if name in _ROWS else value for name, value in found.items()}
+        flat = _flat(given[0])
+        yield {name: _ROWS[name].check(value) if name in _ROWS else value for name, value in flat}
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from None
     except (yaml.YAMLError, AttributeError, LookupError, ParameterError, TypeError, ValueError) as error:

@@ -54,8 +54,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--json", action="store_true", help="print one JSON object per second; with --once, just one")
     add("--seconds", type=seconds, metavar="S", help="exit after S seconds")
     add("--tool", type=Path, metavar="YAML",
-        help="show the wrench without this tool, too, and contact on its contact.surface: parameters, as "
-             "ethercat-identify --yaml writes them")  # fmt: skip
+        help="show the wrench without this tool, too, and contact on its contact.surface (not with "
+             "--web): parameters, as ethercat-identify --yaml writes them")  # fmt: skip
     add_imu_units(made)
     add(
         "--web", type=_loopback, nargs="?", const=DEFAULT_WEB, metavar="PORT",

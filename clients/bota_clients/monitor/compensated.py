@@ -61,7 +61,8 @@ class CompensatedStream:
         newest = slots[-1]
         wrench, (force_bound, torque_bound) = newest["compensated"].tolist(), newest["bounds"].tolist()
         if not math.isfinite(sum(wrench)):
-            self.latest, self.problem = None, "not known of the newest sample"
+            why = windows.doubt or "it is not finite, or came after lost samples"
+            self.latest, self.problem = None, f"not known of the newest sample: {why}"
             return
         force, torque = (wrench[0], wrench[1], wrench[2]), (wrench[3], wrench[4], wrench[5])
         contact = self._contact(force, torque, info)

@@ -407,8 +407,9 @@ class Model:
         self._server = replace(self._server, version=known.version, replay=replayed)
         before, self._sensors = self._sensors, {}
         for info in known.sensors:
-            stream = self._compensated and self._compensated()
-            sensor = before.get(info.sensor) or _Sensor(info.sensor, self._imu_units, stream)
+            sensor = before.get(info.sensor) or _Sensor(
+                info.sensor, self._imu_units, self._compensated and self._compensated()
+            )
             self._sensors[info.sensor] = sensor
             sensor.describe(info, now_s, anew=anew)
 

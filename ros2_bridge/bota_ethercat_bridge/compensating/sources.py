@@ -224,16 +224,14 @@ def _open_topic(node: Node, wanted: Parameters, group: CallbackGroup) -> RobotSo
 
 def _why_silent(node: Node, topic: str, kind: Any) -> str:
     """Why nothing has come on a topic, by who publishes there."""
-    sent = {publisher.topic_type for publisher in node.get_publishers_info_by_topic(topic)}
-    types = {_type_name(kind): name for name, (kind, _) in TOPIC_KINDS.items()}
+    sent = sorted({publisher.topic_type for publisher in node.get_publishers_info_by_topic(topic)})
     if not sent:
         return "nobody publishes it"
     if (expected := _type_name(kind)) in sent:
         return "nothing has come on it yet"
-    sends, remedy = sent.pop(), ""
-    if (name := types.get(sends)) is not None:
-        remedy = f": set gravity_source to {name}"
-    return f"its publisher sends {sends}, not {expected}{remedy}"
+    sources = [name for name, (other, _) in TOPIC_KINDS.items() if _type_name(other) == sent[0]]
+    remedy = f": set gravity_source to {sources[0]}" if sources else ""
+    return f"its publisher sends {sent[0]}, not {expected}{remedy}"
 
 
 def _type_name(kind: Any) -> str:

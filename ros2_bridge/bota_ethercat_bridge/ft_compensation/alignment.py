@@ -42,7 +42,7 @@ _FURTHEST_S: Final = 0.002
 # longer, for longer.
 _GAP_S, _FIR_GAP_S, _GAP_PERIODS = 0.008, 0.015, 2.5
 _UNKNOWN_GAP_S: Final = 0.1  # where the rate is unknown
-# What was before a gap's end is on the line through as much of the motion after it: of less, noise is most.
+# The motion before the end of a gap is extrapolated from so much after it: over less, noise makes the slope.
 _LINE_S: Final = 0.004
 
 
@@ -53,7 +53,7 @@ class Alignment(NamedTuple):
     taps: Array  # (3, n): to acceleration, angular rate and angular acceleration
     lag_s: float | None  # by which force and torque are later than the accelerometer; None: unknown
     gap_s: float  # samples further apart do not belong together
-    lead: int  # so many samples after a gap tell what was before them, at the instant of force and torque
+    lead: int  # so many samples are needed after a gap to tell the instant of force and torque
     settings: Mapping[str, SettingValue]
 
     def noise(self, lever_m: float = 0.0) -> tuple[float, float]:

@@ -37,9 +37,9 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     length,
 )
 
+FARTHEST_M: Final = 10.0  # from the sensor: what a parameter may name
 # Chi squared that 95 % keep to, with 6 and with 2 degrees of freedom, and the root of that with 3.
 _RELEASE, _REGION, _CHI_3 = 12.592, 5.991, 2.795
-_FARTHEST_M: Final = 10.0
 _IMU_MOTION: Final = 0.12  # m/s² on each axis: deviation of what alignment leaves of motion, by its extremes
 _SINC: Final = (66.0, 26.0, 1.0)  # autocorrelation of the third-order sinc filter, from lag 0
 
@@ -108,7 +108,7 @@ def surface_of(text: str) -> Surface | None:
     kind, *words = text.split()
     try:
         *numbers, radius = map(float, words or ["nan"])
-        if not (radius > 0.0 and all(abs(number) <= _FARTHEST_M for number in (*numbers, radius))):
+        if not (radius > 0.0 and all(abs(number) <= FARTHEST_M for number in (*numbers, radius))):
             raise ValueError("a number is out of range")
         x, y, z, *more = numbers
         a, b, c = more if kind in {"plane", "capsule"} else (x, y, z)

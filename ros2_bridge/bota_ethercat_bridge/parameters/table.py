@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.program.real_time import HIGHEST_PRIORITY
-from bota_ethercat_bridge.ft_compensation.contact import Surface, surface_of
+from bota_ethercat_bridge.ft_compensation.contact import FARTHEST_M, Surface, surface_of
 from bota_ethercat_bridge.ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
 from bota_ethercat_bridge.ft_compensation.quantities import (
     DEFAULT_GRAVITY,
@@ -42,7 +42,6 @@ _PORT: Final = 12001
 _LEAST_GRAVITY: Final = 0.1
 _GROUPS: Final = re.compile("^(diagnostics|orientation(?!_cov)|accelerometer|rest|filter|contact|identify)_")
 _FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
-_FARTHEST_M: Final = 10.0
 _REST: Final = StationaryLimits()
 
 
@@ -351,8 +350,8 @@ def _parse_frame(text: str) -> WrenchFrame:
         if len(numbers) not in (3, 7) or not all(map(math.isfinite, numbers)):
             raise ValueError(f"{len(numbers)} numbers follow the name")
         x, y, z, qx, qy, qz, qw = numbers if len(numbers) == 7 else [*numbers, 0.0, 0.0, 0.0, 1.0]
-        if max(abs(x), abs(y), abs(z)) > _FARTHEST_M:
-            raise ValueError(f"that is farther than {_FARTHEST_M:g} m from the sensor")
+        if max(abs(x), abs(y), abs(z)) > FARTHEST_M:
+            raise ValueError(f"that is farther than {FARTHEST_M:g} m from the sensor")
         pose = WrenchTransform.of((x, y, z), (qx, qy, qz, qw))
     except ValueError as error:
         raise ParameterError(

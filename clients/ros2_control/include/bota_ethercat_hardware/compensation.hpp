@@ -127,7 +127,7 @@ struct Alignment {
     }
 
     double period_s, gap_s;  ///< samples further apart than `gap_s` do not belong together
-    int lead;                      ///< this many samples after a gap tell what was before them
+    int lead;                      ///< this many samples are needed after a gap to tell the instant of force and torque
     std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
 
 private:

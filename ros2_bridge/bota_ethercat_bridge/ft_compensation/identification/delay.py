@@ -130,9 +130,7 @@ def check_held_out(
     force, acceleration, rate = np.split(at_times(times, stamps, samples), [3, 6], axis=1)
     both = align(settings, 1.0 / period, lag.seconds), align({}, 1.0 / period)
     aligned, not_aligned = (_held_out(force, acceleration, rate, each) for each in both)
-    if not min(aligned, not_aligned) < _LEFT * float(np.linalg.norm(force - force.mean(axis=0))) / math.sqrt(
-        len(force)
-    ):
+    if not min(aligned, not_aligned) < _LEFT * float(np.linalg.norm(force.std(axis=0))):
         raise CompensationError(
             "the motion in parts of the recording does not tell the force in the others: shake the sensor "
             "all the time, in all directions, and let nothing touch the tool"

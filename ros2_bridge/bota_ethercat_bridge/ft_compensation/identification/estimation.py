@@ -60,7 +60,7 @@ def calibration_prior(*, scale: bool = False, turn: bool = False, crossed: bool 
     return prior
 
 
-EVERYTHING: Final = calibration_prior(scale=True, crossed=True)
+FULL_CALIBRATION: Final = calibration_prior(scale=True, crossed=True)
 
 
 class Value(NamedTuple):
@@ -93,7 +93,7 @@ def estimate(
     regressor: Array | None = None,
     *,
     is_turned: bool = False,
-    prior: Array = EVERYTHING,
+    prior: Array = FULL_CALIBRATION,
 ) -> Estimate:
     """Solve the poses: wrench (..., n, 6), N and Nm, and gravity (..., n, 3), in the sensor's frame, m/s².
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat_bridge.ft_compensation.identification.estimation import (
-    EVERYTHING,
+    FULL_CALIBRATION,
     Estimate,
     Value,
     calibration_prior,
@@ -55,7 +55,7 @@ _MODELS: Final = {
     "offset": calibration_prior(),
     "offset and scale": calibration_prior(scale=True),
     "offset, scale and rotation": calibration_prior(scale=True, turn=True),
-    "offset, scale and crossed axes": EVERYTHING,
+    "offset, scale and crossed axes": FULL_CALIBRATION,
 }
 _AS_GOOD: Final = 1.05
 _LEFT_OUT: Final = 24  # poses, one by one
@@ -198,7 +198,7 @@ class _Equations:
         if len(times) == len(poses) >= _FEWEST_IN_TIME and np.ptp(times) > 0.0:
             self.minutes = (np.array(times) - times[-1]) / _SECONDS_A_MINUTE
 
-        self._is_turned, self._prior = False, EVERYTHING
+        self._is_turned, self._prior = False, FULL_CALIBRATION
 
     def choose(self) -> tuple[str, Estimate | None]:
         """Fit as much of the accelerometer as the poses tell: what that is, and the answer with all of it."""
