@@ -71,7 +71,7 @@ class ServedSimulation(Simulation):
     def note(self, made: Sequence[OutgoingFrame]) -> None:
         """Nothing is kept: it may run for long."""
 
-    def serves(self, until_ns: int, serve: Callable[[int], None]) -> None:
+    def serves(self, until_ns: int, serve: Callable[[int], int]) -> None:
         while not self._todo.empty():
             self._todo.get()()
         super().serves(until_ns, serve)

@@ -121,8 +121,9 @@ class RecordingHub(Hub):
         super().publish(made, now_ns)
         self._simulation.look()
 
-    def serve(self, until_ns: int) -> None:
+    def serve(self, until_ns: int) -> int:
         self._simulation.serves(until_ns, super().serve)
+        return self._simulation.clock.now_ns
 
     def broadcast(self, message: JsonObject) -> None:
         self._simulation.events.append(message)
@@ -254,12 +255,12 @@ class Simulation(SimulatedBus):
 
     def note(self, made: Sequence[OutgoingFrame]) -> None:
         """Keep the frames of an exchange."""
-        for frame, _, _ in made:
+        for frame, *_ in made:
             self._decoder.feed(frame)
             self._decoder.next_data(self.frames)
             self.published_ns.append(self.clock.now_ns)
 
-    def serves(self, until_ns: int, serve: Callable[[int], None]) -> None:
+    def serves(self, until_ns: int, serve: Callable[[int], int]) -> None:
         """Have the hub serve until then, or until somebody goes on who waits for a time."""
         if self.cycle.stopping:
             return

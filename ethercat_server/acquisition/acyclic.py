@@ -34,20 +34,23 @@ class Acyclic:
     """The tasks of a bus.
 
     Attributes:
-        turn: number of exchanges that are back, counted by the loop. After a lost answer no datagram is sent
-            until it grows.
         due_ns: `run` need not be called before.
         awaiting: the task whose answer is awaited; None if none is.
     """
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
-        self.turn = self.due_ns = 0
+        self.due_ns = 0
         self.awaiting: Task | None = None
         self._tasks: list[Task] = []
         self._answer: Answer | None = None
         self._sent_ns = self._until_ns = 0
         self._silent_turn = -1  # in which an answer was lost
+
+    @property
+    def turn(self) -> int:
+        """Number of frames that are back: after a lost answer no datagram is sent until it grows."""
+        return self._bus.process_data.answered
 
     def start(self, steps: Steps[None]) -> Task:
         """Have `steps` done."""

@@ -50,8 +50,8 @@ class Outlet(Protocol):
     def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
         """Take the DATA frames that an exchange made, one for a sensor; `now_ns` is when it was back."""
 
-    def serve(self, until_ns: int) -> None:
-        """Serve the clients, or wait, until CLOCK_MONOTONIC is `until_ns`."""
+    def serve(self, until_ns: int) -> int:
+        """Serve the clients, or wait, until CLOCK_MONOTONIC is `until_ns`; returns the time."""
 
 
 class Watchdog(Protocol):
@@ -84,7 +84,8 @@ class Cycle:
         self.every_second: Callable[[], None] = lambda: None  # called once a second
         self._acyclic, self._jobs = acyclic, jobs
         self._watchdog = watchdog
-        self._bus = bus
+        self._bus, self._process_data = bus, bus.process_data
+        self._backend, self._monotonic_ns = bus.backend, bus.clock.monotonic_ns
         self._sensors = sensors
         self._streams = streams
         self._hub = hub
@@ -103,8 +104,6 @@ class Cycle:
             ]
             for each in bus.process_data.inputs
         ]
-        # The answer that arrived in the last step, and whether all sensors that are not lost took part in it.
-        self._answer: Exchange | None = None
         # When the last exchange was sent; whether it is in flight; how many were sent since the last answer,
         # and when the first of those was, if there are several.
         self._sent_ns = self._unanswered_since_ns = bus.clock.monotonic_ns()
@@ -112,7 +111,6 @@ class Cycle:
         # Wake-up lateness of the first sleep since the clocks learned; None before it.
         self._woke_late_ns: float | None = None
         self._short_ns = 0.0  # an exchange that is back sooner is a short one, from which local clocks learn
-        self._complete = False
         self._wake = RecentDistribution()
         self._exchange = RecentDistribution()
         self._everyone = [self._wake, self._exchange, *(stream.age for stream in streams)]
@@ -131,7 +129,7 @@ class Cycle:
     def run(self) -> None:
         """Run the loop until `stop`."""
         hub, acyclic, recovery = self._hub, self._acyclic, self._recovery
-        monotonic_ns, serve_by, slept = self._bus.clock.monotonic_ns, 0, self._slept
+        monotonic_ns, serve_by, slept = self._monotonic_ns, 0, self._slept
         self._feed_at_ns = 0
         while True:
             due, now = self._due_ns(), monotonic_ns()
@@ -143,18 +141,12 @@ class Cycle:
             in_flight = self._in_flight or acyclic.awaiting is not None
             slept = slept or (due > now and not in_flight)
             if slept or now > serve_by:
-                hub.serve(now if in_flight else due)
+                now = hub.serve(now if in_flight else due)
                 serve_by = now + (_SERVE_IN_FLIGHT_NS if in_flight else _SERVE_EVERY_NS)
             if self.stopping:
                 break
-            self._step(due, (now if in_flight else due) + _SERVE_EVERY_NS, slept=slept)
+            self._step(now, due, (now if in_flight else due) + _SERVE_EVERY_NS, slept=slept)
             now, slept = monotonic_ns(), False
-            if self._answer is not None:
-                acyclic.turn += 1
-                if recovery.incomplete or not self._complete:
-                    recovery.check_answer(complete=self._complete)
-            elif self._unanswered > 1:
-                recovery.check_silence(now - self._unanswered_since_ns, now)
             if now >= self._chores_at_ns:
                 self._do_chores(now)
         self._slept = slept
@@ -165,20 +157,20 @@ class Cycle:
         Polls that lie close together are merged: the earlier one waits for the later, by no more than the
         time that four exchanges cost this machine, as measured. So three quarters of its time are left.
         """
-        streams, sent_ns = self._recovery.polled, self._sent_ns
-        unanswered, in_flight = self._unanswered, self._in_flight
-        if not streams:
-            return sent_ns + _RECOVERY_STEP_NS
+        streams, sent_ns, unanswered = self._recovery.polled, self._sent_ns, self._unanswered
         if len(streams) == 1:
-            poll_ns = streams[0].clock.next_poll_ns(sent_ns, unanswered, in_flight=in_flight)
-        else:
+            poll_ns = streams[0].clock.next_poll_ns(sent_ns, unanswered, in_flight=self._in_flight)
+        elif streams:
             wanted = [
-                stream.clock.next_poll_ns(sent_ns, unanswered, in_flight=in_flight) for stream in streams
+                stream.clock.next_poll_ns(sent_ns, unanswered, in_flight=self._in_flight)
+                for stream in streams
             ]
             latest_ns = min(wanted) + self._spacing_ns
             poll_ns = max([each for each in wanted if each <= latest_ns])
+        else:
+            return sent_ns + _RECOVERY_STEP_NS
         due_ns = poll_ns - min(self._round_trip.late_ns, _LONGEST_LEAD_NS)
-        return int(max(due_ns, sent_ns + self._spacing_ns, self._bus.process_data.blocked_until_ns))
+        return int(max(due_ns, sent_ns + self._spacing_ns, self._process_data.blocked_until_ns))
 
     def _plan(self) -> None:
         """Derive from the sensors' rates, which change, how exchanges follow each other; once a second."""
@@ -189,20 +181,32 @@ class Cycle:
         # Whether the answer to an exchange is usually back before the next one is due.
         self._one_by_one = all(stream.clock.one_by_one for stream in self._streams)
 
-    def _step(self, due: int, until_ns: int, *, slept: bool) -> None:
+    def _step(self, now: int, due: int, until_ns: int, *, slept: bool) -> None:
         """Hand out what arrives until the next exchange is `due`, then send it; return by `until_ns`.
 
         After it is sent its answer is awaited, until yet another one is due. `slept`: the loop has slept
         until it was due.
         """
-        self._answer, bus, monotonic_ns = None, self._bus, self._bus.clock.monotonic_ns
-        now = monotonic_ns()
-        wait = (due if due < until_ns else until_ns) - now
-        if wait > 0 or bus.process_data.in_flight or until_ns <= now:
-            self._receive(wait, now)
-            if self._answer or (now := monotonic_ns()) < due:
+        if now < due or self._process_data.in_flight or until_ns <= now:
+            wait = min(due, until_ns) - now
+            is_answered = self._receive(wait, now)
+            if is_answered or (now := self._monotonic_ns()) < due:
                 return
             slept = slept or wait > 0
+        if self._unanswered or now - due > self._shortest_ns:
+            self._send_late(now, due, slept=slept)
+        self._sent_ns = sent = self._process_data.send()
+        self._in_flight, self._unanswered = True, self._unanswered + 1
+        if slept:
+            self._wake.record(sent - due)
+            if self._woke_late_ns is None:
+                self._woke_late_ns = sent - due
+        most = self._round_trip.patience_ns if self._one_by_one else self._due_ns() - self._monotonic_ns()
+        if (wait := min(int(most), until_ns - now)) > 0:
+            self._receive(wait, sent)
+
+    def _send_late(self, now: int, due: int, *, slept: bool) -> None:
+        """An exchange is about to be sent that is overdue, or while the one before is unanswered."""
         if now - due > self._shortest_ns:
             self._count_missed(due, now)
             if slept:  # otherwise a late answer is why the exchange is overdue
@@ -210,59 +214,54 @@ class Cycle:
         if self._unanswered:
             if self._unanswered == 1:
                 self._unanswered_since_ns = self._sent_ns
+            else:
+                self._recovery.check_silence(now - self._unanswered_since_ns, now)
             self._show_silence(now)
-        self._sent_ns = sent = bus.process_data.send()
-        self._in_flight, self._unanswered = True, self._unanswered + 1
-        if slept:
-            self._wake.record(sent - due)
-            if self._woke_late_ns is None:
-                self._woke_late_ns = sent - due
-        most = int(self._round_trip.patience_ns) if self._one_by_one else self._due_ns() - monotonic_ns()
-        if (wait := min(most, until_ns - now)) > 0:
-            self._receive(wait, sent)
 
-    def _receive(self, wait: int, since_ns: int) -> None:
-        """Wait for a frame, `wait` ns from `since_ns` at most, and hand it out."""
-        bus = self._bus
-        frame, back = bus.backend.receive(wait * 1e-9 if wait > 0 else 0.0), bus.clock.monotonic_ns()
-        if frame is None:
-            return
-        while (exchange := bus.process_data.match(frame, back)) is DUPLICATE:
+    def _receive(self, wait: int, since_ns: int) -> bool:
+        """Wait for a frame, `wait` ns from `since_ns` at most; whether it was an exchange's answer.
+
+        That is handed out.
+        """
+        frame, back = self._backend.receive(wait * 1e-9 if wait > 0 else 0.0), self._monotonic_ns()
+        while frame is not None and (exchange := self._process_data.match(frame, back)) is DUPLICATE:
             # Drain duplicates of earlier answers, which would delay this one.
             if back > self._sent_ns + _SERVE_EVERY_NS:
-                return
-            frame, back = bus.backend.receive(0.0), bus.clock.monotonic_ns()
-            if frame is None:
-                return
-        if exchange is None:
-            self._recovery.causes.see_foreign(frame, back)
-            self._acyclic.receive(frame)
-        else:
-            self._hand_out(exchange, since_ns)
+                return False
+            frame, back = self._backend.receive(0.0), self._monotonic_ns()
+        if frame is None or exchange is None:
+            if frame is not None:
+                self._recovery.causes.see_foreign(frame, back)
+                self._acyclic.receive(frame)
+            return False
+        self._hand_out(exchange, since_ns)
+        return True
 
     def _hand_out(self, exchange: Exchange, since_ns: int) -> None:
         """Hand out what an exchange brought, which was awaited since then; then learn from it."""
-        sent, back, frame, wkc, which = self._answer = exchange
-        round_trip, carried = self._round_trip, self._carried[which]
-        new: list[OutgoingFrame] = []
-        self._complete = complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
-        for start, end, unfilled, at, sensor, stream in carried:
-            if back < stream.clock.phase.phase_ns - stream.clock.before_ns:
-                continue  # the poll was for another sensor
+        sent, back, frame, wkc, which = exchange
+        new, learners = list[OutgoingFrame](), list[SampleClock]()
+        complete = self._recovery.alive_wkc[which] <= wkc <= self._most_wkc[which]
+        for start, end, unfilled, at, sensor, stream in self._carried[which]:
+            if back < stream.clock.phase.phase_ns - stream.clock.before_ns or sent < stream.exchange.sent_ns:
+                continue  # the poll was for another sensor, or was overtaken
             data = frame[start:end]
             # The working counter does not tell sensors apart: one that is out may be counted for another.
             if not complete or sensor.state is not _STREAMING or data == unfilled:
                 made = stream.make_invalid(exchange)
             else:
                 made = stream.make_frame(data, exchange, LATCHED.unpack_from(frame, at) if at else None)
+                if stream.clock.learns:
+                    learners.append(stream.clock)
             if made is not None:
                 new.append(made)
         if new:
             self._hub.publish(new, back)
         self._in_flight, self._unanswered = sent < self._sent_ns, 0
         self._exchange.record(back - sent)
-        learners = [row[-1].clock for row in carried if row[-1].account(exchange)]
-        if learners or not self._short_ns < back - sent < round_trip.usual_ns + self._shortest_ns:
+        if not complete or self._recovery.incomplete:
+            self._recovery.check_answer(complete=complete)
+        if learners or not self._short_ns < back - sent < self._round_trip.usual_ns + self._shortest_ns:
             self._learn(exchange, learners, since_ns)
 
     def _show_silence(self, now: int) -> None:
@@ -295,7 +294,7 @@ class Cycle:
             self._cost_ns += _COST_GAIN * (self._bus.clock.monotonic_ns() - back - self._cost_ns)
         else:
             self.tracing.notes.append(learn_note(exchange, arrived))
-            clocks = [row[-1].clock for row in self._carried[which] if row[-1].is_newest(exchange)]
+            clocks = [row[-1].clock for row in self._carried[which] if row[-1].exchange is exchange]
             learn_short_exchange(round_trip, clocks, sent, arrived)
         if self._local_clocks:
             self._short_ns = max([each.short_ns for each in self._local_clocks])
@@ -307,7 +306,7 @@ class Cycle:
         self.tracing.pack()
         next(self._in_turn).count()
         for stream in self._streams:
-            stream.health.count()
+            stream.count()
         if now >= self._feed_at_ns:
             self._feed_at_ns = now + self._watchdog.feed_every_ns
             self._watchdog.feed()
@@ -337,6 +336,8 @@ class Cycle:
         now_ns = self._bus.clock.monotonic_ns()
         if now_ns >= self._summarize_at_ns:
             self._summarize_at_ns = now_ns + _SUMMARY_NS
+            for stream in self._streams:
+                stream.count()
             self._summaries = [distribution.summaries_us() for distribution in self._everyone]
         (wake, recent_wake), (exchange, recent_exchange), *ages = self._summaries
         return {

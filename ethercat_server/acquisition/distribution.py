@@ -58,12 +58,12 @@ class Distribution:
 class RecentDistribution:
     """Distributions of everything since the start and of the last ten seconds; call `roll` once a second.
 
-    `record` takes next to no time: what it takes is sorted by `count`, which is to be called now and then.
+    `record` and `extend` take next to no time: `count`, to be called now and then, sorts what they took.
     """
 
     def __init__(self) -> None:
         self._ring = array("f")
-        self.record = self._ring.append
+        self.record, self.extend = self._ring.append, self._ring.extend
         self.slots = [Distribution()]
         self.before = Distribution()  # what is older than the slots
 

@@ -132,7 +132,6 @@ class SampleHealth:
     def __init__(self, number: int, on_samples: Callable[[Sequence[Sequence[float]]], object]) -> None:
         self._number = number
         self.not_finite = 0  # new samples with a number that is NaN or infinite
-        self.newest: list[bytes] = []  # process data that was handed out since `count`
         self._on_samples = on_samples
         self._checked = (0, 0, 0)  # the counts of the last check: fresh, repeated, not finite
         self._silent_s = 0
@@ -141,11 +140,8 @@ class SampleHealth:
         self._reported: TrustState | None = None  # of event times, what was reported last
         self._deviating_s = 0
 
-    def count(self) -> None:
-        """Look at the newest samples, and for those that are not finite; to be called now and then."""
-        if not self.newest:
-            return
-        newest, self.newest = self.newest, []
+    def count(self, newest: Sequence[bytes]) -> None:
+        """Count the new samples that are not finite; of at least one, the process data."""
         columns = list(zip(*layout_for(len(newest[0])).struct.iter_unpack(b"".join(newest)), strict=True))
         # An infinity or a NaN survives the sum, so that one look is enough for all of them.
         if math.isfinite(sum(map(sum, columns))):
@@ -155,7 +151,6 @@ class SampleHealth:
 
     def check(self, fresh: int, repeated: int, clock: SampleClock) -> None:
         """Check the last second; `fresh` and `repeated` count frames since the start."""
-        self.count()
         now = fresh, repeated, self.not_finite
         new, repeats, not_finite = (count - before for count, before in zip(now, self._checked, strict=True))
         self._checked = now

@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
-from bota_ethercat.framing import DataFlag, encode_data
+from bota_ethercat.framing import DataFlag, data_encoder
+from bota_ethercat.pdo import LAYOUTS
 from ethercat_server.acquisition.distribution import RecentDistribution
 from ethercat_server.acquisition.drift import Drift
 from ethercat_server.acquisition.health import SampleHealth
@@ -30,8 +31,9 @@ from ethercat_server.sensor.sensor import Sensor
 
 DISCARDED_AT_START: Final = 3  # Bota's own driver discards the first three frames after entering OP
 
-# A DATA frame, the number of its sensor (terminals are numbered after all sensors), its flags.
-OutgoingFrame = tuple[bytes, int, int]
+# A DATA frame, the number of its sensor (terminals are numbered after all sensors), its flags, and when the
+# exchange was back that brought the newest sample.
+OutgoingFrame = tuple[bytes, int, int, int]
 
 REPEATED, INVALID, GAP = (int(flag) for flag in (DataFlag.REPEATED, DataFlag.INVALID, DataFlag.GAP))
 
@@ -47,10 +49,12 @@ class SensorStream:
         latching: DistributedClock | None = None,
         realtime_offset: RealtimeOffset | None = None,
         data_offset_ns: int = 0,
+        data_size: int = min(LAYOUTS),
     ) -> None:
         """`latching` is the clock of the slave controller, if that latches when samples come to be.
 
-        Its process data passes the slave `data_offset_ns` after the frame has arrived there.
+        Its process data, of `data_size` bytes, passes the slave `data_offset_ns` after the frame has arrived
+        there.
         """
         self.number = sensor.number
         self._monotonic_ns = clock.monotonic_ns
@@ -69,16 +73,18 @@ class SensorStream:
         self.age = RecentDistribution()
         self.drift = Drift(sensor, clock)
         self.health = SampleHealth(sensor.number, self.drift.add)
+        # Process data and age of the samples handed out since `count`; None while the clock is not locked.
+        self._counted: list[tuple[bytes, float | None]] = []
+        self._encode = data_encoder(data_size)
         self._discard = DISCARDED_AT_START
         self._gap = 0  # number of new samples to come that have GAP
         self._silent = False  # whether REPEATED or INVALID frames were made since the newest sample
-        # The last valid exchange, and whether it brought a new sample.
-        self._exchange, self._fresh = DUPLICATE, False
+        self.exchange = DUPLICATE  # the last one that was valid for this sensor
+        self._newest_ns = 0  # when the exchange was back that brought the newest sample
         # The working counter of an exchange since then that was not valid; 0 for none.
         self._invalid_wkc = 0
         self._instant_ns = 0  # of the newest sample
         self.notes: list[Note] = []  # see `Tracing`
-        self._latched: Latched | None = None
         self.on_change: Callable[[], None] = lambda: None  # the clock is another one, or begins anew
         self.model, self.nominal_hz = sensor.identity.name, 1e9 / sensor.period_ns
         self.silent_at_ns = 0.0  # it is silent from then on
@@ -95,52 +101,30 @@ class SensorStream:
     def make_frame(
         self, data: bytes, exchange: Exchange, latched: Latched | None = None
     ) -> OutgoingFrame | None:
-        """The frame that a valid exchange gives; None if it gives none.
+        """The frame that a valid exchange gives, no older than the one before; None if it gives none.
 
-        `account` must follow. `latched` is what the slave controller has latched.
+        `latched` is what the slave controller has latched. If `clock.learns` then, `clock.learn` must follow.
         """
         sent_ns, back_ns, _, wkc, _ = exchange
-        if sent_ns < self._exchange.sent_ns:  # overtaken
-            return None
-        clock, self._exchange, self._latched = self.clock, exchange, latched
-        self._fresh = fresh = data != self.process_data
+        clock, self.exchange = self.clock, exchange
+        fresh = data != self.process_data
         is_next = clock.observe(sent_ns, back_ns, latched, fresh=fresh)
+        self.notes.append((exchange, latched or NOTHING, self.number, fresh))
         if not fresh:
             return self.make_silent(back_ns)
-        self.process_data = data
+        self.process_data, self.silent_at_ns = data, back_ns + SILENT_PERIODS * clock.phase.period_ns
         if self._discard:
+            self._discard -= 1
             return None
         flags = 0 if is_next and not (self._silent or self._gap) else self._count_lost()
         if (instant_ns := int(clock.instant_ns)) <= self._instant_ns:  # the one before was dated too late
             instant_ns = self._instant_ns + 1
-        self._instant_ns = instant_ns
+        self._instant_ns, self._newest_ns, self._handed_out = instant_ns, back_ns, data
+        self._counted.append((data, back_ns - clock.instant_ns if clock.locked else None))
         stamp_ns = instant_ns + self.realtime_offset.ns
-        return (
-            encode_data(self.sequence, stamp_ns, instant_ns, self.number, flags, wkc, data),
-            self.number,
-            flags,
-        )
-
-    def account(self, exchange: Exchange) -> bool:
-        """Account for what an exchange brought, after it is published; whether `clock.learn` must follow."""
-        if exchange is not self._exchange:
-            return False
-        self.notes.append((exchange, self._latched or NOTHING, self.number, self._fresh))
-        if self._fresh:
-            self.silent_at_ns = exchange.back_ns + SILENT_PERIODS * self.clock.phase.period_ns
-            if self.clock.locked:
-                self.age.record(exchange.back_ns - self.clock.instant_ns)
-            if self._discard:
-                self._discard -= 1
-            else:
-                self.sequence += 1
-                self._handed_out = self.process_data
-                self.health.newest.append(self.process_data)
-        return self.clock.learns
-
-    def is_newest(self, exchange: Exchange) -> bool:
-        """Whether it is the last one that was valid for this sensor."""
-        return exchange is self._exchange
+        frame = self._encode(self.sequence, stamp_ns, instant_ns, self.number, flags, wkc, data)
+        self.sequence += 1
+        return frame, self.number, flags, back_ns
 
     def make_invalid(self, exchange: Exchange) -> OutgoingFrame | None:
         """The frame for an exchange that brought nothing of this sensor, as `make_silent`."""
@@ -158,18 +142,18 @@ class SensorStream:
         # The next slot is counted from this one, but a stall makes one frame, not a burst.
         self.silent_at_ns = max(self.silent_at_ns + period_ns, float(now_ns))
         # INVALID means that no valid exchange was back for two periods: a single lost frame does not suffice.
-        if now_ns - self._exchange.back_ns < max(2 * period_ns, self._round_trip.patience_ns):
+        if now_ns - self.exchange.back_ns < max(2 * period_ns, self._round_trip.patience_ns):
             self._discard = 0  # a sensor that is stuck from the start has to be visible, too
             self.repeated += 1
-            flags, wkc = REPEATED, self._exchange.wkc
+            flags, wkc = REPEATED, self.exchange.wkc
         else:
             self.invalid_frames += 1
             flags, wkc = INVALID, self._invalid_wkc
             self._invalid_wkc = 0
         stamp_ns, sequence = now_ns + self.realtime_offset.ns, self.sequence
         self.sequence += 1
-        made = encode_data(sequence, stamp_ns, now_ns, self.number, flags, wkc, self._handed_out)
-        return made, self.number, flags
+        made = self._encode(sequence, stamp_ns, now_ns, self.number, flags, wkc, self._handed_out)
+        return made, self.number, flags, self._newest_ns
 
     def _count_lost(self) -> int:
         """The flags of a new sample that may not be the next one after that before it."""
@@ -185,8 +169,17 @@ class SensorStream:
         self._silent = False
         return flags
 
+    def count(self) -> None:
+        """Look at what was handed out since the last time; to be called now and then."""
+        if self._counted:
+            samples, ages = zip(*self._counted, strict=True)
+            self._counted.clear()
+            self.health.count(samples)
+            self.age.extend([age for age in ages if age is not None])
+
     def check(self) -> None:
         """To be called once a second: log what the samples show of the sensor."""
+        self.count()
         self.health.check(self.fresh, self.repeated, self.clock)
         self.drift.each_second()
         events = self.clock.events
@@ -218,7 +211,6 @@ class SensorStream:
     def status(self) -> dict[str, Any]:
         """The sensor's part of the `status` reply, except for the age."""
         clock = self.clock
-        self.health.count()
         return {
             "sensor": self.number,
             "fresh": self.fresh,
@@ -241,10 +233,11 @@ class SensorStream:
 def make_streams(bus: Bus, sensors: Sequence[Sensor], round_trip: RoundTrip) -> list[SensorStream]:
     """Those of the sensors on a bus in OP."""
     offset = RealtimeOffset(bus.clock)
-    offsets_ns = {at.number: at.start * BYTE_NS for inputs in bus.process_data.inputs for at in inputs}
-    return [
-        SensorStream(
-            each, round_trip, bus.clock, bus.finish(bus.read_clock(number)), offset, offsets_ns[number]
+    data = {at.number: at for inputs in bus.process_data.inputs for at in inputs}
+    streams = []
+    for number, sensor in enumerate(sensors):
+        latching, start, end = bus.finish(bus.read_clock(number)), data[number].start, data[number].end
+        streams.append(
+            SensorStream(sensor, round_trip, bus.clock, latching, offset, start * BYTE_NS, end - start)
         )
-        for number, each in enumerate(sensors)
-    ]
+    return streams

@@ -71,7 +71,7 @@ class Terminal:
         self.row = {"terminal": number, **slave.as_json(), "pdo_size": self.size, "layout": layout}
         self._number, self._sequence = number, 0
         self._streams = self._was_valid = False
-        self._newest = b""  # valid process data
+        self._newest, self._newest_ns = b"", 0  # valid process data, and when it was new
 
     def __str__(self) -> str:
         return f"terminal {self._number} ({self.slave.name} at position {self.slave.position})"
@@ -85,8 +85,10 @@ class Terminal:
         bus.terminals.append((self._controller, self.slave.status.state))
         self.steps = self._keep_in_op()
 
-    def make_frame(self, exchange: Exchange, start: int, end: int, stamp_ns: int) -> tuple[bytes, int] | None:
-        """The frame for an exchange and its flags; None as long as it never had valid process data.
+    def make_frame(
+        self, exchange: Exchange, start: int, end: int, stamp_ns: int
+    ) -> tuple[bytes, int, int] | None:
+        """The frame for an exchange, its flags and when its data was new; None before it had valid data.
 
         REPEATED: the same data as before. INVALID: it did not take part, or is not in OP.
         """
@@ -102,7 +104,9 @@ class Terminal:
         self._was_valid = not flags & INVALID
         head = self._sequence, stamp_ns, exchange.back_ns, self._number, flags, wkc
         self._sequence += 1
-        return encode_data(*head, self._newest, _KIND), flags
+        if not flags:
+            self._newest_ns = exchange.back_ns
+        return encode_data(*head, self._newest, _KIND), flags, self._newest_ns
 
     def _keep_in_op(self) -> Steps[None]:
         controller, said = self._controller, ""
@@ -182,6 +186,6 @@ class CycleWithTerminals(Cycle):
         stamp_ns, made = exchange.back_ns + self._streams[0].realtime_offset.ns, list[OutgoingFrame]()
         for number, start, end in self._bus.process_data.terminals[exchange.which]:
             if frame := self.terminals[number].make_frame(exchange, start, end, stamp_ns):
-                made.append((frame[0], len(self._streams) + number, frame[1]))
+                made.append((frame[0], len(self._streams) + number, *frame[1:]))
         if made:
             self._hub.publish(made, exchange.back_ns)

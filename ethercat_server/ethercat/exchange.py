@@ -221,13 +221,15 @@ def _frame(
 # Single datagrams and SOEM use the indices below.
 FIRST_INDEX: Final = 0x90
 _INDICES: Final = 0x100
+_OWN_INDICES: Final = _INDICES - FIRST_INDEX
 # Limit of frames in flight on a bus that does not answer.
 MOST_IN_FLIGHT = 100
 # A frame counts as lost after this time, and its index is used again.
 _LOST_NS: Final = 100_000_000
 _pack_tag_into, _unpack_tag_from = struct.Struct("<I").pack_into, struct.Struct("<I").unpack_from
-# By index: when the frame in flight was sent (0: none is), its number in the exchange, its tag (-1: none).
-_NOT_SENT: Final = (0, 0, -1)
+# Of a frame that was sent, by index: when (0: it is not in flight), its tag (-1: none), its number in the
+# exchange, where its tag, the working counter of the process data and that of separate outputs are.
+_NOT_SENT: Final = (0, -1, 0, 0, 0, 0)
 _IMPOSSIBLE: Final = 0xFFFF
 
 
@@ -283,9 +285,11 @@ class ProcessData:
             (sum(each & 1 for each in frame.counters), sum(each >> 1 for each in frame.counters))
             for frame in frames
         ]
-        self._tagged = [(frame.content, frame.tag) for frame in frames]
-        self._offsets = [(frame.tag, frame.end, frame.written) for frame in frames]
-        self._index, self._tag = FIRST_INDEX, 0
+        self._rows = [
+            (frame.content, which, frame.tag, frame.end, frame.written) for which, frame in enumerate(frames)
+        ]
+        self._tag = 0
+        self._unused = 0  # tags that no frame has, for their index is another's
         self._sent = [_NOT_SENT] * _INDICES
         self.in_flight = 0
         self._lost = 0
@@ -307,24 +311,25 @@ class ProcessData:
     def send(self) -> int:
         """Send an exchange unless too many frames are in flight. Returns the time."""
         sent = self._sent
-        for which, (content, tag_at) in enumerate(self._tagged):
-            index = self._index
+        for content, which, tag_at, end, written in self._rows:
+            self._tag = tag = self._tag + 1 & 0xFFFFFFFF
+            content[DATAGRAM_INDEX] = index = FIRST_INDEX + tag % _OWN_INDICES
             if self.in_flight >= MOST_IN_FLIGHT or sent[index][0]:
                 now_ns = self._monotonic_ns()
                 self._expire(now_ns)
                 if self.in_flight >= MOST_IN_FLIGHT:
+                    self._tag -= 1
                     self.blocked_until_ns = min(row[0] for row in sent if row[0]) + _LOST_NS
                     return now_ns
                 while sent[index][0]:
-                    index = index + 1 & 0xFF or FIRST_INDEX
-            self._index = index + 1 & 0xFF or FIRST_INDEX
-            self._tag = tag = self._tag + 1 & 0xFFFFFFFF
-            content[DATAGRAM_INDEX] = index
+                    self._unused += 1
+                    self._tag = tag = self._tag + 1 & 0xFFFFFFFF
+                    content[DATAGRAM_INDEX] = index = FIRST_INDEX + tag % _OWN_INDICES
             _pack_tag_into(content, tag_at, tag)
             self.in_flight += 1
             now_ns = self._monotonic_ns()
             self._send(content)
-            sent[index] = now_ns, which, tag
+            sent[index] = now_ns, tag, which, tag_at, end, written
         return now_ns
 
     def match(self, frame: bytes, back_ns: int) -> Exchange | None:
@@ -332,14 +337,13 @@ class ProcessData:
         if len(frame) <= DATAGRAM_INDEX or frame[FRAME_HEADER] != self._command:
             return None
         index = frame[DATAGRAM_INDEX]
-        sent_ns, which, tag = self._sent[index]
-        tag_at, end, written = self._offsets[which]
+        sent_ns, tag, which, tag_at, end, written = self._sent[index]
         if len(frame) < tag_at + TAG_SIZE or _unpack_tag_from(frame, tag_at)[0] != tag:  # an older one
             return None
         if not sent_ns:
             self.duplicates += 1
             return DUPLICATE
-        self._sent[index], self.blocked_until_ns = (0, which, tag), 0
+        self._sent[index], self.blocked_until_ns = (0, tag, which, tag_at, end, written), 0
         self.in_flight -= 1
         wkc = frame[end] | frame[end + 1] << 8
         if written:  # an LRW would have counted 2
@@ -350,7 +354,12 @@ class ProcessData:
 
     @property
     def sent(self) -> int:
-        return self._tag // max(1, len(self._frames))
+        return (self._tag - self._unused) // max(1, len(self._frames))
+
+    @property
+    def answered(self) -> int:
+        """Number of frames that were answered; it grows with each."""
+        return self._tag - self._unused - self.in_flight - self._lost
 
     @property
     def lost(self) -> int:
@@ -359,7 +368,7 @@ class ProcessData:
 
     def _expire(self, now_ns: int) -> None:
         """Count frames as lost that are not back after `_LOST_NS`."""
-        for index, (sent_ns, _, _) in enumerate(self._sent):
+        for index, (sent_ns, *_) in enumerate(self._sent):
             if sent_ns and now_ns - sent_ns >= _LOST_NS:
                 self._sent[index] = _NOT_SENT
                 self.in_flight -= 1

@@ -143,11 +143,10 @@ class SampleClock:
 
     def next_poll_ns(self, sent_ns: int, unanswered: int, *, in_flight: bool) -> float:
         """See `Schedule`."""
-        schedule = self._schedule
-        aim_ns = self.phase.phase_ns + schedule.aim_after_ns
+        aim_ns = self.phase.phase_ns + self._schedule.aim_after_ns
         if self._steady and sent_ns < aim_ns and not in_flight:
             return aim_ns
-        return schedule.next_poll_ns(
+        return self._schedule.next_poll_ns(
             sent_ns, unanswered, in_flight=in_flight, locked=self.locked, overdue=self._overdue
         )
 
@@ -172,15 +171,14 @@ class SampleClock:
                 self._schedule.count_early(adapts=False)
                 self._read_at_ns = sent_ns
             return False
-        phase_ns, outward_ns = phase.phase_ns, self._outward_ns
-        if self._steady and back_ns < phase_ns + self._sure_ns:
+        if self._steady and back_ns < (phase_ns := phase.phase_ns) + self._sure_ns:
             if events is None or not events.are_trusted:
-                instant_ns = max(phase_ns, self._read_at_ns) + outward_ns
+                instant_ns = max(phase_ns, self._read_at_ns) + self._outward_ns
                 self._seen_by_ns = back_ns
             else:
                 instant_ns = events.instant_ns
-                self._by_event = instant_ns - outward_ns
-            if -self._doubt_ns < instant_ns - outward_ns - phase_ns < self._doubt_ns:
+                self._by_event = instant_ns - self._outward_ns
+            if -self._doubt_ns < instant_ns - self._outward_ns - phase_ns < self._doubt_ns:
                 self.instant_ns = instant_ns if instant_ns < back_ns else back_ns
                 if self._skipped < self._skips and self._moved_ns == self._round_trip.moved_ns:
                     self._skipped += 1

@@ -223,8 +223,8 @@ class EventTimes:
             return
         clock, before = self.local_clock, self.local_clock.local
         expected = before + back_ns - clock.back_ns
-        clock.local = local = expected + (system - self._offset - expected + _HALF) % _WRAP - _HALF
-        clock.back_ns = back_ns
+        local = expected + (system - self._offset - expected + _HALF) % _WRAP - _HALF
+        clock.local, clock.back_ns = local, back_ns
         if not fresh:
             return
         self._event = event = local - ((local - change + _HALF) % _WRAP - _HALF)
@@ -233,11 +233,10 @@ class EventTimes:
         self._is_next = newest < event < local + self._reading_ns and event - period_ns > oldest
         self._is_certain = self._is_next or event <= newest
         if clock.is_known and (self._is_next or oldest < event <= newest + _SLACK_NS):
-            phase = clock.phase
-            at_ns = phase.phase_ns + (local - clock.local_at) * phase.period_ns
+            at_ns = clock.phase.phase_ns + (local - clock.local_at) * clock.phase.period_ns
             # Else the clock has jumped.
             if sent_ns - clock.doubt_ns < at_ns < back_ns + clock.doubt_ns:
-                passed_ns = (local - event) * phase.period_ns + self._is_next * period_ns
+                passed_ns = (local - event) * clock.phase.period_ns + self._is_next * period_ns
                 self.instant_ns = at_ns - passed_ns - self._half_loop_ns
 
     def learn(self, sent_ns: int, arrived_ns: int, count: int = 1) -> None:

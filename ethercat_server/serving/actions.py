@@ -16,7 +16,7 @@ from bota_ethercat.errors import RequestError
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.serving.connection import Connection, DataSubscription
+from ethercat_server.serving.connection import Connection
 from ethercat_server.serving.hub import Hub
 
 # With more sensors `describe` omits the meaning of their settings: a reply has at most 65536 bytes.
@@ -131,9 +131,7 @@ class Actions:
                     "from 0",
                 )
             wanted += [numbers is None or number in numbers for number in range(len(rows))]
-        connection.subscription = DataSubscription(
-            wanted, request.values["every"], request.values["fresh_only"]
-        )
+        connection.subscribe(wanted, request.values["every"], request.values["fresh_only"])
         self._hub.subscriptions_changed()
         return self._describe(connection, request)
 

@@ -76,15 +76,46 @@ class Unreadable(NamedTuple):
 class DataSubscription:
     """Which DATA a client wants. Lists are by the sensor's number; the terminals follow."""
 
-    def __init__(self, wanted: Sequence[bool], every: int, fresh_only: bool) -> None:
+    def __init__(self, wanted: Sequence[bool], every: int, fresh_only: bool, now_ns: int) -> None:
         self.wanted = wanted
         self.every = every
+        # Whether it leaves out frames that have no flag.
         self.chooses = every != 1 or not all(wanted)
         self.fresh_only = fresh_only
         self.skipped = [every - 1] * len(wanted)
-        # Nothing was sent yet, which counts as long ago even if the clock starts at zero.
-        self.last_ns = [-_IDLE_FRAME_NS] * len(wanted)
-        self.gap = [False] * len(wanted)
+        self._since_ns = now_ns
+        # When the last frame with flags was sent; long ago even if the clock starts at zero.
+        self._flagged_ns = [-_IDLE_FRAME_NS] * len(wanted)
+        self.gaps: set[int] = set()  # sensors whose next frame must carry GAP
+
+    def choose(self, made: Sequence[OutgoingFrame], now_ns: int) -> list[OutgoingFrame]:
+        """What it gets of some DATA frames, of which at least one is not like most."""
+        return [chosen for each in made if (chosen := self._choose(*each, now_ns)) is not None]
+
+    def _choose(
+        self, frame: bytes, number: int, flags: int, newest_ns: int, now_ns: int
+    ) -> OutgoingFrame | None:
+        if not self.wanted[number]:
+            return None
+        if flags & _REPEATED and self.fresh_only:
+            had_ns = max(
+                self._flagged_ns[number], newest_ns if newest_ns >= self._since_ns else -_IDLE_FRAME_NS
+            )
+            if now_ns - had_ns < _IDLE_FRAME_NS:
+                return None
+        if flags & _GAP:
+            self.gaps.add(number)
+        if self.skipped[number] < self.every - 1:
+            self.skipped[number] += 1
+            return None
+        self.skipped[number] = 0
+        if number in self.gaps:
+            self.gaps.discard(number)
+            if not flags & _GAP:
+                frame = with_gap(frame)
+        if flags:
+            self._flagged_ns[number] = now_ns
+        return frame, number, flags, newest_ns
 
 
 class Outbox:
@@ -133,13 +164,13 @@ class Outbox:
         self._queue.append((message, NO_SENSOR))
         self._queued_json_bytes += len(message)
 
-    def send_data(self, frames: Sequence[tuple[bytes, int]]) -> Sequence[int]:
-        """Send DATA frames with their sensors' numbers, one for each, or queue them.
+    def send_data(self, frames: Sequence[OutgoingFrame]) -> Sequence[int]:
+        """Send DATA frames, one of a sensor, or queue them.
 
         Returns the sensors whose next frame must carry GAP because one was dropped.
         """
         if not self._queue:
-            message = frames[0][0] if len(frames) == 1 else b"".join([frame for frame, _ in frames])
+            message = frames[0][0] if len(frames) == 1 else b"".join([each[0] for each in frames])
             try:
                 sent = self._send(message)
             except OSError as error:
@@ -158,7 +189,7 @@ class Outbox:
             frames = frames[whole:]
             self._head_sent = sent
         dropped: set[int] = set()
-        for frame, number in frames:
+        for frame, number, _, _ in frames:
             self._queue.append((with_gap(frame) if number in dropped else frame, number))
             dropped.discard(number)
             self._queued_data += 1
@@ -336,6 +367,10 @@ class Connection:
             self._begun_ns = self._monotonic_ns()
         return None
 
+    def subscribe(self, wanted: Sequence[bool], every: int, fresh_only: bool) -> None:
+        """Begin to take DATA, or change which."""
+        self.subscription = DataSubscription(wanted, every, fresh_only, self._monotonic_ns())
+
     def answer_later(self) -> None:
         """The request that was taken is answered later: `answered` then. It may have ended the connection."""
         if not self.state.ending:
@@ -408,41 +443,13 @@ class Connection:
             return
         self.outbox.send(encode_bare_json(message) if self.bare is not None else encode_json(message))
 
-    def offer(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
-        """Send those DATA frames that the subscription wants, at once: one for a sensor."""
+    def offer(self, made: Sequence[OutgoingFrame], flags: int, now_ns: int) -> None:
+        """Send those DATA frames that the subscription wants, at once; `flags` are those of all of them."""
         if (wants := self.subscription) is None:
             return
-        chosen = []
-        for frame, number, flags in made:
-            if flags or wants.chooses or wants.gap[number]:
-                if (choice := _choose(wants, frame, number, flags, now_ns)) is None:
-                    continue
-                chosen.append((choice, number))
-            else:
-                chosen.append((frame, number))
-            wants.last_ns[number] = now_ns
-        if chosen:
-            for number in self.outbox.send_data(chosen):
-                wants.gap[number] = True
-
-
-def _choose(wants: DataSubscription, frame: bytes, number: int, flags: int, now_ns: int) -> bytes | None:
-    """What a subscription gets of a DATA frame that is not like most."""
-    if not wants.wanted[number]:
-        return None
-    if flags & _REPEATED and wants.fresh_only and now_ns - wants.last_ns[number] < _IDLE_FRAME_NS:
-        return None
-    if flags & _GAP:
-        wants.gap[number] = True
-    if wants.skipped[number] < wants.every - 1:
-        wants.skipped[number] += 1
-        return None
-    wants.skipped[number] = 0
-    if wants.gap[number]:
-        wants.gap[number] = False
-        if not flags & _GAP:
-            frame = with_gap(frame)
-    return frame
+        if (flags or wants.chooses or wants.gaps) and not (made := wants.choose(made, now_ns)):
+            return
+        wants.gaps.update(self.outbox.send_data(made))
 
 
 def with_gap(frame: bytes) -> bytes:

@@ -13,6 +13,8 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import reduce
+from operator import or_
 from typing import Final
 
 from bota_ethercat.control import ErrorCode, error_reply
@@ -61,8 +63,9 @@ class Hub:
 
     def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
         """Send DATA frames to every subscriber that wants them."""
+        flags = made[0][2] if len(made) == 1 else reduce(or_, [each[2] for each in made])
         for connection in self._subscribers:
-            connection.offer(made, now_ns)
+            connection.offer(made, flags, now_ns)
 
     def broadcast(self, message: JsonObject) -> None:
         """Send an event to every framed connection."""
@@ -83,18 +86,21 @@ class Hub:
         """A connection's subscription began or ended."""
         self._subscribers = [c for c in self.connections.values() if c.subscription is not None]
 
-    def serve(self, until_ns: int) -> None:
-        """Serve the clients until the clock is at `until_ns`; once, without waiting, if that has passed."""
-        watched, now_ns = self._watched, self._monotonic_ns()
-        last_start_ns = until_ns - _REQUEST_NS
+    def serve(self, until_ns: int) -> int:
+        """Serve the clients until the clock is at `until_ns`; once, without waiting, if that has passed.
+
+        Returns the time.
+        """
+        watched, now_ns, last_start_ns = self._watched, self._monotonic_ns(), until_ns - _REQUEST_NS
         # One pass is always made, also where there is never time for a request before a deadline.
         hurried = last_start_ns <= now_ns
         while hurried or now_ns < until_ns:
             reads, wake_ns = hurried or now_ns < last_start_ns, until_ns
-            if now_ns < self._pause_ends_ns:
-                reads, wake_ns = False, min(self._pause_ends_ns, until_ns)
-            elif hurried or (reads and self._ready):
-                wake_ns = now_ns
+            if hurried or self._ready or now_ns < self._pause_ends_ns:
+                if now_ns < self._pause_ends_ns:
+                    reads, wake_ns = False, min(self._pause_ends_ns, until_ns)
+                elif reads:
+                    wake_ns = now_ns
             wait_s = (wake_ns - now_ns) * 1e-9 if wake_ns > now_ns else 0.0
             ready = self._transport.wait(watched.readers if reads else (), watched.writers, wait_s)
             if ready[0] or ready[1] or (reads and self._ready):
@@ -102,6 +108,7 @@ class Hub:
             hurried, now_ns = False, self._monotonic_ns()
         if now_ns >= self._sweep_at_ns:
             self._sweep(now_ns)
+        return now_ns
 
     def _serve_ready(
         self,

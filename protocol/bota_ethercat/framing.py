@@ -14,6 +14,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from enum import IntEnum, IntFlag
+from functools import cache, partial
 from typing import Any, Final, NamedTuple, NoReturn
 
 from bota_ethercat.errors import RemoteProtocolError
@@ -74,9 +75,15 @@ def encode_data(
     kind: int = _DATA,
 ) -> bytes:  # fmt: skip
     """A whole DATA or TERMINAL message, ready to send. struct.error if a number does not fit its field."""
-    length = _DATA_OVERHEAD + len(process_data)
-    head = _DATA_MESSAGE.pack(length, kind, sequence, stamp_ns, monotonic_ns, sensor, flags, wkc)
-    return head + process_data
+    return data_encoder(len(process_data), kind)(
+        sequence, stamp_ns, monotonic_ns, sensor, flags, wkc, process_data
+    )
+
+
+@cache
+def data_encoder(size: int, kind: int = _DATA) -> Callable[[int, int, int, int, int, int, bytes], bytes]:
+    """`encode_data` for process data of `size` bytes: it takes the arguments in this order, and no `kind`."""
+    return partial(struct.Struct(f"{_DATA_MESSAGE.format}{size}s").pack, _DATA_OVERHEAD + size, kind)
 
 
 def encode_json(message: JsonObject) -> bytes:

@@ -17,13 +17,13 @@ from bota_ethercat.control import parse_request, reply
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
 from bota_ethercat.pdo import LAYOUTS
 from bota_ethercat.text.json_text import JsonObject
+from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.serving import permissions
 from ethercat_server.serving.connection import (
     MAX_QUEUED_DATA,
     MAX_REQUEST_LENGTH,
     Connection,
     ConnectionState,
-    DataSubscription,
     Limits,
 )
 from ethercat_server.serving.hub import Hub
@@ -42,8 +42,9 @@ def decoded(data: bytes | bytearray) -> list[Any]:
     return list(decoder)
 
 
-def one_frame(sequence: int, position: int = 0, flags: int = 0) -> tuple[bytes, int, int]:
-    return encode_data(sequence, 1, 2, position, flags, 3, bytes(61)), position, flags
+def one_frame(sequence: int, position: int = 0, flags: int = 0, newest_ns: int = 0) -> OutgoingFrame:
+    """One that says that the newest sample was there at `newest_ns`."""
+    return encode_data(sequence, 1, 2, position, flags, 3, bytes(61)), position, flags, newest_ns
 
 
 class Served:
@@ -55,13 +56,14 @@ class Served:
         self.hub = Hub(self.transport, self.clock.monotonic_ns)
         self.hub.start(self.handle)
         self.sequence = 0
+        self.newest_ns = [0, 0]  # when the newest sample of each sensor was there
 
     def handle(self, connection: Connection, message: JsonObject) -> JsonObject:
         request = parse_request(message)
         if request.action == "subscribe":
             values = request.values
             wanted = [number in (values["sensors"] or (0, 1)) for number in range(2)]
-            connection.subscription = DataSubscription(wanted, values["every"], values["fresh_only"])
+            connection.subscribe(wanted, values["every"], values["fresh_only"])
             self.hub.subscriptions_changed()
         return reply(request)
 
@@ -87,7 +89,9 @@ class Served:
     def publish(self, position: int = 0, flags: int = 0, now_ns: int | None = None, count: int = 1) -> None:
         for _ in range(count):
             now_ns = self.clock.now_ns if now_ns is None else now_ns
-            self.hub.publish([one_frame(self.sequence, position, flags)], now_ns)
+            if not flags & DataFlag.REPEATED:
+                self.newest_ns[position] = now_ns
+            self.hub.publish([one_frame(self.sequence, position, flags, self.newest_ns[position])], now_ns)
             self.sequence += 1
 
     def read(self, client: InMemoryStream) -> list[Any]:
@@ -424,7 +428,7 @@ def test_an_idle_connection_of_who_has_most_goes_first(served: Served) -> None:
 
     for client in crowd[:6]:
         client.uid = 1003
-        client.subscription = DataSubscription([True], 1, fresh_only=True)
+        client.subscribe([True], 1, fresh_only=True)
     assert served.is_closed(served.connect(3000)), "none is idle"
     crowd[4].subscription = None
     served.connect(3000)

@@ -17,7 +17,7 @@ from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Re
 from bota_clients.replay.sensors import ReplayedSensors, needs_sensor
 from bota_clients.replay.timeline import Timeline
 from bota_ethercat.control import Event, event
-from bota_ethercat.framing import DataMessage, encode_data
+from bota_ethercat.framing import DataFlag, DataMessage, encode_data
 from ethercat_server.errors import ServerError
 from ethercat_server.serving.actions import Actions
 from ethercat_server.serving.hub import Hub
@@ -62,6 +62,7 @@ class Player:
         self._signals = signals
         self._timeline = Timeline(options.speed)
         self._serve_by = 0
+        self._newest_ns: dict[int, int] = {}  # by sensor, when a frame of it that is not REPEATED was sent
 
     def stop(self) -> None:
         self._signals.asked = True
@@ -136,7 +137,11 @@ class Player:
         self._wait(due_ns)
         if self._signals.asked:
             return
-        self.hub.publish(((encode_data(*frame), frame.sensor, frame.flags),), time.monotonic_ns())
+        now_ns = time.monotonic_ns()
+        if not frame.flags & DataFlag.REPEATED:
+            self._newest_ns[frame.sensor] = now_ns
+        newest_ns = self._newest_ns.get(frame.sensor, 0)
+        self.hub.publish(((encode_data(*frame), frame.sensor, frame.flags, newest_ns),), now_ns)
         self.sensors.count(frame)
 
     def _wait(self, due_ns: int) -> None:
