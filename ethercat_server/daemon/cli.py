@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import sys
@@ -9,7 +10,7 @@ from collections.abc import Sequence
 
 from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.signals import Signals
-from ethercat_server.daemon.options import parse_options
+from ethercat_server.daemon.options import VIRTUAL_INTERFACE, parse_options
 from ethercat_server.errors import ServerError, StopRequestedError
 from ethercat_server.process.logs import set_up_logging
 
@@ -23,10 +24,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     set_up_logging()
     try:
         options = parse_options(argv)
-        # Loading it takes a moment, in which Ctrl-C must work already, and for which --help need not wait.
-        from ethercat_server.daemon.server import serve  # noqa: PLC0415
+        with contextlib.ExitStack() as cleanup:
+            virtual = None
+            if options.ifname == VIRTUAL_INTERFACE:
+                from ethercat_server.virtual_sensor.virtual_bus import VirtualBus  # noqa: PLC0415 - for this only
 
-        serve(options, signals)
+                # By the port two such servers have different sensors, each the same every time.
+                server = options.server
+                virtual = VirtualBus(
+                    options.virtual_arguments, server["rt_priority"], server["user"], options.port
+                )
+                cleanup.callback(virtual.end)
+                virtual.start()  # it takes as long as what follows
+            # Loading it takes a moment: Ctrl-C must work already, and --help need not wait for it.
+            from ethercat_server.daemon.server import serve  # noqa: PLC0415
+
+            serve(options, signals, virtual)
     except StopRequestedError:
         log.info("stopped during start-up")
     except ServerError as error:

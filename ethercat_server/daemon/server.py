@@ -8,12 +8,13 @@ import ipaddress
 import logging
 import os
 import socket
+from contextlib import AbstractContextManager
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from bota_ethercat.program.signals import Signals
 from ethercat_server.daemon.histories import kept
-from ethercat_server.daemon.options import VIRTUAL_INTERFACE, ServerOptions
+from ethercat_server.daemon.options import ServerOptions
 from ethercat_server.daemon.traces import Traces
 from ethercat_server.errors import StopRequestedError
 from ethercat_server.ethercat.soem import open_bus
@@ -25,13 +26,21 @@ from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import SocketTransport
 
+if TYPE_CHECKING:
+    from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
+
 _NEVER_NS: Final = 1 << 62
 
 log = logging.getLogger(__name__)
 
 
-def serve(options: ServerOptions, signals: Signals) -> None:
-    """Start up, stream until asked to stop, shut down; ServerError says what failed."""
+def serve(
+    options: ServerOptions, signals: Signals, virtual: AbstractContextManager[VirtualBus] | None = None
+) -> None:
+    """Start up, stream until asked to stop, shut down; ServerError says what failed.
+
+    On the bus `virtual`, if there is one, in place of the interface of the options.
+    """
     user = user_to_become(options.server["user"])
     if user is not None:
         forbid_new_privileges()  # before the log's thread starts
@@ -44,11 +53,7 @@ def serve(options: ServerOptions, signals: Signals) -> None:
         hub.permissions = permissions
         cleanup.callback(hub.close)
         ifname, priority = options.ifname, options.server["rt_priority"]
-        if options.ifname == VIRTUAL_INTERFACE:
-            from ethercat_server.virtual_sensor.virtual_bus import VirtualBus  # noqa: PLC0415 - for this only
-
-            # By the port two such servers have different sensors, each the same every time.
-            virtual = VirtualBus(options.virtual_arguments, priority, options.server["user"], options.port)
+        if virtual is not None:
             ifname = cleanup.enter_context(virtual).ifname
         bus = cleanup.enter_context(open_bus(ifname, allow_ip=options.allow_ip))
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)

@@ -59,8 +59,8 @@ class VirtualBus:
     def pid(self) -> int:
         return self._process.pid if self._process else 0
 
-    def __enter__(self) -> VirtualBus:
-        """Start the sensor's process and wait until it answers; ServerError if it does not."""
+    def start(self) -> None:
+        """Start the sensor's process, without waiting for it."""
         command = [sys.executable, "-P", "-m", "ethercat_server.virtual_sensor.virtual_bus"]
         command += [self.ifname, str(self._priority), self._user, str(self._number), *self._arguments]
         # A session of its own: Ctrl-C is for the server, which then ends the sensor. Its standard input
@@ -68,6 +68,12 @@ class VirtualBus:
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
+
+    def __enter__(self) -> VirtualBus:
+        """Wait until the sensor's process answers, started now if need be; ServerError if it does not."""
+        if self._process is None:
+            self.start()
+        assert self._process is not None
         assert self._process.stdout is not None
         poller = select.poll()
         poller.register(self._process.stdout, select.POLLIN)
@@ -77,7 +83,7 @@ class VirtualBus:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(_START_TIMEOUT_S)
             code = self._process.poll()
-            self.__exit__()
+            self.end()
             raise ServerError(_why_not_started(code))
         self._enter_namespaces()
         return self
@@ -90,10 +96,14 @@ class VirtualBus:
         with (theirs / "user").open() as user, (theirs / "net").open() as network:
             if any(_LIBC.setns(file.fileno(), 0) for file in (user, network)):
                 why = os.strerror(ctypes.get_errno())
-                self.__exit__()
+                self.end()
                 raise ServerError(f"cannot enter the namespaces of the virtual sensor ({why}): use root")
 
     def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """End the sensor's process, if it runs."""
         process, self._process = self._process, None
         if process is None:
             return
