@@ -84,8 +84,8 @@ class DataSubscription:
         self.fresh_only = fresh_only
         self.skipped = [every - 1] * len(wanted)
         self._since_ns = now_ns
-        # When the last frame with flags was sent; long ago even if the clock starts at zero.
-        self._flagged_ns = [-_IDLE_FRAME_NS] * len(wanted)
+        # When the last frame that `choose` let pass was sent; long ago even if the clock starts at zero.
+        self._chosen_ns = [-_IDLE_FRAME_NS] * len(wanted)
         self.gaps: set[int] = set()  # sensors whose next frame must carry GAP
 
     def choose(self, made: Sequence[OutgoingFrame], now_ns: int) -> list[OutgoingFrame]:
@@ -98,9 +98,9 @@ class DataSubscription:
         if not self.wanted[number]:
             return None
         if flags & _REPEATED and self.fresh_only:
-            had_ns = max(
-                self._flagged_ns[number], newest_ns if newest_ns >= self._since_ns else -_IDLE_FRAME_NS
-            )
+            had_ns = self._chosen_ns[number]
+            if newest_ns >= self._since_ns and not self.chooses:  # that was sent, too
+                had_ns = max(had_ns, newest_ns)
             if now_ns - had_ns < _IDLE_FRAME_NS:
                 return None
         if flags & _GAP:
@@ -113,8 +113,7 @@ class DataSubscription:
             self.gaps.discard(number)
             if not flags & _GAP:
                 frame = with_gap(frame)
-        if flags:
-            self._flagged_ns[number] = now_ns
+        self._chosen_ns[number] = now_ns
         return frame, number, flags, newest_ns
 
 
