@@ -188,6 +188,8 @@ class Cycle:
         until it was due.
         """
         if now < due or self._process_data.in_flight or until_ns <= now:
+            if self._unanswered > 1:
+                self._recovery.check_silence(now - self._unanswered_since_ns, now)
             wait = min(due, until_ns) - now
             is_answered = self._receive(wait, now)
             if is_answered or (now := self._monotonic_ns()) < due:
@@ -214,8 +216,6 @@ class Cycle:
         if self._unanswered:
             if self._unanswered == 1:
                 self._unanswered_since_ns = self._sent_ns
-            else:
-                self._recovery.check_silence(now - self._unanswered_since_ns, now)
             self._show_silence(now)
 
     def _receive(self, wait: int, since_ns: int) -> bool:
