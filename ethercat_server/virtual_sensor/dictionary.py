@@ -150,13 +150,6 @@ class Dictionary(ObjectTable):
             return bytes([self._flash.status(self._now())])
         return self.values[row.address]
 
-    def check_download(self, index: int, subindex: int, length: int, state: AlState) -> None:
-        try:
-            super().check_download(index, subindex, length, state)
-        except TransferRefusedError as error:
-            self._on_write(index, subindex, b"", state, error.code)
-            raise
-
     def write(self, index: int, subindex: int, data: bytes, state: AlState) -> None:
         abort = 0
         try:

@@ -13,6 +13,7 @@ import select
 import socket
 import stat
 import struct
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -24,7 +25,6 @@ from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import arrived_ns, look_up, master_sockets
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import SlaveChain
-from ethercat_server.virtual_sensor.control import own_socket
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, obey
 from ethercat_server.virtual_sensor.options import SlaveOptions
 from ethercat_server.virtual_sensor.world import ExternalWorld
@@ -45,6 +45,8 @@ _STEP: Final = 0.001
 # trip from its quickest frames.
 _QUICK: Final = 1 / 16
 _CHUNK: Final = 1 << 16
+_ANSWER_S: Final = 5.0
+_LONGEST_ANSWER: Final = 1 << 20
 
 
 class LinkError(Exception):
@@ -200,6 +202,29 @@ def bound(path: str) -> Iterator[socket.socket]:
         finally:
             with contextlib.suppress(OSError):
                 Path(path).unlink()
+
+
+def own_socket() -> str:
+    """Where this user's virtual sensor takes commands if no other place is given."""
+    folder = f"/run/user/{os.geteuid()}"
+    if not os.access(folder, os.W_OK):  # none, or hidden from a service by ProtectHome=
+        folder = tempfile.gettempdir()
+    return f"{folder}/ethercat-virtual-sensor-{os.geteuid()}"
+
+
+def send(path: str, command: str) -> str:
+    """The answer to a command of a virtual sensor that listens there, this user's or root's; OSError."""
+    if Path(path).stat().st_uid not in (0, os.geteuid()):
+        raise PermissionError(errno.EPERM, "it is another user's")
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock,
+    ):
+        sock.bind(f"{folder}/answer")
+        sock.settimeout(_ANSWER_S)
+        sock.connect(path)
+        sock.send(command.encode())
+        return sock.recv(_LONGEST_ANSWER).decode()
 
 
 class _Answers:
