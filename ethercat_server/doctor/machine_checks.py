@@ -14,7 +14,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 from ethercat_server.access.adapters import Adapter, is_wireless
-from ethercat_server.daemon.options import VIRTUAL_INTERFACE
 from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.report import (
     CannotLookError,
@@ -30,6 +29,7 @@ from ethercat_server.doctor.report import (
 from ethercat_server.ethercat.nic import (
     ALLOW_IP,
     NEEDED_CAPABILITIES,
+    VIRTUAL_INTERFACE,
     XDP,
     Routes,
     missing_capabilities,

@@ -29,6 +29,7 @@ _INDICES: Final = 0x10
 _TIMEOUT_S: Final = 0.02
 _PAUSE_S: Final = 0.001
 _REGISTER_ATTEMPTS: Final = 20
+_COUNT_ATTEMPTS: Final = 5
 _U16: Final = struct.Struct("<H")
 _LONGEST_TIMEOUT_S: Final = 0.25
 # On a bus whose answers come late the timeout is this many times the longest recent round trip.
@@ -48,7 +49,6 @@ class RegisterAccess(NamedTuple):
     adp: int
     ado: int
     data: bytes
-    timeout_s: float = _TIMEOUT_S
 
 
 class Answer(NamedTuple):
@@ -154,13 +154,13 @@ class Datagrams:
 
     def send(self, access: RegisterAccess) -> int:
         """Send a datagram; returns until when, in ns, its answer is to be awaited."""
-        command, adp, ado, data, timeout_s = access
+        command, adp, ado, data = access
         self._index = (self._index + 1) % len(self._pending_ns)
         frame = build((command, adp, ado, data), first_index=self._index + FIRST_INDEX)
         self._awaited = frame, len(data)
         self._pending_ns[self._index] = now_ns = self._monotonic_ns()
         self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
-        return now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
+        return now_ns + int(max(_TIMEOUT_S, self._late.timeout_s) * 1e9)
 
     def match(self, frame: bytes) -> Answer | None:
         """The answer to the datagram that was sent last, if this frame is that."""
@@ -197,13 +197,10 @@ class Datagrams:
         """Write ESC registers of the slave at a position, scanned or not."""
         return _write(Command.APWR, -position, address, data)
 
-    def count_slaves(self, size: int, timeout_s: float) -> int:
-        """How many slaves answer a broadcast read of `size` bytes from register 0 on; -1 if it is lost.
-
-        Needs no scan and changes nothing, so it also serves to measure the round trip of such a frame.
-        """
-        answer = self._ask(RegisterAccess(Command.BRD, 0, 0, bytes(size), timeout_s))
-        return -1 if answer is None else answer.wkc
+    def count_slaves(self) -> int:
+        """How many slaves answer a broadcast read, the most of some; needs no scan and changes nothing."""
+        answers = [self._ask(RegisterAccess(Command.BRD, 0, 0, b"\0")) for _ in range(_COUNT_ATTEMPTS)]
+        return max(answer.wkc if answer else 0 for answer in answers)
 
     def listen(self, seconds: float) -> int:
         """The number of frames that arrive from others in this time; nothing is sent."""

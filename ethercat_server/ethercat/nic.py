@@ -103,6 +103,7 @@ def _sockets(process: Path) -> Iterator[int]:
                     yield int(target[8:-1])
 
 
+VIRTUAL_INTERFACE: Final = "virtual"  # what stands for a virtual bus with a virtual sensor on it
 LEAST_MTU: Final = 1500  # bytes: an EtherCAT frame may be as long as any Ethernet frame
 CHECK_CABLE: Final = "check cable and power"
 # The option that has the server or a program use an interface with the default route or a leased address.
@@ -180,10 +181,10 @@ def look_up(interface: str | int) -> Interface:
         return _look_up(interface)
     except (OSError, struct.error):
         names = [name for _, name in socket.if_nameindex()]
-        close = difflib.get_close_matches(str(interface), [*names, "virtual"], n=1)
+        close = difflib.get_close_matches(str(interface), [*names, VIRTUAL_INTERFACE], n=1)
         raise InterfaceError(
             f"no network interface {interface!r} on this machine: there are {', '.join(names)}, and "
-            f"'virtual' for a virtual sensor{f'; did you mean {close[0]!r}?' if close else ''}"
+            f"'{VIRTUAL_INTERFACE}' for a virtual sensor{f'; did you mean {close[0]!r}?' if close else ''}"
         ) from None
 
 

@@ -27,7 +27,6 @@ from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.nic import missing_capabilities
 from ethercat_server.process.privileges import become, user_to_become
 
-VIRTUAL_INTERFACE: Final = "virtual"  # the interface name that requests a virtual bus
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
 _START_TIMEOUT_S: Final = 20.0
 _GONE_TIMEOUT_S: Final = 3.0
