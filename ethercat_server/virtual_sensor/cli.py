@@ -206,17 +206,7 @@ def main(
     try:
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)  # reading from the terminal must not suspend it
         with signals_call(stopped.set):
-            link.run(
-                args.iface,
-                slaves,
-                stop=stopped,
-                control_path=args.control,
-                world_path=args.world,
-                commands=sys.stdin,
-                exit_on_eof=args.exit_on_eof,
-                on_open=on_open,
-                on_ready=lambda: print(ready, flush=True),
-            )
+            link.run(args, slaves, on_open, lambda: print(ready, flush=True), stopped)
     except link.LinkError as error:
         _say(error)
         return 1

@@ -350,7 +350,7 @@ class Esc:
         if touched(reg.SYNC_MANAGER, SYNC_MANAGER_COUNT * reg.SYNC_MANAGER_SIZE):
             for manager in self.sync_managers:
                 manager.reload()
-            self._pdi.sync_managers_changed()
+            self._pdi.show_state()
             if self.sync_managers[1].repeat_asked():
                 self._pdi.repeat_requested()
         if self.clock.present and touched(reg.DC_RECEIVE_TIMES, 4):

@@ -5,6 +5,7 @@ One thread, which polls for frames and commands, and checks watchdogs.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import errno
 import gc
@@ -13,12 +14,13 @@ import select
 import socket
 import stat
 import struct
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Final
 
 from bota_ethercat.world import DATAGRAM, decode
 from ethercat_server.errors import InterfaceError
@@ -82,23 +84,19 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
 
 
 def run(
-    ifname: str,
+    args: argparse.Namespace,
     slaves: Iterable[SlaveOptions],
-    *,
-    control_path: str | None,
-    world_path: str | None,
-    commands: TextIO | None,
-    exit_on_eof: bool,
     on_open: Callable[[], None],
     on_ready: Callable[[], None],
     stop: threading.Event,
 ) -> None:
-    """Answer EtherCAT frames on `ifname` until stopped.
+    """Answer EtherCAT frames on `args.iface` until stopped.
 
-    Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the end of `commands` if
+    Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the end of standard input if
     `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is only down is waited
-    for), or a path cannot; without `control_path` `own_socket` is used, if it is free.
+    for), or a path cannot; without `control` `own_socket` is used, if it is free.
     """
+    ifname, control_path = args.iface, args.control
     if master_sockets(ifname):  # two that answer each other's answers would take all of the processors
         raise LinkError(f"{ifname} is in use by another virtual sensor or master: stop that one first")
     with contextlib.ExitStack() as stack:
@@ -114,13 +112,13 @@ def run(
         with contextlib.suppress(LinkError) if control_path is None else contextlib.nullcontext():
             control = stack.enter_context(bound(control_path or own_socket()))
             heard[control.fileno()] = lambda: _obey(control, bus)
-        if world_path:
-            world = stack.enter_context(bound(world_path))
+        if args.world:
+            world = stack.enter_context(bound(args.world))
             heard[world.fileno()] = lambda: _hear(world, bus)
-        if commands is not None:
-            with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
-                typed, begun = commands.fileno(), bytearray()
-                heard[typed] = lambda: obey_lines(typed, begun, bus, poller, exit_on_eof)
+        # None without a standard input, which cannot be polled without a descriptor either.
+        with contextlib.suppress(AttributeError, OSError, ValueError):
+            typed, begun = sys.stdin.fileno(), bytearray()
+            heard[typed] = lambda: obey_lines(typed, begun, bus, poller, args.exit_on_eof)
         for descriptor in heard:
             poller.register(descriptor, select.POLLIN)
         # All that is loaded need never be looked through again, which takes some 20 ms.

@@ -125,6 +125,11 @@ def test_a_sensor_that_is_out_does_not_hide_the_other(bench: Bench) -> None:
 
 def test_a_server_that_does_not_reply_or_ends_is_one_sentence(bench: Bench) -> None:
     bus, server = bench
-    bus.at(0.1, server.hub.close)
+
+    def end() -> None:
+        server.hub.close()
+        server.hangs = True
+
+    bus.at(0.1, end)
     said = refused("objects", *SERVER)
     assert f"the server at {server.address} closed the connection" in said
