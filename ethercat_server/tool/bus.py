@@ -24,8 +24,11 @@ from ethercat_server.tool.command import DONE, Subcommand, chosen, columns, say,
 def _adapters(args: argparse.Namespace) -> int:
     found = adapters()
     if args.json:
-        names = ("name", "kind", "address", "up", "carrier", "loopback")
+        names = ("up", "carrier", "loopback")
         say_json({"adapters": [{
+            "name": row.name,
+            "kind": row.kind,
+            "address": row.address.hex(":") or None,
             **{name: getattr(row, name) for name in names},
             "held_by": str(row.holder) if row.holder else None,
             "default_route": row.routes.default,
@@ -39,7 +42,7 @@ def _adapters(args: argparse.Namespace) -> int:
         ip = str(row.routes) if not row.loopback else ""
         if network_trouble(row.name, row.routes):
             ip = f"not for a sensor: {ip}"
-        rows.append((row.name, row.state, row.address or "", "; ".join(filter(None, (what, held, ip)))))
+        rows.append((row.name, row.state, row.address.hex(":"), "; ".join(filter(None, (what, held, ip)))))
     say(columns(rows))
     return DONE
 

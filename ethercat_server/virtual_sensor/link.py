@@ -64,7 +64,7 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
         found = look_up(ifname)
     except InterfaceError as error:
         raise LinkError(str(error)) from None
-    if not found.is_up:
+    if not found.up:
         raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
     try:
         # No protocol yet: with one, it would receive frames of all interfaces until it is bound.
