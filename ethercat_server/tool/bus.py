@@ -7,7 +7,7 @@ import argparse
 import contextlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from ethercat_server.access.adapters import Adapter, adapters
 from ethercat_server.access.private_server import open_interface
@@ -154,11 +154,8 @@ def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-COMMANDS = (
-    Subcommand("adapters", (), _adapters),
-    Subcommand("find", (), _find),
-    Subcommand(
-        "eeprom",
-        sensor_arguments(all_if_none=True), _eeprom,
-    ),
-)  # fmt: skip
+COMMANDS: Final = {
+    "adapters": Subcommand((), _adapters),
+    "find": Subcommand((), _find),
+    "eeprom": Subcommand(sensor_arguments(all_if_none=True), _eeprom),
+}

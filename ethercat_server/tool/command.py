@@ -33,7 +33,6 @@ def argument(name: str, help_text: str, **options: Any) -> Argument:
 class Subcommand(NamedTuple):
     """One subcommand."""
 
-    name: str
     arguments: Sequence[Argument]
     run: Callable[[argparse.Namespace], int]  # returns the exit code; raises ServerError
 
