@@ -9,15 +9,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import BYTE_NS, Command, Datagram
 from ethercat_server.virtual_sensor.device import PDI_TYPE
 from ethercat_server.virtual_sensor.distributed_clock import HOP_NS, DcUnit
-
-if TYPE_CHECKING:
-    from ethercat_server.virtual_sensor.application import Application
 
 _U16, _AL_STATUS = struct.Struct("<H"), struct.Struct("<HHH")
 _REGISTERS_END, _DC_RECEIVE_TIMES, _DC_END = reg.REGISTERS_END, reg.DC_RECEIVE_TIMES, reg.DC_END
@@ -233,10 +230,23 @@ class SiiInterface:
             self.advance()
 
 
+class _Pdi(Protocol):
+    """The firmware behind the controller: see `Application`."""
+
+    clock: Callable[[], int]
+
+    def al_control(self, control: int) -> None: ...
+    def show_state(self) -> None: ...
+    def mailbox_exchanged(self) -> None: ...
+    def repeat_requested(self) -> None: ...
+    def inputs(self) -> bytes: ...
+    def outputs(self, data: bytes) -> None: ...
+
+
 class Esc:
     """Registers and buffers of one controller."""
 
-    def __init__(self, pdi: Application, sii_image: bytes, sii_read_ns: int = 0) -> None:
+    def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
         self._pdi = pdi
         self.memory = _power_on_values()
         self.memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = sii_image[8:10]

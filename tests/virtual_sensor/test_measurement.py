@@ -164,8 +164,7 @@ def response_to(hz: float, channel: int, step_s: float, count: int, sinc: int, *
         seconds = 20.0 + number * step_s
         reading, felt = source.reading(number, 0, seconds), pitching(seconds)
         plain = (*(a / STANDARD_GRAVITY for a in felt.acceleration), *map(math.degrees, felt.angular_rate))
-        values = (*reading.force_torque, *reading.acceleration, *reading.angular_rate)
-        for which, value in enumerate((values[channel], (*felt.wrench, *plain)[channel])):
+        for which, value in enumerate((reading.values[channel], (*felt.wrench, *plain)[channel])):
             sums[which] += value * cmath.exp(-1j * omega * seconds)
     return sums[0] / sums[1]
 
@@ -206,15 +205,15 @@ def test_a_sine_of_motion_is_late_by_the_profiles_delay(
 def test_what_is_not_read_does_not_change_what_is() -> None:
     """The filters look at samples that no master has read."""
     every, one = (measured(fir=True) for _ in range(2))
-    read = [every.reading(number, 0, number / 800).force_torque for number in range(60)]
-    assert one.reading(59, 0, 59 / 800).force_torque == pytest.approx(read[59])
+    read = [every.reading(number, 0, number / 800).values[:6] for number in range(60)]
+    assert one.reading(59, 0, 59 / 800).values[:6] == pytest.approx(read[59])
 
 
 def test_with_fir_on_there_is_less_noise() -> None:
     deviations = []
     for fir in (False, True):
         noisy = measured(lambda _: Felt((0.0,) * 6), seed=1, noise=True, fir=fir)
-        forces = [noisy.reading(number, 0, number / 800).force_torque[0] for number in range(2000)]
+        forces = [noisy.reading(number, 0, number / 800).values[0] for number in range(2000)]
         deviations.append(statistics.pstdev(forces))
     assert deviations[0] == pytest.approx(noisy.deviations[0], rel=0.1)
     assert deviations[1] == pytest.approx(
@@ -232,8 +231,7 @@ def test_noise_is_that_of_a_healthy_sensor(
     noisy, still = measured(sinc=sinc, seed=1, noise=True), measured(sinc=sinc)
     squares = [0.0] * 12
     for n in range(500):
-        a, b = (source.reading(n, 0, n * sinc / 51200) for source in (noisy, still))
-        values, exact = ((*each.force_torque, *each.acceleration, *each.angular_rate) for each in (a, b))
+        values, exact = (source.reading(n, 0, n * sinc / 51200).values for source in (noisy, still))
         squares = [s + (x - y) ** 2 for s, x, y in zip(squares, values, exact, strict=True)]
     for axis, limit in enumerate((*force, *torque, *(0.1,) * 6)):
         assert (limit / 5 if axis < 6 else 0) < math.sqrt(squares[axis] / 500) < limit
