@@ -296,7 +296,8 @@ def _managers(machine: Host) -> Iterator[CheckResult]:
     configured = rf"^\s*iface\s+{re.escape(machine.ifname)}\s+inet6?\s+(?!manual)"
     if re.search(configured, ifupdown, re.MULTILINE):
         found["ifupdown"] = "sudoedit /etc/network/interfaces"
-    for pid, command in machine.commands_running().items():
+    for pid in filter(str.isdecimal, machine.names("/proc")):
+        command = machine.text(f"/proc/{pid}/comm", "")
         arguments = machine.text(f"/proc/{pid}/cmdline", "").split("\0")
         if command in _DHCP_CLIENTS and machine.ifname in arguments:
             found[f"{command} ({pid})"] = f"sudo kill {pid}"
