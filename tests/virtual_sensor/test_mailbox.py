@@ -71,16 +71,6 @@ def emergency_of(message: tuple[int, bytes] | None) -> tuple[int, int, bytes]:
     return code, register, body[5:]
 
 
-def test_an_emergency_is_the_next_message_out() -> None:
-    master = RawMaster().go(PREOP)
-    do(master, "emergency 0x8130 0x11 0102030405")
-    assert master.mailbox_full()
-    assert emergency_of(master.fetch_mailbox()) == (0x8130, 0x11, b"\1\2\3\4\5")
-    assert master.fetch_mailbox() is None
-    do(master, "emergency 0x1000")
-    assert emergency_of(master.fetch_mailbox()) == (0x1000, 0, bytes(5))
-
-
 def test_an_emergency_comes_before_an_answer_that_is_not_read_yet() -> None:
     master = RawMaster().go(PREOP)
     master.send_mailbox(3, READ_TYPE)
