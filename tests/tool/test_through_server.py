@@ -8,7 +8,6 @@ from collections.abc import Iterator
 import pytest
 
 from tests.simulation import (
-    RATE_HZ,
     SINC_LENGTH,
     SimulatedBus,
     SimulatedServer,
@@ -60,18 +59,6 @@ def test_the_first_name_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None
     assert [row["name"] for row in found] == ["Sampling rate", "FIR disable"]
     assert len(told("read", "fir")["sensors"][0]["objects"]) == 1
     assert "did you mean Sampling rate" in refused("read", *SERVER, "sampling rte", code=2)
-
-
-def test_plan_apply_save(bench: Bench) -> None:
-    bus, server = bench
-    asked = ("--sensor", "20", "--set", "sinc_length=128", *SERVER)
-    assert told("apply", "--dry-run", *asked, code=3)["changes"][0]["then"] == 128
-    applied = told("apply", *asked)
-    assert (applied["rate_hz"], applied["settings"]["sinc_length"]) == (400, 128)
-    assert "nothing to change" in tool_here("apply", "--dry-run", *asked).out
-    tool_here("save", "--sensor", 1, *SERVER)
-    assert ("0x8030", 1, "01") in bus.written(1)
-    assert [row["rate_hz"] for row in server.client().ask("describe")["sensors"]] == [RATE_HZ, 400]
 
 
 def test_what_is_said_to_last_outlasts_the_sensors_power(bench: Bench) -> None:

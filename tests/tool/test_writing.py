@@ -87,7 +87,8 @@ def test_a_chain_wants_a_choice(chain: SimulatedBus) -> None:
     assert "choose one with --sensor" in said
     assert "serial 20" in said
     assert "more than one sensor matches" in refused("save", near, "--sensor", "BFT-SENS-ECAT-M8", code=2)
-    assert chain.written() == []
+    tool_here("save", near, "--sensor", 20)
+    assert (chain.written(), chain.written(1)) == ([], [("0x8030", 1, "01")])
 
 
 def test_apply_that_fails_half_way_takes_everything_back(
