@@ -114,7 +114,8 @@ def test_a_server_that_does_not_reply_or_ends_is_one_sentence(bench: Bench) -> N
     bus, server = bench
 
     def end() -> None:
-        server.hub.close()
+        for connection in server.hub.connections.values():
+            connection.close()
         server.hangs = True
 
     bus.at(0.1, end)

@@ -167,15 +167,14 @@ def stopped_tare(seconds: float) -> int:
         ("deaf", "; its offset may be half written (it was -1.5 2.25 9.75 -0.125 0.0625 -0.03125): tare it"),
     ],
 )
-def test_a_tare_cut_off_half_way_leaves_the_old_offset_or_tells_it(
-    single: SimulatedBus, fault: str, said: str
-) -> None:
-    assert "old offset" in tool_here("tare", single.near, "--samples", 20).out
-    single.command(f"on-write 0x8000 3 {fault}")
-    failed = tool_here("tare", single.near, "--samples", 20, *TARGET, code=1)
-    assert said in failed.err.splitlines()[-1]
-    if "back" in said:
-        assert offset(single.near) == [-1.5, 2.25, 9.75, -0.125, 0.0625, -0.03125]
+def test_a_tare_cut_off_half_way_leaves_the_old_offset_or_tells_it(fault: str, said: str) -> None:
+    with simulated_bus("--signal", "rest", "--noise", "none", "--sinc", "512") as bus:
+        assert "old offset" in tool_here("tare", bus.near, "--samples", 20).out
+        bus.command(f"on-write 0x8000 3 {fault}")
+        failed = tool_here("tare", bus.near, "--samples", 20, *TARGET, code=1)
+        assert said in failed.err.splitlines()[-1]
+        if "back" in said:
+            assert offset(bus.near) == [-1.5, 2.25, 9.75, -0.125, 0.0625, -0.03125]
 
 
 def test_a_snapshot_is_restored_as_far_as_it_differs(bench: SimulatedBus, tmp_path: Path) -> None:
