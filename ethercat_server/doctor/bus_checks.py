@@ -419,9 +419,7 @@ def watched(
             yield from examine(subject, "clients", view.clients)
 
 
-def examine_bus(
-    machine: Host, seconds: float = 10.0, announce: Callable[[str], None] = lambda _: None
-) -> Iterator[CheckResult]:
+def examine_bus(machine: Host, seconds: float, announce: Callable[[str], None]) -> Iterator[CheckResult]:
     """The bus itself, or the figures of its server; and the measurement. `announce` is told the progress."""
     holder, found = find_holder(machine.ifname), None
     if holder is not None and holder.address is not None:

@@ -53,9 +53,9 @@ def master_sockets(ifname: str) -> set[int]:
     return {row.inode for row in packet_sockets() if (row.protocol, row.ifindex) == (ETHERTYPE, index)}
 
 
-def packet_sockets(path: str | Path = "/proc/self/net/packet") -> list[Listener]:
+def packet_sockets() -> list[Listener]:
     """The packet sockets of this network namespace, from the kernel's table of them."""
-    return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in table(path)]
+    return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in table("/proc/self/net/packet")]
 
 
 _SIOCGSTAMPNS: Final = 0x80108907
@@ -76,9 +76,9 @@ def arrived_ns(fd: int) -> int:
     return time.monotonic_ns() - waited_ns  # if anything comes between the two clocks, it is too late
 
 
-def users_of(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Process]:
+def users_of(inodes: set[int]) -> Iterator[Process]:
     """The visible processes that have one of these sockets."""
-    for process in processes.iterdir():
+    for process in Path("/proc").iterdir():
         if process.name.isdecimal() and (sockets := set(_sockets(process))) & inodes:
             yield Process(int(process.name), _name_of(process), sockets)
 

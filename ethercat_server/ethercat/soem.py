@@ -169,7 +169,7 @@ class SoemBackend:
 
 
 @contextlib.contextmanager
-def open_bus(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
+def open_bus(ifname: str, *, allow_ip: bool) -> Iterator[Bus]:
     """The open bus on `ifname`; its sensors go to INIT at the end. Errors as `claimed`."""
     with nic.claimed(ifname, allow_ip=allow_ip):
         backend = SoemBackend(ifname)

@@ -110,7 +110,7 @@ class Dictionary(ObjectTable):
         flash: Flash,
         process_data: Callable[[], bytes],
         now: Callable[[], int],
-        on_write: OnWrite = lambda *_: None,
+        on_write: OnWrite,
     ) -> None:
         entries = sensor_entries(options.pdo_size)
         super().__init__(entries, {address: _initial(row) for address, row in entries.items()})

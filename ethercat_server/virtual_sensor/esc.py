@@ -246,7 +246,7 @@ class _Pdi(Protocol):
 class Esc:
     """Registers and buffers of one controller."""
 
-    def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
+    def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int) -> None:
         self._pdi = pdi
         self.memory = _power_on_values()
         self.memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = sii_image[8:10]

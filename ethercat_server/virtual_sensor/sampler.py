@@ -92,7 +92,7 @@ def _measured(
 _U64: Final = 2**64 - 1
 
 
-def _scattered(number: int, seed: int = 0) -> int:
+def _scattered(number: int, seed: int) -> int:
     """64 random bits that are always the same for a number and a seed (splitmix64)."""
     word = (number + 1 + (seed << 20)) * 0x9E3779B97F4A7C15 & _U64
     word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 & _U64

@@ -131,7 +131,7 @@ def _enter_own_namespaces() -> None:
 
 
 @contextlib.contextmanager
-def veth_pair(near: str, *, apart: bool = True) -> Iterator[str]:
+def veth_pair(near: str, *, apart: bool) -> Iterator[str]:
     """Create the pair and bring it up; yields the name of the far end, in this process's namespace.
 
     `apart`: if possible that is another one than the near end's.
