@@ -13,6 +13,7 @@ import ipaddress
 import struct
 from array import array
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -22,6 +23,7 @@ from bota_ethercat.errors import ProtocolError, UnreachableError
 from bota_ethercat.program.server_choice import default_server
 from ethercat_server.errors import InterfaceError, ServerError
 from ethercat_server.ethercat.nic import (
+    Interface,
     Routes,
     find_routes,
     interfaces,
@@ -35,6 +37,7 @@ from ethercat_server.ethercat.nic import (
 # Kinds that a sensor can be connected to: network cards, and what tests use for one.
 _CARDS: Final = frozenset({"", "veth"})
 _LISTEN: Final = 0x0A
+_NO_ROUTES: Final = Routes()
 # The counters of an interface, in the kernel's order (linux/if_link.h).
 _COUNTERS: Final = (
     "rx_packets", "tx_packets", "rx_bytes", "tx_bytes", "rx_errors", "tx_errors", "rx_dropped", "tx_dropped",
@@ -56,22 +59,13 @@ class Holder(NamedTuple):
         return "another EtherCAT master" if self.address is None else self.name
 
 
-class Adapter(NamedTuple):
-    """A network interface."""
+@dataclass(frozen=True)
+class Adapter(Interface):
+    """A network interface, with what there is to it on this machine."""
 
-    name: str
-    ifindex: int = 0
-    kind: str = ""  # of a virtual one, such as veth or bridge; empty for a network card
-    address: str | None = None
-    up: bool = True
-    carrier: bool = True
-    loopback: bool = False
-    ethernet: bool = True  # wired Ethernet, or a virtual interface like it
     master: str = ""  # bridge or bond that it is a part of
     upper: tuple[str, ...] = ()  # interfaces that stand on it, such as VLANs
-    xdp: tuple[str, ...] = ()  # where XDP programs are attached, see `nic.Interface`
-    counters: Mapping[str, int] = {}
-    routes: Routes = Routes()
+    routes: Routes = _NO_ROUTES
     holder: Holder | None = None  # the EtherCAT master that uses it
 
     @property
@@ -79,11 +73,16 @@ class Adapter(NamedTuple):
         return "down" if not self.up else "up" if self.carrier else "up, no carrier"
 
     @property
+    def counters(self) -> Mapping[str, int]:
+        return dict(zip(_COUNTERS, array("Q", self.stats[: 8 * len(_COUNTERS)]), strict=False))
+
+    @property
     def unfit(self) -> str | None:
         """Why nobody should look for a sensor on it; None if it is a candidate."""
         if self.loopback:
             return "loopback"
-        if not self.ethernet or self.kind not in _CARDS:
+        wireless = is_wireless(Path("/sys/class/net") / self.name)
+        if not self.ethernet or wireless or self.kind not in _CARDS:
             return self.kind or "no wired Ethernet"
         if self.master or self.upper:
             return "part of a bridge, bond or VLAN"
@@ -97,7 +96,7 @@ def adapters() -> list[Adapter]:
     found = []
     for row in links():
         with contextlib.suppress(OSError):  # it has just gone
-            found.append(row._replace(routes=find_routes(row.ifindex), holder=find_holder(row.name)))
+            found.append(replace(row, routes=find_routes(row.ifindex), holder=find_holder(row.name)))
     return found
 
 
@@ -107,22 +106,13 @@ def links() -> list[Adapter]:
     names = {row.ifindex: row.name for row in rows}
     return [
         Adapter(
-            row.name,
-            ifindex=row.ifindex,
-            kind=row.kind,
-            address=row.address.hex(":") or None,
-            up=row.is_up,
-            carrier=row.has_carrier,
-            loopback=row.is_loopback,
-            ethernet=row.is_ethernet and not is_wireless(Path("/sys/class/net") / row.name),
-            master=names.get(row.master, ""),
+            **vars(row),
+            master=names.get(row.master_index, ""),
             # A veth's other end, or an interface of another namespace, does not stand on it.
             upper=tuple(
                 each.name for each in rows
                 if each.link == row.ifindex != each.ifindex and not each.namespace and each.kind != "veth"
             ),
-            xdp=row.xdp,
-            counters=dict(zip(_COUNTERS, array("Q", row.stats[: 8 * len(_COUNTERS)]), strict=False)),
         )
         for row in rows
     ]  # fmt: skip

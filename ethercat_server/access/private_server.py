@@ -18,12 +18,13 @@ from typing import Final
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
 from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.nic import VIRTUAL_INTERFACE
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.server import Server
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.transport import SocketStream, SocketTransport
-from ethercat_server.virtual_sensor.virtual_bus import VIRTUAL_INTERFACE, VirtualBus
+from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 
 STOPPED: Final = "stopped before it was done"
 _END_S: Final = 5.0

@@ -25,7 +25,7 @@ from bota_ethercat.settings import (
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server.acquisition.terminal_choice import CHOICE
 from ethercat_server.errors import UsageError
-from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
+from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP, VIRTUAL_INTERFACE
 from ethercat_server.process import realtime
 
 if TYPE_CHECKING:
@@ -186,9 +186,6 @@ def _sensors(
             raise SettingError(f"[sensor.{key}]: the table must be named by {error}") from None
         by_sensor[choice] = check_settings(values)
     return check_settings(common), by_sensor
-
-
-VIRTUAL_INTERFACE: Final = "virtual"  # means a virtual bus with a virtual sensor on it
 
 
 def _defaults() -> dict[str, Any]:

@@ -49,9 +49,6 @@ from ethercat_server.sensor import models, scan
 from ethercat_server.sensor.sensor import is_known_model
 
 MOST_PORTS: Final = 4
-_FIND_ATTEMPTS: Final = 5
-_FIND_TIMEOUT_S: Final = 0.05
-_PROBE_SIZE: Final = 2
 _WATCHDOG_CODE: Final = 0x001B
 _CABLE: Final = "check the cable, its connectors and shield, and sources of interference"
 
@@ -422,9 +419,7 @@ def watched(
             yield from examine(subject, "clients", view.clients)
 
 
-def examine_bus(
-    machine: Host, seconds: float = 10.0, announce: Callable[[str], None] = lambda _: None
-) -> Iterator[CheckResult]:
+def examine_bus(machine: Host, seconds: float, announce: Callable[[str], None]) -> Iterator[CheckResult]:
     """The bus itself, or the figures of its server; and the measurement. `announce` is told the progress."""
     holder, found = find_holder(machine.ifname), None
     if holder is not None and holder.address is not None:
@@ -515,7 +510,7 @@ def _card_counters(ifname: str) -> Mapping[str, int]:
 
 def _slaves(machine: Host, bus: Bus, found: list[ExaminedSlave]) -> Generator[CheckResult, None, int]:
     """Those that answer, which are added to `found`; returns how many there are."""
-    count = max(0, *(bus.count_slaves(_PROBE_SIZE, _FIND_TIMEOUT_S) for _ in range(_FIND_ATTEMPTS)))
+    count = bus.count_slaves()
     silent = CHECK_CABLE if count else bus.backend.why_silent()
     yield from examine("bus", "slaves", answers, machine.shown, count, silent)
     in_use = any(scan.look_at(bus, position).at_work for position in range(count))

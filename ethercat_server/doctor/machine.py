@@ -107,20 +107,17 @@ class Host:
 
     def text(self, name: str, default: str | None = None) -> str:
         """Content of a file, stripped; `default`, if there is one, where it cannot be read."""
+        found = b""
         try:
-            return self._read(name).decode("utf-8", errors="replace").strip().strip("\0")
+            # In small parts: some files in /proc refuse to be read into a large place.
+            with self.path(name).open("rb", buffering=0) as file:
+                while len(found) < _MOST_BYTES and (part := file.read(_PART_BYTES)):
+                    found += part
         except OSError as error:
             if default is None:
                 raise CannotLookError(f"{name}: {error.strerror or error}") from None
             return default
-
-    def _read(self, name: str) -> bytes:
-        found = b""
-        # In small parts: some files in /proc refuse to be read into a large place.
-        with self.path(name).open("rb", buffering=0) as file:
-            while len(found) < _MOST_BYTES and (part := file.read(_PART_BYTES)):
-                found += part
-        return found
+        return found.decode("utf-8", errors="replace").strip().strip("\0")
 
     def number(self, name: str) -> int:
         text = self.text(name)
@@ -139,10 +136,6 @@ class Host:
     @cached_property
     def processors(self) -> list[int]:
         return processor_list(self.text("/sys/devices/system/cpu/online"))
-
-    def commands_running(self) -> dict[int, str]:
-        pids = [int(name) for name in self.names("/proc") if name.isdecimal()]
-        return {pid: name for pid in pids if (name := self.text(f"/proc/{pid}/comm", ""))}
 
 
 def processor_list(text: str) -> list[int]:

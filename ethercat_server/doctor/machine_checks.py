@@ -14,7 +14,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 from ethercat_server.access.adapters import Adapter, is_wireless
-from ethercat_server.daemon.options import VIRTUAL_INTERFACE
 from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.report import (
     CannotLookError,
@@ -30,6 +29,7 @@ from ethercat_server.doctor.report import (
 from ethercat_server.ethercat.nic import (
     ALLOW_IP,
     NEEDED_CAPABILITIES,
+    VIRTUAL_INTERFACE,
     XDP,
     Routes,
     missing_capabilities,
@@ -296,7 +296,8 @@ def _managers(machine: Host) -> Iterator[CheckResult]:
     configured = rf"^\s*iface\s+{re.escape(machine.ifname)}\s+inet6?\s+(?!manual)"
     if re.search(configured, ifupdown, re.MULTILINE):
         found["ifupdown"] = "sudoedit /etc/network/interfaces"
-    for pid, command in machine.commands_running().items():
+    for pid in filter(str.isdecimal, machine.names("/proc")):
+        command = machine.text(f"/proc/{pid}/comm", "")
         arguments = machine.text(f"/proc/{pid}/cmdline", "").split("\0")
         if command in _DHCP_CLIENTS and machine.ifname in arguments:
             found[f"{command} ({pid})"] = f"sudo kill {pid}"

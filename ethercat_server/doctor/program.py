@@ -13,14 +13,13 @@ from bota_ethercat.health.limits import Level
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import visible
 from ethercat_server.access.adapters import find_holder, is_elsewhere, server_here
-from ethercat_server.daemon.options import VIRTUAL_INTERFACE
 from ethercat_server.doctor import trace
 from ethercat_server.doctor.bus_checks import examine_bus
 from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.machine_checks import examine_machine
 from ethercat_server.doctor.report import CannotLookError, CheckResult, Report, as_json, is_bus_unknown, worst
 from ethercat_server.errors import ServerError, UsageError
-from ethercat_server.ethercat.nic import name_trouble, own_name
+from ethercat_server.ethercat.nic import VIRTUAL_INTERFACE, name_trouble, own_name
 from ethercat_server.process import command_line
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 

@@ -97,7 +97,6 @@ class Bus(Datagrams):
             self.finish(steps, check_interrupt)
 
     def scan_again(self, check_interrupt: CheckInterrupt) -> None:
-        """See `scan`."""
         self.scan(self.positions, self._sii, check_interrupt, again=True)
 
     def map_process_data(self, check_interrupt: CheckInterrupt) -> list[int]:

@@ -21,15 +21,7 @@ class Clock(Protocol):
         """Return after `seconds` at the earliest."""
 
 
-class SystemClock:
-    """The kernel's clocks."""
-
-    monotonic_ns = staticmethod(time.monotonic_ns)
-    time_ns = staticmethod(time.time_ns)
-    sleep = staticmethod(time.sleep)
-
-
-SYSTEM_CLOCK: Final = SystemClock()
+SYSTEM_CLOCK: Final[Clock] = time  # the kernel's clocks
 
 
 class RealtimeOffset:

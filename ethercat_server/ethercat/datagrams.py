@@ -29,6 +29,7 @@ _INDICES: Final = 0x10
 _TIMEOUT_S: Final = 0.02
 _PAUSE_S: Final = 0.001
 _REGISTER_ATTEMPTS: Final = 20
+_COUNT_ATTEMPTS: Final = 5
 _U16: Final = struct.Struct("<H")
 _LONGEST_TIMEOUT_S: Final = 0.25
 # On a bus whose answers come late the timeout is this many times the longest recent round trip.
@@ -48,7 +49,6 @@ class RegisterAccess(NamedTuple):
     adp: int
     ado: int
     data: bytes
-    timeout_s: float = _TIMEOUT_S
 
 
 class Answer(NamedTuple):
@@ -104,37 +104,12 @@ def finish(
         return result
 
 
-class LateAnswers:
-    """The timeout of datagrams.
-
-    It grows while answers are late, so that a slow machine reads its sensors slowly rather than not at all:
-    an answer that arrives after its timeout shows the present round trip.
-    """
-
-    def __init__(self, clock: Clock) -> None:
-        self.timeout_s = 0.0  # the timeout at least; 0 on a bus that is in time
-        self._monotonic_ns = clock.monotonic_ns
-        # By index less the first: when a frame was sent that is not back; else 0.
-        self.pending_ns = [0] * _INDICES
-
-    def note(self, answer: bytes) -> None:
-        """Take an answer that is not the one awaited."""
-        index = answer[DATAGRAM_INDEX] - FIRST_INDEX if len(answer) > DATAGRAM_INDEX else -1
-        if 0 <= index < _INDICES and self.pending_ns[index]:
-            self.timeout_s = min(max(self.timeout_s, self._least_s(index)), _LONGEST_TIMEOUT_S)
-            self.pending_ns[index] = 0
-
-    def in_time(self, index: int) -> None:
-        """Take the awaited answer: the timeout falls if it was early."""
-        timeout_s = min(max(self.timeout_s / 2, self._least_s(index)), _LONGEST_TIMEOUT_S)
-        self.timeout_s = timeout_s if timeout_s > _SHORTEST_TIMEOUT_S else 0.0
-
-    def _least_s(self, index: int) -> float:
-        return _LATE_FACTOR * (self._monotonic_ns() - self.pending_ns[index]) * 1e-9
-
-
 class Datagrams:
-    """Single datagrams through `backend`. Used by one thread."""
+    """Single datagrams through `backend`. Used by one thread.
+
+    Their timeout grows while answers are late, so that a slow machine reads its sensors slowly rather than
+    not at all: an answer that arrives after its timeout shows the present round trip.
+    """
 
     def __init__(self, backend: Backend) -> None:
         self.backend = backend
@@ -142,8 +117,9 @@ class Datagrams:
         self._send, self._receive = backend.send, backend.receive
         self._monotonic_ns = backend.clock.monotonic_ns
         self._index = 0
-        self._late = LateAnswers(backend.clock)
-        self._pending_ns = self._late.pending_ns
+        self._timeout_s = 0.0  # the timeout at least; 0 on a bus that is in time
+        # By index less the first: when a frame was sent that is not back; else 0.
+        self._pending_ns = [0] * _INDICES
         self._awaited: tuple[bytearray, int] | None = None  # the frame sent last, bytes of data in it
         self.stations: list[int] = []  # configured station addresses of the sensors, by number
 
@@ -154,24 +130,34 @@ class Datagrams:
 
     def send(self, access: RegisterAccess) -> int:
         """Send a datagram; returns until when, in ns, its answer is to be awaited."""
-        command, adp, ado, data, timeout_s = access
+        command, adp, ado, data = access
         self._index = (self._index + 1) % len(self._pending_ns)
         frame = build((command, adp, ado, data), first_index=self._index + FIRST_INDEX)
         self._awaited = frame, len(data)
         self._pending_ns[self._index] = now_ns = self._monotonic_ns()
         self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
-        return now_ns + int(max(timeout_s, self._late.timeout_s) * 1e9)
+        return now_ns + int(max(_TIMEOUT_S, self._timeout_s) * 1e9)
 
     def match(self, frame: bytes) -> Answer | None:
         """The answer to the datagram that was sent last, if this frame is that."""
         if self._awaited is None or not is_answer(frame, *self._awaited):
-            self._late.note(frame)
+            index = frame[DATAGRAM_INDEX] - FIRST_INDEX if len(frame) > DATAGRAM_INDEX else -1
+            if 0 <= index < _INDICES and self._pending_ns[index]:  # it is late
+                self._set_timeout(self._timeout_s, index)
+                self._pending_ns[index] = 0
             return None
-        if self._late.timeout_s:
-            self._late.in_time(self._index)
+        if self._timeout_s:  # it falls if the answer was early
+            self._set_timeout(self._timeout_s / 2, self._index)
+            if self._timeout_s <= _SHORTEST_TIMEOUT_S:
+                self._timeout_s = 0.0
         end = FIRST_DATA + self._awaited[1]
         self._pending_ns[self._index], self._awaited = 0, None
         return Answer(_U16.unpack_from(frame, end)[0], frame[FIRST_DATA:end])
+
+    def _set_timeout(self, least_s: float, index: int) -> None:
+        """What the answer to the frame with this index, which has just come, suggests."""
+        round_trip_s = (self._monotonic_ns() - self._pending_ns[index]) * 1e-9
+        self._timeout_s = min(max(least_s, _LATE_FACTOR * round_trip_s), _LONGEST_TIMEOUT_S)
 
     def give_up(self) -> None:
         """The answer that was awaited is lost, or late."""
@@ -197,13 +183,10 @@ class Datagrams:
         """Write ESC registers of the slave at a position, scanned or not."""
         return _write(Command.APWR, -position, address, data)
 
-    def count_slaves(self, size: int, timeout_s: float) -> int:
-        """How many slaves answer a broadcast read of `size` bytes from register 0 on; -1 if it is lost.
-
-        Needs no scan and changes nothing, so it also serves to measure the round trip of such a frame.
-        """
-        answer = self._ask(RegisterAccess(Command.BRD, 0, 0, bytes(size), timeout_s))
-        return -1 if answer is None else answer.wkc
+    def count_slaves(self) -> int:
+        """How many slaves answer a broadcast read, the most of some; needs no scan and changes nothing."""
+        answers = [self._ask(RegisterAccess(Command.BRD, 0, 0, b"\0")) for _ in range(_COUNT_ATTEMPTS)]
+        return max(answer.wkc if answer else 0 for answer in answers)
 
     def listen(self, seconds: float) -> int:
         """The number of frames that arrive from others in this time; nothing is sent."""

@@ -20,6 +20,7 @@ import sys
 import time
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -52,9 +53,9 @@ def master_sockets(ifname: str) -> set[int]:
     return {row.inode for row in packet_sockets() if (row.protocol, row.ifindex) == (ETHERTYPE, index)}
 
 
-def packet_sockets(path: str | Path = "/proc/self/net/packet") -> list[Listener]:
+def packet_sockets() -> list[Listener]:
     """The packet sockets of this network namespace, from the kernel's table of them."""
-    return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in table(path)]
+    return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in table("/proc/self/net/packet")]
 
 
 _SIOCGSTAMPNS: Final = 0x80108907
@@ -75,9 +76,9 @@ def arrived_ns(fd: int) -> int:
     return time.monotonic_ns() - waited_ns  # if anything comes between the two clocks, it is too late
 
 
-def users_of(inodes: set[int], processes: Path = Path("/proc")) -> Iterator[Process]:
+def users_of(inodes: set[int]) -> Iterator[Process]:
     """The visible processes that have one of these sockets."""
-    for process in processes.iterdir():
+    for process in Path("/proc").iterdir():
         if process.name.isdecimal() and (sockets := set(_sockets(process))) & inodes:
             yield Process(int(process.name), _name_of(process), sockets)
 
@@ -103,6 +104,7 @@ def _sockets(process: Path) -> Iterator[int]:
                     yield int(target[8:-1])
 
 
+VIRTUAL_INTERFACE: Final = "virtual"  # what stands for a virtual bus with a virtual sensor on it
 LEAST_MTU: Final = 1500  # bytes: an EtherCAT frame may be as long as any Ethernet frame
 CHECK_CABLE: Final = "check cable and power"
 # The option that has the server or a program use an interface with the default route or a leased address.
@@ -155,23 +157,26 @@ _DROPS: Final = "a bridge, which drops EtherCAT frames because their source addr
 _FAMILIES: Final = (socket.AF_INET, socket.AF_INET6)
 
 
-class Interface(NamedTuple):
+@dataclass(frozen=True)
+class Interface:
     """An interface as it is now; the index stays while it is there, its names may change."""
 
-    ifindex: int
     name: str  # the one that is no alternative
-    is_up: bool
-    is_loopback: bool
-    has_carrier: bool  # it is linked, and ready to send
-    mtu: int
-    master: int  # index of the bridge or bond that it is part of, 0 if none
-    address: bytes  # of the hardware
-    kind: str  # of a virtual one, such as veth or bridge; empty for a network card
-    link: int  # index of what it stands on, or of a veth pair's other end
-    namespace: bytes  # of that, as the kernel numbers namespaces; empty if it is this one
-    is_ethernet: bool
-    stats: bytes  # struct rtnl_link_stats64
-    xdp: tuple[str, ...]  # where XDP programs are attached, as ip calls it: xdpdrv, xdpgeneric, xdpoffload
+    ifindex: int = 0
+    up: bool = True
+    loopback: bool = False
+    carrier: bool = True  # it is linked, and ready to send
+    mtu: int = LEAST_MTU
+    master_index: int = 0  # of the bridge or bond that it is part of, 0 if none
+    address: bytes = b""  # of the hardware
+    kind: str = ""  # of a virtual one, such as veth or bridge; empty for a network card
+    link: int = 0  # index of what it stands on, or of a veth pair's other end
+    namespace: bytes = b""  # of that, as the kernel numbers namespaces; empty if it is this one
+    ethernet: bool = True
+    stats: bytes = b""  # struct rtnl_link_stats64
+    xdp: tuple[
+        str, ...
+    ] = ()  # where XDP programs are attached, as ip calls it: xdpdrv, xdpgeneric, xdpoffload
 
 
 def look_up(interface: str | int) -> Interface:
@@ -180,10 +185,10 @@ def look_up(interface: str | int) -> Interface:
         return _look_up(interface)
     except (OSError, struct.error):
         names = [name for _, name in socket.if_nameindex()]
-        close = difflib.get_close_matches(str(interface), [*names, "virtual"], n=1)
+        close = difflib.get_close_matches(str(interface), [*names, VIRTUAL_INTERFACE], n=1)
         raise InterfaceError(
             f"no network interface {interface!r} on this machine: there are {', '.join(names)}, and "
-            f"'virtual' for a virtual sensor{f'; did you mean {close[0]!r}?' if close else ''}"
+            f"'{VIRTUAL_INTERFACE}' for a virtual sensor{f'; did you mean {close[0]!r}?' if close else ''}"
         ) from None
 
 
@@ -209,18 +214,18 @@ def _interface(fixed: tuple[int, ...], found: dict[int, bytes], namespace: bytes
         for name in (_IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_CARRIER)
     )
     return Interface(
-        index,
         _text(found.get(_IFLA_NAME, b"")),
-        is_up=bool(flags & _IFF_UP),
-        is_loopback=bool(flags & _IFF_LOOPBACK),
-        has_carrier=bool(carrier and flags & _IFF_RUNNING),  # the flag may follow the driver a second later
+        index,
+        up=bool(flags & _IFF_UP),
+        loopback=bool(flags & _IFF_LOOPBACK),
+        carrier=bool(carrier and flags & _IFF_RUNNING),  # the flag may follow the driver a second later
         mtu=mtu,
-        master=master,
+        master_index=master,
         address=found.get(_IFLA_ADDRESS, b""),
         kind=_text(_attributes(found.get(_IFLA_INFO, b"")).get(_INFO_KIND, b"")),
         link=link,
         namespace=found.get(_IFLA_LINK_NAMESPACE, namespace),
-        is_ethernet=kind == _ETHERNET,
+        ethernet=kind == _ETHERNET,
         stats=found.get(_IFLA_STATS, b""),
         xdp=tuple(
             mode for kind, mode in _XDP_MODES.items() if kind in _attributes(found.get(_IFLA_XDP, b""))
@@ -261,10 +266,10 @@ def trouble(interface: str | int) -> str | None:
     name = found.name
     if found.kind == _BRIDGE:
         return f"{name} is {_DROPS}: name the interface that the sensor is connected to"
-    if not found.is_up:
+    if not found.up:
         return f"{name} is down: bring it up with 'sudo ip link set {name} up'"
-    if found.master:
-        master = own_name(found.master, f"interface {found.master}")
+    if found.master_index:
+        master = own_name(found.master_index, f"interface {found.master_index}")
         return (
             f"{name} is part of {master} (a bridge or bond), which takes its frames: remove it with "
             f"'sudo ip link set {name} nomaster', or use another interface"
@@ -274,7 +279,7 @@ def trouble(interface: str | int) -> str | None:
             f"{name} has an MTU of {found.mtu} bytes, too few for EtherCAT: "
             f"'sudo ip link set {name} mtu {LEAST_MTU}'"
         )
-    if not found.has_carrier:
+    if not found.carrier:
         return f"{name} has no carrier: check the cable, the PoE injector and its power supply"
     return None
 
@@ -288,8 +293,8 @@ def in_between(interface: str | int) -> str | None:
     if found.link and (found.namespace or found.link != found.ifindex):
         with contextlib.suppress(OSError, struct.error):  # it may not look into the other's namespace
             port = other = _look_up(found.link, found.namespace)
-            if other.kind != _BRIDGE and other.master:
-                other = _look_up(other.master, found.namespace)
+            if other.kind != _BRIDGE and other.master_index:
+                other = _look_up(other.master_index, found.namespace)
             if other.kind == _BRIDGE:
                 removed = f", or 'sudo ip link set {port.name} nomaster'" if port.name != other.name else ""
                 return (
@@ -564,7 +569,7 @@ def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
     if problem := name_trouble(ifname):
         raise InterfaceError(problem)
     found = look_up(ifname)
-    if found.is_loopback:
+    if found.loopback:
         raise InterfaceError(f"{ifname} is the loopback interface: name the one the sensor is connected to")
     if not allow_ip:
         try:
@@ -587,7 +592,7 @@ def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
 def _wait_usable(ifname: str) -> None:
     # A link that was just brought up takes a moment, with a real network card up to some seconds.
     deadline = time.monotonic() + _CARRIER_TIMEOUT_S
-    while (found := look_up(ifname)).is_up and not found.has_carrier and time.monotonic() < deadline:
+    while (found := look_up(ifname)).up and not found.carrier and time.monotonic() < deadline:
         time.sleep(0.02)
     if problem := trouble(ifname):
         raise InterfaceError(problem)

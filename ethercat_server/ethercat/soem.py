@@ -60,13 +60,12 @@ class SoemBackend:
 
     @property
     def ifname(self) -> str:
-        """See `Backend`: the name that it has now."""
+        """The name that it has now."""
         if self._ifindex:
             self._ifname = nic.own_name(self._ifindex, self._ifname)
         return self._ifname
 
     def open(self) -> None:
-        """See `Backend`."""
         before, flags = packet_sockets(), nic.IFF_PROMISC
         with contextlib.suppress(InterfaceError):  # it cannot be opened either
             flags = nic.change_flags(nic.look_up(self._ifname).ifindex)
@@ -93,14 +92,12 @@ class SoemBackend:
             pass
 
     def send(self, frame: bytes | bytearray) -> None:
-        """See `Backend`."""
         try:
             self._socket.send(frame, _DONT_WAIT)
         except OSError:  # the link is down: it is lost
             return
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """See `Backend`."""
         try:
             # SO_RCVTIMEO is rounded up to jiffies, the time-out of `socket` to milliseconds; this is not.
             if timeout_s <= 0 or select.select((self._fd,), (), (), timeout_s)[0]:
@@ -110,19 +107,15 @@ class SoemBackend:
         return None
 
     def arrived_ns(self) -> int:
-        """See `Backend`."""
         return nic.arrived_ns(self._fd)
 
     def check_present(self) -> None:
-        """See `Backend`."""
         nic.check_present(self._ifindex, self._ifname)
 
     def why_silent(self) -> str:
-        """See `Backend`."""
         return nic.why_silent(self.ifname)
 
     def scan(self, positions: Sequence[int], check_interrupt: CheckInterrupt) -> None:
-        """See `Master`."""
         # If a slave disappears during the scan, SOEM retries every byte of its SII, for two minutes, and no
         # signal is noticed before it returns. So it runs in a thread, which can be abandoned.
         counts: list[int] = []
@@ -150,7 +143,7 @@ class SoemBackend:
             )
 
     def map_process_data(self, check_interrupt: CheckInterrupt) -> None:
-        """See `Master`. SOEM requests SAFEOP, too."""
+        """SOEM requests SAFEOP, too."""
         check_interrupt()
         try:
             mapped = self._master.config_map()
@@ -168,7 +161,6 @@ class SoemBackend:
         )
 
     def close(self) -> None:
-        """See `Backend`."""
         if not self._opened or self._abandoned:
             return
         self._opened = False
@@ -177,7 +169,7 @@ class SoemBackend:
 
 
 @contextlib.contextmanager
-def open_bus(ifname: str, *, allow_ip: bool = False) -> Iterator[Bus]:
+def open_bus(ifname: str, *, allow_ip: bool) -> Iterator[Bus]:
     """The open bus on `ifname`; its sensors go to INIT at the end. Errors as `claimed`."""
     with nic.claimed(ifname, allow_ip=allow_ip):
         backend = SoemBackend(ifname)

@@ -16,7 +16,6 @@ class GuardedSdo:
         self.clock = sdo.clock
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
-        """See `Sdo`."""
         return (yield from self._sdo.read(index, subindex))
 
     def write(self, index: int, subindex: int, data: bytes) -> Steps[None]:

@@ -27,9 +27,6 @@ from ethercat_server.sensor.objects.dictionary import is_sensor
 _LISTEN_S: Final = 0.1
 # As many frames in this time are a master's cycle; fewer may be the last ones of a server that was killed.
 _MASTER_FRAMES: Final = 3
-_TIMEOUT_S: Final = 0.02
-_ATTEMPTS: Final = 5
-_PROBE_BYTES: Final = 1
 _PAUSE_S: Final = 0.002
 # Start and length of a Bota sensor's sync managers 0 to 2, and start of the last one.
 _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
@@ -101,7 +98,7 @@ def look_safely(
         )
     check_interrupt()
     slaves = []
-    for position in range(max(bus.count_slaves(_PROBE_BYTES, _TIMEOUT_S) for _ in range(_ATTEMPTS))):
+    for position in range(bus.count_slaves()):
         check_interrupt()
         slaves.append(look_at(bus, position))
     if not slaves:

@@ -6,10 +6,11 @@ Frames are processed by `virtual_sensor.bus.SlaveChain` as those of a network in
 from __future__ import annotations
 
 import heapq
+import random
 
 from ethercat_server.ethercat.nic import CHECK_CABLE
 from ethercat_server.ethercat.wire import BYTE_NS
-from ethercat_server.simulation.machine import Machine, SimulatedClock, Wire
+from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor import bus as virtual
 from ethercat_server.virtual_sensor.distributed_clock import HOP_NS
 from ethercat_server.virtual_sensor.faults import obey
@@ -22,10 +23,10 @@ class MemoryBackend:
     master = None
 
     def __init__(self, *slaves: SlaveOptions, machine: Machine | None = None) -> None:
-        machine = machine or Machine()
+        self._machine = machine = machine or Machine()
+        self._chance = random.Random(machine.seed + 1)
         self.ifname = "memory"
         self.clock = SimulatedClock(machine)
-        self.wire = Wire(machine)
         self.sensors = virtual.SlaveChain(slaves or (SensorOptions(),), self.clock.now_ns)
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
@@ -38,8 +39,8 @@ class MemoryBackend:
         return obey(self.sensors, line)
 
     def become(self, machine: Machine) -> None:
+        self._machine = machine
         self.clock.become(machine)
-        self.wire.become(machine)
 
     def open(self) -> None: ...
 
@@ -51,7 +52,7 @@ class MemoryBackend:
         return CHECK_CABLE
 
     def send(self, frame: bytes | bytearray) -> None:
-        if (times := self.wire.carry()) is None:
+        if (times := self.carry()) is None:
             return
         outward_ns, round_trip_ns = times
         answer, now_ns = bytearray(frame), self.clock.now_ns
@@ -64,6 +65,21 @@ class MemoryBackend:
             hops_ns = 2 * HOP_NS * (len(self.sensors.slaves) - 1)
             back_ns = arrives_ns + passes_ns + hops_ns + round_trip_ns - outward_ns
             heapq.heappush(self._on_the_wire, (back_ns, self._sent, bytes(answer)))
+
+    def carry(self) -> tuple[int, int] | None:
+        """The next frame's times in ns until the slaves see it and until it is back; None if it is lost."""
+        machine, chance = self._machine, self._chance
+        if machine.lost and chance.random() < machine.lost:
+            return None
+        late_ns = machine.late_ns if machine.late and chance.random() < machine.late else 0.0
+        delay_ns = chance.expovariate(1) * machine.frame_jitter_ns + late_ns
+        if machine.even_jitter_ns:
+            delay_ns += chance.random() * machine.even_jitter_ns
+        # It may be held up on its way out, on its way back, or by a slave in between.
+        return (
+            round(machine.frame_ns / 2 + chance.random() * delay_ns),
+            round(machine.frame_ns + delay_ns),
+        )
 
     def put_on_the_wire(self, frame: bytes) -> None:
         """Have a frame of somebody else arrive now."""

@@ -1,4 +1,4 @@
-"""A simulated machine: its clock, how late it wakes, when it stalls, and what happens to frames on the wire.
+"""A simulated machine: its clock, how late it wakes, when it stalls, and what it does to frames on the wire.
 
 Everything is drawn from one seed, so a run can be repeated to the nanosecond.
 """
@@ -89,29 +89,3 @@ class SimulatedClock:
     def _next_stall(self) -> float:
         every_s = self._machine.stall_every_s
         return self.now_ns + self._chance.expovariate(1 / every_s) * 1e9 if every_s else float("inf")
-
-
-class Wire:
-    """How long frames take, and which do not come back."""
-
-    def __init__(self, machine: Machine) -> None:
-        self._machine = machine
-        self._chance = random.Random(machine.seed + 1)
-
-    def become(self, machine: Machine) -> None:
-        self._machine = machine
-
-    def carry(self) -> tuple[int, int] | None:
-        """The next frame's times in ns until the slaves see it and until it is back; None if it is lost."""
-        machine, chance = self._machine, self._chance
-        if machine.lost and chance.random() < machine.lost:
-            return None
-        late_ns = machine.late_ns if machine.late and chance.random() < machine.late else 0.0
-        delay_ns = chance.expovariate(1) * machine.frame_jitter_ns + late_ns
-        if machine.even_jitter_ns:
-            delay_ns += chance.random() * machine.even_jitter_ns
-        # It may be held up on its way out, on its way back, or by a slave in between.
-        return (
-            round(machine.frame_ns / 2 + chance.random() * delay_ns),
-            round(machine.frame_ns + delay_ns),
-        )

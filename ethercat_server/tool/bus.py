@@ -7,7 +7,7 @@ import argparse
 import contextlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from ethercat_server.access.adapters import Adapter, adapters
 from ethercat_server.access.private_server import open_interface
@@ -24,8 +24,11 @@ from ethercat_server.tool.command import DONE, Subcommand, chosen, columns, say,
 def _adapters(args: argparse.Namespace) -> int:
     found = adapters()
     if args.json:
-        names = ("name", "kind", "address", "up", "carrier", "loopback")
+        names = ("up", "carrier", "loopback")
         say_json({"adapters": [{
+            "name": row.name,
+            "kind": row.kind,
+            "address": row.address.hex(":") or None,
             **{name: getattr(row, name) for name in names},
             "held_by": str(row.holder) if row.holder else None,
             "default_route": row.routes.default,
@@ -39,7 +42,7 @@ def _adapters(args: argparse.Namespace) -> int:
         ip = str(row.routes) if not row.loopback else ""
         if network_trouble(row.name, row.routes):
             ip = f"not for a sensor: {ip}"
-        rows.append((row.name, row.state, row.address or "", "; ".join(filter(None, (what, held, ip)))))
+        rows.append((row.name, row.state, row.address.hex(":"), "; ".join(filter(None, (what, held, ip)))))
     say(columns(rows))
     return DONE
 
@@ -151,11 +154,8 @@ def _rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-COMMANDS = (
-    Subcommand("adapters", (), _adapters),
-    Subcommand("find", (), _find),
-    Subcommand(
-        "eeprom",
-        sensor_arguments(all_if_none=True), _eeprom,
-    ),
-)  # fmt: skip
+COMMANDS: Final = {
+    "adapters": Subcommand((), _adapters),
+    "find": Subcommand((), _find),
+    "eeprom": Subcommand(sensor_arguments(all_if_none=True), _eeprom),
+}

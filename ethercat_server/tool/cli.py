@@ -55,13 +55,6 @@ class _Parser(Parser):
         super().error(message)
 
 
-def subcommand(name: str) -> Subcommand:
-    """The one of `COMMANDS` with this name."""
-    module = import_module(f"ethercat_server.tool.{COMMANDS[name][0]}")
-    command: Subcommand = next(each for each in module.COMMANDS if each.name == name)
-    return command
-
-
 def build_parser() -> argparse.ArgumentParser:
     """The command line up to the subcommand's name."""
     width = max(map(len, COMMANDS))
@@ -89,10 +82,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if named and arguments[0] not in COMMANDS:
         guess = did_you_mean(arguments[0], COMMANDS)
         parser.error(f"no command {arguments[0]!r}: there are {', '.join(COMMANDS)}{guess}")
-    command = subcommand(parser.parse_args(arguments[:1] if named else arguments).command)
-    summary = COMMANDS[command.name][1]
+    name: str = parser.parse_args(arguments[:1] if named else arguments).command
+    module, summary = COMMANDS[name]
+    command: Subcommand = import_module(f"ethercat_server.tool.{module}").COMMANDS[name]
     description = f"{summary[0].upper()}{summary[1:]}."
-    parser = _Parser(f"{_PROGRAM} {command.name}", description, _EXIT_CODES)
+    parser = _Parser(f"{_PROGRAM} {name}", description, _EXIT_CODES)
     for add in command.arguments:
         add(parser)
     parser.add_argument("--json", action="store_true", help="machine-readable output")

@@ -33,7 +33,6 @@ def argument(name: str, help_text: str, **options: Any) -> Argument:
 class Subcommand(NamedTuple):
     """One subcommand."""
 
-    name: str
     arguments: Sequence[Argument]
     run: Callable[[argparse.Namespace], int]  # returns the exit code; raises ServerError
 
@@ -89,9 +88,9 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
-def say_json(value: dict[str, Any], *, indent: int | None = 2) -> None:
+def say_json(value: dict[str, Any]) -> None:
     """One JSON object; infinite and NaN become null."""
-    say(json.dumps(finite(value), indent=indent, allow_nan=False))
+    say(json.dumps(finite(value), indent=2, allow_nan=False))
 
 
 def report(as_json: bool, opened: Sensors, found: FoundSensor, values: dict[str, Any], *lines: str) -> None:

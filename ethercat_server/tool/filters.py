@@ -114,13 +114,8 @@ def _filters(args: argparse.Namespace) -> int:
     return DONE
 
 
-COMMANDS = (
-    Subcommand(
-        "filters",
-        (
-            argument("--loop", "rate of the control loop", metavar="HZ", type=_HERTZ, required=True),
-            argument("--bandwidth", "its bandwidth (default: loop / 10)", metavar="HZ", type=_HERTZ),
-        ),
-        _filters,
-    ),
-)  # fmt: skip
+_ARGUMENTS: Final = (
+    argument("--loop", "rate of the control loop", metavar="HZ", type=_HERTZ, required=True),
+    argument("--bandwidth", "its bandwidth (default: loop / 10)", metavar="HZ", type=_HERTZ),
+)
+COMMANDS: Final = {"filters": Subcommand(_ARGUMENTS, _filters)}

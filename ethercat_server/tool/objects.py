@@ -156,10 +156,7 @@ def _line(row: dict[str, Any]) -> tuple[str, ...]:
 
 _SENSORS: Final = sensor_arguments(all_if_none=True)
 _NAME: Final = "object: a name such as 'Sampling rate' or 'Force/Torque Offset', a setting, or 0x8006:1"
-COMMANDS: Final = (
-    Subcommand("objects", _SENSORS, _objects),
-    Subcommand(
-        "read",
-        (*_SENSORS, argument("names", _NAME, nargs="+", metavar="NAME")), _read,
-    ),
-)  # fmt: skip
+COMMANDS: Final = {
+    "objects": Subcommand(_SENSORS, _objects),
+    "read": Subcommand((*_SENSORS, argument("names", _NAME, nargs="+", metavar="NAME")), _read),
+}

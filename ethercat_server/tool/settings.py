@@ -387,27 +387,18 @@ _SAMPLES: Final = f"number of samples to average, 1 to {MAX_TARE_SAMPLES} (defau
 _DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
 _TARGET: Final = "wrench the sensor is to read, in N and Nm (default: zeros)"
 
+_TARE: Final = (
+    *_SENSOR,
+    argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
+    argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=AXES),
+    argument("--undo", "restore the offset of before the last tare"),
+    argument("--clear", "set the offset to zero"),
+)
 
-COMMANDS: Final = (
-    Subcommand("apply", _SETTINGS, _apply),
-    Subcommand("save", _SENSOR, _save),
-    Subcommand(
-        "tare",
-        (
-            *_SENSOR,
-            argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
-            argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=AXES),
-            argument("--undo", "restore the offset of before the last tare"),
-            argument("--clear", "set the offset to zero"),
-        ),
-        _tare,
-    ),
-    Subcommand(
-        "snapshot",
-        (*_FILE, argument("--force", "replace an existing file")), _snapshot,
-    ),
-    Subcommand(
-        "restore",
-        (*_FILE, _SAVE, argument("--force", "accept a file of another sensor")), _restore,
-    ),
-)  # fmt: skip
+COMMANDS: Final = {
+    "apply": Subcommand(_SETTINGS, _apply),
+    "save": Subcommand(_SENSOR, _save),
+    "tare": Subcommand(_TARE, _tare),
+    "snapshot": Subcommand((*_FILE, argument("--force", "replace an existing file")), _snapshot),
+    "restore": Subcommand((*_FILE, _SAVE, argument("--force", "accept a file of another sensor")), _restore),
+}

@@ -69,7 +69,7 @@ class Application:
         self.mailbox = Mailbox(managers[0], managers[1], coe.answer, device.protocols)
         self._outputs = [(entry.address, entry.type.size) for entry in device.output_entries]
         self._fed = 0  # when the process data watchdog was last triggered; 0 = not running
-        self._show_state()
+        self.show_state()
 
     def inputs(self) -> bytes:
         return b"".join(self.objects.read(*entry.address) for entry in self.device.input_entries)
@@ -109,27 +109,19 @@ class Application:
                 self.state = AlState(wanted)
         if self.state is not before:
             self._fed = 0
-        self._show_state()
-
-    def sync_managers_changed(self) -> None:
-        """The master wrote sync manager registers: fall to the state that they still allow."""
-        if self.state >= AlState.PREOP and (fault := self._fault_in(AlState.PREOP)):
-            self.fail(AlState.INIT, fault)
-        elif self.state >= AlState.SAFEOP and (fault := self._fault_in(AlState.SAFEOP)):
-            self.fail(AlState.PREOP, fault)
-        else:
-            self._show_state()
+        self.show_state()
 
     def fail(self, state: AlState, code: int) -> None:
         """Fall to `state`, or stay below it, with the error bit and AL status code `code`."""
         self.state = min(self.state, state)
         self._refuse(code)
-        self._show_state()
+        self.show_state()
 
     def _refuse(self, code: int) -> None:
         self.error, self.code = True, code
 
-    def _show_state(self) -> None:
+    def show_state(self) -> None:
+        """Let the sync managers and AL status be those of the state."""
         state, managers = self.state, self.esc.sync_managers
         mailbox_on = state >= AlState.PREOP
         if mailbox_on == managers[0].locked:

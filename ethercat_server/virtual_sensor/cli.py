@@ -16,8 +16,13 @@ from bota_ethercat.program.real_time import make_real_time
 from bota_ethercat.program.signals import signals_call
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.nic import look_up
+from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from ethercat_server.sensor.models import MODELS
-from ethercat_server.virtual_sensor.commands import CLOCK_WORDS, COMMANDS, PPM_LIMIT, parse_clock
+from ethercat_server.virtual_sensor import link
+from ethercat_server.virtual_sensor.commands import PPM_LIMIT
+from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_clock
+from ethercat_server.virtual_sensor.faults import COMMANDS
 from ethercat_server.virtual_sensor.options import (
     FAULT,
     KINDS,
@@ -33,6 +38,7 @@ from ethercat_server.virtual_sensor.options import (
     slaves_in,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
+from ethercat_server.virtual_sensor.world import ExternalWorld
 
 _PROGRAM: Final = "ethercat-virtual-sensor"
 _SERIAL_NUMBERS: Final = 100  # for each bus: more than it has slaves
@@ -120,8 +126,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _number_of(ifname: str) -> int:
     """Of an interface: another has another, and it is the same after a restart."""
-    from ethercat_server.ethercat.nic import look_up  # noqa: PLC0415 - likewise
-
     try:
         return int.from_bytes(look_up(ifname).address[3:])
     except InterfaceError:  # said when it is to be opened
@@ -140,8 +144,6 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
         count = max(named, 1)
     if named > count:
         raise UsageError(f"{named} sensors are named but there are to be {count}: name no more than that")
-
-    from ethercat_server.virtual_sensor.world import ExternalWorld  # noqa: PLC0415 - --help need not wait for it
 
     def of(given: list[Any], position: int, default: Any) -> Any:
         """The last one applies to the rest."""
@@ -169,8 +171,6 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
 
 def _get_priority() -> None:
     """That of SCHED_FIFO above a master's: real sensors do not wait for a CPU."""
-    from ethercat_server.process.realtime import DEFAULT_PRIORITY  # noqa: PLC0415 - likewise
-
     if refused := make_real_time(DEFAULT_PRIORITY + 1).refused:
         _say(f"not granted: {', '.join(refused)}; samples may come late")
 
@@ -194,8 +194,6 @@ def main(
         slaves = options_from(args, _SERIAL_NUMBERS * (number or _number_of(args.iface)) or 1)
     except UsageError as error:
         parser.error(str(error))
-    from ethercat_server.virtual_sensor import link  # noqa: PLC0415 - loading it takes a moment
-
     stopped = threading.Event()
     models = [slave.model for slave in slaves if isinstance(slave, SensorOptions)]
     foreign = [slave.kind for slave in slaves if isinstance(slave, ForeignOptions)]
@@ -208,17 +206,7 @@ def main(
     try:
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)  # reading from the terminal must not suspend it
         with signals_call(stopped.set):
-            link.run(
-                args.iface,
-                slaves,
-                stop=stopped,
-                control_path=args.control,
-                world_path=args.world,
-                commands=sys.stdin,
-                exit_on_eof=args.exit_on_eof,
-                on_open=on_open,
-                on_ready=lambda: print(ready, flush=True),
-            )
+            link.run(args, slaves, on_open, lambda: print(ready, flush=True), stopped)
     except link.LinkError as error:
         _say(error)
         return 1
@@ -231,11 +219,9 @@ def _say(sentence: object) -> None:
 
 def _send(path: str | None, command: str) -> int:
     """Exit code 0 if the virtual sensor that listens there has obeyed."""
-    from ethercat_server.virtual_sensor import control  # noqa: PLC0415 - likewise
-
-    path = path or control.own_socket()
+    path = path or link.own_socket()
     try:
-        answer = control.send(path, command)
+        answer = link.send(path, command)
     except OSError as error:
         why = error.strerror or error
         _say(f"no virtual sensor of yours answers at {path} ({why}): start one, or give --control")

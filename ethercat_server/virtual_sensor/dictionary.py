@@ -110,7 +110,7 @@ class Dictionary(ObjectTable):
         flash: Flash,
         process_data: Callable[[], bytes],
         now: Callable[[], int],
-        on_write: OnWrite = lambda *_: None,
+        on_write: OnWrite,
     ) -> None:
         entries = sensor_entries(options.pdo_size)
         super().__init__(entries, {address: _initial(row) for address, row in entries.items()})
@@ -149,13 +149,6 @@ class Dictionary(ObjectTable):
         if row.address == table.CONTROL_STATUS and self._saved:
             return bytes([self._flash.status(self._now())])
         return self.values[row.address]
-
-    def check_download(self, index: int, subindex: int, length: int, state: AlState) -> None:
-        try:
-            super().check_download(index, subindex, length, state)
-        except TransferRefusedError as error:
-            self._on_write(index, subindex, b"", state, error.code)
-            raise
 
     def write(self, index: int, subindex: int, data: bytes, state: AlState) -> None:
         abort = 0

@@ -7,10 +7,13 @@ ESC data sheets. No master steers it, and there are no SYNC and LATCH signals. A
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
+from bota_ethercat.program.arguments import number
 from ethercat_server.ethercat.slave import registers as reg
+from ethercat_server.virtual_sensor.commands import PPM_LIMIT, Fault
+from ethercat_server.virtual_sensor.options import UsageError
 
 RATE_SCALE: Final = 10**12  # rates are in parts of this
 HOP_NS: Final = 700  # from slave to slave, cable included
@@ -141,19 +144,39 @@ class DcUnit:
         self.events.update(now)
         return now
 
-    def apply(self, word: str, numbers: Sequence[float]) -> None:
-        """Do what a word of `commands.CLOCK_WORDS` says."""
-        EFFECTS[word](self, self.settle(), *numbers)
+    def apply(self, word: Fault, numbers: Sequence[float]) -> None:
+        """Do what a word of `CLOCK_WORDS` says."""
+        word.effect(self, self.settle(), *numbers)
 
 
-# By the names of `commands.CLOCK_WORDS`: the clock, the time, numbers.
-EFFECTS: Final[dict[str, Callable[..., Any]]] = {
-    "ok": lambda c, _: c.events.repair(),
-    "none": lambda c, _: c.remove(),
-    "32-bit": lambda c, _: c.narrow(),
-    "no-events": lambda c, _: c.events.remove(),
-    "stuck": lambda c, _: setattr(c.events, "stuck", True),
-    "late": lambda c, _, us: setattr(c.events, "shift", round(us * 1000)),
-    "at": lambda c, now, ns: c.local.set(now, round(ns)),
-    "ppm": lambda c, now, ppm: c.local.set_ppm(now, ppm),
-}
+# Their effects get the clock, the time, numbers.
+CLOCK_WORDS: Final = (
+    Fault("ok", "end all faults; rate and time stay as they are", lambda c, _: c.events.repair()),
+    Fault("none", "no distributed clock: no feature bit, its registers read zero", lambda c, _: c.remove()),
+    Fault("32-bit", "system and local time have 32 bits", lambda c, _: c.narrow()),
+    Fault("no-events", "no 0x09FC: it reads zero", lambda c, _: c.events.remove()),
+    Fault("stuck", "0x09FC stands still", lambda c, _: setattr(c.events, "stuck", True)),
+    Fault("late US", "0x09FC is late by this; negative is early",
+          lambda c, _, us: setattr(c.events, "shift", round(us * 1000)), (number(-1e6, 1e6),)),
+    Fault("at NS", "the local clock jumps to this time",
+          lambda c, now, ns: c.local.set(now, round(ns)), (number(0, 2.0**62),)),
+    Fault("ppm X", "rate of the local clock, without a jump of the time",
+          lambda c, now, ppm: c.local.set_ppm(now, ppm), (number(-PPM_LIMIT, PPM_LIMIT),)),
+)  # fmt: skip
+_FROM_POWER_ON: Final = ("none", "32-bit")  # which cannot come about while the controller runs
+
+
+def parse_clock_word(name: str, values: Sequence[str], *, running: bool) -> tuple[Fault, list[Any]]:
+    """One of `CLOCK_WORDS`, for a clock that is `running`, and its numbers; UsageError if it is wrong."""
+    known = {word.name: word for word in CLOCK_WORDS if not (running and word.name in _FROM_POWER_ON)}
+    word = known.get(name.lower())
+    if word is None:
+        raise UsageError(f"no {name[:40]!r} of a distributed clock: available: {', '.join(known)}")
+    return word, word.parse(values)
+
+
+def parse_clock(text: str) -> Iterator[tuple[Fault, list[Any]]]:
+    """Words and numbers of an option such as `32-bit+late=50`, for power-on; UsageError if one is wrong."""
+    for item in text.split("+") if text else ():
+        name, _, values = item.partition("=")
+        yield parse_clock_word(name, values.split("/") if values else [], running=False)

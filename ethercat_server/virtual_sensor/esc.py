@@ -47,8 +47,7 @@ _WRITABLE: Final = (
     (reg.STATION_ADDRESS, 2, 0xFF), (reg.DL_CONTROL, 4, 0xFF), (reg.AL_CONTROL, 2, 0xFF),
     *((counters.start, len(counters), 0xFF) for counters in CLEARED_BY_WRITE),
     (reg.WATCHDOG_DIVIDER, 2, 0xFF), (reg.WATCHDOG_TIME, 2, 0xFF),
-    (reg.SII_OWNER, 1, 0x03), (reg.SII_CONTROL, 1, 0x01), (reg.SII_CONTROL + 1, 1, 0x07),
-    (reg.SII_ADDRESS, 8, 0xFF),
+    (reg.SII_OWNER, 1, 0x03), (reg.SII_CONTROL + 1, 1, 0x07), (reg.SII_ADDRESS, 4, 0xFF),
     *((reg.FMMU + number * reg.FMMU_SIZE, 13, 0xFF) for number in range(FMMU_COUNT)),
     *((manager, 5, 0xFF) for manager in _SYNC_MANAGERS),
     *((manager + reg.SM_ACTIVATE, 1, 0xC3) for manager in _SYNC_MANAGERS),
@@ -67,8 +66,8 @@ def _write_mask() -> bytearray:
 
 
 def _power_on_values() -> bytearray:
-    """Registers and memory of a controller that has just been switched on."""
-    memory = bytearray(MEMORY_END)
+    """Registers of a controller that has just been switched on."""
+    memory = bytearray(reg.REGISTERS_END)
     # Type, revision, build, FMMUs, sync managers, RAM in KB, ports 0 and 1 MII, features: FMMUs of bytes,
     # distributed clock, of 64 bits, separate counting of check sum errors.
     struct.pack_into(
@@ -101,23 +100,16 @@ class Fmmu:
             return None
         return cls(logical, length, physical, bool(kind & reg.FMMU_READ), bool(kind & reg.FMMU_WRITE))
 
-    def overlap(self, address: int, length: int) -> tuple[int, int, int] | None:
-        """The part of a logical command that it maps; None if none.
-
-        Returns: offset in the command's data, bytes there, first physical address.
-        """
-        start = max(address, self.logical)
-        end = min(address + length, self.logical + self.length)
-        if start >= end:
-            return None
-        return start - address, end - start, self.physical + start - self.logical
+    def is_within(self, address: int, length: int) -> bool:
+        """Whether a logical command has all that it maps."""
+        return address <= self.logical and self.logical + self.length <= address + length
 
 
 class SyncManager:
-    """A view of one sync manager's eight registers, and the state of its buffer.
+    """A view of one sync manager's eight registers, and its mailbox.
 
-    A buffer is opened by an access to its first byte and handed over by one to its last; an access out of
-    turn is refused and changes nothing. A mailbox is read when it is full, and written when it is not.
+    A mailbox is read when it is full, and written when it is not. Buffers are accessed as a whole, as all
+    masters do.
     """
 
     def __init__(self, memory: bytearray, number: int) -> None:
@@ -127,7 +119,7 @@ class SyncManager:
         self._status, self._activate, self._pdi_control = (
             self.registers + offset for offset in (reg.SM_STATUS, reg.SM_ACTIVATE, reg.SM_PDI_CONTROL)
         )
-        self.open = False
+        self.content = b""  # of the mailbox
         self.reload()
 
     def reload(self) -> None:
@@ -152,7 +144,7 @@ class SyncManager:
         inside = self.start >= reg.REGISTERS_END and self.end <= MEMORY_END
         self.active = self.enabled and self.length > 0 and inside
         if not on:
-            self.full = self.open = False
+            self.full = False
 
     def _set(self, register: int, bit: int, on: bool) -> None:
         self._memory[register] = self._memory[register] & ~bit | (bit if on else 0)
@@ -174,34 +166,24 @@ class SyncManager:
     def full(self, value: bool) -> None:
         self._set(self._status, reg.MAILBOX_FULL, value)
 
-    def access(self, offset: int, length: int) -> bool:
-        """The master accesses the buffer; False if it may not now."""
-        inside = offset >= 0 and offset + length <= self.length
-        if not inside or self.locked or (self.mailbox and self.full == self.master_writes):
-            return False
-        may = self.open or offset == 0
-        self.open = may and offset + length < self.length
-        return may
+    @property
+    def accessible(self) -> bool:
+        """Whether the master may access the buffer now."""
+        return not self.locked and not (self.mailbox and self.full == self.master_writes)
 
     def load(self, message: bytes) -> None:
-        self._memory[self.start : self.end] = message.ljust(self.length, b"\0")[: self.length]
-        self.open = False
+        self.content = message.ljust(self.length, b"\0")[: self.length]
         self.full = True
 
-    def content(self) -> bytes:
-        return bytes(self._memory[self.start : self.end])
 
-
-_EIGHT_BYTE_READS, _BUSY, _ERROR_COMMAND, _ERROR_WRITE_ENABLE = 0x0040, 0x8000, 0x2000, 0x4000
-_NO_OPERATION, _READ, _WRITE, _RELOAD = 0, 1, 2, 4
+_EIGHT_BYTE_READS, _BUSY, _ERROR_COMMAND = 0x0040, 0x8000, 0x2000
+_NO_OPERATION, _READ = 0, 1
 
 
 class SiiInterface:
     """The registers 0x0500 to 0x050F, through which a master reads the EEPROM (SII).
 
-    Reading takes `read_ns`; other commands are done at once. It is read-only: a write command is not
-    acknowledged by the EEPROM, which is bit 13; one without the write enable bit in the same frame never gets
-    there, which is bit 14.
+    Reading takes `read_ns`. All other commands end with an error, as does reading what is the firmware's.
     """
 
     # Error bits by name: an EEPROM that works, that returns an error, that stays busy.
@@ -237,23 +219,15 @@ class SiiInterface:
 
     def command(self) -> None:
         control, word = struct.unpack_from("<HI", self._memory, reg.SII_CONTROL)
-        self.advance()
         operation = control >> 8 & 0x07
-        if self._done_at is not None:  # it takes no command meanwhile
-            self._show(_BUSY)
-            struct.pack_into("<I", self._memory, reg.SII_ADDRESS, self._word)
-        elif self._memory[reg.SII_OWNER] & 0x01:  # the firmware's until the master takes it back
-            self._show(_ERROR_COMMAND)
-        elif operation == _READ and self._faults:
-            self._show(self._faults)
-        elif operation == _READ:
+        if operation != _READ or self._memory[reg.SII_OWNER] & 0x01:  # until the master takes it back
+            self._end(0 if operation == _NO_OPERATION else _ERROR_COMMAND)
+        elif self._faults:
+            self._end(self._faults)
+        else:
             self._done_at, self._word = self._clock() + self._read_ns, word
             self._show(_BUSY)
             self.advance()
-        elif operation == _WRITE:
-            self._show(_ERROR_COMMAND if control & 0x01 else _ERROR_WRITE_ENABLE)
-        else:
-            self._show(0 if operation in (_NO_OPERATION, _RELOAD) else _ERROR_COMMAND)
 
 
 class _Pdi(Protocol):
@@ -262,7 +236,7 @@ class _Pdi(Protocol):
     clock: Callable[[], int]
 
     def al_control(self, control: int) -> None: ...
-    def sync_managers_changed(self) -> None: ...
+    def show_state(self) -> None: ...
     def mailbox_exchanged(self) -> None: ...
     def repeat_requested(self) -> None: ...
     def inputs(self) -> bytes: ...
@@ -270,9 +244,9 @@ class _Pdi(Protocol):
 
 
 class Esc:
-    """Registers and memory of one controller."""
+    """Registers and buffers of one controller."""
 
-    def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int = 0) -> None:
+    def __init__(self, pdi: _Pdi, sii_image: bytes, sii_read_ns: int) -> None:
         self._pdi = pdi
         self.memory = _power_on_values()
         self.memory[reg.STATION_ALIAS : reg.STATION_ALIAS + 2] = sii_image[8:10]
@@ -281,8 +255,6 @@ class Esc:
         self.clock = DcUnit(self.memory, self._write_mask, pdi.clock)
         self.sync_managers = [SyncManager(self.memory, n) for n in range(SYNC_MANAGER_COUNT)]
         self.fmmus: list[Fmmu] = []  # the active ones
-        # What each logical command copies, by address and length; emptied when an FMMU changes.
-        self.plans: dict[tuple[int, int], list[tuple[Fmmu, int, int, int]]] = {}
         self.has_lrw = True
         self.station = 0  # as the register has it
         self.into_ns = 0  # from the start of a datagram until the bytes that are being copied pass
@@ -309,71 +281,39 @@ class Esc:
         _AL_STATUS.pack_into(self.memory, reg.AL_STATUS, status, 0, code)
         return True
 
-    def read(self, address: int, current: bytes | bytearray) -> bytes | bytearray | None:
-        """`len(current)` bytes from `address` on, as a master reads them; None if it may read none of them.
-
-        Bytes that may not be read stay as they are in `current`.
-        """
-        length = len(current)
+    def read(self, address: int, length: int) -> bytes | bytearray | None:
+        """`length` bytes from `address` on, as a master reads them; None if it may not."""
         end = address + length
         if end <= _REGISTERS_END:
             return self.read_registers(address, end) if length else None
-        for manager in self.sync_managers:
-            if manager.active and manager.start == address and manager.length == length:
-                return self._read_manager(manager, 0, length)
-        if address < _REGISTERS_END:  # it ends in the memory, which is not read
-            return self.read_registers(address, _REGISTERS_END) + current[_REGISTERS_END - address :]
-        owner = self._owner(address, end)
-        if owner is not None:
-            return self._read_manager(owner, address - owner.start, length)
-        part = self.memory[address:end]
-        return part + current[len(part) :] if part else None
+        manager = self._manager(address, end)
+        if manager is None or manager.master_writes or not manager.accessible:
+            return None
+        if not manager.mailbox:  # the newest of three buffers
+            return self._pdi.inputs()[:length].ljust(length, b"\0")
+        message, manager.full = manager.content, False
+        self._pdi.mailbox_exchanged()
+        return message
 
     def write(self, address: int, data: bytes) -> bool:
-        """Write `data` as a master does; False if it may write none of it."""
+        """Write `data` as a master does; False if it may not."""
         if self.record is not None:
             self.record(address, data)
         end = address + len(data)
-        for manager in self.sync_managers:
-            if manager.active and manager.start == address and manager.end == end:
-                return self._write_manager(manager, 0, data)
-        if address < _REGISTERS_END:
-            return self._write_registers(address, data[: _REGISTERS_END - address])
-        owner = self._owner(address, end)
-        if owner is not None:
-            return self._write_manager(owner, address - owner.start, data)
-        self.memory[address:end] = data[: MEMORY_END - address]
-        return address < MEMORY_END and bool(data)
-
-    def _owner(self, start: int, end: int) -> SyncManager | None:
-        return next((m for m in self.sync_managers if m.active and m.start < end and start < m.end), None)
-
-    def _read_manager(self, manager: SyncManager, offset: int, length: int) -> bytes | None:
-        if manager.master_writes or not manager.access(offset, length):
-            return None
-        if offset == 0 and not manager.mailbox:  # the newest of three buffers
-            newest = self._pdi.inputs()[: manager.length].ljust(manager.length, b"\0")
-            self.memory[manager.start : manager.end] = newest
-        data = bytes(self.memory[manager.start + offset : manager.start + offset + length])
-        if not manager.open:
-            self._exchanged(manager)
-        return data
-
-    def _write_manager(self, manager: SyncManager, offset: int, data: bytes) -> bool:
-        if not manager.master_writes or not manager.access(offset, len(data)):
+        if end <= _REGISTERS_END:
+            return self._write_registers(address, data)
+        manager = self._manager(address, end)
+        if manager is None or not manager.master_writes or not manager.accessible:
             return False
-        self.memory[manager.start + offset : manager.start + offset + len(data)] = data
-        if not manager.open:
-            self._exchanged(manager)
+        if manager.mailbox:
+            manager.load(data)
+            self._pdi.mailbox_exchanged()
+        else:
+            self._pdi.outputs(data)
         return True
 
-    def _exchanged(self, manager: SyncManager) -> None:
-        """The master has read or written the last byte of a buffer."""
-        if manager.mailbox:
-            manager.full = manager.master_writes
-            self._pdi.mailbox_exchanged()
-        elif manager.master_writes:
-            self._pdi.outputs(manager.content())
+    def _manager(self, start: int, end: int) -> SyncManager | None:
+        return next((m for m in self.sync_managers if m.active and (m.start, m.end) == (start, end)), None)
 
     def read_registers(self, start: int, end: int) -> bytes | bytearray:
         clock = self.clock
@@ -415,13 +355,12 @@ class Esc:
         if touched(reg.SII_CONTROL, 2):
             self.sii.command()
         if touched(reg.FMMU, FMMU_COUNT * reg.FMMU_SIZE):
-            self.plans.clear()
             every = (Fmmu.decode(self.memory, n) for n in range(FMMU_COUNT))
             self.fmmus = [fmmu for fmmu in every if fmmu is not None]
         if touched(reg.SYNC_MANAGER, SYNC_MANAGER_COUNT * reg.SYNC_MANAGER_SIZE):
             for manager in self.sync_managers:
                 manager.reload()
-            self._pdi.sync_managers_changed()
+            self._pdi.show_state()
             if self.sync_managers[1].repeat_asked():
                 self._pdi.repeat_requested()
         if self.clock.present and touched(reg.DC_RECEIVE_TIMES, 4):
@@ -434,93 +373,68 @@ class Esc:
 _LOGICAL = frozenset({Command.LRD, Command.LWR, Command.LRW})
 _READS = frozenset({Command.APRD, Command.FPRD, Command.BRD})
 _WRITES = frozenset({Command.APWR, Command.FPWR, Command.BWR})
+_READS_AND_WRITES = frozenset({Command.APRW, Command.FPRW, Command.BRW, Command.ARMW, Command.FRMW})
 _BROADCAST = frozenset({Command.BRD, Command.BWR, Command.BRW})
 _READ_MULTIPLE_WRITE = frozenset({Command.ARMW, Command.FRMW})
 # Their position is, by every slave.
 _COUNTED_UP = _BROADCAST | {Command.APRD, Command.APWR, Command.APRW, Command.ARMW}
-_KNOWN = frozenset(Command) - {Command.NOP}
-_PLANS_KEPT: Final = 64
-_FPRD: Final = int(Command.FPRD)
 
 
 def pass_through(escs: Sequence[Esc], frame: bytearray, datagram: Datagram) -> None:
     """Process one datagram in place as it passes these slaves, in their order."""
-    command, _, station, address, _, start, length = datagram
-    end = address + length
-    if command != _FPRD or end > _REGISTERS_END or not length:
-        for esc in escs:
-            execute(esc, frame, datagram)
-        return
-    # Masters read the times of a sensor's clock with every frame: the same as `execute`, in less time.
-    for esc in escs:
-        if esc.station == station:
-            counter = start + length
-            frame[start:counter] = esc.read_registers(address, end)
-            _U16.pack_into(frame, counter, (_U16.unpack_from(frame, counter)[0] + 1) & 0xFFFF)
-
-
-def execute(esc: Esc, frame: bytearray, datagram: Datagram) -> None:
-    """Process one datagram in place as it passes one slave."""
-    command = datagram.command
-    if command not in _KNOWN:
-        return
-    counted = (_logical if command in _LOGICAL else _physical)(esc, frame, datagram)
-    if counted:
-        at = datagram.end
-        _U16.pack_into(frame, at, (_U16.unpack_from(frame, at)[0] + counted) & 0xFFFF)
-
-
-def _physical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
-    command, address = datagram.command, datagram.ado
-    position_or_station = _U16.unpack_from(frame, datagram.header + 2)[0]
-    if command in _COUNTED_UP:  # the one it reaches as 0 is meant
-        _U16.pack_into(frame, datagram.header + 2, (position_or_station + 1) & 0xFFFF)
-        meant = command in _BROADCAST or position_or_station == 0
+    command, _, adp, _, header, _, _ = datagram
+    if command in _LOGICAL:
+        counted = sum(_logical(esc, frame, datagram) for esc in escs)
+    elif command in _READS or command in _WRITES or command in _READS_AND_WRITES:
+        meant: Sequence[Esc]
+        if command in _COUNTED_UP:
+            _U16.pack_into(frame, header + 2, (adp + len(escs)) & 0xFFFF)
+            at = -adp & 0xFFFF  # the one that it reaches as 0
+            meant = escs if command in _BROADCAST else escs[at : at + 1]
+        else:
+            meant = [esc for esc in escs if esc.station == adp]
+        if command in _READ_MULTIPLE_WRITE:
+            counted = sum(
+                _physical(esc, frame, datagram, reads=esc in meant, writes=esc not in meant) for esc in escs
+            )
+        else:
+            reads, writes = command not in _WRITES, command not in _READS
+            counted = sum(_physical(esc, frame, datagram, reads=reads, writes=writes) for esc in meant)
     else:
-        meant = position_or_station == esc.station
-    reads, writes = command not in _WRITES, command not in _READS
-    if command in _READ_MULTIPLE_WRITE:
-        reads, writes = meant, not meant
-    elif not meant:
-        return 0
+        return
+    _U16.pack_into(frame, datagram.end, (_U16.unpack_from(frame, datagram.end)[0] + counted) & 0xFFFF)
+
+
+def _physical(esc: Esc, frame: bytearray, datagram: Datagram, *, reads: bool, writes: bool) -> int:
     start, end = datagram.data, datagram.end
-    incoming = bytes(frame[start:end])
-    counted = 0
-    if reads and (read := esc.read(address, incoming)) is not None:
+    incoming, counted = bytes(frame[start:end]), 0
+    if reads and (read := esc.read(datagram.ado, datagram.length)) is not None:
         counted = 1
-        if command in _BROADCAST:
+        if datagram.command in _BROADCAST:
             read = bytes(a | b for a, b in zip(read, incoming, strict=True))
         frame[start:end] = read
-    if writes and esc.write(address, incoming):
+    if writes and esc.write(datagram.ado, incoming):
         counted += 2 if reads else 1
     return counted
 
 
 def _logical(esc: Esc, frame: bytearray, datagram: Datagram) -> int:
-    key = address, length = datagram.ado << 16 | datagram.adp, datagram.length
-    command = datagram.command
+    command, address, length = datagram.command, datagram.ado << 16 | datagram.adp, datagram.length
     if command == Command.LRW and not esc.has_lrw:
         return 0
-    plan = esc.plans.get(key)
-    if plan is None:
-        found = ((fmmu, fmmu.overlap(address, length)) for fmmu in esc.fmmus)
-        plan = [(fmmu, *overlap) for fmmu, overlap in found if overlap is not None]
-        if len(esc.plans) >= _PLANS_KEPT:
-            esc.plans.clear()
-        esc.plans[key] = plan
     read = written = False
     base = datagram.data
     incoming = bytes(frame[base : datagram.end])
-    reads, writes = command != Command.LWR, command != Command.LRD
-    for fmmu, offset, size, at in plan:
-        start, end = base + offset, base + offset + size
+    for fmmu in esc.fmmus:
+        if not fmmu.is_within(address, length):
+            continue
+        offset, size = fmmu.logical - address, fmmu.length
+        start = base + offset
         esc.into_ns = (start - datagram.header) * BYTE_NS
-        if writes and fmmu.writes:
-            written |= esc.write(at, incoming[offset : offset + size])
-        if reads and fmmu.reads:
-            current = esc.read(at, frame[start:end])
-            if current is not None:
-                frame[start:end] = current
-                read = True
+        if command != Command.LRD and fmmu.writes:
+            written |= esc.write(fmmu.physical, incoming[offset : offset + size])
+        if command != Command.LWR and fmmu.reads and (data := esc.read(fmmu.physical, size)) is not None:
+            frame[start : start + size] = data
+            read = True
     esc.into_ns = 0
     return read + (2 * written if command == Command.LRW else written)

@@ -1,4 +1,4 @@
-"""Fault injection by text commands: what each command of `commands.COMMANDS` does.
+"""Fault injection by text commands.
 
 A command is one line: its name, arguments, and anywhere `@N` to mean sensor N, or `#N` the slave at
 position N of the chain (from 0; without it sensor 0). The answer is one line: `ok ...`, or `error: ` and a
@@ -7,23 +7,26 @@ sentence.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
-from bota_ethercat.program.arguments import whole
+from bota_ethercat.program.arguments import number, whole
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor.application import Application, VirtualSlave
 from ethercat_server.virtual_sensor.bus import SlaveChain
-from ethercat_server.virtual_sensor.commands import COMMANDS, parse_clock_word
+from ethercat_server.virtual_sensor.commands import PPM_LIMIT, Fault
+from ethercat_server.virtual_sensor.distributed_clock import parse_clock_word
 from ethercat_server.virtual_sensor.esc import SiiInterface
-from ethercat_server.virtual_sensor.options import UsageError
+from ethercat_server.virtual_sensor.options import UsageError, model_name
 from ethercat_server.virtual_sensor.sensor import Firmware, VirtualSensor
-from ethercat_server.virtual_sensor.signals import CHANNELS
+from ethercat_server.virtual_sensor.signals import CHANNELS, SIGNALS
 
 LONGEST_LINE: Final = 1000
+_MOST_SKIPPED: Final = 90.0  # %
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,50 +89,104 @@ class Call:
         sampler.changed()
 
     def _dc(self, word: str, *values: str) -> None:
-        name, numbers = parse_clock_word(word, values, running=True)
+        fault, numbers = parse_clock_word(word, values, running=True)
         if not self.application.esc.clock.present:
             raise UsageError("that slave has no distributed clock: start it without `--dc none`")
-        self.application.esc.clock.apply(name, numbers)
+        self.application.esc.clock.apply(fault, numbers)
 
 
-# By the names of `COMMANDS`.
-EFFECTS: Final[dict[str, Callable[..., Any]]] = {
-    "lose": lambda c, n: c.bus.lose(n),
-    "deaf": lambda c, seconds=math.inf: setattr(c.bus, "deaf_until", c.bus.now + seconds * 1e9),
-    "deaf-after": lambda c, n: c.bus.lose(math.inf, n),
-    "hear": lambda c: c.bus.repair(),
-    "damage": lambda c, n: setattr(c.bus, "damage", (c.slave, n) if n else None),
-    "flap": lambda c: c.bus.flap(c.slave),
-    "power": Call._power,
-    "disconnect": lambda c: c.bus.connect(c.slave, False),
-    "connect": lambda c: c.bus.connect(c.slave, True),
-    "swap": Call._swap,
-    "safeop": lambda c, code: c.application.fail(AlState.SAFEOP, code),
-    "error": lambda c, code: c.application.fail(c.application.state, code),
-    "abort": lambda c, index, sub, code: c.firmware.dictionary.aborts.update({(index, sub): code}),
-    "on-write": Call._on_write,
-    "saving": Call._saving,
-    "cut-save": Call._cut_save,
-    "mute-mailbox": lambda c, n: setattr(c.application.mailbox, "mute", n),
-    "emergency": Call._emergency,
-    "sii": lambda c, result: c.application.esc.sii.fail(SiiInterface.FAULTS[result]),
-    "warn": lambda c, bits, samples=None: c.firmware.sampler.set_warnings(bits, samples),
-    "stick": lambda c: setattr(c.firmware.sampler, "stuck", c.firmware.sampler.newest()),
-    "unstick": lambda c: setattr(c.firmware.sampler, "stuck", b""),
-    "noise": lambda c, channel, value: c._channel_fault("noise", channel, value, value > 0),
-    "limit": lambda c, channel, value: c._channel_fault("limits", channel, value, value is not None),
-    "freeze": lambda c, channel: c._channel_fault("frozen", channel, None, True),
-    "thaw": lambda c, channel: c._channel_fault("frozen", channel, None, False),
-    "skip": lambda c, percent: c.firmware.sampler.set_skip(percent),
-    "ppm": lambda c, ppm: c.sensor.set_ppm(ppm),
-    "signal": lambda c, name: c.sensor.set_signal(name),
-    "dc": Call._dc,
-    "stats": lambda c: json.dumps(c.bus.statistics(), separators=(",", ":")),
-    "help": lambda _: " | ".join(f"{c.usage}: {c.meaning}" for c in COMMANDS),
-    "quit": lambda c: setattr(c.bus, "quit", True),
-}
+_COUNT, _LONG, _WORD, _BYTE = (whole(0, most) for most in (2**31, 2**32 - 1, 0xFFFF, 0xFF))
+_AMOUNT = number(0, 1e6)
 
-BY_NAME: Final = {command.name: (command, EFFECTS[command.name]) for command in COMMANDS}
+
+def _hex(text: str) -> bytes:
+    with contextlib.suppress(ValueError):
+        if len(data := bytes.fromhex(text)) <= 5:
+            return data
+    raise UsageError("the data of an emergency are at most 5 bytes in hexadecimal digits")
+
+
+def _one_of(what: str, known: Sequence[str]) -> Callable[[str], str]:
+    def parse(text: str) -> str:
+        if text.lower() not in known:
+            raise UsageError(f"no {what} {text[:40]!r}: available: {', '.join(known)}")
+        return text.lower()
+
+    return parse
+
+
+def _limit(text: str) -> float | None:
+    return None if text == "off" else _AMOUNT(text)
+
+
+_CHANNEL = _one_of("channel", CHANNELS)
+
+COMMANDS: Final[tuple[Fault, ...]] = (
+    Fault("lose N", "lose the next N frames", lambda c, n: c.bus.lose(n), (_COUNT,)),
+    Fault("deaf [SECONDS]", "lose every frame until `hear`, or for this time",
+          lambda c, seconds=math.inf: setattr(c.bus, "deaf_until", c.bus.now + seconds * 1e9), (_AMOUNT,)),
+    Fault("deaf-after N", "lose every frame after the next N",
+          lambda c, n: c.bus.lose(math.inf, n), (_COUNT,)),
+    Fault("hear", "end `deaf`, `deaf-after`, `lose` and `damage`", lambda c: c.bus.repair()),
+    Fault("damage N [@N]", "corrupt the next N frames on the cable before this slave",
+          lambda c, n: setattr(c.bus, "damage", (c.slave, n) if n else None), (_COUNT,)),
+    Fault("flap [@N]", "interrupt the link before this slave for a moment", lambda c: c.bus.flap(c.slave)),
+    Fault("power off|on|cycle [SECONDS] [@N]",
+          "switch a slave off or on; those behind one without power are cut off",
+          Call._power, (str, _AMOUNT)),
+    Fault("disconnect [@N]", "unplug the cable at port 0", lambda c: c.bus.connect(c.slave, False)),
+    Fault("connect [@N]", "end `disconnect`", lambda c: c.bus.connect(c.slave, True)),
+    Fault("swap MODEL SERIAL [@N]", "replace the sensor by another one", Call._swap, (model_name, _LONG)),
+    Fault("safeop CODE [@N]", "fall to SAFEOP with this AL status code",
+          lambda c, code: c.application.fail(AlState.SAFEOP, code), (_WORD,)),
+    Fault("error CODE [@N]", "set the error bit and this AL status code",
+          lambda c, code: c.application.fail(c.application.state, code), (_WORD,)),
+    Fault("abort INDEX SUBINDEX CODE [@N]", "abort the next SDO on that entry",
+          lambda c, index, sub, code: c.firmware.dictionary.aborts.update({(index, sub): code}),
+          (_WORD, _BYTE, _LONG)),
+    Fault("on-write INDEX SUBINDEX COMMAND ...", "execute a command after the next SDO write to that entry",
+          Call._on_write, (_WORD, _BYTE, str)),
+    Fault("saving SECONDS [STATUS] [@N]", "duration and final status of the save command (0 = success)",
+          Call._saving, (_AMOUNT, whole(0, 0xFE))),
+    Fault("cut-save N [@N]", "lose power in the next save after N entries",
+          Call._cut_save, (whole(0, 1000),)),
+    Fault("mute-mailbox N [@N]", "drop the next N mailbox requests",
+          lambda c, n: setattr(c.application.mailbox, "mute", n), (_COUNT,)),
+    Fault("emergency CODE [REGISTER [HEX]] [@N]", "send a CoE emergency before anything else in the mailbox",
+          Call._emergency, (_WORD, _BYTE, _hex)),
+    Fault("sii error|busy|ok [@N]", "result of reading the EEPROM",
+          lambda c, result: c.application.esc.sii.fail(SiiInterface.FAULTS[result]),
+          (_one_of("result", ("error", "busy", "ok")),)),
+    Fault("warn BITS [SAMPLES] [@N]", "set warnings, permanently or for some samples",
+          lambda c, bits, samples=None: c.firmware.sampler.set_warnings(bits, samples),
+          (_LONG, whole(1, 2**31))),
+    Fault("stick [@N]", "repeat the same process data",
+          lambda c: setattr(c.firmware.sampler, "stuck", c.firmware.sampler.newest())),
+    Fault("unstick [@N]", "end `stick`", lambda c: setattr(c.firmware.sampler, "stuck", b"")),
+    Fault("noise CHANNEL DEVIATION [@N]", "add noise of this standard deviation to a channel; 0 ends it",
+          lambda c, channel, value: c._channel_fault("noise", channel, value, value > 0),
+          (_CHANNEL, _AMOUNT)),
+    Fault("limit CHANNEL VALUE|off [@N]", "saturate a channel at plus and minus VALUE",
+          lambda c, channel, value: c._channel_fault("limits", channel, value, value is not None),
+          (_CHANNEL, _limit)),
+    Fault("freeze CHANNEL [@N]", "freeze a channel at its next value",
+          lambda c, channel: c._channel_fault("frozen", channel, None, True), (_CHANNEL,)),
+    Fault("thaw CHANNEL [@N]", "end `freeze`",
+          lambda c, channel: c._channel_fault("frozen", channel, None, False), (_CHANNEL,)),
+    Fault("skip PERCENT [@N]", "skip this percentage of the samples at random; 0 ends it",
+          lambda c, percent: c.firmware.sampler.set_skip(percent), (number(0, _MOST_SKIPPED),)),
+    Fault("ppm X [@N]", "set the error of the sensor's clock",
+          lambda c, ppm: c.sensor.set_ppm(ppm), (number(-PPM_LIMIT, PPM_LIMIT),)),
+    Fault("signal NAME [@N]", "measure another signal, from its beginning",
+          lambda c, name: c.sensor.set_signal(name), (_one_of("signal", SIGNALS),)),
+    Fault("dc WORD [VALUE] ... [@N]", "a fault of the distributed clock, as in --dc; `dc ok` ends it",
+          Call._dc, (str, str)),
+    Fault("stats", "counters and states, as JSON",
+          lambda c: json.dumps(c.bus.statistics(), separators=(",", ":"))),
+    Fault("help", "this list", lambda _: " | ".join(f"{c.usage}: {c.meaning}" for c in COMMANDS)),
+    Fault("quit", "end the program", lambda c: setattr(c.bus, "quit", True)),
+)  # fmt: skip
+BY_NAME: Final = {command.name: command for command in COMMANDS}
 
 
 def obey(bus: SlaveChain, line: str) -> str:
@@ -150,9 +207,8 @@ def _parse(bus: SlaveChain, line: Sequence[str], slave: VirtualSlave | None) -> 
     words = [word for word in line if word not in positions]
     if not words:
         raise UsageError("an empty line: type `help` for the commands")
-    if (name := words[0].lower()) not in BY_NAME:
+    if (command := BY_NAME.get(words[0].lower())) is None:
         raise UsageError(f"no command {words[0][:40]!r}: type `help` for the commands")
-    command, run = BY_NAME[name]
     arguments = command.parse(words[1:])
     if len(positions) > 1:
         raise UsageError("more than one slave: use `@N` or `#N` once")
@@ -160,4 +216,4 @@ def _parse(bus: SlaveChain, line: Sequence[str], slave: VirtualSlave | None) -> 
         slaves: Sequence[VirtualSlave] = bus.sensors if position[0] == "@" else bus.slaves
         slave = slaves[whole(0, len(slaves) - 1)(position[1:])]
     call = Call(bus, slave or (bus.sensors or bus.slaves)[0])
-    return lambda: run(call, *arguments)
+    return lambda: command.effect(call, *arguments)

@@ -5,6 +5,7 @@ One thread, which polls for frames and commands, and checks watchdogs.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import errno
 import gc
@@ -13,18 +14,19 @@ import select
 import socket
 import stat
 import struct
+import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Final
 
 from bota_ethercat.world import DATAGRAM, decode
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import arrived_ns, look_up, master_sockets
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import SlaveChain
-from ethercat_server.virtual_sensor.control import own_socket
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, obey
 from ethercat_server.virtual_sensor.options import SlaveOptions
 from ethercat_server.virtual_sensor.world import ExternalWorld
@@ -45,6 +47,8 @@ _STEP: Final = 0.001
 # trip from its quickest frames.
 _QUICK: Final = 1 / 16
 _CHUNK: Final = 1 << 16
+_ANSWER_S: Final = 5.0
+_LONGEST_ANSWER: Final = 1 << 20
 
 
 class LinkError(Exception):
@@ -60,7 +64,7 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
         found = look_up(ifname)
     except InterfaceError as error:
         raise LinkError(str(error)) from None
-    if not found.is_up:
+    if not found.up:
         raise LinkError(f"interface {ifname} is down: bring it up with `ip link set {ifname} up`")
     try:
         # No protocol yet: with one, it would receive frames of all interfaces until it is bound.
@@ -80,23 +84,19 @@ def open_interface(ifname: str, protocol: int = _ETH_P_ALL) -> socket.socket:
 
 
 def run(
-    ifname: str,
+    args: argparse.Namespace,
     slaves: Iterable[SlaveOptions],
-    *,
-    control_path: str | None,
-    world_path: str | None,
-    commands: TextIO | None,
-    exit_on_eof: bool,
     on_open: Callable[[], None],
     on_ready: Callable[[], None],
     stop: threading.Event,
 ) -> None:
-    """Answer EtherCAT frames on `ifname` until stopped.
+    """Answer EtherCAT frames on `args.iface` until stopped.
 
-    Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the end of `commands` if
+    Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the end of standard input if
     `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is only down is waited
-    for), or a path cannot; without `control_path` `own_socket` is used, if it is free.
+    for), or a path cannot; without `control` `own_socket` is used, if it is free.
     """
+    ifname, control_path = args.iface, args.control
     if master_sockets(ifname):  # two that answer each other's answers would take all of the processors
         raise LinkError(f"{ifname} is in use by another virtual sensor or master: stop that one first")
     with contextlib.ExitStack() as stack:
@@ -112,13 +112,13 @@ def run(
         with contextlib.suppress(LinkError) if control_path is None else contextlib.nullcontext():
             control = stack.enter_context(bound(control_path or own_socket()))
             heard[control.fileno()] = lambda: _obey(control, bus)
-        if world_path:
-            world = stack.enter_context(bound(world_path))
+        if args.world:
+            world = stack.enter_context(bound(args.world))
             heard[world.fileno()] = lambda: _hear(world, bus)
-        if commands is not None:
-            with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor cannot be polled
-                typed, begun = commands.fileno(), bytearray()
-                heard[typed] = lambda: obey_lines(typed, begun, bus, poller, exit_on_eof)
+        # None without a standard input, which cannot be polled without a descriptor either.
+        with contextlib.suppress(AttributeError, OSError, ValueError):
+            typed, begun = sys.stdin.fileno(), bytearray()
+            heard[typed] = lambda: obey_lines(typed, begun, bus, poller, args.exit_on_eof)
         for descriptor in heard:
             poller.register(descriptor, select.POLLIN)
         # All that is loaded need never be looked through again, which takes some 20 ms.
@@ -200,6 +200,29 @@ def bound(path: str) -> Iterator[socket.socket]:
         finally:
             with contextlib.suppress(OSError):
                 Path(path).unlink()
+
+
+def own_socket() -> str:
+    """Where this user's virtual sensor takes commands if no other place is given."""
+    folder = f"/run/user/{os.geteuid()}"
+    if not os.access(folder, os.W_OK):  # none, or hidden from a service by ProtectHome=
+        folder = tempfile.gettempdir()
+    return f"{folder}/ethercat-virtual-sensor-{os.geteuid()}"
+
+
+def send(path: str, command: str) -> str:
+    """The answer to a command of a virtual sensor that listens there, this user's or root's; OSError."""
+    if Path(path).stat().st_uid not in (0, os.geteuid()):
+        raise PermissionError(errno.EPERM, "it is another user's")
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock,
+    ):
+        sock.bind(f"{folder}/answer")
+        sock.settimeout(_ANSWER_S)
+        sock.connect(path)
+        sock.send(command.encode())
+        return sock.recv(_LONGEST_ANSWER).decode()
 
 
 class _Answers:

@@ -72,9 +72,8 @@ class Mailbox:
         if self._read.full:
             return
         if not self._replies and self._written.full:
-            message = self._written.content()
             self._written.full = False
-            self._request(message)
+            self._request(self._written.content)
         if self._replies:
             self._last = self._replies.popleft()
             kind, address, body = self._last
@@ -85,7 +84,7 @@ class Mailbox:
     def raise_emergency(self, code: int, register: int, data: bytes) -> None:
         """Put a CoE emergency before all that the master has not read yet; the mailbox must be on."""
         body = struct.pack("<HHB5s", _COE_EMERGENCY << 12, code, register, data)
-        if self._read.full and not self._read.open and self._last is not None:
+        if self._read.full and self._last is not None:
             self._replies.appendleft(self._last)
             self._read.full = False
             self._counter = (self._counter - 2) % 7 + 1
@@ -158,10 +157,6 @@ class ObjectTable:
     def write(self, index: int, subindex: int, data: bytes, state: AlState) -> None:
         self.check_write(self.entry(index, subindex), len(data), state)
         self.values[index, subindex] = data
-
-    def check_download(self, index: int, subindex: int, length: int, state: AlState) -> None:
-        """Refuse a download before its data has come."""
-        self.check_write(self.entry(index, subindex), length, state)
 
     def check_write(self, row: ObjectEntry, length: int, state: AlState) -> None:
         """TransferRefusedError if `length` bytes cannot be written to `row` in `state`, whatever they are."""
@@ -238,12 +233,11 @@ class CoeServer:
 
     def _download(self, request: bytes, index: int, subindex: int) -> bytes:
         command = request[0]
-        if not command & _EXPEDITED:
+        if command & _EXPEDITED:
+            data = request[4 : 8 - (command >> 2 & 3)]
+        else:
             (size,) = struct.unpack_from("<I", request, 4)
             data = request[_SDO_HEADER_SIZE : _SDO_HEADER_SIZE + size]
-            self._objects.check_download(index, subindex, size, self._state())
-        else:
-            data = request[4 : 8 - (command >> 2 & 3)]
         self._objects.write(index, subindex, data, self._state())
         return struct.pack("<BHBI", _DOWNLOADED << 5, index, subindex, 0)
 

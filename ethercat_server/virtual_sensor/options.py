@@ -33,7 +33,7 @@ class SensorOptions:
     sinc_length: int | None = None  # None: the value in flash, by default 64
     chop_divides: int = 1  # by what CHOP divides its sampling rate
     ppm: float = 0.0  # error of its clock: positive is fast
-    dc: str = ""  # its distributed clock, in `commands.CLOCK_WORDS`: `32-bit+ppm=20+late=50`
+    dc: str = ""  # its distributed clock, in `distributed_clock.CLOCK_WORDS`: `32-bit+ppm=20+late=50`
     signal: str = "scene"
     world: World | None = None  # instead of the signal
     noise: bool = True  # of a healthy sensor, in scenes and worlds

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from bota_ethercat.pdo import layout_for
@@ -21,7 +21,6 @@ from ethercat_server.virtual_sensor.signals import (
     SCENES,
     Formula,
     PhysicalSample,
-    physical_sample,
 )
 from ethercat_server.virtual_sensor.world import ExternalWorld, Measured
 
@@ -80,7 +79,7 @@ _LARGEST_REAL32 = 3.4e38
 
 
 def _measured(
-    values: tuple[float, ...], offsets: tuple[float, ...], limit: float
+    values: Sequence[float], offsets: tuple[float, ...], limit: float
 ) -> tuple[tuple[float, ...], int]:
     """`values` plus offsets, cut off at the range, and a bit for each axis that was."""
     x, y, z = values[0] + offsets[0], values[1] + offsets[1], values[2] + offsets[2]
@@ -93,7 +92,7 @@ def _measured(
 _U64: Final = 2**64 - 1
 
 
-def _scattered(number: int, seed: int = 0) -> int:
+def _scattered(number: int, seed: int) -> int:
     """64 random bits that are always the same for a number and a seed (splitmix64)."""
     word = (number + 1 + (seed << 20)) * 0x9E3779B97F4A7C15 & _U64
     word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 & _U64
@@ -171,26 +170,22 @@ class Sampler:
         self.made += 1
         instant = self.clock.instant(number)
         reading = self._signal.reading(number, instant, (instant - self._signal_start) * 1e-9)
+        values = [*reading.values]
         if self._has_last_bit:
-            reading = self._with_last_bit(reading, number)
-        reading, saturated = self._disturb(reading)
+            self._add_last_bits(values, number)
+        saturated = self._disturb(values)
         warnings = self._warnings if number < self._warnings_until else 0
-        return self._pack(reading, warnings, saturated)
+        return self._pack(reading._replace(values=values), warnings, saturated)
 
-    def _with_last_bit(self, reading: PhysicalSample, number: int) -> PhysicalSample:
-        """The reading of sample `number` with up to the last bit of each converter added or subtracted."""
-        values = [*reading.force_torque, *reading.acceleration, *reading.angular_rate]
+    def _add_last_bits(self, values: list[float], number: int) -> None:
+        """Add or subtract up to the last bit of each converter to the values of sample `number`."""
         chance = _scattered(number, self._seed)
         for position, bit in enumerate(_LAST_BITS):
             values[position] += bit * ((chance % _STEPS + 0.5) / _STEPS * 2 - 1)
             chance //= _STEPS
-        return physical_sample(values, reading.temperature, reading.orientation)
 
-    def _disturb(self, reading: PhysicalSample) -> tuple[PhysicalSample, int]:
-        """The reading with every fault in it, and which channels are saturated, as bits."""
-        if not (self.noise or self.limits or self.frozen):
-            return reading, 0
-        values = [*reading.force_torque, *reading.acceleration, *reading.angular_rate]
+    def _disturb(self, values: list[float]) -> int:
+        """Put every fault into the values; returns which channels are saturated, as bits."""
         for position, deviation in self.noise.items():
             values[position] += self._gauss(0.0, deviation)
         bits = 0
@@ -200,7 +195,7 @@ class Sampler:
                 bits |= 1 << position
         for position, kept in self.frozen.items():
             self.frozen[position] = values[position] = values[position] if kept is None else kept
-        return physical_sample(values, reading.temperature, reading.orientation), bits
+        return bits
 
     def _pack(self, reading: PhysicalSample, warnings: int, saturated: int) -> bytes:
         """Process data of one sample, as the settings have it.
@@ -209,7 +204,8 @@ class Sampler:
         IMU and the orientation estimate can be off; without the calibration matrix force and torque are raw
         counts. `warnings` is ORed into the register, `saturated` (channels as bits) into the fields.
         """
-        load, acceleration, rate, temperature, quaternion = reading
+        values, temperature, quaternion = reading
+        load, acceleration, rate = values[:6], values[6:9], values[9:]
         load = tuple(a + b for a, b in zip(load, self._offset, strict=True))
         if not self._calibrated:
             load = tuple(float(round(a * s)) for a, s in zip(load, _COUNTS, strict=True))

@@ -10,8 +10,8 @@ from typing import Any, Final
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.objects.dictionary import BY_SETTING, FACTORY_CALIBRATION
 from ethercat_server.virtual_sensor.application import Application, VirtualSlave
-from ethercat_server.virtual_sensor.commands import parse_clock
 from ethercat_server.virtual_sensor.dictionary import Dictionary, Flash, OnWrite, sensor_device
+from ethercat_server.virtual_sensor.distributed_clock import parse_clock
 from ethercat_server.virtual_sensor.mailbox import Address
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sampler import Sampler

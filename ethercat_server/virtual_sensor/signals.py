@@ -25,20 +25,10 @@ World = Callable[[float], Felt]  # of the time since power-on, s, or of CLOCK_MO
 class PhysicalSample(NamedTuple):
     """One sample before settings act on it, in the units of the process data."""
 
-    force_torque: tuple[float, ...]  # N, Nm
-    acceleration: tuple[float, ...]  # specific force, g: +1 along the axis that points up, if stationary
-    angular_rate: tuple[float, ...]  # °/s
+    # As `CHANNELS`: N, Nm; specific force, g, +1 along the axis that points up, if stationary; °/s.
+    values: Sequence[float]
     temperature: float  # °C
     orientation: tuple[float, ...]  # x, y, z, w: turns vectors of the sensor's frame into the world's
-
-
-def physical_sample(
-    values: Sequence[float], temperature: float, orientation: tuple[float, ...]
-) -> PhysicalSample:
-    """A reading from force, torque, acceleration and angular rate one after another."""
-    return PhysicalSample(
-        tuple(values[:6]), tuple(values[6:9]), tuple(values[9:12]), temperature, orientation
-    )
 
 
 CONSTANT: Final = (1.5, -2.25, -9.75, 0.125, -0.0625, 0.03125)  # exact in REAL32
@@ -53,8 +43,8 @@ class Formula:
     is_exact: bool = False  # noise would make its numbers unreadable
 
     def reading(self, number: int, instant: int, seconds: float) -> PhysicalSample:  # noqa: ARG002
-        load, temperature = tuple(self.load(number, instant)), self.temperature(number)
-        return PhysicalSample(load, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), temperature, (0.0, 0.0, 0.0, 1.0))
+        values = *self.load(number, instant), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
+        return PhysicalSample(values, self.temperature(number), (0.0, 0.0, 0.0, 1.0))
 
 
 def _clock(number: int, instant: int) -> Iterable[float]:

@@ -27,7 +27,6 @@ from ethercat_server.errors import ServerError
 from ethercat_server.ethercat.nic import missing_capabilities
 from ethercat_server.process.privileges import become, user_to_become
 
-VIRTUAL_INTERFACE: Final = "virtual"  # the interface name that requests a virtual bus
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
 _START_TIMEOUT_S: Final = 20.0
 _GONE_TIMEOUT_S: Final = 3.0
@@ -142,7 +141,7 @@ def _enter_own_namespaces() -> None:
 
 
 @contextlib.contextmanager
-def veth_pair(near: str, *, apart: bool = True) -> Iterator[str]:
+def veth_pair(near: str, *, apart: bool) -> Iterator[str]:
     """Create the pair and bring it up; yields the name of the far end, in this process's namespace.
 
     `apart`: if possible that is another one than the near end's.

@@ -17,7 +17,7 @@ from bota_ethercat.sensor.response import FIR_TAPS, fir_taps, healthy_noise
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
 from bota_ethercat.world import REST, Felt
 from ethercat_server.virtual_sensor.options import FAULT, ZERO
-from ethercat_server.virtual_sensor.signals import PhysicalSample, World, physical_sample, quaternion
+from ethercat_server.virtual_sensor.signals import PhysicalSample, World, quaternion
 
 LOST_AFTER_S: Final = 0.1  # also by how much a time stamp may differ from the time
 _REMEMBERED: Final = 4096  # moments, of which the filters look at the last second at most
@@ -149,4 +149,4 @@ class Measured:
                 values[axis] += self._gauss(0.0, _ACCELERATION_NOISE)
                 values[axis + 3] += self._gauss(0.0, _ANGULAR_RATE_NOISE)
         orientation = (0.0, 0.0, 0.0, 0.0) if felt.attitude is None else quaternion(felt.attitude)
-        return physical_sample(values, felt.temperature, orientation)
+        return PhysicalSample(values, felt.temperature, orientation)

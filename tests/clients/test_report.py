@@ -105,7 +105,7 @@ def test_nothing_is_found_on_a_healthy_sensor(sinc_length: int, seconds: float, 
 def test_the_noise_is_that_of_the_sensor_whatever_it_does(healthy: Subject) -> None:
     examination = expect(healthy)
     source = measured(sinc=SINC, noise=True)
-    readings = np.array([source.reading(n, 0, 0.0).force_torque for n in range(2000)])
+    readings = np.array([source.reading(n, 0, 0.0).values[:6] for n in range(2000)])
     assert examination.noise.deviation[:6] == pytest.approx(readings.std(axis=0), rel=0.06)
     assert np.ptp(healthy.columns.force[:, 2]) > 20 * examination.noise.deviation[2], "there was a contact"
 

@@ -9,7 +9,7 @@ import pytest
 from bota_ethercat.health.limits import Level
 from bota_ethercat.replies import DistributionStatus
 from ethercat_server.doctor import bus_checks
-from ethercat_server.doctor.bus_checks import ErrorCounters, ExaminedSlave
+from ethercat_server.doctor.bus_checks import ExaminedSlave
 from ethercat_server.doctor.report import CheckResult
 from ethercat_server.ethercat.slave.al import AlStatus
 from ethercat_server.sensor import scan
@@ -18,7 +18,7 @@ FINE, NOTE, LOOK, BAD = Level.GOOD, Level.NOTE, Level.LOOK, Level.TROUBLE
 USUAL: dict[str, Any] = {"position": 0, "al": AlStatus.of(1, 0), "sii_problem": ""}
 PORTS = {
     "invalid": slice(0, 8, 2), "physical": slice(1, 8, 2), "forwarded": slice(8, 12),
-    "processing_unit": slice(12, 13), "lost_links": slice(16, 20),
+    "processing_unit": slice(12, 13), "pdi": slice(13, 14), "lost_links": slice(16, 20),
 }  # fmt: skip
 
 
@@ -96,7 +96,7 @@ def exchanges(p50_us: float, p99_us: float, lost: int = 0) -> CheckResult:
         (errors(1, invalid=(0, 1, 0, 0)), LOOK, "1 corrupted at port 1 of slave 1"),
         (errors(1, forwarded=(2, 0, 0, 0)), NOTE, "2 corrupted before reaching slave 1, port 0"),
         (errors(0, lost_links=(1, 0, 0, 0)), NOTE, "link lost 1 times between the interface and slave 0"),
-        (errors(0, processing_unit=(1,)), NOTE, "processing unit 1, PDI 0"),
+        (errors(0, processing_unit=(1,), pdi=(2,)), NOTE, "processing unit 1, PDI 2"),
         (grown(counted(invalid=(5, 0, 0, 0)), counted()), FINE, "no new errors"),
         (grown(counted(invalid=(6, 0, 0, 0)), counted(forwarded=(1, 0, 0, 0))), BAD,
          "1 corrupted between the interface and slave 0; "),
@@ -122,9 +122,3 @@ def test_a_bus_without_a_sensor_is_bad_unless_one_of_its_slaves_may_be_one() -> 
     assert (found.level, found.found) == (BAD, "no Bota Gen-0 sensor")
     for other in (slave(), slave(sii_problem="busy")):
         assert not [*bus_checks.any_sensor([coupler, other])]
-
-
-def test_counters_are_taken_apart_by_port() -> None:
-    registers = bytes([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 0, 0, 17, 18, 19, 20])
-    ports = (1, 3, 5, 7), (2, 4, 6, 8), (9, 10, 11, 12)
-    assert ErrorCounters.parse(registers) == (*ports, 13, 14, (17, 18, 19, 20))

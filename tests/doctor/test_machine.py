@@ -270,7 +270,7 @@ def test_garbage_in_every_file(tmp_path: Path, number: int) -> None:
 
 
 def test_no_files_at_all(tmp_path: Path) -> None:
-    unknown = but(**dict.fromkeys(FACTS, "no") | {"link": {"counters": {}}})
+    unknown = but(**dict.fromkeys(FACTS, "no") | {"link": {}})
     found = list(examine_machine(Host("ens5", facts=dict(unknown), root=tmp_path)))
     assert {finding.check for finding in found} == {name for _, name in CHECKS}
     assert {finding.level for finding in found} <= {FINE, SKIP}

@@ -49,28 +49,22 @@ def single() -> Iterator[SimulatedBus]:
         yield bus
 
 
-def test_sensors_are_found_and_left_as_they_are(bench: SimulatedBus, tmp_path: Path) -> None:
-    found = examined(bench, tmp_path, LOOK)
-    on_bus = found.of("bus")
-    assert on_bus["slaves"].values == {"slaves": 2}
-    assert [on_bus[f"slave {n}"].found.partition(", supp")[0] for n in range(2)] == [
-        "BFT-SENS-ECAT-M8, serial 10",
-        "BFT-ROKS-ECAT-M8, serial 20",
-    ]
-    assert set(found.levels("bus").values()) == {"ok"}
-    assert_left_as_they_were(bench)
-
-
 def assert_left_as_they_were(bus: SimulatedBus) -> None:
     for position in range(2):
         now = bus.stats(position)
         assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
 
 
-def test_what_is_measured(bench: SimulatedBus, tmp_path: Path) -> None:
+def test_what_is_found_and_measured_and_left_as_it_is(bench: SimulatedBus, tmp_path: Path) -> None:
     announced: list[str] = []
     findings = examined(bench, tmp_path, 1.0, announce=announced.append)
-    found = findings.of("measurement")
+    found, on_bus = findings.of("measurement"), findings.of("bus")
+    assert on_bus["slaves"].values == {"slaves": 2}
+    assert [on_bus[f"slave {n}"].found.partition(", supp")[0] for n in range(2)] == [
+        "BFT-SENS-ECAT-M8, serial 10",
+        "BFT-ROKS-ECAT-M8, serial 20",
+    ]
+    assert set(findings.levels("bus").values()) == {"ok"}
     assert set(found) == {
         "scheduling", "sensors", "wake-ups", "exchanges", "age of data", "card meanwhile", "bus meanwhile",
     }  # fmt: skip

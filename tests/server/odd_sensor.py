@@ -45,11 +45,8 @@ def report(call: Call, index: int, subindex: int, before: int, after: int) -> No
 
 
 NUMBER = functools.partial(int, base=0)
-faults.BY_NAME["ignore"] = (Fault("ignore STATE", "", (NUMBER,)), ignore)
-faults.BY_NAME["report"] = (
-    Fault("report INDEX SUBINDEX BEFORE AFTER", "", (NUMBER,) * 4),
-    report,
-)
+faults.BY_NAME["ignore"] = Fault("ignore STATE", "", ignore, (NUMBER,))
+faults.BY_NAME["report"] = Fault("report INDEX SUBINDEX BEFORE AFTER", "", report, (NUMBER,) * 4)
 
 if __name__ == "__main__":
     sys.exit(cli.main())

@@ -132,7 +132,7 @@ def test_a_hold_up_counts_as_the_periods_that_it_takes(
     """Also where many exchanges are under way at once; this computer is blamed for its own only."""
     running = simulation(Machine(frame_ns=frame_us * 1e3))
     running.run(2.0)
-    carry, clock = running.backend.wire.carry, running.clock
+    carry, clock = running.backend.carry, running.clock
     for periods in (16, 40, 80, 120):
         before, until_ns = running.status()["missed_deadlines"], clock.now_ns + periods * PERIOD_NS
         if where == "machine":
@@ -143,7 +143,7 @@ def test_a_hold_up_counts_as_the_periods_that_it_takes(
                 times = carry()
                 return times and (times[0], max(times[1], until_ns - clock.now_ns))
 
-            monkeypatch.setattr(running.backend.wire, "carry", held)
+            monkeypatch.setattr(running.backend, "carry", held)
         running.run(periods * 1.25e-3 + 0.1)
         missed = running.status()["missed_deadlines"] - before
         # A frame that is away for more than 100 ms may be lost, and not late.
@@ -167,7 +167,7 @@ def test_event_times_stay_in_use_while_frames_are_held_up_on_their_way_out(
 ) -> None:
     """On a busy machine frames leave late for some time: the registers are right, and samples keep them."""
     running, chance = simulation(), random.Random(1)
-    carry, began_ns = running.backend.wire.carry, running.clock.now_ns
+    carry, began_ns = running.backend.carry, running.clock.now_ns
 
     def busy() -> tuple[int, int] | None:
         times, seconds = carry(), (running.clock.now_ns - began_ns) * 1e-9
@@ -176,7 +176,7 @@ def test_event_times_stay_in_use_while_frames_are_held_up_on_their_way_out(
         longer_ns = 1000 * (longer_us + chance.expovariate(1) * jitter_us)
         return round(times[0] + longer_ns), round(times[1] + longer_ns)
 
-    running.backend.wire.carry = busy  # type: ignore[method-assign]
+    running.backend.carry = busy  # type: ignore[method-assign]
     running.run(busy_s[0] - 0.1)
     events = running.streams[0].clock.events
     assert events is not None

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -111,7 +112,7 @@ def test_an_interface_that_is_down_or_gone_is_why_nothing_comes_back(veth: Veth)
     assert not listed(veth).up
     veth.ip("link", "set", veth.near, "up")
     veth.ip("link", "set", veth.far, "up")
-    wait_until(lambda: look_up(veth.near).has_carrier, "the carrier")
+    wait_until(lambda: look_up(veth.near).carrier, "the carrier")
     assert "no network interface 'nothing0'" in why_silent("nothing0")
     assert why_silent("virtaul").endswith("; did you mean 'virtual'?")
 
@@ -161,7 +162,7 @@ def test_a_bridge_on_the_way_is_why_no_slave_answers(elsewhere: bool) -> None:
         assert why_silent(veth.near) == "check cable and power"
         bridge = stack.enter_context(bridged(there, veth))
         why = f"{veth.near} is connected to {bridge}, a bridge, which drops EtherCAT frames"
-        wait_until(lambda: look_up(veth.near).has_carrier, "the carrier")
+        wait_until(lambda: look_up(veth.near).carrier, "the carrier")
         assert (
             f"no EtherCAT slave answers on {veth.near}: {why}" in tool_here("eeprom", veth.near, code=1).err
         )
@@ -181,7 +182,7 @@ def test_a_link_that_is_too_fast_for_a_slave_ends_in_a_switch(
     veth: Veth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a card: a pair of interfaces has a speed that means nothing."""
-    card = look_up(veth.near)._replace(kind="", link=0)
+    card = replace(look_up(veth.near), kind="", link=0)
     assert (mbits := nic._link_mbits(veth.near)) > 100, "as the driver of a pair says"
     monkeypatch.setattr(nic, "look_up", lambda _: card)
     assert f"{veth.near} is linked at {mbits} Mbit/s" in why_silent(veth.near)

@@ -41,19 +41,6 @@ def wrong_rate(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(dictionary, "sampling_rate_hz", lambda _: 500)
 
 
-def other_sinc_length(patch: pytest.MonkeyPatch) -> None:
-    """Reads back another SINC length than it was given, as real sensors do: 768 at 400 Hz, 2048 at 150 Hz."""
-    read = dictionary.Dictionary.read
-
-    def read_other(self: dictionary.Dictionary, index: int, subindex: int) -> bytes:
-        if (index, subindex) == (0x8006, 1):
-            rate_hz = int.from_bytes(read(self, 0x8011, 0), "little")
-            return round(307200 / rate_hz).to_bytes(2, "little")
-        return read(self, index, subindex)
-
-    patch.setattr(dictionary.Dictionary, "read", read_other)
-
-
 def fewer_objects(patch: pytest.MonkeyPatch) -> None:
     """No coordinate system and no inertia compensation."""
     _lack(patch, FEWER, AbortCode.NO_SUBINDEX)

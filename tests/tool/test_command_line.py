@@ -204,8 +204,8 @@ def test_a_name_that_there_is_not_is_answered_with_the_nearest(arguments: list[s
 def test_the_table_of_subcommands_is_what_their_modules_have() -> None:
     """The table is read without loading them."""
     for module in {module for module, _ in COMMANDS.values()}:
-        commands = [each.name for each in import_module(f"ethercat_server.tool.{module}").COMMANDS]
-        assert commands == [name for name, (of, _) in COMMANDS.items() if of == module]
+        commands = import_module(f"ethercat_server.tool.{module}").COMMANDS
+        assert [*commands] == [name for name, (of, _) in COMMANDS.items() if of == module]
 
 
 def test_the_docs_show_every_setting_and_subcommand() -> None:

@@ -11,7 +11,7 @@ from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.sensor.objects.dictionary import KNOWN_OBJECTS
 from ethercat_server.virtual_sensor.foreign import ForeignSlave
 from tests.simulation import SimulatedBus, SimulatedServer, registers, simulated_bus, simulated_server
-from tests.tool.odd_firmware import FOREIGN_VENDOR, fewer_objects, foreign
+from tests.tool.odd_firmware import fewer_objects
 from tests.tool.running import refused, told, tool_here
 
 
@@ -80,14 +80,6 @@ def test_objects_that_cannot_be_read_have_a_line_with_the_reason(
     assert "this firmware does not have it" in alone.out + alone.err
 
 
-def test_a_foreign_slave_is_no_sensor_to_anybody(monkeypatch: pytest.MonkeyPatch) -> None:
-    foreign(monkeypatch)
-    with simulated_bus() as bus:
-        assert told("eeprom", bus.near)["slaves"][0]["vendor"] == FOREIGN_VENDOR
-        assert "no Bota Gen-0 sensor" in refused("objects", bus.near)
-        assert bus.written() == []
-
-
 def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
     bench.command("sii error")
     said = refused("eeprom", bench.near)
@@ -127,6 +119,7 @@ def test_a_bus_without_a_sensor_is_not_touched(
         for slave in bus.backend.sensors.slaves:
             assert isinstance(slave, ForeignSlave)
             assert {address for address, _ in slave.writes} <= SII_ACCESS
+        assert [row["name"] for row in told("eeprom", bus.near)["slaves"]] == ["EK1100", "DRIVE"]
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def test_a_whole_command_on_the_interface(bench: Bench) -> None:
     """pysoem's SDO transfers and its way to PREOP, standard output that is a pipe, settings that stay."""
     veth, sensor = bench
     changed = ("--sensor", "20", "--set", "fir=on")
-    assert tool("apply", veth.near, *changed, "--json").json["settings"]["fir"] is True
+    assert told("apply", veth.near, *changed)["settings"]["fir"] is True
     assert '"serial": 20' in tool("snapshot", veth.near, "/dev/stdout", "--sensor", "20").out
     assert ("0x8006", 2, "00") in sensor.written(1), "FIR had been switched on"
     assert {row[0] for row in sensor.written(1)} == {"0x8006"}

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 import pytest
 
 from tests.simulation import (
-    RATE_HZ,
     SINC_LENGTH,
     SimulatedBus,
     SimulatedServer,
@@ -62,18 +61,6 @@ def test_the_first_name_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None
     assert "did you mean Sampling rate" in refused("read", *SERVER, "sampling rte", code=2)
 
 
-def test_plan_apply_save(bench: Bench) -> None:
-    bus, server = bench
-    asked = ("--sensor", "20", "--set", "sinc_length=128", *SERVER)
-    assert told("apply", "--dry-run", *asked, code=3)["changes"][0]["then"] == 128
-    applied = told("apply", *asked)
-    assert (applied["rate_hz"], applied["settings"]["sinc_length"]) == (400, 128)
-    assert "nothing to change" in tool_here("apply", "--dry-run", *asked).out
-    tool_here("save", "--sensor", 1, *SERVER)
-    assert ("0x8030", 1, "01") in bus.written(1)
-    assert [row["rate_hz"] for row in server.client().ask("describe")["sensors"]] == [RATE_HZ, 400]
-
-
 def test_what_is_said_to_last_outlasts_the_sensors_power(bench: Bench) -> None:
     bus, server = bench
     applied = tool_here("apply", "--sensor", 0, "--set", "sinc_length=128", *SERVER).out
@@ -125,6 +112,12 @@ def test_a_sensor_that_is_out_does_not_hide_the_other(bench: Bench) -> None:
 
 def test_a_server_that_does_not_reply_or_ends_is_one_sentence(bench: Bench) -> None:
     bus, server = bench
-    bus.at(0.1, server.hub.close)
+
+    def end() -> None:
+        for connection in server.hub.connections.values():
+            connection.close()
+        server.hangs = True
+
+    bus.at(0.1, end)
     said = refused("objects", *SERVER)
     assert f"the server at {server.address} closed the connection" in said

@@ -14,7 +14,7 @@ import pytest
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.datagrams import Steps
 from tests.simulation import SimulatedBus, more_if_long, simulated_bus
-from tests.tool.odd_firmware import fewer_objects, other_sinc_length, refusing
+from tests.tool.odd_firmware import fewer_objects, refusing
 from tests.tool.running import offset, one_sentence, refused, told, tool_here
 
 TARGET = ("--target", "1", "2", "3", "4", "5", "6")
@@ -87,7 +87,8 @@ def test_a_chain_wants_a_choice(chain: SimulatedBus) -> None:
     assert "choose one with --sensor" in said
     assert "serial 20" in said
     assert "more than one sensor matches" in refused("save", near, "--sensor", "BFT-SENS-ECAT-M8", code=2)
-    assert chain.written() == []
+    tool_here("save", near, "--sensor", 20)
+    assert (chain.written(), chain.written(1)) == ([], [("0x8030", 1, "01")])
 
 
 def test_apply_that_fails_half_way_takes_everything_back(
@@ -166,15 +167,14 @@ def stopped_tare(seconds: float) -> int:
         ("deaf", "; its offset may be half written (it was -1.5 2.25 9.75 -0.125 0.0625 -0.03125): tare it"),
     ],
 )
-def test_a_tare_cut_off_half_way_leaves_the_old_offset_or_tells_it(
-    single: SimulatedBus, fault: str, said: str
-) -> None:
-    assert "old offset" in tool_here("tare", single.near, "--samples", 20).out
-    single.command(f"on-write 0x8000 3 {fault}")
-    failed = tool_here("tare", single.near, "--samples", 20, *TARGET, code=1)
-    assert said in failed.err.splitlines()[-1]
-    if "back" in said:
-        assert offset(single.near) == [-1.5, 2.25, 9.75, -0.125, 0.0625, -0.03125]
+def test_a_tare_cut_off_half_way_leaves_the_old_offset_or_tells_it(fault: str, said: str) -> None:
+    with simulated_bus("--signal", "rest", "--noise", "none", "--sinc", "512") as bus:
+        assert "old offset" in tool_here("tare", bus.near, "--samples", 20).out
+        bus.command(f"on-write 0x8000 3 {fault}")
+        failed = tool_here("tare", bus.near, "--samples", 20, *TARGET, code=1)
+        assert said in failed.err.splitlines()[-1]
+        if "back" in said:
+            assert offset(bus.near) == [-1.5, 2.25, 9.75, -0.125, 0.0625, -0.03125]
 
 
 def test_a_snapshot_is_restored_as_far_as_it_differs(bench: SimulatedBus, tmp_path: Path) -> None:
@@ -280,49 +280,42 @@ MEANINGS = {
 }
 
 
-@pytest.fixture
-def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedBus]:
-    other_sinc_length(monkeypatch)
-    with simulated_bus("--signal", "rest") as found:
-        yield found
-
-
 @pytest.mark.parametrize("length", more_if_long([128, 1000], MEANINGS))
-def test_what_is_said_of_it_follows_the_rate(bus: SimulatedBus, length: int) -> None:
-    applied = told("apply", bus.near, "--set", f"sinc_length={length}")
+def test_what_is_said_of_it_follows_the_rate(single: SimulatedBus, length: int) -> None:
+    applied = told("apply", single.near, "--set", f"sinc_length={length}")
     assert applied["settings"]["sinc_length"] == length
-    (read,) = told("read", bus.near, "sinc_length")["sensors"][0]["objects"]
+    (read,) = told("read", single.near, "sinc_length")["sensors"][0]["objects"]
     assert (read["value"], read["meaning"]) == MEANINGS[length]
-    assert MEANINGS[length][1] in tool_here("objects", bus.near).out
+    assert MEANINGS[length][1] in tool_here("objects", single.near).out
 
 
-def test_a_length_that_chop_hides_is_not_overwritten(bus: SimulatedBus) -> None:
-    let_chop_divide(bus)
-    assert told("apply", bus.near, "--set", "chop=on")["rate_hz"] == 400
-    assert told("apply", "--dry-run", bus.near, "--set", "imu_active=3", code=3)["rate_hz"] == 400
-    written = bus.written()
-    assert told("apply", bus.near, "--set", "imu_active=3")["rate_hz"] == 400
-    assert {row[0] for row in bus.written()[len(written) :]} == {"0x8010"}
+def test_a_length_that_chop_hides_is_not_overwritten(single: SimulatedBus) -> None:
+    let_chop_divide(single)
+    assert told("apply", single.near, "--set", "chop=on")["rate_hz"] == 400
+    assert told("apply", "--dry-run", single.near, "--set", "imu_active=3", code=3)["rate_hz"] == 400
+    written = single.written()
+    assert told("apply", single.near, "--set", "imu_active=3")["rate_hz"] == 400
+    assert {row[0] for row in single.written()[len(written) :]} == {"0x8010"}
     asked = ("--set", "sinc_length=64")
-    assert "nothing to change" in tool_here("apply", "--dry-run", bus.near, *asked).out
-    (read,) = told("read", bus.near, "sinc_length")["sensors"][0]["objects"]
-    assert (read["value"], read["meaning"]) == (768, "400 Hz; cut-off not in the table" + UNMATCHED)
+    assert "nothing to change" in tool_here("apply", "--dry-run", single.near, *asked).out
+    (read,) = told("read", single.near, "sinc_length")["sensors"][0]["objects"]
+    assert (read["value"], read["meaning"]) == (384, "400 Hz; cut-off not in the table" + UNMATCHED)
 
 
 @pytest.mark.parametrize("length", more_if_long([32, 342], [32, 128, 341, 342, 1000]))
-def test_plan_and_restore_end(bus: SimulatedBus, length: int, tmp_path: Path) -> None:
+def test_plan_and_restore_end(single: SimulatedBus, length: int, tmp_path: Path) -> None:
     asked = ("--set", f"sinc_length={length}")
-    tool_here("apply", "--dry-run", bus.near, *asked, code=3)
-    tool_here("apply", bus.near, *asked)
-    assert "nothing to change" in tool_here("apply", "--dry-run", bus.near, *asked).out
+    tool_here("apply", "--dry-run", single.near, *asked, code=3)
+    tool_here("apply", single.near, *asked)
+    assert "nothing to change" in tool_here("apply", "--dry-run", single.near, *asked).out
     path = tmp_path / "a.json"
-    tool_here("snapshot", bus.near, path)
+    tool_here("snapshot", single.near, path)
     content = json.loads(path.read_text())
     content["settings"]["sinc_length"] = length  # of several with this rate, it cannot know which
     path.write_text(json.dumps(content))
-    assert "nothing to restore" in tool_here("restore", bus.near, path).out
-    tool_here("apply", bus.near, "--set", "sinc_length=64", "--set", "fir=on")
-    restored = told("restore", bus.near, path)
+    assert "nothing to restore" in tool_here("restore", single.near, path).out
+    tool_here("apply", single.near, "--set", "sinc_length=64", "--set", "fir=on")
+    restored = told("restore", single.near, path)
     assert {row["name"]: row["then"] for row in restored["changes"]} == {"sinc_length": length, "fir": False}
-    assert "nothing to restore" in tool_here("restore", bus.near, path).out
-    assert bus.stats()["sinc_length"] == length
+    assert "nothing to restore" in tool_here("restore", single.near, path).out
+    assert single.stats()["sinc_length"] == length

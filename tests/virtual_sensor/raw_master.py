@@ -6,6 +6,8 @@ import struct
 from collections.abc import Sequence
 
 from ethercat_server.ethercat import wire
+from ethercat_server.ethercat.slave.registers import FMMU_LAYOUT
+from ethercat_server.ethercat.slave.registers import pack_sync_manager as sync_manager
 from ethercat_server.ethercat.wire import Command
 from ethercat_server.virtual_sensor.bus import SlaveChain
 from ethercat_server.virtual_sensor.faults import obey
@@ -16,12 +18,8 @@ INIT, PREOP, BOOT, SAFEOP, OP = 1, 2, 3, 4, 8
 ACK = 0x10
 
 
-def sync_manager(start: int, length: int, control: int, active: int = 1) -> bytes:
-    return struct.pack("<HHBBBB", start, length, control, 0, active, 0)
-
-
 def fmmu(logical: int, length: int, physical: int, kind: int) -> bytes:
-    return struct.pack("<IHBBHBBB3x", logical, length, 0, 7, physical, 0, kind, 1)
+    return FMMU_LAYOUT.pack(logical, length, 0, 7, physical, 0, kind, 1)
 
 
 class Abort(Exception):  # noqa: N818

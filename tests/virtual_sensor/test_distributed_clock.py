@@ -94,15 +94,6 @@ def test_event_times_are_those_of_the_sample_in_the_data(dc: str, ppm: float) ->
     assert life.sampler.made - made == len(samples), "no sample was computed twice"
 
 
-def test_the_next_sample_may_come_within_the_frame() -> None:
-    """The event is read some µs after the data."""
-    master = prepared()
-    instant = look(master)[0]
-    master.wait(instant + 4 * PERIOD - 4000 - master.now)
-    shown, _, change = look(master)
-    assert (shown, change) == (instant + 3 * PERIOD, instant + 4 * PERIOD - START)
-
-
 def test_events_are_latched_from_safeop_on_if_the_activate_register_says_so() -> None:
     master = RawMaster(SensorOptions(signal="clock"), start=START).go(OP)
     master.wait(3 * MS)

@@ -2,8 +2,6 @@
 
 import json
 import struct
-import subprocess
-import sys
 from statistics import stdev
 from typing import Any
 
@@ -14,9 +12,7 @@ from hypothesis import strategies as st
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, SampleDecoder
 from bota_ethercat.sensor.warnings_register import WarningFlag
 from ethercat_server.ethercat.wire import Command
-from ethercat_server.virtual_sensor import distributed_clock, faults
-from ethercat_server.virtual_sensor.commands import CLOCK_WORDS, COMMANDS
-from ethercat_server.virtual_sensor.faults import obey
+from ethercat_server.virtual_sensor.faults import COMMANDS, obey
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.signals import CONSTANT
 from scripts.benchmarks.records import decode_clock
@@ -280,22 +276,6 @@ def test_commands_that_cannot_be_executed_now() -> None:
     assert all(command.usage in text for command in COMMANDS)
     do(master, "quit")
     assert master.bus.quit
-
-
-def test_every_word_of_the_help_has_an_effect_and_no_other_has() -> None:
-    for words, effects in ((COMMANDS, faults.EFFECTS), (CLOCK_WORDS, distributed_clock.EFFECTS)):
-        assert [word.name for word in words] == list(effects)
-
-
-def test_the_help_loads_no_virtual_machine() -> None:
-    package = "ethercat_server.virtual_sensor."
-    script = f"""
-import sys
-from {package}cli import build_parser
-build_parser().format_help()
-print(*sorted(name.removeprefix({package!r}) for name in sys.modules if name.startswith({package!r})))"""
-    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert loaded.stdout.split() == ["cli", "commands", "options", "signals"]
 
 
 @given(st.text(max_size=60))

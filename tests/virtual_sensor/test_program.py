@@ -102,35 +102,28 @@ def test_a_typed_line_comes_in_pieces(capfd: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.bus
-def test_it_says_when_it_is_ready_and_how_it_ends(veth: tuple[str, str], start: Start) -> None:
-    sensor = start(veth[0], "--sensors", "2")
-    sensor.signal(signal.SIGTERM)
-    assert sensor.wait() == 0
-    [ready] = told(sensor)
-    assert ready.startswith(f"ready: 2 sensor(s) BFT-SENS-ECAT-M8 on {veth[0]},")
-    quitting = start(veth[0])
-    quitting.command("quit")
-    assert quitting.wait() == 0
-    ending = start(veth[0], "--exit-on-eof")
-    assert ending.process.stdin is not None
-    ending.process.stdin.close()
-    assert ending.wait() == 0
-
-
-@pytest.mark.bus
-def test_each_interface_has_serial_numbers_of_its_own(veth: tuple[str, str], start: Start) -> None:
-    def serials(ifname: str) -> list[int]:
-        sensor = start(ifname, "--sensors", "2")
-        answer = json.loads(sensor.command("stats"))
-        sensor.signal(signal.SIGINT)
-        assert sensor.wait() == 0
-        return [each["serial"] for each in answer["sensors"]]
+def test_it_says_when_it_is_ready_and_how_it_ends_and_each_interface_has_serial_numbers_of_its_own(
+    veth: tuple[str, str], start: Start
+) -> None:
+    def serials(sensor: VirtualSensor) -> list[int]:
+        return [each["serial"] for each in json.loads(sensor.command("stats"))["sensors"]]
 
     for number, end in enumerate(veth):  # as of two ports of one card
         subprocess.run(["ip", "link", "set", end, "address", f"02:00:00:00:00:0{number}"], check=True)
-    one, other, again = (serials(ifname) for ifname in (*veth, veth[0]))
-    assert len({*one, *other}) == 4
-    assert again == one, "the same sensors, started again"
+    sensor, other = start(veth[0], "--sensors", "2"), start(veth[1], "--sensors", "2")
+    one, others = serials(sensor), serials(other)
+    assert len({*one, *others}) == 4
+    sensor.signal(signal.SIGTERM)
+    assert sensor.wait() == 0
+    ready, _stats = told(sensor)
+    assert ready.startswith(f"ready: 2 sensor(s) BFT-SENS-ECAT-M8 on {veth[0]},")
+    other.command("quit")
+    assert other.wait() == 0
+    ending = start(veth[0], "--sensors", "2", "--exit-on-eof")
+    assert serials(ending) == one, "the same sensors, started again"
+    assert ending.process.stdin is not None
+    ending.process.stdin.close()
+    assert ending.wait() == 0
 
 
 @pytest.mark.bus

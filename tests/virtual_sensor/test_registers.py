@@ -4,10 +4,8 @@ import struct
 
 import pytest
 
-from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.wire import Command
-from ethercat_server.virtual_sensor.options import ForeignOptions
-from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, RawMaster, chain, fmmu, sync_manager
+from tests.virtual_sensor.raw_master import OP, PREOP, SAFEOP, RawMaster, chain, fmmu
 
 
 @pytest.mark.parametrize("register", [0x0000, 0x0008, 0x0012, 0x0110, 0x0130, 0x0134, 0x0140, 0x0220, 0x0904])
@@ -28,12 +26,17 @@ def test_what_commands_count() -> None:
     assert master.one(Command.APRW, 0, 0x1000, b"") == (b"", 0), "no data"
 
 
-def test_read_multiple_write() -> None:
+@pytest.mark.parametrize(("command", "address"), [(Command.ARMW, -1), (Command.FRMW, 0x1002)])
+def test_read_multiple_write(command: int, address: int) -> None:
+    """The slaves behind the one that is read get what it has, those before it what the master sent."""
     master = RawMaster(*chain(3))
+    master.write(0x0010, b"\x02\x10", 1)
     master.write(0x0F80, b"\xaa", 1)
-    data, counter = master.one(Command.ARMW, -1, 0x0F80, b"\x11")
+    data, counter = master.one(command, address, 0x0F80, b"\x11")
     assert (data, counter) == (b"\xaa", 3)
     assert [master.read(0x0F80, 1, position) for position in range(3)] == [b"\x11", b"\xaa", b"\xaa"]
+    for missed in (-3, 1):
+        assert master.one(Command.APRD, missed, 0x0F80, b"\0") == (b"\0", 0)
 
 
 def test_process_data_by_fmmu() -> None:
@@ -63,37 +66,15 @@ def test_process_data_needs_the_state() -> None:
     assert master.upload(0x7000, 0) == b"\x09"
 
 
-def test_a_buffer_is_read_and_written_from_its_first_byte_on() -> None:
-    """A real controller does not count an access that begins in the middle."""
+def test_a_buffer_is_read_as_a_whole_and_in_its_direction() -> None:
     master = RawMaster().go(OP)
-
-    def middle() -> int:
-        return master.one(Command.APRD, 0, 0x1180 + 20, bytes(41))[1]
-
-    assert middle() == 0
-    assert master.one(Command.APRD, 0, 0x1180, bytes(20))[1] == 1
-    assert middle() == 1, "it goes on"
-    assert middle() == 0, "it was handed back with its last byte"
-    for start, size in ((0x117F, 62), (0x1180, 62)):
-        assert master.one(Command.APRD, 0, start, bytes(size))[1] == 0, "not all of it is the buffer's"
-    drive = RawMaster(ForeignOptions("DRIVE", state=AlState.SAFEOP))
-    at = drive.read16(0x0810)
-    assert [drive.write(at + n, bytes(size)) for n, size in ((1, 5), (0, 1), (1, 5), (1, 5))] == [0, 1, 1, 0]
+    for start, size, counted in ((0x1180, 61, 1), (0x1180, 20, 0), (0x1181, 60, 0), (0x117F, 62, 0)):
+        assert master.one(Command.APRD, 0, start, bytes(size))[1] == counted
+    assert master.one(Command.APRD, 0, 0x1100, b"x") == (b"x", 0)
+    assert master.write(0x1180, bytes(61)) == 0
 
 
 def test_an_enabled_sync_manager_keeps_its_area() -> None:
     master = RawMaster().go(PREOP)
     master.write(0x0800, struct.pack("<HH", 0x1400, 64))
     assert master.read(0x0800, 4) == struct.pack("<HH", 0x1000, 128)
-
-
-def test_memory_that_sync_managers_guard() -> None:
-    master = RawMaster()
-    master.write(0x0800, sync_manager(0x1000, 128, 0x26, 0))
-    assert master.write(0x1010, b"x") == 1, "a disabled one frees its memory"
-    master.go(OP)
-    assert master.one(Command.APWR, 0, 0x1180, b"x")[1] == 0, "the wrong direction"
-    assert master.one(Command.APRD, 0, 0x1100, b"x") == (b"x", 0)
-    # Free memory behind the buffers is anyone's.
-    assert master.write(0x1F00, b"note") == 1
-    assert master.read(0x1F00, 4) == b"note"

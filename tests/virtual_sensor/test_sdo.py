@@ -78,7 +78,8 @@ def test_what_is_refused() -> None:
 def test_setting_ranges(name: str) -> None:
     master = RawMaster().go(PREOP)
     row, setting = BY_SETTING[name], SETTINGS[name]
-    for value in (False, True) if setting.is_bool else tuple(setting.choices or ()):
+    choices = (False, True) if setting.is_bool else tuple(setting.choices or ())
+    for value in choices if len(choices) < 100 else (*choices[::50], choices[-1]):
         master.download(row.index, row.subindex, row.encode_setting(value))
         held = master.upload(row.index, row.subindex)
         if name == "sinc_length":

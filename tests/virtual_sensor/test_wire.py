@@ -1,15 +1,12 @@
 """Frames: parsing, and what hostile ones do (nothing)."""
 
-import itertools
 import struct
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ethercat_server.ethercat import wire
-from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import Command
-from ethercat_server.virtual_sensor.esc import Esc, execute, pass_through
 from ethercat_server.virtual_sensor.options import SensorOptions, parse_chain, slaves_in
 from tests.virtual_sensor.raw_master import INIT, OP, RawMaster, do
 
@@ -46,29 +43,6 @@ def test_a_broken_datagram_leaves_those_before_it_alone() -> None:
     assert frame[second.data : second.end + 2] == bytes(4)
 
 
-def chain() -> list[Esc]:
-    """Five, two of them of one station address."""
-    master = RawMaster(*(SensorOptions(serial=number) for number in range(5)))
-    escs = [slave.life.esc for slave in master.bus.slaves if slave.life]
-    for esc, station in zip(escs, (0, 0x1001, 0x1002, 0x1001, 0x2001), strict=True):
-        esc.write(reg.STATION_ADDRESS, struct.pack("<H", station))
-    return escs
-
-
-def test_passing_slaves_that_are_not_meant_is_the_same_as_asking_each() -> None:
-    adps = (0, 1, 0xFFFF, 0xFFFE, 0xFFFC, 0xFFFB, 0x1001, 0x1002, 0x2001)
-    for command, ado, adp in itertools.product(range(17), (0x0010, 0x0130), adps):
-        if adp == 0:  # what the frames before have written is gone
-            at_once, one_by_one = chain(), chain()
-        frame = wire.build((command, adp, ado, b"\2\1"))
-        other, (datagram,) = frame[:], wire.parse(frame, len(frame))
-        pass_through(at_once, frame, datagram)
-        for esc in one_by_one:
-            execute(esc, other, datagram)
-        assert frame == other, f"{command} {adp:#x} {ado:#x}"
-        assert [esc.memory for esc in at_once] == [esc.memory for esc in one_by_one]
-
-
 @given(st.binary(max_size=200))
 def test_noise_never_crashes_it(noise: bytes) -> None:
     master = RawMaster()
@@ -79,7 +53,7 @@ def test_noise_never_crashes_it(noise: bytes) -> None:
         assert len(frame) == before
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(DATAGRAMS, min_size=1, max_size=4), st.integers(0, 2))
 def test_hostile_datagrams_never_crash_it(frames: list[list[tuple[int, int, int, bytes]]], chop: int) -> None:
     master = RawMaster(SensorOptions(), *slaves_in(parse_chain("EK1100:OP,EL3102:PREOP,DRIVE:OP")))

@@ -65,21 +65,11 @@ def test_what_is_no_datagram_is_dropped(data: bytes) -> None:
 def test_a_moment_holds_until_the_next_and_comes_in_order() -> None:
     world = ExternalWorld()
     assert world(5.0) == push(0.0), "at rest before the first"
-    for time_s, newtons in ((10.0, 1.0), (10.001, 2.0), (10.0005, 3.0), (math.nan, 3.0), (10.2, 3.0)):
+    wrong = 9.9, 10.102, 10.0005, math.nan  # old, to come, out of order, none
+    for time_s, newtons in ((9.9, 3.0), (10.0, 1.0), (10.001, 2.0), *((each, 3.0) for each in wrong)):
         world.update(time_s, push(newtons), 10.001)
-    assert world.counts == {"taken": 2, "refused": 3}
+    assert world.counts == {"taken": 2, "refused": 5}
     assert [world(t).wrench[0] for t in (9.999, 10.0, 10.0009, 10.001, 11.0)] == [0.0, 1.0, 1.0, 2.0, 2.0]
-
-
-@pytest.mark.parametrize("away_s", [-3600.0, -LOST_AFTER_S - 0.001, LOST_AFTER_S + 0.001, 3600.0])
-def test_a_stamp_that_is_old_or_to_come_is_refused(away_s: float) -> None:
-    """By another clock, or from a queue: nothing was felt then that a sample could have in it."""
-    world, now_s = ExternalWorld(), 10_000.0
-    world.update(now_s + away_s, push(5.0), now_s)
-    assert world.counts == {"taken": 0, "refused": 1}
-    assert world(now_s) == push(0.0), "at rest still"
-    world.update(now_s + math.copysign(LOST_AFTER_S - 0.001, away_s), push(5.0), now_s)
-    assert world.counts == {"taken": 1, "refused": 1}
 
 
 @pytest.mark.parametrize(("lost", "newtons"), [("hold", 8.0), ("zero", 0.0), ("fault", None)])
@@ -164,13 +154,13 @@ def test_a_seed_gives_a_run_to_the_bit() -> None:
         simulation = Simulation(
             SensorOptions(seed=seed), machine=machine, settings={"sinc_length": 512}, world=rising
         )
-        simulation.at(1.0, "skip 3")
-        simulation.at(2.0, "noise force.x 3")
-        simulation.run(10.0)
+        simulation.at(0.5, "skip 3")
+        simulation.at(1.0, "noise force.x 3")
+        simulation.run(3.0)
         return [frame.process_data + frame.monotonic_ns.to_bytes(8) for frame in simulation.frames]
 
     one = run(1)
-    assert len(one) > 900
+    assert len(one) > 250
     assert one == run(1) != run(2)
 
 
@@ -183,80 +173,6 @@ def test_whoever_reads_all_samples_gets_all_at_their_instants() -> None:
         took_ns = simulation.clock.now_ns - began_ns
     assert all(reading.fresh and not reading.passed_over for reading in readings)
     assert took_ns == pytest.approx(400 * 1.25 * MS, rel=0.01)
-
-
-@pytest.mark.parametrize("milliseconds", [0.3, 1.0, 3.1])
-def test_time_passes_by_as_much_as_is_asked_for(milliseconds: float) -> None:
-    simulation = Simulation(world=rising, machine=Machine(wake_ns=1_000.0))
-    began_ns = simulation.clock.now_ns
-    for _ in range(200):
-        simulation.run(milliseconds * 1e-3)
-    assert simulation.clock.now_ns - began_ns == pytest.approx(200 * milliseconds * MS, rel=0.2)
-
-
-STIFFNESS = 2000.0  # of a wall, N/m
-
-
-class Press:
-    """A controller that moves a tool by force, m/s per N, at each sample; as wall it answers by a spring."""
-
-    def __init__(self, gain: float) -> None:
-        self._gain = gain
-        self.depth = 0.05
-        self.forces: list[float] = []
-
-    def force(self, _time_s: float = 0.0) -> float:
-        return -STIFFNESS * self.depth
-
-    def act(self, force: float) -> None:
-        self.forces.append(force)
-        self.depth += 1.25e-3 * self._gain * force
-
-    def settles(self) -> bool:
-        """Whether the force decays."""
-        return statistics.pstdev(self.forces[-200:]) < statistics.pstdev(self.forces[10:60])
-
-
-def settles_by_model(gain: float, age_s: float) -> bool:
-    """Written down from the stated delays only: a wall that answers once a millisecond, three moving averages
-    over a sample period each, samples that are `age_s` old when the controller gets them."""
-    step_s, period, wall = 25e-6, 50, 40  # the two in steps
-    press, box = Press(gain), [deque([-100.0] * period, maxlen=period) for _ in range(3)]
-    sums, due, force = [-100.0 * period] * 3, list[tuple[int, float]](), press.force()
-    for now in range(800 * period):
-        if now % wall == 0:
-            force = press.force()
-        value = force
-        for each in range(3):
-            sums[each] += value - box[each][0]
-            box[each].append(value)
-            value = sums[each] / period
-        if now % period == 0:
-            due.append((now + round(age_s / step_s), value))
-        if due and due[0][0] <= now:
-            press.act(due.pop(0)[1])
-    return press.settles()
-
-
-def test_a_controller_is_stable_up_to_the_gain_that_the_stated_delays_allow() -> None:
-    def settles(gain: float) -> bool:
-        press = Press(gain)
-        simulation = Simulation(world=lambda _: push(press.force()))
-        with Client(12001, channel=MemoryChannel(simulation)).connect() as sensor:
-            simulation.run(1.0)  # at rest until the sensor's clock is followed
-            sensor.latest(timeout_s=1.0)
-            for _ in range(800):
-                reading = sensor.latest(timeout_s=0.05)
-                assert reading.sample is not None
-                press.act(reading.sample.force[0])
-        return press.settles()
-
-    low, high = 0.1, 1.0
-    for _ in range(8):
-        middle = (low + high) / 2
-        low, high = (middle, high) if settles_by_model(middle, 125e-6) else (low, middle)
-    assert settles(0.9 * low), f"it settles up to {low:.3f} m/s per N"
-    assert not settles(1.1 * high)
 
 
 def test_there_need_be_no_sensor(tmp_path: Path) -> None:

@@ -251,7 +251,6 @@ class MailboxSdo:
         self._stale = True  # whether an answer may come that was not asked for last
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
-        """See `Sdo`."""
         command, rest = yield from self._transfer(index, subindex, _UPLOAD, b"")
         if command & 0x02:  # expedited; bit 0: the size is given
             return rest[: 4 - (command >> 2 & 3)] if command & 0x01 else rest[:4]
