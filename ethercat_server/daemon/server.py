@@ -17,7 +17,6 @@ from ethercat_server.daemon.histories import kept
 from ethercat_server.daemon.options import ServerOptions
 from ethercat_server.daemon.traces import Traces
 from ethercat_server.errors import StopRequestedError
-from ethercat_server.ethercat.nic import VIRTUAL_INTERFACE
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.process.privileges import User, become, forbid_new_privileges, user_to_become

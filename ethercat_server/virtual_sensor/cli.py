@@ -16,10 +16,7 @@ from bota_ethercat.program.real_time import make_real_time
 from bota_ethercat.program.signals import signals_call
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic import look_up
-from ethercat_server.process.realtime import DEFAULT_PRIORITY
 from ethercat_server.sensor.models import MODELS
-from ethercat_server.virtual_sensor import link
 from ethercat_server.virtual_sensor.commands import PPM_LIMIT
 from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_clock
 from ethercat_server.virtual_sensor.faults import COMMANDS
@@ -38,7 +35,6 @@ from ethercat_server.virtual_sensor.options import (
     slaves_in,
 )
 from ethercat_server.virtual_sensor.signals import SIGNALS
-from ethercat_server.virtual_sensor.world import ExternalWorld
 
 _PROGRAM: Final = "ethercat-virtual-sensor"
 _SERIAL_NUMBERS: Final = 100  # for each bus: more than it has slaves
@@ -126,6 +122,8 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _number_of(ifname: str) -> int:
     """Of an interface: another has another, and it is the same after a restart."""
+    from ethercat_server.ethercat.nic import look_up  # noqa: PLC0415 - --help need not wait for it
+
     try:
         return int.from_bytes(look_up(ifname).address[3:])
     except InterfaceError:  # said when it is to be opened
@@ -144,6 +142,8 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
         count = max(named, 1)
     if named > count:
         raise UsageError(f"{named} sensors are named but there are to be {count}: name no more than that")
+
+    from ethercat_server.virtual_sensor.world import ExternalWorld  # noqa: PLC0415 - likewise
 
     def of(given: list[Any], position: int, default: Any) -> Any:
         """The last one applies to the rest."""
@@ -171,6 +171,8 @@ def options_from(args: argparse.Namespace, default_serial: int = 1) -> tuple[Sla
 
 def _get_priority() -> None:
     """That of SCHED_FIFO above a master's: real sensors do not wait for a CPU."""
+    from ethercat_server.process.realtime import DEFAULT_PRIORITY  # noqa: PLC0415 - likewise
+
     if refused := make_real_time(DEFAULT_PRIORITY + 1).refused:
         _say(f"not granted: {', '.join(refused)}; samples may come late")
 
@@ -194,6 +196,8 @@ def main(
         slaves = options_from(args, _SERIAL_NUMBERS * (number or _number_of(args.iface)) or 1)
     except UsageError as error:
         parser.error(str(error))
+    from ethercat_server.virtual_sensor import link  # noqa: PLC0415 - likewise
+
     stopped = threading.Event()
     models = [slave.model for slave in slaves if isinstance(slave, SensorOptions)]
     foreign = [slave.kind for slave in slaves if isinstance(slave, ForeignOptions)]
@@ -219,6 +223,8 @@ def _say(sentence: object) -> None:
 
 def _send(path: str | None, command: str) -> int:
     """Exit code 0 if the virtual sensor that listens there has obeyed."""
+    from ethercat_server.virtual_sensor import link  # noqa: PLC0415 - likewise
+
     path = path or link.own_socket()
     try:
         answer = link.send(path, command)

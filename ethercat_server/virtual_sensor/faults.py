@@ -12,18 +12,19 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from bota_ethercat.program.arguments import number, whole
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.virtual_sensor.application import Application, VirtualSlave
-from ethercat_server.virtual_sensor.bus import SlaveChain
 from ethercat_server.virtual_sensor.commands import PPM_LIMIT, Fault
 from ethercat_server.virtual_sensor.distributed_clock import parse_clock_word
-from ethercat_server.virtual_sensor.esc import SiiInterface
 from ethercat_server.virtual_sensor.options import UsageError, model_name
-from ethercat_server.virtual_sensor.sensor import Firmware, VirtualSensor
 from ethercat_server.virtual_sensor.signals import CHANNELS, SIGNALS
+
+if TYPE_CHECKING:  # --help, which shows the table, need not wait for the sensor
+    from ethercat_server.virtual_sensor.application import Application, VirtualSlave
+    from ethercat_server.virtual_sensor.bus import SlaveChain
+    from ethercat_server.virtual_sensor.sensor import Firmware, VirtualSensor
 
 LONGEST_LINE: Final = 1000
 _MOST_SKIPPED: Final = 90.0  # %
@@ -38,9 +39,10 @@ class Call:
 
     @property
     def sensor(self) -> VirtualSensor:
-        if not isinstance(self.slave, VirtualSensor):
-            raise UsageError("that slave is no sensor: choose one with `@N`")
-        return self.slave
+        for sensor in self.bus.sensors:
+            if sensor is self.slave:
+                return sensor
+        raise UsageError("that slave is no sensor: choose one with `@N`")
 
     @property
     def application(self) -> Application:
@@ -155,7 +157,7 @@ COMMANDS: Final[tuple[Fault, ...]] = (
     Fault("emergency CODE [REGISTER [HEX]] [@N]", "send a CoE emergency before anything else in the mailbox",
           Call._emergency, (_WORD, _BYTE, _hex)),
     Fault("sii error|busy|ok [@N]", "result of reading the EEPROM",
-          lambda c, result: c.application.esc.sii.fail(SiiInterface.FAULTS[result]),
+          lambda c, result: c.application.esc.sii.fail(c.application.esc.sii.FAULTS[result]),
           (_one_of("result", ("error", "busy", "ok")),)),
     Fault("warn BITS [SAMPLES] [@N]", "set warnings, permanently or for some samples",
           lambda c, bits, samples=None: c.firmware.sampler.set_warnings(bits, samples),
