@@ -7,6 +7,11 @@
 //   server [HOST:PORT]        which one a program uses that is given this, or nothing
 //   info [POSITION] | ask REQUEST | describe | tare SAMPLES FX FY FZ MX MY MZ
 //
+// `driver decode` is explained in decode.hpp. `driver contact` tells contact of wrenches on standard input, a line each: a
+// surface (start, end, radius, normal or zeros), an uncertainty (force, torque, tool, center, spin, motion), force, torque,
+// angular rate and acceleration. For each a line: `update` of a detector that was not in contact, then of one that was, and
+// what `locate` says, as numbers.
+//
 // Built with ASan, whose hook counts what `latest` and `next` allocate.
 #include <bota_ethercat.hpp>
 #include <bota_ethercat/world.hpp>
@@ -90,6 +95,32 @@ void conditions() {
             std::printf("%d %s %s\n", number, name(condition), to_string(condition));
 }
 
+Vector3 vector(std::istream& in) {
+    Vector3 v{};
+    in >> v[0] >> v[1] >> v[2];
+    return v;
+}
+
+void contact() {
+    for (std::string line; std::getline(std::cin, line);) {
+        std::istringstream in(line);
+        Surface surface;
+        surface.start = vector(in), surface.end = vector(in), in >> surface.radius;
+        if (const Vector3 normal = vector(in); normal != Vector3{}) surface.normal = normal;
+        Uncertainty known;
+        in >> known.force, known.torque = vector(in), in >> known.tool, known.center = vector(in), in >> known.spin >> known.motion;
+        const Vector3 force = vector(in), torque = vector(in), rate = vector(in), spin = vector(in);
+        ContactDetector one(surface, known, 800.0), other(surface, known, 800.0, 0.394, 0.5);
+        (void)other.update({0, 0, 1000}, {});
+        const bool began = one.update(force, torque, rate, spin), stayed = other.update(force, torque, rate, spin);
+        const Contact found = other.locate(force, torque, rate, spin);
+        std::printf("%d %d %d %d", began, stayed, static_cast<int>(found.why), found.is_press);
+        for (const Vector3& each : {found.point, found.center, found.normal, found.u, found.v})
+            std::printf(" %.17g %.17g %.17g", each[0], each[1], each[2]);
+        std::printf(" %.17g %.17g %.17g\n", found.uu, found.uv, found.vv);
+    }
+}
+
 std::string text_of(const Reading& r) {
     const auto measured_ns = [&r](Channel channel) { return json_text(r.measured_ns(channel)); };
     constexpr std::array channels{Channel::force_torque, Channel::acceleration, Channel::angular_rate};
@@ -148,6 +179,7 @@ int main(int argc, char** argv) {
     if (argc > 1 && std::string_view(argv[1]) == "decode") return decode(argc > 2 && std::string_view(argv[2]) == "accounting");
     if (argc > 3 && std::string_view(argv[1]) == "real_time") return real_time(std::atoi(argv[2]), std::atoi(argv[3])), 0;
     if (argc > 1 && std::string_view(argv[1]) == "conditions") return conditions(), 0;
+    if (argc > 1 && std::string_view(argv[1]) == "contact") return contact(), 0;
     if (argc > 2 && std::string_view(argv[1]) == "world") return !World(argv[2]).send(0.5, {{1, 2, 3, 4, 5, 6}, {7, 8, 9}, {10, 11, 12}, 13}, 2);
     __sanitizer_install_malloc_and_free_hooks([](const volatile void*, std::size_t) { ++allocations; }, [](const volatile void*) {});
     std::optional<Client> maybe_client;
