@@ -12,7 +12,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from bota_clients.errors import ClientError
+from bota_clients.errors import RecordingError
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.program.signals import Signals, interrupt_on_signals
 
@@ -42,7 +42,7 @@ def start(program: str, module: str, *arguments: object) -> int:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)
     except ImportError as error:
         code = not_installed(program, error)
-    except (ClientError, ProtocolError) as error:
+    except (RecordingError, ProtocolError) as error:
         say(program, str(error))
         code = 1
     except KeyboardInterrupt:  # of those that write a file at the end

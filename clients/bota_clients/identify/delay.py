@@ -13,8 +13,7 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.identify.program import choose
 from bota_clients.program import say
-from bota_clients.recording.columns import Columns
-from bota_clients.recording.own_offset import at_last_offset
+from bota_clients.recording.columns import Columns, at_last_offset
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import force_lag_s
 from bota_ethercat.settings import SettingValue

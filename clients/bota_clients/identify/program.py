@@ -22,8 +22,7 @@ from bota_clients.identify.stationary_periods import (
     usable_rows,
 )
 from bota_clients.program import say
-from bota_clients.recording.columns import Columns
-from bota_clients.recording.own_offset import at_last_offset
+from bota_clients.recording.columns import Columns, at_last_offset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
