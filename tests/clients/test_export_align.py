@@ -164,10 +164,10 @@ JOINTS = [
     ("shoulder_pan_joint", "revolute", "0 0 0", "0 0 1"),
     ("wrist_3_joint", "continuous", f"{PI_2} 3.141592653589793 3.14", "0 0 1"),
     ("joint_a1", "revolute", "", "0 0 -1"),
-    ("joint_a2", "revolute", "0 0 0", "0 2 0"),
     ("left_joint2", "revolute", f"-{PI_2} 0 0", ""),
     ("left_drive_joint", "revolute", "0 0 0", "1 0 0"),
     ("left_finger_joint", "revolute", "0 0 0.5", "-1 0 0"),
+    ("joint_a2", "revolute", "0 0 0", "0 2 0"),
     ("fr3_finger_joint1", "prismatic", "0 0 0", "0 1 0"),
     ("flange-tool0", "fixed", f"0 {PI_2} 0", "0 0 0"),
 ]
