@@ -20,7 +20,7 @@ from bota_clients.export.windows import Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
-from tests.clients.simulated import Script, simulate
+from tests.clients.simulated import simulate
 from tests.clients.test_export_windows import NOT_FINITE, SETTINGS, TOOL, joined, stamps, tared
 from tests.descriptions import sensor_row
 from tests.ended import run_here
@@ -112,7 +112,7 @@ def test_a_long_interruption_has_no_more_rows_than_the_limit(tmp_path: Path) -> 
 
 def test_the_rows_are_those_of_the_windows(tmp_path: Path) -> None:
     """To the bit, also compensated, and across the parts in which a recording is read."""
-    frames = simulate(6.0, script=Script(((1.0, "stick"), (1.2, "unstick")), lost_frames=0.02))
+    frames = simulate(6.0, at=((1.0, "stick"), (1.2, "unstick")), lost=0.02)
     path, row = tmp_path / "run.mcap", sensor_row()
     record(path, frames, sensors=(0,), **row["settings"])
     with open_recording(path) as recording:

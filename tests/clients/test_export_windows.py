@@ -25,8 +25,8 @@ from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.bags import imu, write_bag
-from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
-from tests.clients.simulated import Script, simulate
+from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
+from tests.clients.simulated import simulate
 from tests.descriptions import sensor_row
 from tests.ended import run_here
 
@@ -114,7 +114,7 @@ def test_a_step_of_the_wall_clock_in_the_middle_bends_nothing(tmp_path: Path, st
 
 def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> None:
     """The stream is without REPEATED frames, comes in other batches, and is asked as it comes."""
-    frames = simulate(3.0, script=Script(((1.0, "stick"), (1.2, "unstick")), lost_frames=0.02))
+    frames = simulate(3.0, at=((1.0, "stick"), (1.2, "unstick")), lost=0.02)
     path, row, chance = tmp_path / "run.mcap", sensor_row(), random.Random(1)
     record(path, frames, sensors=(0,), **row["settings"])
     with open_recording(path) as recording:
@@ -156,17 +156,16 @@ def test_the_compensated_wrench_is_the_nodes() -> None:
 
 def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
     """A second at each of these forces along x, of which the sensor tells that its own offset is so."""
-    made, row = writer(path), describe(0, **SETTINGS)
+    row = describe(0, **SETTINGS)
     row["sensors"][0] |= {} if told[0] is None else {"offset": [told[0], 0, 0, 0, 0, 0]}
-    made.describe(START_NS, row)
+    items: list[Any] = [row]
     for part, (offset, force) in enumerate(zip(told, steps, strict=True)):
         if part:
             six = None if offset is None else [offset, 0, 0, 0, 0, 0]
-            made.event(START_NS, {"event": "offset_changed", "sensor": 0, "offset": six})
-        for number in range(800 * part, 800 * (part + 1)):
-            values: Any = {"force.x": force}
-            made.frame(frame(number, **values))
-    made.finish({})
+            items.append({"event": "offset_changed", "sensor": 0, "offset": six})
+        values: Any = {"force.x": force}
+        items += [frame(number, **values) for number in range(800 * part, 800 * (part + 1))]
+    write(path, items)
     return path
 
 

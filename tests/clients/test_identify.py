@@ -29,7 +29,7 @@ from ethercat_server.virtual_sensor.dictionary import Flash
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
 from ethercat_server.virtual_sensor.signals import MOVE_LENGTH, POSE_LENGTH
-from tests.clients.recordings import START_NS, describe, record, writer
+from tests.clients.recordings import START_NS, describe, record, write
 from tests.compensation import motion
 from tests.compensation.making import written_parameters
 from tests.ended import run_here
@@ -229,17 +229,9 @@ def test_wrong_usage_is_exit_code_2(arguments: list[str]) -> None:
 
 
 def test_a_sensor_that_was_exchanged_meanwhile_is_refused(tmp_path: Path) -> None:
-    path, half = tmp_path / "swapped.mcap", len(posed()) // 2
-    made = writer(path)
-    description = describe(0)
-    made.describe(START_NS, description)
-    for frame in posed()[:half]:
-        made.frame(frame)
-    other = {**description, "sensors": [{**description["sensors"][0], "serial": 7}]}
-    made.describe(posed()[half].stamp_ns, other)
-    for frame in posed()[half:]:
-        made.frame(frame)
-    made.finish({})
+    path, half, other = tmp_path / "swapped.mcap", len(posed()) // 2, describe(0)
+    other["sensors"][0]["serial"] = 7
+    write(path, [describe(0), *posed()[:half], other, *posed()[half:]])
     assert "sensor 0 was replaced during it (serial numbers 100, 7)" in refused(path)
 
 
