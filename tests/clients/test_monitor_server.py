@@ -154,7 +154,7 @@ def test_once_without_a_server_is_exit_1_and_one_sentence(run: Run) -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [["--server=nonsense:port"], ["--server=::1"], ["localhost"], ["--seconds=0"], ["--once", "--seconds=3"]],
+    [["localhost"], ["--seconds=0"], ["--once", "--seconds=3"]],
 )  # fmt: skip
 def test_wrong_usage_is_exit_2(arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -194,21 +194,17 @@ def test_the_terminal_is_as_it_was_and_had_no_color(shared: ServedSimulation) ->
     assert not codes & colors, "NO_COLOR"
 
 
-@pytest.mark.parametrize("way", ["r again", "the terminal closes", "SIGHUP and the terminal closes"])
+@pytest.mark.parametrize("way", ["the terminal closes", "SIGHUP and the terminal closes"])
 def test_a_recording_ends_with_the_monitor(shared: ServedSimulation, way: str, tmp_path: Path) -> None:
     with Terminal("--server", str(shared.port), cwd=tmp_path) as terminal:
         terminal.wait_for("BFT-SENS-ECAT-M8")
         terminal.type("r")
         terminal.wait_for("REC ")
         wait_until(lambda: any(map(frames_in, tmp_path.glob("*.mcap"))), "frames in the recording")
-        if way == "r again":
-            terminal.type("r")
-            terminal.wait_for("Recorded recording-")
-        else:
-            terminal.hang_up()
-            if "SIGHUP" in way:  # which nohup ignores
-                terminal.process.send_signal(signal.SIGHUP)
-            terminal.process.wait(PATIENCE_S)
+        terminal.hang_up()
+        if "SIGHUP" in way:  # which nohup ignores
+            terminal.process.send_signal(signal.SIGHUP)
+        terminal.process.wait(PATIENCE_S)
     (made,) = tmp_path.glob("*.mcap")
     with open_recording(made) as recording:
         assert recording.end is not None

@@ -19,12 +19,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from mcap.reader import NonSeekingReader
-from rosbags.rosbag2 import Reader
 
 from bota_clients.record import cli, program, recorder
 from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch
-from bota_clients.recording.file_format import frame_topic
 from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -435,12 +432,3 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
     with open_recording(out) as opened:
         assert opened.sensors[0].info.settings["sinc_length"] == 512
         assert is_whole(list(opened.frames()))
-
-
-def test_other_libraries_read_it(source: Path) -> None:
-    with Reader(source) as bag:
-        counts = {connection.topic: connection.msgcount for connection in bag.connections}
-    assert counts[frame_topic(0)] + counts[frame_topic(1)] == SECOND
-    with source.open("rb") as file:
-        messages = NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False)
-        assert sum(1 for _ in messages) == sum(counts.values())

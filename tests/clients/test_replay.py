@@ -351,9 +351,7 @@ def test_numbers_and_times_stay_in_their_fields() -> None:
     ("code", "arguments", "sentence"),
     [
         (2, (), "required"),
-        (2, ("x.mcap", "--server", "99999"), "99999 is no port: it must be from 1 to 65535"),
         (2, ("x.mcap", "--speed", "nan"), "it must be a number"),
-        (2, ("x.mcap", "--server", "nowhere:1"), "an IP address of this machine"),
         (1, ("/no/x.mcap",), "No such file"),
         (1, (__file__,), "is not an MCAP file"),
     ],
