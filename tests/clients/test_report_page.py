@@ -65,7 +65,7 @@ class Reader(HTMLParser):
 @pytest.fixture(scope="module")
 def page() -> str:
     """A report on a sensor with a noisy axis, and some samples lost."""
-    noisy = sensor(12, "noise force.y 0.6", "skip 0.3", seed=12)
+    noisy = sensor(6, "noise force.y 0.6", "skip 0.3", seed=12)
     return render([Examination(noisy)], made=MADE, program="ethercat-report")
 
 

@@ -57,15 +57,12 @@ class MonitorRecording:
 
     def _run(self, path: Path) -> None:
         try:
-            self._said = f"Recorded {path}: {self._record(path)}", False
+            with contextlib.closing(files.RecordingClient(self._address, None)) as source:
+                source.connect()
+                recorder = files.Recorder(path, files.NAME, files.notes(source), overwrite=False)
+                files.record(source, recorder, lambda _: "asked to stop" if self._asked.is_set() else None)
+            if recorder.error is not None:
+                raise recorder.error
+            self._said = f"Recorded {path}: {recorder.summary}", False
         except (RecordingError, ProtocolError) as error:
             self._said = f"The recording failed: {error}", True
-
-    def _record(self, path: Path) -> str:
-        with contextlib.closing(files.RecordingClient(self._address, None)) as source:
-            source.connect()
-            recorder = files.Recorder(path, files.NAME, files.notes(source), overwrite=False)
-            files.record(source, recorder, lambda _: "asked to stop" if self._asked.is_set() else None)
-        if recorder.error is not None:
-            raise recorder.error
-        return recorder.summary
