@@ -138,22 +138,6 @@ def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> N
         assert array.tobytes() == recorded[name].tobytes(), name
 
 
-def test_the_compensated_wrench_is_the_nodes() -> None:
-    """The worked example of docs/compensation.md; unknown where it turns and what was before is not known."""
-    force: Any = {"force.x": 8.0, "force.y": -9.345, "force.z": 7.25, "acceleration.y": 1.0}
-    held = force | {"torque.x": 0.631, "torque.y": 0.55, "torque.z": 0.094}
-    frames = [frame(8, **held), *(frame(number) for number in range(9, 100))]
-    turning: dict[str, Any] = {"acceleration.y": 1.0, "angular_rate.z": 90.0}
-    frames[50:] = [frame(number, flags=4, **turning) for number in range(130, 136)]
-    parts = "tool_mass", "tool_center_of_gravity", "bias"
-    windows = Windows(1, tool={name: TOOL[name] for name in parts})
-    windows.configure({**sensor_row()["settings"], **SETTINGS}, RATE_HZ, "BFT-SENS-ECAT-M8")
-    windows.add(frames)
-    made = windows.at(np.array([8, 130, 133, 134]) * PERIOD_NS - 1_880_000)
-    assert made["force_torque_compensated"][0, 0] == pytest.approx([5, 0, 0, 0, 0.6, 0], abs=1e-3)
-    assert made["force_torque_compensated_valid"].ravel().tolist() == [True, False, False, True]
-
-
 def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
     """A second at each of these forces along x, of which the sensor tells that its own offset is so."""
     row = describe(0, **SETTINGS)
