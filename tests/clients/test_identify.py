@@ -267,9 +267,10 @@ def test_the_inertia_is_found_if_the_tool_turned_between_the_poses_and_likely_if
     begin_s, wrist, arm = 21.0, motion.turned(3), motion.waypoints(1.4, 1.6, 2, radians=5.0)
 
     def path(t: motion.Array) -> tuple[motion.Array, motion.Array]:
-        share = np.clip((t - begin_s) / 2.0, 0.0, 1.0)[:, None] ** 2
-        (place, angles), (_, more) = arm(np.minimum(t, begin_s)), wrist(t)
-        return place, angles + share * more
+        (place, angles), late = arm(np.minimum(t, begin_s)), t > begin_s
+        share = np.clip((t[late] - begin_s) / 2.0, 0.0, 1.0)[:, None] ** 2
+        angles[late] += share * wrist(t[late])[1]
+        return place, angles
 
     tool = Payload(1.5, (0.05, -0.03, 0.07), (0.009, 0.011, 0.006, 0.001, -0.002, 0.001))
     settings: dict[str, Any] = start_up_defaults()
