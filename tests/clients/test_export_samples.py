@@ -181,20 +181,3 @@ def test_what_any_tool_reads_in_the_parquet_file(tmp_path: Path) -> None:
     for name in table.column_names:
         column = table[name].to_numpy()
         assert column.astype(npz[name].dtype).tobytes() == npz[name].tobytes(), name
-
-
-def test_a_filter_by_validity_finds_in_the_file_what_it_finds_in_memory(tmp_path: Path) -> None:
-    """One by values does not: NaN is not in the statistics of a file."""
-    compute, dataset = pytest.importorskip("pyarrow.compute"), pytest.importorskip("pyarrow.dataset")
-    path, out = tmp_path / "run.mcap", tmp_path / "run.parquet"
-    record(path, [frame(0), frame(1), frame(3, flags=GAP), frame(4)], **SETTINGS)
-    assert run_here(main, path, out).code == 0
-    valid, force = compute.field("valid"), compute.field("force_x_N")
-    for wanted, rows in (
-        (valid & ~(force < 1), [1, 3, 4]),
-        (~valid & ~(force < 1), [2]),
-        (valid, [0, 1, 3, 4]),
-    ):
-        file = dataset.dataset(out)
-        for found in (file.to_table(filter=wanted), file.to_table().filter(wanted)):
-            assert [round(each / 1.25e-3) for each in found["time_s"].to_pylist()] == rows
