@@ -24,6 +24,7 @@ from bota_ethercat.pdo import LAYOUTS, STANDARD_GRAVITY, ImuUnits
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
 
 # The largest process data as a NumPy record, from the table. The smaller begins alike.
 _SIZE: Final = max(LAYOUTS)
@@ -62,12 +63,12 @@ class Columns:
         return len(self.stamp_ns)
 
     @property
-    def fresh(self) -> npt.NDArray[np.bool_]:
+    def fresh(self) -> Bools:
         """(n,) True where the frame is a new and valid sample."""
-        fresh: npt.NDArray[np.bool_] = (self.flags & NOT_NEW) == 0
+        fresh: Bools = (self.flags & NOT_NEW) == 0
         return fresh
 
-    def where(self, mask: npt.NDArray[np.bool_]) -> Columns:
+    def where(self, mask: Bools) -> Columns:
         """The rows where `mask` is True, for example `columns.where(columns.fresh)`."""
         return Columns(*(getattr(self, name)[mask] for name in self.__slots__))
 

@@ -23,8 +23,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_clients.numbers import count, figure, listing, seconds
-from bota_clients.recording.columns import Floats, Ints
-from bota_clients.report.series import CHANNELS, Bools, Series, Subject, bits, channel_limit
+from bota_clients.recording.columns import Bools, Floats, Ints
+from bota_clients.report.series import CHANNELS, Series, Subject, bits, channel_limit
 from bota_ethercat.health.judge import SATURATIONS, Observation, judge
 from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.pdo import STANDARD_GRAVITY

@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count, listing, moment
-from bota_clients.recording.columns import Columns, Floats, Ints, columns, joined
+from bota_clients.recording.columns import Bools, Columns, Floats, Ints, columns, joined
 from bota_clients.recording.reader import InForce, RecordedSensor, Recording, open_recording
 from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.health.limits import LIMITS
@@ -27,8 +26,6 @@ from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.filters import LONG_SINC, SHORT_SINC, noise_limit
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
 from bota_ethercat.text.untrusted import printable
-
-Bools = npt.NDArray[np.bool_]
 
 _HIGHEST_RATE_HZ: Final = 100_000.0
 _MOST_EVENTS_NAMED: Final = 10
