@@ -30,7 +30,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
-from tests.clients.running import frames_in
+from tests.clients.running import frames_in, signalled
 from tests.golden_vectors import odd_messages
 from tests.served_simulation import ServedSimulation, served
 from tests.server.running import PATIENCE_S, free_port, wait_until
@@ -172,6 +172,12 @@ def test_a_reader_that_goes_is_no_traceback(shared: ServedSimulation) -> None:
     assert done.returncode == 0
 
 
+def test_ctrl_c_is_no_failure(shared: ServedSimulation, capsys: pytest.CaptureFixture[str]) -> None:
+    ready = lambda: "connected" in capsys.readouterr().out  # noqa: E731
+    assert signalled(cli.main, signal.SIGINT, ready, "--json", "--server", shared.port) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_a_dumb_terminal_gets_the_table_once_without_escape_sequences(shared: ServedSimulation) -> None:
     with Terminal("--server", str(shared.port), TERM="dumb", PYTHONIOENCODING="ascii") as terminal:
         terminal.end()
@@ -279,6 +285,14 @@ def test_tare_says_why_not() -> None:
         text, bad = tare(Address("localhost", 1), 0)
         assert bad
         assert re.match("Sensor 0 was not tared: .*no reply to describe", text)
+
+
+def test_an_offset_that_is_unknown_or_not_taken_is_told() -> None:
+    with ScriptedServer() as server:
+        address = Address("localhost", server.port)
+        assert tare(address, 0, "clear")[0].endswith("not cleared: its offset is unknown to the server")
+        server.description["sensors"][0]["offset"] = [1.0] * 6
+        assert tare(address, 0, "clear")[0].endswith("not cleared: the sensor did not take the offset")
 
 
 @pytest.mark.parametrize("way", ["silent", "gone"])
