@@ -12,9 +12,11 @@ from bota_ethercat.program.arguments import typed
 from bota_ethercat.sensor_choice import MAX_SENSORS
 
 
-def add_server(parser: argparse.ArgumentParser, what: str = "the server") -> None:
+def add_server(parser: argparse.ArgumentParser) -> None:
     """`--server HOST:PORT`; see `server_of`."""
-    parser.add_argument("--server", type=address, metavar="HOST:PORT", help=f"{what} {server_choice.HELP}")
+    parser.add_argument(
+        "--server", type=address, metavar="HOST:PORT", help=f"the server {server_choice.HELP}"
+    )
 
 
 def server_of(parser: argparse.ArgumentParser, given: Address | None) -> Address:

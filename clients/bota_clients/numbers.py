@@ -36,7 +36,7 @@ def listing(texts: Sequence[str], most: int = 6) -> str:
 
 def count(number: int, noun: str) -> str:
     """`1 sample`, `12 345 samples`."""
-    return f"{number:,} {noun}{'' if number == 1 else 'es' if noun.endswith('ch') else 's'}".replace(",", " ")
+    return f"{number:,} {noun}{'' if number == 1 else 's'}".replace(",", " ")
 
 
 def seconds(value: float) -> str:

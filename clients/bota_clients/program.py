@@ -12,16 +12,14 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from bota_clients.errors import ClientError
+from bota_clients.errors import RecordingError
 from bota_ethercat.errors import ProtocolError
 from bota_ethercat.program.signals import Signals, interrupt_on_signals
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
 
-__all__ = [
-    "Signals", "call_on", "interrupt_on_signals", "not_installed", "say", "start",
-]  # fmt: skip
+__all__ = ["Signals", "call_on", "interrupt_on_signals", "say", "start"]
 
 _OF_DATASETS: Final = ("pyarrow", "zarr", "rosbags", "yaml")
 
@@ -40,15 +38,18 @@ def start(program: str, module: str, *arguments: object) -> int:
         sys.stderr = _standard_error()
     try:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)
+        return code
     except ImportError as error:
-        code = not_installed(program, error)
-    except (ClientError, ProtocolError) as error:
-        say(program, str(error))
-        code = 1
+        package = (error.name or str(error)).partition(".")[0]
+        extra = "dataset" if package in _OF_DATASETS else "client"
+        command = shlex.join([sys.executable, "-m", "pip", "install", f".[{extra}]"])
+        said = f"{package} is not installed: in this project's folder run {command}"
+    except (RecordingError, ProtocolError) as error:
+        said = str(error)
     except KeyboardInterrupt:  # of those that write a file at the end
-        say(program, "stopped: nothing was written")
-        code = 1
-    return code
+        said = "stopped: nothing was written"
+    say(program, said)
+    return 1
 
 
 class _Unheard(io.FileIO):
@@ -67,15 +68,6 @@ def _standard_error() -> io.TextIOWrapper:
     file = _Unheard(2, "w", closefd=False) if sys.stderr else io.FileIO(os.devnull, "w")
     encoding = getattr(sys.stderr, "encoding", None)
     return io.TextIOWrapper(io.BufferedWriter(file), encoding, "backslashreplace", line_buffering=True)
-
-
-def not_installed(program: str, error: ImportError) -> int:
-    """Say which package is not installed, and how to install it; returns the exit code."""
-    package = (error.name or str(error)).partition(".")[0]
-    extra = "dataset" if package in _OF_DATASETS else "client"
-    command = shlex.join([sys.executable, "-m", "pip", "install", f".[{extra}]"])
-    say(program, f"{package} is not installed: in this project's folder run {command}")
-    return 1
 
 
 def call_on(loop: AbstractEventLoop, stop: Callable[[], object], *names: str) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 
 from bota_clients.recording.writer import DiskFile, RecordingWriter
@@ -13,6 +14,7 @@ from tests.descriptions import description, sensor_row
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 1_250_000
+NOTHING: Mapping[str, str] = {}
 
 
 def describe(*sensors: int, **settings: object) -> JsonObject:
@@ -28,10 +30,28 @@ def frame(number: int, sensor: int = 0, flags: int = 0, size: int = 61, **values
     return DataMessage(number, START_NS + moment, moment, sensor, flags, 3, data)
 
 
-def writer(path: Path, **notes: str) -> RecordingWriter:
-    """A new recording at `path`."""
-    disk = DiskFile(path, overwrite=True)
-    return RecordingWriter(disk, "test", notes)
+def write(
+    path: Path,
+    items: Iterable[DataMessage | JsonObject],
+    chunk: int = 100,
+    end: Mapping[str, str] | None = NOTHING,
+    **notes: str,
+) -> None:
+    """A recording of frames, descriptions and events, which are received with the frame before.
+
+    With a chunk for so many frames. `end` are the notes at its end; None: it is cut off.
+    """
+    made, now_ns, frames = RecordingWriter(DiskFile(path, overwrite=True), "test", notes), START_NS, 0
+    for item in items:
+        if not isinstance(item, DataMessage):
+            (made.event if "event" in item else made.describe)(now_ns, item)
+            continue
+        made.frame(item)
+        now_ns, frames = item.stamp_ns, frames + 1
+        if frames % chunk == 0:
+            made.flush()
+    if end is not None:
+        made.finish(end)
 
 
 def record(
@@ -40,15 +60,6 @@ def record(
     chunk: int = 100,
     sensors: tuple[int, ...] = (0,),
     **settings: object,
-) -> list[DataMessage]:
-    """A whole recording of `frames`, with a chunk for so many of them; returns them."""
-    made = writer(path)
-    made.describe(START_NS, describe(*sensors, **settings))
-    written = []
-    for count, item in enumerate(frames, 1):
-        written.append(item)
-        made.frame(item)
-        if count % chunk == 0:
-            made.flush()
-    made.finish({})
-    return written
+) -> None:
+    """A whole recording of `frames` of these sensors, which have these settings."""
+    write(path, chain([describe(*sensors, **settings)], frames), chunk)

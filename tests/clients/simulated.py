@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-from bota_clients.recording.columns import Columns, columns
+from bota_clients.recording.columns import columns
 from bota_clients.report.series import Subject
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import SensorInfo
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -25,50 +23,40 @@ STARTED_AT_NS = 1_767_225_600 * 10**9
 """2026-01-01 00:00:00 UTC"""
 
 
-@dataclass(frozen=True)
-class Script:
-    """What to do to the sensor, and when: commands of the virtual sensor by seconds after the start."""
-
-    commands: tuple[tuple[float, str], ...] = ()
-    lost_frames: float = 0.0
-    """Part of the exchanges whose frame does not come back."""
-
-
 @functools.cache
 def simulate(
-    seconds: float, *commands: str, script: Script = Script(), begin: float = 0.0, **options: Any
+    seconds: float,
+    *commands: str,
+    at: tuple[tuple[float, str], ...] = (),
+    lost: float = 0.0,
+    begin: float = 0.0,
+    **options: Any,
 ) -> tuple[DataMessage, ...]:
-    """The frames of so many seconds from `begin` on, when `commands` are given.
+    """The frames of so many seconds from `begin` on, when `commands` are given; others `at` their seconds.
 
-    `options` are `SensorOptions`'. In the signal `scene` there is a contact 5 s after power-on.
+    `lost` is the part of the exchanges whose frame does not come back; `options` are `SensorOptions`'. In the
+    signal `scene` there is a contact 5 s after power-on.
     """
     options = {"sinc_length": 64, **options}
     sensor = SensorOptions(**options)
-    machine = Machine(seed=sensor.seed, lost=script.lost_frames)
+    machine = Machine(seed=sensor.seed, lost=lost)
     simulation = Simulation(sensor, machine=machine, settings={"sinc_length": options["sinc_length"]})
     simulation.run(begin)
     for line in commands:
         simulation.command(line)
-    for at_s, line in script.commands:
+    for at_s, line in at:
         simulation.at(at_s, line)
     before, moved_ns = len(simulation.frames), STARTED_AT_NS - simulation.clock.time_ns()
     simulation.run(seconds)
     return tuple(each._replace(stamp_ns=each.stamp_ns + moved_ns) for each in simulation.frames[before:])
 
 
-def decoded(frames: Sequence[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
-    return columns([frame for frame in frames if frame.sensor == 0], imu_units)
-
-
 def subject_of(
-    frames: Sequence[DataMessage],
-    row: Mapping[str, Any] | None = None,
-    source: str = "simulated.mcap",
-    **kind: Any,
+    frames: Sequence[DataMessage], row: Mapping[str, Any], source: str = "simulated.mcap"
 ) -> Subject:
-    info = SensorInfo.parse(sensor_row() if row is None else row)
+    info = SensorInfo.parse(row)
     assert info is not None
-    return Subject(info, decoded(frames, **kind), source)
+    return Subject(info, columns(frames), source)
 
 
 def sensor(seconds: float, *commands: str, **options: Any) -> Subject:

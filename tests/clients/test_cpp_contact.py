@@ -11,7 +11,7 @@ from bota_ethercat.pdo import Vector3
 from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Plane, Uncertainty, Why
 from bota_ethercat_bridge.ft_compensation.quantities import ZERO, Turning
 from bota_ethercat_bridge.ft_compensation.stationary import triple
-from tests.clients.cpp_programs import FAST, SANITIZED, SOURCES, build, needs_gxx, patient
+from tests.clients.cpp_programs import FAST, SANITIZED, driver_program, needs_gxx, patient
 from tests.compensation.making import SEED
 from tests.compensation.test_contact import NOISE, PLACES, TOOL, pushed
 
@@ -66,7 +66,7 @@ def line(case: Case) -> str:
 def test_it_is_that_of_python(flags: tuple[str, ...]) -> None:
     made = cases()
     answers = subprocess.run(
-        [build(SOURCES / "contact.cpp", flags)], input="\n".join(map(line, made)), capture_output=True,
+        [driver_program(flags), "contact"], input="\n".join(map(line, made)), capture_output=True,
         text=True, check=True,
     ).stdout.splitlines()  # fmt: skip
     assert {told(case)[2] for case in made} == set(range(len(Why)))

@@ -192,7 +192,7 @@ CONVERSATIONS: dict[str, tuple[Any, list[Any]]] = {
         told("info", bad_messages=5),
     ]),
     "odd values where others are expected": ({}, [
-        *odd_messages(),
+        b"".join(map(encode_json, odd_messages())),
         F(1), told("latest", fresh=True, is_new=True), told("info", link="up"),
     ]),
     # Nothing from the network commands a terminal, and it is cut between two characters.

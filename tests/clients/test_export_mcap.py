@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from bota_clients.export.cli import main
 from bota_clients.recording.file_format import frame_topic
 from bota_clients.recording.reader import open_recording
-from tests.clients.recordings import START_NS, describe, frame, record, writer
+from tests.clients.recordings import describe, frame, record, write
 from tests.clients.running import Replay, frames_in
 from tests.ended import run_here
 from tests.server.running import PATIENCE_S, wait_until
@@ -83,15 +83,11 @@ def test_what_a_recorder_that_was_killed_leaves_becomes_a_whole_file(tmp_path: P
 def test_of_a_complete_recording_every_message_and_note_is_the_same(tmp_path: Path) -> None:
     """In many chunks; then of one sensor alone."""
     path, out = tmp_path / "run.mcap", tmp_path / "out.mcap"
-    made = writer(path, started="today")
-    made.describe(START_NS, describe(0, 1))
-    for number in range(3000):
-        made.frame(frame(number // 2, sensor=number % 2))
-        if number % 1000 == 500:
-            made.event(START_NS + number, {"event": "reconfigured", "sensor": 0, "values": [0.1, None]})
-            made.flush()
+    items: list[Any] = [frame(number // 2, sensor=number % 2) for number in range(3000)]
+    for at in (2500, 1500, 500):
+        items.insert(at, {"event": "reconfigured", "sensor": 0, "values": [0.1, None]})
     notes = {"reason": "asked to stop", "dropped": "7"}
-    made.finish(notes)
+    write(path, [describe(0, 1), *items], 1000, notes, started="today")
     export(path, out)
     assert messages(out) == messages(path)
     with open_recording(out) as recording:

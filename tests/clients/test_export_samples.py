@@ -20,7 +20,7 @@ from bota_clients.export.windows import Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
-from tests.clients.simulated import Script, simulate
+from tests.clients.simulated import simulate
 from tests.clients.test_export_windows import NOT_FINITE, SETTINGS, TOOL, joined, stamps, tared
 from tests.descriptions import sensor_row
 from tests.ended import run_here
@@ -112,7 +112,7 @@ def test_a_long_interruption_has_no_more_rows_than_the_limit(tmp_path: Path) -> 
 
 def test_the_rows_are_those_of_the_windows(tmp_path: Path) -> None:
     """To the bit, also compensated, and across the parts in which a recording is read."""
-    frames = simulate(6.0, script=Script(((1.0, "stick"), (1.2, "unstick")), lost_frames=0.02))
+    frames = simulate(6.0, at=((1.0, "stick"), (1.2, "unstick")), lost=0.02)
     path, row = tmp_path / "run.mcap", sensor_row()
     record(path, frames, sensors=(0,), **row["settings"])
     with open_recording(path) as recording:
@@ -181,20 +181,3 @@ def test_what_any_tool_reads_in_the_parquet_file(tmp_path: Path) -> None:
     for name in table.column_names:
         column = table[name].to_numpy()
         assert column.astype(npz[name].dtype).tobytes() == npz[name].tobytes(), name
-
-
-def test_a_filter_by_validity_finds_in_the_file_what_it_finds_in_memory(tmp_path: Path) -> None:
-    """One by values does not: NaN is not in the statistics of a file."""
-    compute, dataset = pytest.importorskip("pyarrow.compute"), pytest.importorskip("pyarrow.dataset")
-    path, out = tmp_path / "run.mcap", tmp_path / "run.parquet"
-    record(path, [frame(0), frame(1), frame(3, flags=GAP), frame(4)], **SETTINGS)
-    assert run_here(main, path, out).code == 0
-    valid, force = compute.field("valid"), compute.field("force_x_N")
-    for wanted, rows in (
-        (valid & ~(force < 1), [1, 3, 4]),
-        (~valid & ~(force < 1), [2]),
-        (valid, [0, 1, 3, 4]),
-    ):
-        file = dataset.dataset(out)
-        for found in (file.to_table(filter=wanted), file.to_table().filter(wanted)):
-            assert [round(each / 1.25e-3) for each in found["time_s"].to_pylist()] == rows

@@ -25,8 +25,8 @@ from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.bags import imu, write_bag
-from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, writer
-from tests.clients.simulated import Script, simulate
+from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
+from tests.clients.simulated import simulate
 from tests.descriptions import sensor_row
 from tests.ended import run_here
 
@@ -114,7 +114,7 @@ def test_a_step_of_the_wall_clock_in_the_middle_bends_nothing(tmp_path: Path, st
 
 def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> None:
     """The stream is without REPEATED frames, comes in other batches, and is asked as it comes."""
-    frames = simulate(3.0, script=Script(((1.0, "stick"), (1.2, "unstick")), lost_frames=0.02))
+    frames = simulate(3.0, at=((1.0, "stick"), (1.2, "unstick")), lost=0.02)
     path, row, chance = tmp_path / "run.mcap", sensor_row(), random.Random(1)
     record(path, frames, sensors=(0,), **row["settings"])
     with open_recording(path) as recording:
@@ -138,35 +138,18 @@ def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> N
         assert array.tobytes() == recorded[name].tobytes(), name
 
 
-def test_the_compensated_wrench_is_the_nodes() -> None:
-    """The worked example of docs/compensation.md; unknown where it turns and what was before is not known."""
-    force: Any = {"force.x": 8.0, "force.y": -9.345, "force.z": 7.25, "acceleration.y": 1.0}
-    held = force | {"torque.x": 0.631, "torque.y": 0.55, "torque.z": 0.094}
-    frames = [frame(8, **held), *(frame(number) for number in range(9, 100))]
-    turning: dict[str, Any] = {"acceleration.y": 1.0, "angular_rate.z": 90.0}
-    frames[50:] = [frame(number, flags=4, **turning) for number in range(130, 136)]
-    parts = "tool_mass", "tool_center_of_gravity", "bias"
-    windows = Windows(1, tool={name: TOOL[name] for name in parts})
-    windows.configure({**sensor_row()["settings"], **SETTINGS}, RATE_HZ, "BFT-SENS-ECAT-M8")
-    windows.add(frames)
-    made = windows.at(np.array([8, 130, 133, 134]) * PERIOD_NS - 1_880_000)
-    assert made["force_torque_compensated"][0, 0] == pytest.approx([5, 0, 0, 0, 0.6, 0], abs=1e-3)
-    assert made["force_torque_compensated_valid"].ravel().tolist() == [True, False, False, True]
-
-
 def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
     """A second at each of these forces along x, of which the sensor tells that its own offset is so."""
-    made, row = writer(path), describe(0, **SETTINGS)
+    row = describe(0, **SETTINGS)
     row["sensors"][0] |= {} if told[0] is None else {"offset": [told[0], 0, 0, 0, 0, 0]}
-    made.describe(START_NS, row)
+    items: list[Any] = [row]
     for part, (offset, force) in enumerate(zip(told, steps, strict=True)):
         if part:
             six = None if offset is None else [offset, 0, 0, 0, 0, 0]
-            made.event(START_NS, {"event": "offset_changed", "sensor": 0, "offset": six})
-        for number in range(800 * part, 800 * (part + 1)):
-            values: Any = {"force.x": force}
-            made.frame(frame(number, **values))
-    made.finish({})
+            items.append({"event": "offset_changed", "sensor": 0, "offset": six})
+        values: Any = {"force.x": force}
+        items += [frame(number, **values) for number in range(800 * part, 800 * (part + 1))]
+    write(path, items)
     return path
 
 

@@ -29,7 +29,7 @@ from ethercat_server.virtual_sensor.dictionary import Flash
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
 from ethercat_server.virtual_sensor.signals import MOVE_LENGTH, POSE_LENGTH
-from tests.clients.recordings import START_NS, describe, record, writer
+from tests.clients.recordings import START_NS, describe, record, write
 from tests.compensation import motion
 from tests.compensation.making import written_parameters
 from tests.ended import run_here
@@ -229,17 +229,9 @@ def test_wrong_usage_is_exit_code_2(arguments: list[str]) -> None:
 
 
 def test_a_sensor_that_was_exchanged_meanwhile_is_refused(tmp_path: Path) -> None:
-    path, half = tmp_path / "swapped.mcap", len(posed()) // 2
-    made = writer(path)
-    description = describe(0)
-    made.describe(START_NS, description)
-    for frame in posed()[:half]:
-        made.frame(frame)
-    other = {**description, "sensors": [{**description["sensors"][0], "serial": 7}]}
-    made.describe(posed()[half].stamp_ns, other)
-    for frame in posed()[half:]:
-        made.frame(frame)
-    made.finish({})
+    path, half, other = tmp_path / "swapped.mcap", len(posed()) // 2, describe(0)
+    other["sensors"][0]["serial"] = 7
+    write(path, [describe(0), *posed()[:half], other, *posed()[half:]])
     assert "sensor 0 was replaced during it (serial numbers 100, 7)" in refused(path)
 
 
@@ -271,17 +263,18 @@ def record_felt(path: Path, felt: motion.Felt, settings: dict[str, Any]) -> None
 def test_the_inertia_is_found_if_the_tool_turned_between_the_poses_and_likely_if_not(
     turns: bool, tmp_path: Path
 ) -> None:
-    """Ten poses, and 12 s in which it is turned to and fro."""
-    begin_s, wrist, arm = 30.0, motion.turned(3), motion.waypoints(1.4, 1.6, 2, radians=5.0)
+    """Seven poses, and 8 s in which it is turned to and fro."""
+    begin_s, wrist, arm = 21.0, motion.turned(3), motion.waypoints(1.4, 1.6, 2, radians=5.0)
 
     def path(t: motion.Array) -> tuple[motion.Array, motion.Array]:
-        share = turns * np.clip((t - begin_s) / 2.0, 0.0, 1.0)[:, None] ** 2
-        (place, angles), (_, more) = arm(np.minimum(t, begin_s)), wrist(t)
-        return place, angles + share * more
+        (place, angles), late = arm(np.minimum(t, begin_s)), t > begin_s
+        share = np.clip((t[late] - begin_s) / 2.0, 0.0, 1.0)[:, None] ** 2
+        angles[late] += share * wrist(t[late])[1]
+        return place, angles
 
     tool = Payload(1.5, (0.05, -0.03, 0.07), (0.009, 0.011, 0.006, 0.001, -0.002, 0.001))
     settings: dict[str, Any] = start_up_defaults()
-    felt = motion.filtered(path, tool, begin_s + 12.0 * turns, settings)
+    felt = motion.filtered(path if turns else arm, tool, begin_s + 8.0 * turns, settings)
     if not turns:  # not even from pose to pose
         felt = motion.Felt(*(part[felt.times % 3.0 < 1.6] for part in felt))
     record_felt(tmp_path / "a.mcap", felt, settings)
@@ -307,7 +300,7 @@ def test_the_inertia_is_found_if_the_tool_turned_between_the_poses_and_likely_if
 def test_without_a_rest_all_is_found_by_motion_and_a_wrong_unit_is_refused(tmp_path: Path) -> None:
     tool = Payload(1.5, (0.05, -0.03, 0.07), (0.009, 0.011, 0.006, 0.001, -0.002, 0.001))
     settings: dict[str, Any] = start_up_defaults()
-    felt = motion.filtered(motion.turned(3), tool, 16.0, settings)
+    felt = motion.filtered(motion.turned(3), tool, 10.0, settings)
     record_felt(tmp_path / "a.mcap", felt, settings)
     code, found, _ = asked(tmp_path / "a.mcap", "--yaml", tmp_path / "tool.yaml")
     assert (code, bool(problems("identify", found)), found["poses"]) == (0, False, [])

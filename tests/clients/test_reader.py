@@ -19,7 +19,7 @@ from bota_clients.recording.container import MAX_CHUNK, McapFile
 from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import SampleDecoder
-from tests.clients.recordings import START_NS, describe, frame, record, writer
+from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
 
 DOCS = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
 CHUNKS = 10
@@ -71,23 +71,17 @@ def test_sensors_are_told_apart(path: Path) -> None:
 
 
 def test_settings_are_known_over_time(path: Path) -> None:
-    made = writer(path)
-    first = describe(0, chop=False)
+    first, then = describe(0, chop=False), describe(0)
     first["sensors"][0]["serial"] = 2**32 - 1
-    made.describe(START_NS, first)
-    made.frame(frame(0))
-    made.event(START_NS + 10, {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}})
-    reply = describe(0)
-    reply["sensors"][0] |= {"settings": {"sinc_length": 32}, "rate_hz": 1600, "serial": 2**32 - 1}
-    made.describe(START_NS + 20, reply)
-    made.frame(frame(1))
-    made.finish({"reason": "asked to"})
+    then["sensors"][0] |= {"settings": {"sinc_length": 32}, "rate_hz": 1600, "serial": 2**32 - 1}
+    event: Any = {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}}
+    write(path, [first, frame(8), event, then, frame(9)], end={"reason": "asked to"})
     with open_recording(path) as recording:
         (sensor,) = recording.sensors
         assert sensor.info.serial == 2**32 - 1
         assert sensor.info.settings == {"sinc_length": 64, "chop": False}
         history = [(at - START_NS, info.settings["sinc_length"], info.rate_hz) for at, info in sensor.history]
-        assert history == [(0, 64, 800), (10, 32, 1600)]
+        assert history == [(0, 64, 800), (8 * PERIOD_NS, 32, 1600)]
         assert [type(item) for item in recording.everything()] == [
             RecordedDescription, DataMessage, RecordedEvent, RecordedDescription, DataMessage,
         ]  # fmt: skip
@@ -176,7 +170,7 @@ def test_other_files_and_what_was_cut_off_before_the_first_chunk_are_refused(pat
 
 
 def test_what_is_not_there_or_another_format_is_said(path: Path) -> None:
-    writer(path, format="99").finish({})
+    write(path, [], format="99")
     with pytest.raises(RecordingError, match="'99'"):
         open_recording(path)
     with pytest.raises(RecordingError, match="No such file"):

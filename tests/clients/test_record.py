@@ -19,12 +19,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from mcap.reader import NonSeekingReader
-from rosbags.rosbag2 import Reader
 
 from bota_clients.record import cli, program, recorder
 from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch
-from bota_clients.recording.file_format import frame_topic
 from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -253,8 +250,7 @@ def test_of_a_file_that_is_removed_nothing_is_said_to_be_there(out: Path) -> Non
     assert (removed.saved, removed.dropped) == (0, 11)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_it_records_on_when_nobody_reads_what_it_says(out: Path, number: signal.Signals) -> None:
+def test_it_records_on_when_nobody_reads_what_it_says(out: Path) -> None:
     """A process: its standard error is a pipe whose reader goes before something is said."""
     reading, writing = os.pipe()
     with ScriptedServer() as server, open(reading) as said:  # noqa: PTH123
@@ -268,7 +264,7 @@ def test_it_records_on_when_nobody_reads_what_it_says(out: Path, number: signal.
                 server.send_json({"event": "reconfigured", "sensor": 0})
                 server.send_sample(float(sequence))
                 wait_until(lambda: frames_in(out) == server.sequence, "the sample")
-            process.send_signal(number)
+            process.send_signal(signal.SIGHUP)
             assert process.wait(PATIENCE_S) == 0
         finally:
             process.kill()
@@ -436,12 +432,3 @@ def test_settings_that_change_meanwhile_are_in_the_recording(out: Path) -> None:
     with open_recording(out) as opened:
         assert opened.sensors[0].info.settings["sinc_length"] == 512
         assert is_whole(list(opened.frames()))
-
-
-def test_other_libraries_read_it(source: Path) -> None:
-    with Reader(source) as bag:
-        counts = {connection.topic: connection.msgcount for connection in bag.connections}
-    assert counts[frame_topic(0)] + counts[frame_topic(1)] == SECOND
-    with source.open("rb") as file:
-        messages = NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False)
-        assert sum(1 for _ in messages) == sum(counts.values())

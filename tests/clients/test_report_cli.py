@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,31 +13,14 @@ import pytest
 
 from bota_clients.report import cli, page, plots
 from bota_ethercat.framing import DataFlag, DataMessage
-from tests.clients.recordings import writer
-from tests.clients.simulated import STARTED_AT_NS, simulate
+from tests.clients.recordings import write
+from tests.clients.simulated import simulate
 from tests.descriptions import description, sensor_row
 
 SINC, SPLIT = 128, 600
 
 
 Frames = Sequence[DataMessage]
-
-
-def record(path: Path, *items: Frames | dict[str, object], end: bool = True, **options: str) -> Path:
-    """A recording of frames, descriptions and events, in this order; each is received with the last frame."""
-    made, now_ns = writer(path, **options), STARTED_AT_NS
-    for item in items:
-        if isinstance(item, dict):
-            (made.event if "event" in item else made.describe)(now_ns, item)
-            continue
-        for number, frame in enumerate(item):
-            made.frame(frame)
-            if number % 1000 == 999:
-                made.flush()
-        now_ns = item[-1].stamp_ns
-    if end:
-        made.finish({})
-    return path
 
 
 def reconfigured(row: dict[str, Any]) -> dict[str, object]:
@@ -71,8 +55,12 @@ class Report:
 
     def of(self, *items: Frames | dict[str, object], **options: Any) -> tuple[int, str]:
         """Exit code and output with a recording of these."""
-        record(self.path, *items, **options)
+        self.record(*items, **options)
         return self.run(self.path)[:2]
+
+    def record(self, *items: Frames | dict[str, object], **options: Any) -> None:
+        """Frames, descriptions and events, in this order."""
+        write(self.path, chain(*([item] if isinstance(item, dict) else item for item in items)), **options)
 
     def again(self, *options: object) -> tuple[int, str, str]:
         return self.run(self.path, "--force", *options)
@@ -97,7 +85,7 @@ def number(frames: Frames) -> str:
 
 
 def test_a_recording_becomes_a_page_beside_it(report: Report) -> None:
-    record(report.path, SENSOR, frames())
+    report.record(SENSOR, frames())
     code, out, err = report.run(report.path, "--note", "cell 3 <b>")
     assert (code, err) == (0, f"ethercat-report: the report is in {report.out}\n")
     assert out == "Sensor 0 (BFT-SENS-ECAT-M8, serial 100): Good. All checks passed.\n"
@@ -170,7 +158,7 @@ def test_a_sensor_that_was_not_to_be_recorded_is_not_judged(report: Report) -> N
 
 
 def test_a_recording_that_was_cut_off_is_reported_on_as_far_as_it_goes(report: Report) -> None:
-    code, out = report.of(SENSOR, frames(), end=False)
+    code, out = report.of(SENSOR, frames(), end=None)
     assert code == 0
     for said in (out, report.out.read_text(), report.again("--json")[1]):
         assert "The recording was cut off: it has no footer" in said
@@ -190,7 +178,7 @@ def test_wrong_usage(report: Report, arguments: str, words: str) -> None:
 
 
 def test_what_cannot_be_read_or_written_is_said_in_a_sentence(report: Report) -> None:
-    record(report.path, SENSOR, frames())
+    report.record(SENSOR, frames())
     text, kept = report.folder / "text.mcap", report.folder / "kept.html"
     text.write_text("no recording")
     kept.mkdir()
@@ -212,7 +200,7 @@ def test_ctrl_c_leaves_nothing(report: Report, monkeypatch: pytest.MonkeyPatch) 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    record(report.path, SENSOR, frames())
+    report.record(SENSOR, frames())
     monkeypatch.setattr(page, "render", interrupted)
     assert report.run(report.path) == (1, "", "ethercat-report: stopped: nothing was written\n")
     assert list(report.folder.iterdir()) == [report.path]

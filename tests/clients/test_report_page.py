@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from bota_clients.numbers import figure, seconds
-from bota_clients.recording.columns import Columns, Floats
+from bota_clients.recording.columns import Columns, Floats, columns
 from bota_clients.report import page as page_module
 from bota_clients.report.checks import Examination
 from bota_clients.report.page import as_json, render
 from bota_clients.report.plots import envelope, stretches
 from bota_clients.report.series import GROUPS
 from bota_ethercat.framing import DataFlag
-from tests.clients.simulated import decoded, sensor, simulate, subject_of
+from tests.clients.simulated import sensor, simulate, subject_of
 from tests.descriptions import sensor_row
 from tests.simulation import more_if_long
 
@@ -65,7 +65,7 @@ class Reader(HTMLParser):
 @pytest.fixture(scope="module")
 def page() -> str:
     """A report on a sensor with a noisy axis, and some samples lost."""
-    noisy = sensor(12, "noise force.y 0.6", "skip 0.3", seed=12)
+    noisy = sensor(6, "noise force.y 0.6", "skip 0.3", seed=12)
     return render([Examination(noisy)], made=MADE, program="ethercat-report")
 
 
@@ -126,7 +126,7 @@ def two() -> tuple[str, str]:
     first = subject_of(simulate(1), row, source=EVIL)
     examined = [
         Examination(first),
-        Examination(replace(first, info=first.info._replace(sensor=1, serial=9), columns=decoded([]))),
+        Examination(replace(first, info=first.info._replace(sensor=1, serial=9), columns=columns([]))),
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike

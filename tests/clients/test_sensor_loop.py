@@ -45,6 +45,7 @@ from tests.clients.test_identify import posed
 from tests.compensation.motion import settings
 from tests.descriptions import sensor_row
 from tests.ended import run_here
+from tests.ros_package.test_urdf import FIGURES
 from tests.server.running import PATIENCE_S, free_port, wait_until
 
 pytestmark = [needs_gxx, patient]
@@ -223,11 +224,6 @@ TOOL = {
     "accelerometer.scale": "1.01,0.99,1.002",
     "accelerometer.cross_axis": "0.001,-0.002,0.003,-0.004,0.005,-0.006",
 }
-# mm from the mounting face, of the drawings in Bota's URDFs: wrench origin, IMU.
-HEIGHTS = {
-    "SENS": (35, 9.3), "ROKS": (32, 9.8), "ROKA": (32, 9.8), "MEDS": (32, 9.8), "MEDA": (32, 9.8),
-    "LAXS": (44.5, 11.95), "MEGS": (59, 13.4), "NONE": (0, 0),
-}  # fmt: skip
 
 
 def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
@@ -311,7 +307,7 @@ def test_the_bounds_are_those_of_python(running: Loop, seed: int) -> None:
         assert told == pytest.approx([force_bound_95(tool, imu, taken), torque])
 
 
-@pytest.mark.parametrize(("model", "heights"), HEIGHTS.items())
+@pytest.mark.parametrize(("model", "heights"), [*FIGURES.items(), ("NONE", (0.0, 0.0))])
 def test_the_imu_is_where_the_model_has_it(running: Loop, model: str, heights: tuple[float, float]) -> None:
     running.new(tool_mass=2)
     turning = [(1 + number / 800, (0.0, 0.0, 9.0, 3.0, 0.0, 0.0)) for number in range(6)]

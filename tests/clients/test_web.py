@@ -7,17 +7,14 @@ import math
 import re
 import shutil
 import subprocess
-import threading
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from bota_clients.monitor.cli import parse
-from bota_clients.monitor.tare import Say
 from bota_clients.monitor.web.pages import CHANNELS, STEP_NS, Page, WebModel, state_text
 from bota_clients.monitor.web.server import HEADERS, STREAM, read_page, respond
 from bota_ethercat.framing import DataFlag, DataMessage
@@ -119,16 +116,11 @@ def test_a_slow_sensor_has_a_point_for_each_sample_at_its_time(feed: WebModel) -
 
 
 class Harness(Web):
-    """A pages with a model of two sensors; a tare goes on until it is ended."""
+    """A page with a model of two sensors."""
 
     def __init__(self) -> None:
         super().__init__("one", "two")
-        self.taring_now = True
         self.page = self.join()
-
-    def tare(self, position: int, say: Say, way: str) -> threading.Thread:
-        super().tare(position, say, way)
-        return cast("threading.Thread", SimpleNamespace(is_alive=lambda: self.taring_now))
 
     def join(self) -> Page:
         page = self.pages.join()

@@ -7,6 +7,8 @@ import contextlib
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
+from types import SimpleNamespace
+from typing import cast
 
 from bota_clients.monitor.recording import MonitorRecording
 from bota_clients.monitor.tare import Say
@@ -19,7 +21,10 @@ from tests.server.running import PATIENCE_S
 
 
 class Web:
-    """A monitor that is connected to a server with one sensor, or with sensors of these names, at START_S."""
+    """A monitor that is connected to a server with one sensor, or with sensors of these names, at START_S.
+
+    A tare goes on until it is ended.
+    """
 
     def __init__(self, *names: str) -> None:
         self.model = WebModel(made.ADDRESS)
@@ -28,11 +33,12 @@ class Web:
         self.pages = Pages(self.model, self.tare, self.recorder)
         self.port = 0
         self.tared: list[tuple[int, str]] = []  # the positions that were to be tared, and the way
+        self.taring_now = True
 
     def tare(self, position: int, say: Say, way: str) -> threading.Thread:
         self.tared.append((position, way))
         say(f"Sensor {position} was tared", False)
-        return threading.Thread()
+        return cast("threading.Thread", SimpleNamespace(is_alive=lambda: self.taring_now))
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from bota_clients.errors import RecordingError
-from bota_clients.identify.bota_file import read_bota, write_bota
 from bota_clients.identify.cli import main
+from bota_clients.identify.tool_file import read_bota, write_bota
 from bota_ethercat.settings import start_up_defaults
 from bota_ethercat_bridge.ft_compensation.alignment import align
 from bota_ethercat_bridge.ft_compensation.compensator import Compensator

@@ -22,8 +22,7 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.identify.tool_file import tool_parameters
-from bota_clients.recording.columns import Columns, Ints, columns
-from bota_clients.recording.own_offset import DOUBT_AFTER, doubt_ns
+from bota_clients.recording.columns import DOUBT_AFTER, Columns, Ints, columns, doubt_ns
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, Vector3

@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return start("ethercat-identify", "identify.delay", parse_delay(given[1:]))
     options = parse_options(given)
     is_tool = options.path.suffix in {".json", ".yaml", ".yml"}
-    return start("ethercat-identify", "identify.bota_file" if is_tool else "identify.program", options)
+    return start("ethercat-identify", "identify.tool_file" if is_tool else "identify.program", options)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,7 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.identify.program import choose
 from bota_clients.program import say
-from bota_clients.recording.columns import Columns
-from bota_clients.recording.own_offset import at_last_offset
+from bota_clients.recording.columns import Columns, at_last_offset
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import force_lag_s
 from bota_ethercat.settings import SettingValue
@@ -37,7 +36,14 @@ def run(options: argparse.Namespace) -> int:
     expected_s = force_lag_s(settings, sensor.info.rate_hz or None)
     expected_ms = None if expected_s is None else expected_s * 1e3
     if options.json:
-        sys.stdout.write(json.dumps(_as_json(found, expected_ms, error, left), indent=1) + "\n")
+        told: dict[str, Any] = {"ok": False, "error": error}
+        if found is not None:
+            told = {
+                "ok": True, "lag_ms": found.seconds * 1e3, "interval_ms": found.interval_s * 1e3,
+                "expected_ms": expected_ms, "left_N": left[0], "left_unaligned_N": left[1],
+                "explained": found.explained,
+            }  # fmt: skip
+        sys.stdout.write(json.dumps(told, indent=1) + "\n")
     elif found is not None:
         implied = "unknown" if expected_ms is None else f"{expected_ms:.2f} ms"
         sys.stdout.write(
@@ -59,14 +65,3 @@ def _find(data: Columns, settings: Mapping[str, SettingValue]) -> tuple[Lag, tup
     force, acceleration, rate = np.split(samples, 3, axis=1)
     lag = find_lag(times, force, acceleration, rate, gyroscope_later_s(settings))
     return lag, check_held_out(times, samples, settings, lag)
-
-
-def _as_json(
-    found: Lag | None, expected_ms: float | None, error: str, left: tuple[float, float]
-) -> dict[str, Any]:
-    if found is None:
-        return {"ok": False, "error": error}
-    lag_ms, interval_ms = found.seconds * 1e3, found.interval_s * 1e3
-    values = {"lag_ms": lag_ms, "interval_ms": interval_ms, "expected_ms": expected_ms}
-    values |= {"left_N": left[0], "left_unaligned_N": left[1]}
-    return {"ok": True, **values, "explained": found.explained}

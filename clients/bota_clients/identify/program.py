@@ -14,16 +14,15 @@ from rich.console import Console
 from rich.table import Table
 
 from bota_clients.errors import RecordingError
-from bota_clients.identify.bota_file import write_bota
 from bota_clients.identify.stationary_periods import (
     LEAST_S,
     StationaryPeriod,
     find_stationary_periods,
     usable_rows,
 )
+from bota_clients.identify.tool_file import write_bota
 from bota_clients.program import say
-from bota_clients.recording.columns import Columns
-from bota_clients.recording.own_offset import at_last_offset
+from bota_clients.recording.columns import Columns, at_last_offset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing

@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from bota_clients.recording.columns import Columns
+from bota_clients.recording.columns import Bools, Columns, Floats
 from bota_ethercat_bridge.ft_compensation.quantities import StationaryLimits
 from bota_ethercat_bridge.ft_compensation.stationary import (
     BAD_WRENCH,
@@ -31,9 +30,6 @@ _BLOCK_SAMPLES: Final = 8  # at least, however slow the sensor is
 _LONGEST_GAP_S: Final = 0.5
 _SAME_POSE: Final = math.cos(math.radians(1.5))
 _LIMITS: Final = StationaryLimits()
-
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 
 class StationaryPeriod(NamedTuple):

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from bota_clients.arguments import add_imu_units, add_server, address, is_loopback, server_of
-from bota_clients.errors import ClientError
-from bota_clients.program import not_installed, say
+from bota_clients.program import start
 from bota_ethercat.address import DEFAULT_HOST, Address
 from bota_ethercat.program.arguments import Parser, seconds
 from bota_ethercat.program.output import discard_output, ends_with_its_reader
@@ -21,23 +20,13 @@ DEFAULT_WEB: Final = Address(DEFAULT_HOST, 12080)
 
 @ends_with_its_reader
 def main(argv: Sequence[str] | None = None) -> int:
-    options = parse(argv)
-    from bota_clients.monitor.program import run  # noqa: PLC0415 - --help need not wait for it
-
     try:
-        return run(options)
+        return start("ethercat-monitor", "monitor.program", parse(argv))
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.EIO):  # the reader or the terminal was closed
             raise
         discard_output()
         return 0
-    except KeyboardInterrupt:
-        return 1 if options.once else 0
-    except ClientError as error:
-        say("ethercat-monitor", str(error))
-        return 1
-    except ImportError as error:  # of rich, textual, websockets, which are imported where they are used
-        return not_installed("ethercat-monitor", error)
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:

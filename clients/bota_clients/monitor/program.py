@@ -29,10 +29,17 @@ _ANSWER_S: Final = 6.0
 
 def run(options: argparse.Namespace) -> int:
     """Show it; the exit code."""
-    if options.web is not None:
+    try:
+        if options.web is None:
+            return _in_terminal(options)
         from bota_clients.monitor.web.server import run_web  # noqa: PLC0415
 
         return run_web(options.address, options.web, options.imu_units, options.seconds)
+    except KeyboardInterrupt:
+        return 1 if options.once else 0
+
+
+def _in_terminal(options: argparse.Namespace) -> int:
     terminal = (
         sys.stdin.isatty() and sys.stdout.isatty() and os.environ.get("TERM", "dumb") not in {"", "dumb"}
     )

@@ -28,24 +28,17 @@ class MonitorRecording:
         """Whether a recording was started and has not been reported as ended."""
         return self._thread is not None
 
-    def start(self, now_s: float) -> str:
+    def toggle(self, now_s: float) -> str:
+        """Start a recording, or request the end of that which runs, which `ended` reports; what to say."""
+        if self.running:
+            self._asked.set()
+            return "Stopping the recording"
         path = Path(time.strftime("recording-%Y%m%d-%H%M%S.mcap"))
         self._asked.clear()
         self._thread = threading.Thread(target=self._run, args=(path,), name="recording")
         self._thread.start()
         self.since_s = now_s
         return f"Recording to {path}"
-
-    def toggle(self, now_s: float) -> str:
-        """Start a recording, or request the end of that which runs; what to say."""
-        if not self.running:
-            return self.start(now_s)
-        self.stop()
-        return "Stopping the recording"
-
-    def stop(self) -> None:
-        """Request the end; `ended` reports it."""
-        self._asked.set()
 
     def ended(self) -> tuple[str, bool] | None:
         """A message about a recording that has ended, and whether it is an error; else None."""
@@ -56,7 +49,7 @@ class MonitorRecording:
 
     def close(self) -> str | None:
         """Stop the recording and wait for it; a message, if there was one."""
-        self.stop()
+        self._asked.set()
         if self._thread is not None:
             self._thread.join()
         found = self.ended()
@@ -64,15 +57,12 @@ class MonitorRecording:
 
     def _run(self, path: Path) -> None:
         try:
-            self._said = f"Recorded {path}: {self._record(path)}", False
+            with contextlib.closing(files.RecordingClient(self._address, None)) as source:
+                source.connect()
+                recorder = files.Recorder(path, files.NAME, files.notes(source), overwrite=False)
+                files.record(source, recorder, lambda _: "asked to stop" if self._asked.is_set() else None)
+            if recorder.error is not None:
+                raise recorder.error
+            self._said = f"Recorded {path}: {recorder.summary}", False
         except (RecordingError, ProtocolError) as error:
             self._said = f"The recording failed: {error}", True
-
-    def _record(self, path: Path) -> str:
-        with contextlib.closing(files.RecordingClient(self._address, None)) as source:
-            source.connect()
-            recorder = files.Recorder(path, files.NAME, files.notes(source), overwrite=False)
-            files.record(source, recorder, lambda _: "asked to stop" if self._asked.is_set() else None)
-        if recorder.error is not None:
-            raise recorder.error
-        return recorder.summary

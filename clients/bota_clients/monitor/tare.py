@@ -6,15 +6,15 @@ import contextlib
 import threading
 from array import array
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Final
 
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
-from bota_ethercat.control import six_numbers
+from bota_ethercat.control import known_six, six_numbers
 from bota_ethercat.errors import ConnectionFailedError, ProtocolError
 from bota_ethercat.program.tare_memory import former, remember
+from bota_ethercat.replies import Description, SensorInfo
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import number, rows, whole
 
 _TIMEOUT_S: Final = 60.0
 _OFFSET: Final = 0x8000  # the sensor's force/torque offset, in sub-indices 1 to 6
@@ -44,35 +44,35 @@ def tare(address: Address, position: int, way: str = "tare") -> tuple[str, bool]
     residual = ""
     try:
         with Client(address.port, address.host, stream=False, reconnect=False).connect() as client:
-            serial = whole(_row(client.description, position).get("serial"))
+            sensor = _sensor(client.description, position)
             try:
                 if way == "tare":
                     reply = client.ask("tare", _TIMEOUT_S, sensor=position)
                     before, after = six_numbers(reply.get("old_offset")), six_numbers(reply.get("new_offset"))
                     residual = _residual(reply.get("residual"))
                 else:
-                    before = _offset(client.description, position)
-                    after = former(serial, before, f"sensor {position}") if way == "undo" else [0.0] * 6
+                    before, after = _offset(sensor), [0.0] * 6
+                    if way == "undo":
+                        after = former(sensor.serial, before, f"sensor {position}")
                     _replace(client, position, before, after)
             except ConnectionFailedError as error:
                 return f"It is unknown whether {done}: {error}", True
     except (ProtocolError, ValueError) as error:
         return f"{failed[0].upper()}{failed[1:]}: {error}", True
     with contextlib.suppress(OSError):  # then it cannot be undone
-        if serial is not None:
-            remember(serial, before, after)
+        if sensor.serial is not None:
+            remember(sensor.serial, before, after)
     return f"{done[0].upper()}{done[1:]}{residual}", False
 
 
-def _row(description: JsonObject, position: int) -> JsonObject:
-    return next((row for row in rows(description.get("sensors")) if row.get("sensor") == position), {})
+def _sensor(description: JsonObject, position: int) -> SensorInfo:
+    return Description.parse(description).find(position) or SensorInfo(position)
 
 
-def _offset(description: JsonObject, position: int) -> Sequence[float]:
-    try:
-        return six_numbers(_row(description, position).get("offset"))
-    except ValueError:
-        raise ValueError("its offset is unknown to the server") from None
+def _offset(sensor: SensorInfo) -> Sequence[float]:
+    if sensor.offset is None:
+        raise ValueError("its offset is unknown to the server")
+    return sensor.offset
 
 
 def _replace(client: Client, position: int, before: Sequence[float], after: Sequence[float]) -> None:
@@ -83,7 +83,7 @@ def _replace(client: Client, position: int, before: Sequence[float], after: Sequ
             client.ask(
                 "sdo_write", sensor=position, index=_OFFSET, subindex=subindex, type="f32", value=value
             )
-        if array("f", _offset(client.ask("describe"), position)) != array("f", offset):
+        if array("f", _offset(_sensor(client.ask("describe"), position))) != array("f", offset):
             raise ValueError("the sensor did not take the offset")
 
     try:
@@ -95,9 +95,8 @@ def _replace(client: Client, position: int, before: Sequence[float], after: Sequ
         raise
 
 
-def _residual(values: Any) -> str:
-    found = [number(value) for value in values] if isinstance(values, list) else []
-    known = [abs(value) for value in found if value is not None]
-    if len(known) != 6:
+def _residual(values: object) -> str:
+    if (six := known_six(values)) is None:
         return ""
-    return f"; residual at most {max(known[:3]):.3f} N and {max(known[3:]):.4f} Nm"
+    force, torque = (max(map(abs, part)) for part in (six[:3], six[3:]))
+    return f"; residual at most {force:.3f} N and {torque:.4f} Nm"

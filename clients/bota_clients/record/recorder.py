@@ -115,11 +115,6 @@ def notes(source: RecordingClient) -> dict[str, str]:
     }
 
 
-def lost(frames: int, reason: str) -> RecordedEvent:
-    """The event that `frames` frames were received but not recorded."""
-    return _noted("lost", frames=frames, reason=reason)
-
-
 class Recorder:
     """Records batches into a file until it is stopped or the file cannot be written; `with` stops it.
 
@@ -201,7 +196,7 @@ class Recorder:
     def _put_overflow(self) -> None:
         if self._overflow:
             self._backlog += 1
-            self._queue.put([lost(self._overflow, "the disk did not keep up")])
+            self._queue.put([_noted("lost", frames=self._overflow, reason="the disk did not keep up")])
             self._overflow = 0
 
     # -- the thread
@@ -235,7 +230,9 @@ class Recorder:
                 batch = []
             if batch is None:
                 if too_late:
-                    self._write(lost(too_late, "there was no time left to write them"))
+                    self._write(
+                        _noted("lost", frames=too_late, reason="there was no time left to write them")
+                    )
                 return
             self._backlog -= len(batch)
             if time.monotonic() >= self._end_by:

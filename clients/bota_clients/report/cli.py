@@ -54,11 +54,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    from bota_clients.report import checks, page, subjects  # noqa: PLC0415 - needs the extra
+    from bota_clients.report import checks, page, series  # noqa: PLC0415 - needs the extra
 
     interrupt_on_signals()
     with NewFile(options.output, force=options.force) as file:
-        found = subjects.of_recording(options.recording, options.imu_units)
+        found = series.of_recording(options.recording, options.imu_units)
         examinations = [checks.Examination(each) for each in found]
         now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         file.write(page.render(examinations, made=now, program=f"{_PROGRAM} {VERSION}", note=options.note))

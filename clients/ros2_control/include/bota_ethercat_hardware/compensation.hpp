@@ -15,7 +15,11 @@
 
 namespace bota_ethercat_hardware {
 
+using bota_ethercat::kPi;
+using bota_ethercat::kStandardGravity;
 using bota_ethercat::Vector3;
+using bota_ethercat::detail::length;
+using bota_ethercat::detail::vector_product;
 using Wrench = std::array<double, 6>;  // Fx Fy Fz (N) Mx My Mz (Nm), about the wrench origin
 
 /// What hangs on the sensor's tool side, and what its accelerometer reads: `scale` times the truth plus `offset`, per axis.
@@ -30,28 +34,22 @@ struct Payload {
     std::array<double, 6> cross_axis_interval{0.0098, 0.0098, 0.0098, 0.0098, 0.0098, 0.0098}, inertia_interval{};
 };
 
-inline Vector3 cross(const Vector3& a, const Vector3& b) noexcept {
-    return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
-}
-
-inline double length(const Vector3& a) noexcept { return std::sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2]); }
-
 /// What the compensated wrench is wrong by without contact, in 95 % of samples: as ft_compensation/bounds.py, which explains it.
 /// `tared`: the bias is of a tare by this accelerometer. `felt`, m/s^2, at the center of gravity; `rate`, rad/s; `spin`, rad/s^2.
 struct Bounds {
     double force, torque;  ///< N, Nm
 
     Bounds(const Payload& tool, bool tared, const Vector3& felt, const Vector3& rate, const Vector3& spin, double noise) noexcept {
-        constexpr double kG = 9.80665, kAxes = 2.80 / 1.96, kPoses = 4.39 / 1.96, kReach = 0.1, kLikely = 0.2, kTyped = 0.1;
+        constexpr double kAxes = 2.80 / 1.96, kPoses = 4.39 / 1.96, kReach = 0.1, kLikely = 0.2, kTyped = 0.1;
         const auto& scale = tool.scale_interval;
         const auto& crossed = tool.cross_axis_interval;
         double largest = *std::max_element(crossed.begin(), crossed.end()), half = 0.0;
         for (std::size_t i = 0; i < 3; ++i) {
             const double part = std::max({scale[i], crossed[2 * i], crossed[2 * i + 1]});
-            half = std::max(half, std::hypot(tool.offset_interval[i], kG * part));
+            half = std::max(half, std::hypot(tool.offset_interval[i], kStandardGravity * part));
             largest = std::max(largest, scale[i]);
         }
-        force = tool.mass * (tared ? kPoses * kG * largest : kAxes * half);
+        force = tool.mass * (tared ? kPoses * kStandardGravity * largest : kAxes * half);
         auto halves = tool.inertia_interval;
         if (halves == decltype(halves){}) {
             const double moment = *std::max_element(tool.inertia.begin(), tool.inertia.end());
@@ -120,7 +118,7 @@ struct Alignment {
         gap_s = std::max(whole ? 0.015 : 0.008, 2.5 / rate_hz);
         const int count = static_cast<int>(std::ceil(late)) + (whole ? 13 : std::max(3, static_cast<int>(std::nearbyint(0.014 * rate_hz))));
         for (std::size_t band = 0; band < kBands; ++band) gains_[band] = lag_s ? gain(hertz(band) * period_s, whole) : 1.0;
-        const double acceleration_noise = 250e-6 * 9.80665 * std::sqrt(460.0), rate_noise = 0.01 * kPi / 180.0 * std::sqrt(184.0);
+        const double acceleration_noise = 250e-6 * kStandardGravity * std::sqrt(460.0), rate_noise = 0.01 * kPi / 180.0 * std::sqrt(184.0);
         const auto turned = [&](bool slope) { return fitted(4.0, 1.5, rate_noise, std::max(at_s - gyroscope_s, -kFurthest), count, slope); };
         lead = std::min(lead + std::max(1, static_cast<int>(std::ceil(0.004 * rate_hz))), count);
         taps = {lag_s ? fitted(10.0, 9.0, acceleration_noise, std::max(at_s, -kFurthest), count, false) : Taps{1.0}, turned(false), turned(true)};
@@ -133,7 +131,6 @@ struct Alignment {
 private:
     static constexpr std::size_t kBands = 21;
     static constexpr double kFurthest = 0.002;  // s: extrapolation goes no further
-    static constexpr double kPi = 3.14159265358979323846;
 
     static double hertz(std::size_t band) { return 0.5 * std::pow(2.0, 0.5 * static_cast<double>(band)); }
 
@@ -205,12 +202,12 @@ public:
         append(row(sample), time_s - time_s_);
         time_s_ = time_s;
         if (known_ < alignment_.lead && (moved_ || turns(ring_[at_])) && lever_ != Vector3{}) return none();
-        const Vector3 omega = aligned(1, 3), alpha = aligned(2, 3), tangential = cross(alpha, lever_);
-        const Vector3 centripetal = cross(omega, cross(omega, lever_)), s = aligned(0, 0);
+        const Vector3 omega = aligned(1, 3), alpha = aligned(2, 3), tangential = vector_product(alpha, lever_);
+        const Vector3 centripetal = vector_product(omega, vector_product(omega, lever_)), s = aligned(0, 0);
         Vector3 force{};
         for (std::size_t i = 0; i < 3; ++i) force[i] = -payload_.mass * (s[i] + tangential[i] + centripetal[i]);
-        Vector3 torque = cross(payload_.center, force);
-        const Vector3 spun = inertia(alpha), turned = cross(omega, inertia(omega));
+        Vector3 torque = vector_product(payload_.center, force);
+        const Vector3 spun = inertia(alpha), turned = vector_product(omega, inertia(omega));
         for (std::size_t i = 0; i < 3; ++i) torque[i] -= spun[i] + turned[i];
         return {force[0], force[1], force[2], torque[0], torque[1], torque[2]};
     }
