@@ -10,6 +10,7 @@ const DRAW_MS = 40;
 
 const history = new History();
 const traces = GROUPS.map((group) => new Trace(group));
+let paused = null;
 let span = 10;
 let newest = null, sensor = null, refused = null, control = false;
 let troubles = { link: "not connected yet", server: null };
@@ -131,6 +132,13 @@ byId("spans").append(...SPANS_S.map((seconds) => {
   return button;
 }));
 
+byId("pause").addEventListener("click", () => {
+  paused = paused ? null : { history: history.copy(), edge: history.edge() };
+  for (const trace of traces) trace.read(newest);
+  setText(byId("pause"), paused ? "Resume" : "Pause");
+  byId("pause").setAttribute("aria-pressed", Boolean(paused));
+});
+
 for (const id of ["reset", "record"]) byId(id).addEventListener("click", () => link.send({ do: id }));
 byId("tare").addEventListener("click", () => {
   byId("ask").dataset.sensor = link.sensor;
@@ -164,12 +172,12 @@ showControl();
 function frame(now) {
   requestAnimationFrame(frame);
   const width = traces[0].box.clientWidth || 300;
-  const edge = history.edge();
+  const edge = paused ? paused.edge : history.edge();
   if (edge !== null && now - drawn >= Math.max(DRAW_MS, (span / width) * 1000) - 4) {
     drawn = now;
-    for (const trace of traces) trace.draw(history, edge);
+    for (const trace of traces) trace.draw(paused?.history ?? history, edge);
   }
-  if (now - read >= READ_MS) {
+  if (!paused && now - read >= READ_MS) {
     read = now;
     for (const trace of traces) trace.read(newest);
   }

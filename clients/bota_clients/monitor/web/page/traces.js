@@ -44,6 +44,10 @@ export class History {
     return this.offset === null ? null : performance.now() / 1000 + this.offset - BEHIND_S;
   }
 
+  copy() {
+    return Object.assign(new History(), structuredClone({ ...this }));
+  }
+
   #push(time, columns, i) {
     this.times.push(time);
     for (let channel = 0; channel < CHANNELS; channel++) {
@@ -62,8 +66,8 @@ export class History {
 export const GROUPS = [
   { id: "force", title: "Force", axes: ["Fx", "Fy", "Fz"], first: 0, unit: "N", digits: 2, least: 1 },
   { id: "torque", title: "Torque", axes: ["Mx", "My", "Mz"], first: 3, unit: "Nm", digits: 3, least: 0.05 },
-  { id: "acceleration", title: "Acceleration", axes: ["ax", "ay", "az"], first: 6, unit: "m/s²", digits: 2, least: 1 },
-  { id: "angular-rate", title: "Angular rate", axes: ["ωx", "ωy", "ωz"], first: 9, unit: "rad/s", digits: 3, least: 0.1 },
+  { id: "acceleration", title: "Acceleration", axes: ["ax", "ay", "az"], first: 6, unit: "m/s²", digits: 2, least: 1, imu: true },
+  { id: "angular-rate", title: "Angular rate", axes: ["ωx", "ωy", "ωz"], first: 9, unit: "rad/s", digits: 3, least: 0.1, imu: true },
 ];
 
 export const signed = (value, digits) =>
