@@ -123,6 +123,7 @@ STREAMS: dict[str, tuple[Callable[[], Stream], Level, str]] = {
         Observation(is_lost=True),
         Observation(samples=800, invalid=2),
         Observation(samples=800, recoveries=1),
+        Observation(samples=800, recoveries=1, lost=400),
     ],
 )
 def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable(seen: Observation) -> None:
@@ -130,6 +131,7 @@ def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable(seen: Obser
         verdict = judge(seen._replace(nominal_hz=800.0, missed_deadlines=missed))
         assert ("its cable" in verdict.sentence) is cable
         assert ("computer stood still" in verdict.sentence) is not cable
+        assert "too busy" not in " ".join(finding.sentence for finding in verdict.findings)
 
 
 # What each knows of itself in 8.4 s without a new sample, and who was late by that.

@@ -196,6 +196,8 @@ def _losses(seen: Observation, limits: StreamLimits) -> Iterator[Finding]:
         total = seen.samples + seen.lost
         found = f"{seen.lost} of {total} samples ({_percent(seen.lost, total)}) were lost"
         remedy = f"The machine is too busy or the cable is bad; {IT_TELLS}"
+        if seen.recoveries or seen.is_lost:  # whatever took it off the bus has taken its samples, too
+            remedy = _advice(seen)
         if seen.unread_s > _BUFFERED_S:
             why, advice = did_not_read(seen.unread_s, busy=seen.busy)
             found, remedy = f"{found}, {why}", advice
