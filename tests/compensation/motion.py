@@ -27,11 +27,13 @@ from bota_ethercat_bridge.ft_compensation.alignment import Alignment
 from bota_ethercat_bridge.ft_compensation.compensator import Compensator
 from bota_ethercat_bridge.ft_compensation.quantities import (
     EXACT,
+    NO_WRENCH,
     OFFSET_PRIOR,
     SCALE_PRIOR,
     Accelerometer,
     Payload,
     Turning,
+    Wrench,
 )
 from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
 
@@ -114,7 +116,8 @@ def filtered(
     Force and torque go through the filters, on a grid that is finer than the samples; the IMU's only delay.
     """
     rate_hz = 51200 / settings["sinc_length"]
-    finer, times = _finer(rate_hz), np.arange(0.0, seconds, 1.0 / rate_hz)
+    finer = _finer(rate_hz)
+    times: Array = np.arange(0.0, seconds, 1.0 / rate_hz)
     step_s, full = 1.0 / finer / rate_hz, SINC_ORDER + FIR_TAPS  # samples until the filters are full
     early_s = SINC_ORDER / 2 * step_s  # by which averages over steps are early
     begin_s, count = -full / rate_hz - early_s, (full + len(times)) * finer
@@ -143,7 +146,7 @@ def _finer(rate_hz: float) -> int:
 
 def _truth(path: Path, tool: Payload, begin_s: float, count: int, step_s: float) -> Felt:
     """As a perfect IMU at its place feels it, at instants `step_s` apart."""
-    times = begin_s + step_s * np.arange(-2, count + 2)
+    times = begin_s + step_s * np.arange(-2, count + 2, dtype=np.float64)
     positions, angles = path(times)
     turned = rotations(angles)  # sensor to world
     rates = _rate(turned[:-2], turned[2:], step_s)
@@ -157,8 +160,7 @@ def _truth(path: Path, tool: Payload, begin_s: float, count: int, step_s: float)
         return found
 
     force = -tool.mass * at(tool.center)
-    xx, yy, zz, xy, xz, yz = tool.inertia
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    inertia = tensor(tool.inertia)
     torque = np.cross(tool.center, force) - spin @ inertia - np.cross(rate, rate @ inertia)
     return Felt(times[2:-2], force, torque, at(IMU), rate)
 
@@ -194,7 +196,8 @@ class Left(NamedTuple):
     times: Array  # (n,) s
     force: Array  # (n, 3) N
     torque: Array  # (n, 3) Nm
-    turning: Sequence[Turning] = ()  # of each
+    turning: Sequence[Turning]  # of each
+    felt: Array  # (n, 3) m/s²: specific force at the center of gravity
 
     @property
     def size(self) -> Array:
@@ -214,19 +217,25 @@ def left_over(
     alignment: Alignment | None = None,
     accelerometer: Accelerometer = EXACT,
     settling_s: float = -math.inf,
+    bias: Wrench = NO_WRENCH,
 ) -> Left:
-    """Of these samples, with no contact and no bias; samples that are withheld are missing."""
+    """Of these samples, with no contact; samples that are withheld are missing."""
     x, y, z = (center - imu for center, imu in zip(tool.center, IMU, strict=True))
-    imu, compensator = ImuSpecificForce((x, y, z), accelerometer, alignment), Compensator(tool)
+    imu, compensator = ImuSpecificForce((x, y, z), accelerometer, alignment), Compensator(tool, bias)
     rows, turnings = [], []
     for time_s, force, torque, acceleration, rate in zip(*(part.tolist() for part in felt), strict=True):
         specific = imu.follow((*acceleration,), (*rate,), time_s)
         if specific is not None and time_s >= settling_s:
             final = compensator.compensate((*force,), (*torque,), specific, imu.turning).final
-            rows.append((time_s, *final.values))
+            rows.append((time_s, *final.values, *specific))
             turnings.append(imu.turning)
     found = np.array(rows)
-    return Left(found[:, 0], found[:, 1:4], found[:, 4:], turnings)
+    return Left(found[:, 0], found[:, 1:4], found[:, 4:7], turnings, found[:, 7:])
+
+
+def tensor(inertia: tuple[float, ...]) -> Array:
+    xx, yy, zz, xy, xz, yz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def rotations(angles: Array) -> Array:
