@@ -42,6 +42,8 @@ os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="ethercat-state-")
 atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 # Nor do they use the server that this user has chosen.
 os.environ["BOTA_SERVER"] = "localhost:12001"
+# NumPy's threads spin while they wait for each other: with one the same takes half of the CPU time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # A tenth of the time goes into looking for cycles among what was imported and collected, which all stays.
 gc.set_threshold(20_000, 10, 10)
 if "TEST_NAMESPACE" in os.environ:  # scripts/test made a network namespace, in which loopback is down

@@ -327,7 +327,8 @@ class Simulation(SimulatedBus):
 
     def close(self) -> None:
         """The server ends, as by SIGTERM: the sensors go to INIT, the clients are disconnected."""
-        self.cycle.stopping = False  # else nothing is served, and simulated time stands still
+        # Else nothing is served, and simulated time stands still while a client does not take what it gets.
+        self.cycle.stopping, self._until_ns = False, 1 << 63
         self.hub.close()
         self.bus.close()
 

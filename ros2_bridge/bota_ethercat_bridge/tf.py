@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from rclpy.node import Node
 from rclpy.time import Time
@@ -17,12 +17,6 @@ TF_PERIOD_S: Final = 0.005  # how often poses are looked up
 
 class UnusableError(Exception):
     """There is no pose or orientation just now; the text says why."""
-
-
-class FramePose(NamedTuple):
-    translation: Vector3  # m
-    rotation: Quaternion
-    stamp_ns: int  # since the Unix epoch; 0: static, it holds at any time
 
 
 def check_tf(wanted: str = "parameter gravity_source is 'tf'", instead: str = "take another source") -> None:
@@ -45,8 +39,11 @@ class Tf:
         self._buffer = Buffer()
         self.close = TransformListener(self._buffer, node, spin_thread=False).unregister
 
-    def look_up(self, base: str, frame: str) -> FramePose:
-        """The latest pose of `frame` in `base`; UnusableError."""
+    def look_up(self, base: str, frame: str) -> tuple[Vector3, Quaternion, int]:
+        """The latest pose of `frame` in `base`, m, and its stamp, ns since the Unix epoch; UnusableError.
+
+        A stamp of 0 is that of a static pose, which holds at any time.
+        """
         from tf2_ros import TransformException  # noqa: PLC0415
 
         try:
@@ -56,7 +53,7 @@ class Tf:
         except (TransformException, ValueError) as error:
             why = " ".join(str(error).split())
             raise UnusableError(f"TF has no pose of {frame} in {base}: {why}") from None
-        return FramePose((t.x, t.y, t.z), rotation, stamp_ns(found.header.stamp))
+        return (t.x, t.y, t.z), rotation, stamp_ns(found.header.stamp)
 
 
 def stamp_ns(stamp: Any) -> int:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import rclpy
-import yaml
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode
@@ -18,6 +17,7 @@ from bota_ethercat.sensor.warnings_register import WARNINGS
 from bota_ethercat_bridge.diagnostics import text_of
 from tests.bridge.real_node import retire
 from tests.bridge.simulated_node import HEALTHY, SETTINGS, Node, Server, level, status, values
+from tests.compensation.making import written_parameters
 from tests.server.running import wait_until
 
 
@@ -57,7 +57,7 @@ def test_a_healthy_stream(node: Node) -> None:
 
 def test_the_analyzer_of_the_package_takes_the_statuses_of_every_node_and_no_others(node: Node) -> None:
     file = Path(__file__).parents[2] / "ros2_bridge/config/diagnostic_aggregator.yaml"
-    parameters = yaml.safe_load(file.read_text())["/**"]["ros__parameters"]
+    parameters = written_parameters(file)
     analyzer = parameters.pop("force_torque")
     assert (parameters, analyzer.pop("type")) == (
         {"path": "Sensors"},

@@ -14,7 +14,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-import yaml
 from numpy.typing import NDArray
 
 from bota_clients.export.cli import main as export
@@ -31,6 +30,7 @@ from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import QUICK, STEP_S, Node, Server, Stages, six, stamp_ns
 from tests.clients.cpp_programs import end_driver, needs_gxx, patient
 from tests.clients.test_sensor_loop import Loop, Seen, program
+from tests.compensation.making import written_parameters
 from tests.ended import run_here
 from tests.server.running import wait_until
 from tests.simulation import MemoryChannel, Simulation
@@ -108,11 +108,6 @@ def tool(heard: Recorded) -> Path:
     return path
 
 
-def parameters(tool: Path) -> dict[str, Any]:
-    found: dict[str, Any] = yaml.safe_load(tool.read_text())["/**"]["ros__parameters"]
-    return found
-
-
 def exported(run: Path, tool: Path) -> tuple[list[int], Array]:
     out = run.with_suffix(".npz")
     with open_recording(run) as recording:
@@ -137,7 +132,7 @@ def is_no_contact(wrench: Array) -> bool:
 
 def test_the_bias_is_that_of_the_last_offset(heard: Recorded, tool: Path) -> None:
     """The virtual sensor's bias is its offset; half of the poses were read with another one."""
-    found = parameters(tool)
+    found = written_parameters(tool)
     assert found["sensor_offset"] == pytest.approx(heard.offset, abs=1e-6)
     assert found["bias"] == pytest.approx(heard.offset, abs=0.05)
     assert max(map(abs, heard.offset)) > 5.0
@@ -186,7 +181,7 @@ def test_the_nodes_wrench_is_the_exported_one(heard: Recorded, tool: Path) -> No
     stamps, wrench = exported(heard.run, tool)
     with open_recording(heard.run) as recording:
         server = Again([*recording.everything(0)])
-    with Node(server, **QUICK, **parameters(tool)) as node:
+    with Node(server, **QUICK, **written_parameters(tool)) as node:
         stages = Stages(node)
         node.run_until(lambda: not server.items, "the end")
         by_stamp = {stamp_ns(message): six(message) for message in stages.final}

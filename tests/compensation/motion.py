@@ -27,11 +27,13 @@ from bota_ethercat_bridge.ft_compensation.alignment import Alignment
 from bota_ethercat_bridge.ft_compensation.compensator import Compensator
 from bota_ethercat_bridge.ft_compensation.quantities import (
     EXACT,
+    NO_WRENCH,
     OFFSET_PRIOR,
     SCALE_PRIOR,
     Accelerometer,
     Payload,
     Turning,
+    Wrench,
 )
 from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
 
@@ -40,7 +42,7 @@ Array = NDArray[np.float64]
 Path = Callable[[Array], tuple[Array, Array]]
 GRAVITY: Final = np.array((0.0, 0.0, -STANDARD_GRAVITY))
 IMU: Final[Vector3] = (0.0, 0.0, -0.0257)  # where a SensONE has it
-_STEP_S: Final = 5e-5
+_GRID_HZ: Final = 6400.0
 
 
 class Imperfection(NamedTuple):
@@ -82,7 +84,6 @@ class Felt(NamedTuple):
 
 HEALTHY: Final = Imperfection()
 PERFECT: Final = Imperfection(0.0, 0.0, 0.0)
-_FINER: Final = 8
 
 
 def feel(
@@ -95,32 +96,10 @@ def feel(
     imu: Imperfection = HEALTHY,
 ) -> Felt:
     """The samples of `path` with the wrench's origin on it."""
-    times = np.arange(0.0, seconds, 1.0 / rate_hz)
-    moments = times[:, None] + _STEP_S * np.arange(-2, 3)  # (n, 5)
-    shape = moments.shape
-    positions, angles = (part.reshape(*shape, 3) for part in path(moments.ravel()))
-    turned = rotations(angles)  # sensor to world
-    rates = [_rate(turned[:, k - 1], turned[:, k + 1]) for k in (1, 2, 3)]
-    rate, spin = rates[1], (rates[2] - rates[0]) / (2 * _STEP_S)
-    moved = (positions[:, 3] - 2 * positions[:, 2] + positions[:, 1]) / _STEP_S**2
-    origin = np.einsum("nji,nj->ni", turned[:, 2], moved - GRAVITY)
-
-    def at(place: Vector3) -> Array:
-        d = np.array(place)
-        found: Array = origin + np.cross(spin, d) + np.cross(rate, np.cross(rate, d))
-        return found
-
-    draw = np.random.default_rng(seed)
-    force = -tool.mass * at(tool.center)
-    xx, yy, zz, xy, xz, yz = tool.inertia
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    torque = np.cross(tool.center, force) - spin @ inertia - np.cross(rate, rate @ inertia)
-    crossed = np.eye(3)
-    crossed[~np.eye(3, dtype=bool)] = -np.array(imu.cross_axis)
-    acceleration = at(IMU) @ np.linalg.inv(crossed).T * imu.scale + imu.acceleration_offset
-    acceleration += draw.normal(scale=imu.acceleration_noise, size=acceleration.shape)
-    measured = rate + imu.rate_offset + draw.normal(scale=imu.rate_noise, size=rate.shape)
-    return Felt(times, force, torque, acceleration, measured)
+    finer = _finer(rate_hz)
+    samples = len(np.arange(0.0, seconds, 1.0 / rate_hz))
+    truth = _truth(path, tool, 0.0, (samples - 1) * finer + 1, 1.0 / finer / rate_hz)
+    return _read(Felt(*(part[::finer] for part in truth)), imu, seed)
 
 
 def filtered(
@@ -137,20 +116,64 @@ def filtered(
     Force and torque go through the filters, on a grid that is finer than the samples; the IMU's only delay.
     """
     rate_hz = 51200 / settings["sinc_length"]
-    start_s = (SINC_ORDER + FIR_TAPS) / rate_hz  # until the filters are full
-    early_s = SINC_ORDER / 2 / _FINER / rate_hz  # by which averages over steps are early
-    fine = feel(later(path, start_s + early_s), tool, seconds + start_s, _FINER * rate_hz, imu=PERFECT)
-    second = np.zeros(_FINER * (FIR_TAPS - 1) + 1)
-    second[::_FINER] = fir_taps()
-    load = np.concatenate([fine.force, fine.torque], axis=1)
-    for taps in [np.full(_FINER, 1 / _FINER)] * SINC_ORDER + [second] * bool(settings["fir"]):
-        load = np.stack([np.convolve(column, taps)[: len(load)] for column in load.T], axis=1)
+    finer = _finer(rate_hz)
+    times: Array = np.arange(0.0, seconds, 1.0 / rate_hz)
+    step_s, full = 1.0 / finer / rate_hz, SINC_ORDER + FIR_TAPS  # samples until the filters are full
+    early_s = SINC_ORDER / 2 * step_s  # by which averages over steps are early
+    begin_s, count = -full / rate_hz - early_s, (full + len(times)) * finer
+    truth = _truth(path, tool, begin_s, count, step_s)
+    sinc = np.ones(1)
+    for _ in range(SINC_ORDER):
+        sinc = np.convolve(sinc, np.full(finer, 1 / finer))
+    second = np.array(fir_taps()) if settings["fir"] else np.ones(1)
+
+    def passed(column: Array) -> Array:
+        found: Array = np.convolve(np.convolve(column, sinc)[:count:finer], second)
+        return found[full : full + len(times)]
+
+    force, torque = (np.stack(list(map(passed, part.T)), axis=1) for part in (truth.force, truth.torque))
     late = [response(settings).delay_s or 0.0 for response in (acceleration_response, angular_rate_response)]
-    accelerometer, gyroscope = (
-        feel(later(path, by_s), tool, seconds, rate_hz, seed=seed, imu=imu) for by_s in late
+    acceleration, rate = (
+        np.stack([np.interp(times - by_s, truth.times, column) for column in part.T], axis=1)
+        for by_s, part in zip(late, (truth.acceleration, truth.rate), strict=True)
     )
-    load = load[round(start_s * rate_hz) * _FINER :: _FINER][: len(gyroscope.times)]
-    return Felt(gyroscope.times, load[:, :3], load[:, 3:], accelerometer.acceleration, gyroscope.rate)
+    return _read(Felt(times, force, torque, acceleration, rate), imu, seed)
+
+
+def _finer(rate_hz: float) -> int:
+    return max(1, round(_GRID_HZ / rate_hz))
+
+
+def _truth(path: Path, tool: Payload, begin_s: float, count: int, step_s: float) -> Felt:
+    """As a perfect IMU at its place feels it, at instants `step_s` apart."""
+    times = begin_s + step_s * np.arange(-2, count + 2, dtype=np.float64)
+    positions, angles = path(times)
+    turned = rotations(angles)  # sensor to world
+    rates = _rate(turned[:-2], turned[2:], step_s)
+    rate, spin = rates[1:-1], (rates[2:] - rates[:-2]) / (2 * step_s)
+    moved = (positions[3:-1] - 2 * positions[2:-2] + positions[1:-3]) / step_s**2
+    origin = np.einsum("nji,nj->ni", turned[2:-2], moved - GRAVITY)
+
+    def at(place: Vector3) -> Array:
+        d = np.array(place)
+        found: Array = origin + np.cross(spin, d) + np.cross(rate, np.cross(rate, d))
+        return found
+
+    force = -tool.mass * at(tool.center)
+    inertia = tensor(tool.inertia)
+    torque = np.cross(tool.center, force) - spin @ inertia - np.cross(rate, rate @ inertia)
+    return Felt(times[2:-2], force, torque, at(IMU), rate)
+
+
+def _read(felt: Felt, imu: Imperfection, seed: int) -> Felt:
+    """As this IMU reads it."""
+    draw, shape = np.random.default_rng(seed), felt.rate.shape
+    crossed = np.eye(3)
+    crossed[~np.eye(3, dtype=bool)] = -np.array(imu.cross_axis)
+    acceleration = felt.acceleration @ np.linalg.inv(crossed).T * imu.scale + imu.acceleration_offset
+    acceleration += draw.normal(scale=imu.acceleration_noise, size=shape)
+    rate = felt.rate + imu.rate_offset + draw.normal(scale=imu.rate_noise, size=shape)
+    return felt._replace(acceleration=acceleration, rate=rate)
 
 
 def later(path: Path, by_s: float) -> Path:
@@ -173,7 +196,8 @@ class Left(NamedTuple):
     times: Array  # (n,) s
     force: Array  # (n, 3) N
     torque: Array  # (n, 3) Nm
-    turning: Sequence[Turning] = ()  # of each
+    turning: Sequence[Turning]  # of each
+    felt: Array  # (n, 3) m/s²: specific force at the center of gravity
 
     @property
     def size(self) -> Array:
@@ -193,19 +217,25 @@ def left_over(
     alignment: Alignment | None = None,
     accelerometer: Accelerometer = EXACT,
     settling_s: float = -math.inf,
+    bias: Wrench = NO_WRENCH,
 ) -> Left:
-    """Of these samples, with no contact and no bias; samples that are withheld are missing."""
+    """Of these samples, with no contact; samples that are withheld are missing."""
     x, y, z = (center - imu for center, imu in zip(tool.center, IMU, strict=True))
-    imu, compensator = ImuSpecificForce((x, y, z), accelerometer, alignment), Compensator(tool)
+    imu, compensator = ImuSpecificForce((x, y, z), accelerometer, alignment), Compensator(tool, bias)
     rows, turnings = [], []
     for time_s, force, torque, acceleration, rate in zip(*(part.tolist() for part in felt), strict=True):
         specific = imu.follow((*acceleration,), (*rate,), time_s)
         if specific is not None and time_s >= settling_s:
             final = compensator.compensate((*force,), (*torque,), specific, imu.turning).final
-            rows.append((time_s, *final.values))
+            rows.append((time_s, *final.values, *specific))
             turnings.append(imu.turning)
     found = np.array(rows)
-    return Left(found[:, 0], found[:, 1:4], found[:, 4:], turnings)
+    return Left(found[:, 0], found[:, 1:4], found[:, 4:7], turnings, found[:, 7:])
+
+
+def tensor(inertia: tuple[float, ...]) -> Array:
+    xx, yy, zz, xy, xz, yz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def rotations(angles: Array) -> Array:
@@ -218,11 +248,11 @@ def rotations(angles: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _rate(before: Array, after: Array) -> Array:
+def _rate(before: Array, after: Array, step_s: float) -> Array:
     """(n, 3), rad/s in the sensor's frame, in the middle of two attitudes two steps apart."""
     turn = np.einsum("nji,njk->nik", before, after)
     x, y, z = turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]
-    return np.stack([x, y, z], axis=-1) / (4 * _STEP_S)
+    return np.stack([x, y, z], axis=-1) / (4 * step_s)
 
 
 # -- what arms do

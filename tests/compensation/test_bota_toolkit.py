@@ -21,13 +21,11 @@ from bota_clients.identify.cli import main
 from bota_clients.identify.tool_file import read_bota, write_bota
 from bota_ethercat.settings import start_up_defaults
 from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
 from bota_ethercat_bridge.ft_compensation.quantities import Accelerometer, Payload, Wrench
-from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
 from tests.clients.test_identify import record_felt
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, written_parameters
-from tests.compensation.motion import IMU, Array, Felt
+from tests.compensation.motion import IMU, Array, Felt, left_over
 from tests.compensation.motion import Path as Motion
 from tests.compensation.test_inertia import FORCE_NOISE, TORQUE_NOISE, rms, tool_of
 from tests.ended import run_here
@@ -109,17 +107,9 @@ def left_by_ours(felt: Felt, parameters: dict[str, Any]) -> Array:
         *(tuple(parameters[f"tool_{name}"]) for name in ("center_of_gravity", "inertia")),
     )
     known = Accelerometer(*(tuple(parameters[f"accelerometer.{name}"]) for name in Accelerometer._fields))
-    lever: Any = tuple(np.subtract(tool.center, IMU))
-    source, compensator = (
-        ImuSpecificForce(lever, known, align(SETTINGS, RATE_HZ)),
-        Compensator(tool, Wrench.of(parameters["bias"])),
-    )
-    rows = []
-    for time_s, force, torque, acceleration, rate in zip(*(part.tolist() for part in felt), strict=True):
-        specific = source.follow(acceleration, rate, time_s)
-        if time_s >= FROM_S and specific is not None:
-            rows.append(compensator.compensate(force, torque, specific, source.turning).final.values)
-    return np.array(rows)
+    bias = Wrench.of(parameters["bias"])
+    left = left_over(felt, tool, align(SETTINGS, RATE_HZ), known, settling_s=FROM_S, bias=bias)
+    return np.hstack([left.force, left.torque])
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ import pytest
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat_bridge.ft_compensation.alignment import align
 from bota_ethercat_bridge.ft_compensation.bounds import torque_bound_95, torque_noise_95
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
 from bota_ethercat_bridge.ft_compensation.identification.inertia import identify_inertia, turn
 from bota_ethercat_bridge.ft_compensation.identification.payload import Identified, identify
 from bota_ethercat_bridge.ft_compensation.quantities import (
@@ -21,22 +20,15 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Accelerometer,
     CompensationError,
     Payload,
-    Turning,
     likely_inertia,
 )
-from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
 from tests.compensation import motion
 from tests.compensation.making import AXES, BIAS, SEED, pose
-from tests.compensation.motion import IMU, Array, Felt, Path, imperfect, settings
+from tests.compensation.motion import IMU, Array, Felt, Left, Path, imperfect, left_over, settings, tensor
 from tests.simulation import more_if_long
 
 RATE_HZ = 800.0
 FORCE_NOISE, TORQUE_NOISE = 0.17 / math.sqrt(3), (0.0059, 0.0059, 0.0021)  # a healthy sensor's, SINC 64
-
-
-def tensor(inertia: tuple[float, ...]) -> Array:
-    xx, yy, zz, xy, xz, yz = inertia
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def tool_of(seed: int, mass: float = 1.5) -> Payload:
@@ -60,7 +52,6 @@ def path_of(name: str, seed: int) -> Path:
 
 
 @functools.cache
-@functools.lru_cache(maxsize=4)
 def recorded(name: str, seed: int, tool: Payload, seconds: float = 20.0, *, fir: bool = False) -> Felt:
     """With the sensor's noise and bias."""
     felt = motion.filtered(
@@ -80,19 +71,9 @@ def identified(felt: Felt, tool: Payload, known: Accelerometer = EXACT, *, fir: 
     return identify_inertia(turn(felt.times, np.hstack(felt[1:]), alignment, known, IMU), poses)
 
 
-def left(felt: Felt, tool: Payload, known: Accelerometer) -> tuple[Array, list[Turning], Array]:
-    """Torque (n, 3) that is left after the first second, with the motion, and the specific force."""
-    lever = tuple(center - imu for center, imu in zip(tool.center, IMU, strict=True))
-    source = ImuSpecificForce(lever, known, align(settings(), RATE_HZ))  # type: ignore[arg-type]
-    rows, turnings, felts = [], [], []
-    for time_s, force, torque, acceleration, rate in zip(*(part.tolist() for part in felt), strict=True):
-        specific = source.follow(acceleration, rate, time_s)
-        if time_s >= 1.0 and specific is not None:
-            final = Compensator(tool, BIAS).compensate(force, torque, specific, source.turning).final
-            rows.append(final.torque)
-            turnings.append(source.turning)
-            felts.append(specific)
-    return np.array(rows), turnings, np.array(felts)
+def left(felt: Felt, tool: Payload, known: Accelerometer) -> Left:
+    """After the first second."""
+    return left_over(felt, tool, align(settings(), RATE_HZ), known, settling_s=1.0, bias=BIAS)
 
 
 def rms(torque: Array) -> float:
@@ -110,7 +91,7 @@ def test_in_20_s_of_motion_every_principal_moment_is_found_to_10_percent(seed: i
     assert np.abs(moments / truth - 1.0).max() < 0.1
     assert max(found.payload.inertia_interval) < 0.1 * truth[2]
     if not fir:
-        assert rms(left(felt, found.payload, known)[0]) < 0.03
+        assert rms(left(felt, found.payload, known).torque) < 0.03
 
 
 @pytest.mark.parametrize("count", more_if_long([12], [12, 60]))
@@ -138,7 +119,7 @@ def test_the_bound_covers_95_percent_of_the_torque_that_is_left(name: str, seed:
     felt, found = recorded(name, seed, tool, 6.0), identified(recorded("turned", seed, tool), tool, known)
     cases = (tool._replace(inertia=(0.0,) * 6), 0.9), (found.payload, 0.05)
     for each, most in cases:
-        torque, turnings, felts = left(felt, each, known)
+        _, _, torque, turnings, felts = left(felt, each, known)
         noise = torque_noise_95(each, align(settings(), RATE_HZ))
         bounds = np.array([
             torque_bound_95(each, known, None, specific, turning, noise)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import random
 import re
@@ -504,12 +505,15 @@ def test_the_interval_of_an_offset_holds_it_and_shrinks_with_more_poses() -> Non
     assert halves[1] < 0.5 * halves[0] < 0.01
 
 
-@pytest.mark.parametrize("degrees", [0.0, 0.1, 0.5, 1.5])
+@pytest.mark.parametrize(
+    ("degrees", "count"),
+    more_if_long([(0.1, 20), (1.5, 20)], itertools.product((0.0, 0.1, 0.5, 1.5), (20, 60))),
+)
 def test_a_mounting_turned_against_the_robot_is_found_told_and_in_the_intervals(
-    degrees: float,
+    degrees: float, count: int
 ) -> None:
     held = []
-    for seed in range(60):
+    for seed in range(count):
         draw, noise = np.random.default_rng([seed, 9]), random.Random(seed)
         axis = draw.normal(size=3)
         axis *= math.radians(degrees) / np.linalg.norm(axis)

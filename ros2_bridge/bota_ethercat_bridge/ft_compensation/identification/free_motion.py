@@ -14,7 +14,12 @@ from typing import Final
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from bota_ethercat_bridge.ft_compensation.identification.estimation import CROSS_COLUMN, CROSS_ROW, Value
+from bota_ethercat_bridge.ft_compensation.identification.estimation import (
+    CROSS_COLUMN,
+    CROSS_ROW,
+    FULL_CALIBRATION,
+    Value,
+)
 from bota_ethercat_bridge.ft_compensation.identification.inertia import (
     Turned,
     crossing,
@@ -35,8 +40,6 @@ from bota_ethercat_bridge.ft_compensation.identification.payload import (
 from bota_ethercat_bridge.ft_compensation.identification.poses import Coverage
 from bota_ethercat_bridge.ft_compensation.identification.weighted import Array, students_t
 from bota_ethercat_bridge.ft_compensation.quantities import (
-    OFFSET_PRIOR,
-    SCALE_PRIOR,
     ZERO,
     CompensationError,
     Payload,
@@ -53,7 +56,7 @@ _TYPICAL: Final = 2.0  # times the median of the residuals: more is no part of t
 # kg, kg m, N, Nm, and a minute: so vague is what is known before that it says nothing.
 _ANY: Final = [1e3] * 4
 _ANY_BIAS: Final = [1e4] * 12
-_CALIBRATION: Final = [OFFSET_PRIOR] * 3 + [SCALE_PRIOR] * 9
+_CALIBRATION: Final = np.diag(FULL_CALIBRATION) ** -0.5
 _UNKNOWNS: Final = 34  # mass, moment, tensor, bias and what it drifts a minute, calibration
 _PARTS: Final = slice(22, 25), slice(25, 28), slice(28, 34)
 _LEAST_PIECES: Final = 20  # of half a second
@@ -150,7 +153,7 @@ def _check_free(answer: Array, mass_interval: float, left: Array, share: float) 
         share < _LEAST_FREE
         or force > _MISFIT_N + _MISFIT_SHARE * weight
         or torque > _MISFIT_N * ARM + _MISFIT_SHARE * moment
-        or (np.abs(answer[22:]) > _HEALTHY * np.array(_CALIBRATION)).any()
+        or (np.abs(answer[22:]) > _HEALTHY * _CALIBRATION).any()
     ):
         raise CompensationError(
             f"force and torque, off by {force:.2g} N and {torque:.2g} Nm, and in {100 * (1 - share):.0f} % "

@@ -94,13 +94,13 @@ def solve(design: Array, measured: Array, known: Known, variances: Array | None 
             break
     information = square / before[..., np.newaxis, np.newaxis]
     shares = plain[..., np.newaxis, :, :] @ information
-    crossed = np.einsum("...iab,...jba->...ij", shares, shares)
+    flat = shares.reshape(*shares.shape[:-2], -1)
+    crossed = flat @ np.swapaxes(np.swapaxes(shares, -1, -2).reshape(flat.shape), -1, -2)
     own = np.einsum("...kaa->...k", shares)
     fisher = crossed + np.eye(design.shape[-3]) * (count - 2.0 * own + known.degrees)[..., np.newaxis, :]
     uncertainty = 2.0 * np.linalg.inv(fisher)
-    inner = np.einsum("...kk,...kab->...ab", uncertainty, information) - np.einsum(
-        "...ij,...iab,...jbc->...ac", uncertainty, information, shares
-    )
+    mixed = (uncertainty @ flat).reshape(shares.shape)
+    inner = np.einsum("...kk,...kab->...ab", uncertainty, information) - (information @ mixed).sum(axis=-3)
     growth = 2.0 * inner @ plain
     return Solution(
         answer,
