@@ -214,6 +214,8 @@ class Simulation(SimulatedBus):
     ) -> None:
         """`backend` is that of a simulation before, for a server that is started again.
 
+        With a `machine` or a `backend` of the test's the server reads all of the SII at its start.
+
         The sensors feel `world`, which is asked once a millisecond, with the simulated time, s.
         """
         external = ExternalWorld()
@@ -234,7 +236,10 @@ class Simulation(SimulatedBus):
         self.on_serve: Callable[[int], None] = lambda _: None
         self.hub = RecordingHub(self)
         self.bus = Bus(self.backend)
-        self.server = Server(self.bus, self.hub, wanted or Asked(settings), extra=extra)
+        with pytest.MonkeyPatch.context() as patch:
+            if backend is None and machine is None:
+                patch.setattr(scan, "read_image", _read_image)
+            self.server = Server(self.bus, self.hub, wanted or Asked(settings), extra=extra)
         self.sensors, self.streams, self.others = self.server.sensors, self.server.streams, self.server.others
         self.recovery, self.jobs, self.cycle = self.server.recovery, self.server.jobs, self.server.cycle
         self.clients: list[Client] = []

@@ -212,7 +212,7 @@ def test_one_that_dies_while_another_is_out_and_counted_is_lost_too() -> None:
 def test_a_sensor_that_keeps_its_error_is_not_asked_for_op(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    simulation, client = streaming()
+    simulation, client = streaming(sinc_length=512)
     asked: list[int] = []
     monkeypatch.setattr(life_of(simulation.backend), "al_control", asked.append)
     simulation.command("safeop 0x1B")
