@@ -66,6 +66,7 @@ from tests.server.running import OLD, Commanded, FramedClient
 
 PATIENCE_S = 60.0  # simulated time that anything may take
 AT_REST = SensorOptions(signal="rest", last_bit=False)
+USUAL = SensorOptions(signal="rest")  # it costs half of `scene`
 _EXCUSE = int(DataFlag.GAP | DataFlag.REPEATED)
 
 
@@ -221,7 +222,7 @@ class Simulation(SimulatedBus):
         external = ExternalWorld()
         if world is not None:
             sensors = tuple(replace(each, world=external) for each in sensors or (SensorOptions(),))
-        super().__init__(backend or MemoryBackend(*sensors, machine=machine))
+        super().__init__(backend or MemoryBackend(*(sensors or (USUAL,)), machine=machine))
         self.started_ns = self.clock.now_ns
         if world is not None:
             self._ask(world, external, 0)
@@ -514,8 +515,11 @@ def _read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambd
 
 @contextlib.contextmanager
 def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterator[SimulatedBus]:
-    """Sensors as `ethercat-virtual-sensor IFACE arguments...` simulates; nobody writes their calibration."""
-    slaves = options_from(build_parser().parse_args(["lo", *map(str, arguments)]))
+    """Sensors as `ethercat-virtual-sensor IFACE --signal rest arguments...` simulates.
+
+    Nobody writes their calibration.
+    """
+    slaves = options_from(build_parser().parse_args(["lo", "--signal", "rest", *map(str, arguments)]))
     bus = SimulatedBus(MemoryBackend(*slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scan, "read_image", _read_image)

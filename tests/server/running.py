@@ -386,11 +386,11 @@ def another_machine(veth: Veth) -> Iterator[list[str]]:
 
 @contextlib.contextmanager
 def virtual_sensor(
-    *arguments: str, module: str = "ethercat_server.virtual_sensor.cli", first: tuple[str, ...] = ()
+    *arguments: str, module: str = "ethercat_server.virtual_sensor.cli"
 ) -> Iterator[tuple[Veth, VirtualSensor]]:
-    """A veth pair with a virtual sensor on its far end: `module first... IFACE arguments...`."""
+    """A veth pair with a virtual sensor on its far end: `module IFACE --signal rest arguments...`."""
     with Veth() as veth:
-        sensor = VirtualSensor(module, [*first, veth.far, *arguments])
+        sensor = VirtualSensor(module, [veth.far, "--signal", "rest", *arguments])
         try:
             sensor.wait_for("ready")
             yield veth, sensor
