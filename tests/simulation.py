@@ -527,7 +527,7 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
 
         def private(_ifname: str, *, force: bool = False, **_: object) -> PrivateServer:
             server = PrivateServer(bus, AsFound(force=force))
-            patch.setattr(Sensors, "clock", server.clients_clock)
+            patch.setattr(Sensors, "clock", server)
             return server
 
         patch.setattr(sensors, "PrivateServer", private)
@@ -538,7 +538,10 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
 
 
 class SimulatedServer(Simulation):
-    """A server that streams the sensors of a bus, while somebody waits for something from it."""
+    """A server that streams the sensors of a bus, while somebody waits for something from it.
+
+    It is the clock of its clients, too: while one sleeps, the server goes on.
+    """
 
     address = "localhost:12001"
 
@@ -547,7 +550,15 @@ class SimulatedServer(Simulation):
         super().__init__(
             backend=bus.backend, settings={"sinc_length": SINC_LENGTH}, wanted=wanted, boot_id="simulated"
         )
-        self.clients_clock = _ServersClock(self)
+
+    def monotonic_ns(self) -> int:
+        return self.clock.monotonic_ns()
+
+    def time_ns(self) -> int:
+        return self.clock.time_ns()
+
+    def sleep(self, seconds: float, /) -> None:
+        self.go_on(lambda: False, seconds)
 
     def client(self) -> blocking.Client:
         """A client for this test's own requests."""
@@ -574,21 +585,5 @@ def simulated_server(bus: SimulatedBus) -> Iterator[SimulatedServer]:
     server = SimulatedServer(bus)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bota_ethercat.client.client.TcpChannel", lambda *_: MemoryChannel(server))
-        patch.setattr(Sensors, "clock", server.clients_clock)
+        patch.setattr(Sensors, "clock", server)
         yield server
-
-
-class _ServersClock:
-    """A client's time: while it sleeps, the server goes on."""
-
-    def __init__(self, server: SimulatedServer) -> None:
-        self._server = server
-
-    def monotonic_ns(self) -> int:
-        return self._server.clock.monotonic_ns()
-
-    def time_ns(self) -> int:
-        return self._server.clock.time_ns()
-
-    def sleep(self, seconds: float, /) -> None:
-        self._server.go_on(lambda: False, seconds)
