@@ -172,13 +172,13 @@ def test_no_answer_is_taken_from_a_job_and_no_emergency_is_lost_to_it() -> None:
     simulation = Simulation(CLOCK)
     client = simulation.connect()
     simulation.run(1.0)
-    for n in range(100):
+    for n in range(50):
         simulation.at(n * 0.025, HOT)
-    for _ in range(100):
+    for _ in range(50):
         asked_ns = simulation.clock.now_ns
         assert client.ask("sdo_read", index=0x8011, type="u16")["value"] == 800
         assert simulation.clock.now_ns - asked_ns < 400_000_000
-    simulation.run_until(lambda: simulation.status()["sensors"][0]["emergencies"] == 100, "all of them")
+    simulation.run_until(lambda: simulation.status()["sensors"][0]["emergencies"] == 50, "all of them")
     assert simulation.streams[0].lost_samples == 0
 
 

@@ -382,7 +382,7 @@ def test_time_out_of_op_is_no_lost_samples(dc: str, lost: float) -> None:
     """Exchanges go on while it comes back, and bring samples as soon as it is in OP; steps are repeated."""
     simulation, client = streaming(SensorOptions(signal="clock", ppm=150.0, dc=dc))
     stream = simulation.streams[0]
-    for recovery in range(10):
+    for recovery in range(7):
         simulation.backend.become(Machine(lost=lost))
         simulation.run(0.2)
         simulation.command("safeop 0x1B" if recovery % 3 else f"power cycle {0.06 * recovery}")
@@ -448,7 +448,7 @@ def test_one_that_returns_with_a_slow_eeprom_costs_the_other_nothing(seed: int, 
 
 def test_a_busy_computer_is_named_where_it_explains_the_loss() -> None:
     """And only there: the same AL error without a stall, or a second after it, is the sensor's."""
-    simulation, client = streaming()
+    simulation, client = streaming(sinc_length=512)
     for stall_ns, later_s, named in (
         (300e6, 0.0, True),
         (0.0, 0.0, False),
