@@ -11,7 +11,6 @@ import os
 import pwd
 import signal
 import socket
-import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -28,6 +27,7 @@ from ethercat_server.errors import ServerError, StopRequestedError, UsageError
 from ethercat_server.process import privileges, realtime
 from ethercat_server.process.privileges import User, user_to_become
 from tests import rights
+from tests.ended import completed, run_here
 from tests.rights import IPC_LOCK, NOBODY, SYS_NICE, needs_another_user, without
 from tests.server.running import (
     Server,
@@ -105,13 +105,9 @@ def test_what_needs_root_is_done_before_a_frame_is_read(monkeypatch: pytest.Monk
     monkeypatch.setattr(realtime, "prepare", prepare)
     monkeypatch.setattr(daemon, "forbid_new_privileges", lambda: done.append("forbade new ones"))
     monkeypatch.setattr(daemon, "become", lambda user: done.append(f"became {user}"))
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
-        with pytest.raises(StopRequestedError):
-            daemon.serve(parse_options(["ens5", str(free_port()), "--user", "nobody"]), Signals())
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    words = ["ens5", str(free_port()), "--user", "nobody"]
+    with pytest.raises(StopRequestedError):
+        run_here(lambda _: daemon.serve(parse_options(words), Signals()))
     prepared = "prepared, becomes user: True"
     assert done == ["forbade new ones", "opened ens5", prepared, "became nobody", "brought up"]
 
@@ -337,10 +333,8 @@ print(json.dumps(dict(own=scheduling(), thread=left, locked=int(locked), slack=s
 def probe(priority: int, cpu: int | None, *, capable: bool = True) -> tuple[dict[str, Any], str]:
     """What the process then has, and what it said."""
     drop = None if capable else without(IPC_LOCK, SYS_NICE)
-    done = subprocess.run(
-        [sys.executable, "-c", PROBE.format(priority=priority, cpu=cpu)],
-        capture_output=True, text=True, check=True, preexec_fn=drop,
-    )  # fmt: skip
+    program = PROBE.format(priority=priority, cpu=cpu)
+    done = completed(sys.executable, "-c", program, check=True, preexec_fn=drop)
     return json.loads(done.stdout), done.stderr.strip()
 
 
