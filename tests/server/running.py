@@ -29,6 +29,7 @@ from tests.rights import socket_of
 Test = TypeVar("Test", bound=Callable[..., None])
 OLD = int(DataFlag.REPEATED | DataFlag.INVALID)  # flags of frames that carry no new sample
 START_TIMEOUT_S = 40.0
+SLOW = ("--set", "sinc_length=512")  # of a server: 100 Hz take little of the machine
 HERE, THERE = "10.77.12.1", "10.77.12.2"  # the ends of a Veth between two machines
 PATIENCE_S = 30.0
 

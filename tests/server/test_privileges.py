@@ -30,6 +30,7 @@ from tests import rights
 from tests.ended import completed, run_here
 from tests.rights import IPC_LOCK, NOBODY, SYS_NICE, needs_another_user, without
 from tests.server.running import (
+    SLOW,
     Server,
     Veth,
     VirtualSensor,
@@ -199,7 +200,7 @@ def test_only_the_loop_has_real_time_priority(running: tuple[Server, Path]) -> N
 @pytest.mark.parametrize("stuck", [False, True])
 def test_the_virtual_sensor_becomes_the_same_user_and_goes_with_the_server(stuck: bool) -> None:
     """A stopped process does not end by itself; that of another user could not be killed."""
-    with server("virtual", "--user", "nobody") as found:
+    with server("virtual", *SLOW, "--user", "nobody") as found:
         process = found.process.pid
         (child,) = Path(f"/proc/{process}/task/{process}/children").read_text().split()
         for each in (process, int(child)):
@@ -218,7 +219,7 @@ def test_the_virtual_sensor_becomes_the_same_user_and_goes_with_the_server(stuck
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
 @on_a_bus
 def test_root_without_sudo_stays_root_and_is_told_how_not_to() -> None:
-    with server("virtual") as found:
+    with server("virtual", *SLOW) as found:
         assert rows_of(found.process.pid)["Uid"].split() == ["0"] * 4
         assert found.said().count("running as root: name a user with --user") == 1
         found.signal(signal.SIGTERM)
@@ -281,7 +282,7 @@ def test_an_ordinary_user_has_a_virtual_bus_in_namespaces_of_its_own() -> None:
 def test_the_units_capabilities_are_enough_for_everything(spare: Veth) -> None:
     (ambient,) = values(SERVER_UNIT, "AmbientCapabilities")
     expected = sum(1 << getattr(rights, name.removeprefix("CAP_")) for name in ambient.split())
-    with server(spare.near, **confined(ambient.split())) as found:
+    with server(spare.near, *SLOW, **confined(ambient.split())) as found:
         process = rows_of(found.process.pid)
         assert process["Uid"].split() == [str(NOBODY.pw_uid)] * 4
         for kind in ("CapEff", "CapPrm", "CapBnd", "CapAmb"):
