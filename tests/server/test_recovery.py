@@ -154,22 +154,6 @@ def test_an_interface_that_is_down_is_the_reason_and_is_asked_once(
     assert len(asked) == 1
 
 
-def test_one_of_a_chain_is_lost_and_the_other_goes_on() -> None:
-    simulation, client = streaming(CLOCK, SensorOptions(signal="clock", serial=2))
-    simulation.command("power off @1")
-    client.wait_event("sensor_lost", 1)
-    frames = [f for f in client.fresh(300) if f.sensor == 0]
-    assert len(frames) == 300
-    assert (state(client, 0), state(client, 1)) == ("OP", "LOST")
-    simulation.command("power on @1")
-    client.wait_event("sensor_back", 1)
-    assert (state(client, 0), state(client, 1)) == ("OP", "OP")
-    assert {f.sensor for f in client.fresh(300)} == {0, 1}
-    for position in (0, 1):
-        check_frames(f for f in simulation.frames if f.sensor == position)
-    assert client.ask("status")["sensors"][0]["recoveries"] == 0, "the first was never out"
-
-
 def chain_of_two() -> tuple[Simulation, Client]:
     return streaming(CLOCK, SensorOptions(signal="clock", serial=2))
 
