@@ -1,4 +1,4 @@
-"""Runs one of our programs to its end."""
+"""Runs a command, or one of our programs, to its end."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class Result(NamedTuple):
         return found
 
 
-def run_here(main: Callable[[Sequence[str]], int], *arguments: object) -> Result:
+def run_here(main: Callable[[Sequence[str]], int | None], *arguments: object) -> Result:
     """Run a program's `main` in this process."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     out, err = io.StringIO(), io.StringIO()
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            code = main([*map(str, arguments)])
+            code = main([*map(str, arguments)]) or 0
     except SystemExit as ended:
         code = int(ended.code or 0)
     finally:
@@ -44,17 +44,16 @@ def run_here(main: Callable[[Sequence[str]], int], *arguments: object) -> Result
     return Result(code, out.getvalue(), err.getvalue())
 
 
+def completed(*command: object, check: bool = False, **how: Any) -> subprocess.CompletedProcess[str]:
+    """A command that has ended; `how` is for `subprocess.run`."""
+    return subprocess.run([*map(str, command)], capture_output=True, text=True, check=check, **how)
+
+
 def run(
     module: str, *arguments: object, under: tuple[str, ...] = (), python: str | Path = sys.executable
 ) -> Result:
     """Run `python -m module arguments...`, whose error must be no traceback."""
-    ended = subprocess.run(
-        [*under, python, "-m", module, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+    ended = completed(*under, python, "-m", module, *arguments, timeout=PATIENCE_S)
     assert "Traceback" not in ended.stderr, ended.stderr
     return Result(ended.returncode, ended.stdout, ended.stderr)
 

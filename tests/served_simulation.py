@@ -25,7 +25,7 @@ from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor import bus as virtual
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.server.running import PATIENCE_S, Client, free_port
-from tests.simulation import Simulation
+from tests.simulation import USUAL, Simulation
 
 
 class _Backend(MemoryBackend):
@@ -34,7 +34,7 @@ class _Backend(MemoryBackend):
     def __init__(self, *sensors: SensorOptions) -> None:
         super().__init__(*sensors)
         self.clock = SimulatedClock(Machine(), time.monotonic_ns())
-        self.sensors = virtual.SlaveChain(sensors or (SensorOptions(),), self.clock.now_ns)
+        self.sensors = virtual.SlaveChain(sensors or (USUAL,), self.clock.now_ns)
 
 
 class _Transport(SocketTransport):

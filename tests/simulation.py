@@ -66,6 +66,7 @@ from tests.server.running import OLD, Commanded, FramedClient
 
 PATIENCE_S = 60.0  # simulated time that anything may take
 AT_REST = SensorOptions(signal="rest", last_bit=False)
+USUAL = SensorOptions(signal="rest")  # it costs half of `scene`
 _EXCUSE = int(DataFlag.GAP | DataFlag.REPEATED)
 
 
@@ -215,12 +216,14 @@ class Simulation(SimulatedBus):
     ) -> None:
         """`backend` is that of a simulation before, for a server that is started again.
 
+        With a `machine` or a `backend` of the test's the server reads all of the SII at its start.
+
         The sensors feel `world`, which is asked once a millisecond, with the simulated time, s.
         """
         external = ExternalWorld()
         if world is not None:
             sensors = tuple(replace(each, world=external) for each in sensors or (SensorOptions(),))
-        super().__init__(backend or MemoryBackend(*sensors, machine=machine))
+        super().__init__(backend or MemoryBackend(*(sensors or (USUAL,)), machine=machine))
         self.started_ns = self.clock.now_ns
         if world is not None:
             self._ask(world, external, 0)
@@ -235,7 +238,10 @@ class Simulation(SimulatedBus):
         self.on_serve: Callable[[int], None] = lambda _: None
         self.hub = RecordingHub(self)
         self.bus = Bus(self.backend)
-        self.server = Server(self.bus, self.hub, wanted or Asked(settings), extra=extra)
+        with pytest.MonkeyPatch.context() as patch:
+            if backend is None and machine is None:
+                patch.setattr(scan, "read_image", _read_image)
+            self.server = Server(self.bus, self.hub, wanted or Asked(settings), extra=extra)
         self.sensors, self.streams, self.others = self.server.sensors, self.server.streams, self.server.others
         self.recovery, self.jobs, self.cycle = self.server.recovery, self.server.jobs, self.server.cycle
         self.clients: list[Client] = []
@@ -511,8 +517,11 @@ def _read_image(bus: Bus, position: int, check_interrupt: CheckInterrupt = lambd
 
 @contextlib.contextmanager
 def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterator[SimulatedBus]:
-    """Sensors as `ethercat-virtual-sensor IFACE arguments...` simulates; nobody writes their calibration."""
-    slaves = options_from(build_parser().parse_args(["lo", *map(str, arguments)]))
+    """Sensors as `ethercat-virtual-sensor IFACE --signal rest arguments...` simulates.
+
+    Nobody writes their calibration.
+    """
+    slaves = options_from(build_parser().parse_args(["lo", "--signal", "rest", *map(str, arguments)]))
     bus = SimulatedBus(MemoryBackend(*slaves, machine=machine))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scan, "read_image", _read_image)
@@ -520,7 +529,7 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
 
         def private(_ifname: str, *, force: bool = False, **_: object) -> PrivateServer:
             server = PrivateServer(bus, AsFound(force=force))
-            patch.setattr(Sensors, "clock", server.clients_clock)
+            patch.setattr(Sensors, "clock", server)
             return server
 
         patch.setattr(sensors, "PrivateServer", private)
@@ -531,7 +540,10 @@ def simulated_bus(*arguments: object, machine: Machine | None = None) -> Iterato
 
 
 class SimulatedServer(Simulation):
-    """A server that streams the sensors of a bus, while somebody waits for something from it."""
+    """A server that streams the sensors of a bus, while somebody waits for something from it.
+
+    It is the clock of its clients, too: while one sleeps, the server goes on.
+    """
 
     address = "localhost:12001"
 
@@ -540,7 +552,15 @@ class SimulatedServer(Simulation):
         super().__init__(
             backend=bus.backend, settings={"sinc_length": SINC_LENGTH}, wanted=wanted, boot_id="simulated"
         )
-        self.clients_clock = _ServersClock(self)
+
+    def monotonic_ns(self) -> int:
+        return self.clock.monotonic_ns()
+
+    def time_ns(self) -> int:
+        return self.clock.time_ns()
+
+    def sleep(self, seconds: float, /) -> None:
+        self.go_on(lambda: False, seconds)
 
     def client(self) -> blocking.Client:
         """A client for this test's own requests."""
@@ -567,21 +587,5 @@ def simulated_server(bus: SimulatedBus) -> Iterator[SimulatedServer]:
     server = SimulatedServer(bus)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bota_ethercat.client.client.TcpChannel", lambda *_: MemoryChannel(server))
-        patch.setattr(Sensors, "clock", server.clients_clock)
+        patch.setattr(Sensors, "clock", server)
         yield server
-
-
-class _ServersClock:
-    """A client's time: while it sleeps, the server goes on."""
-
-    def __init__(self, server: SimulatedServer) -> None:
-        self._server = server
-
-    def monotonic_ns(self) -> int:
-        return self._server.clock.monotonic_ns()
-
-    def time_ns(self) -> int:
-        return self._server.clock.time_ns()
-
-    def sleep(self, seconds: float, /) -> None:
-        self._server.go_on(lambda: False, seconds)

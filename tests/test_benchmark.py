@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from scripts.benchmarks import program as benchmark
 from scripts.benchmarks.chain import Turn, clocks_steady
 from scripts.benchmarks.records import ArrivalRecorder, began, deadlines
 from scripts.chain import ScriptError
+from tests.ended import completed
 from tests.server.running import needs_bus
 
 ROOT = Path(__file__).parent.parent
@@ -198,10 +198,9 @@ def test_a_run_for_the_page_with_ros_and_two_sensors(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
     page = shutil.copy(ROOT / "docs" / "benchmark.md", tmp_path)
     arguments = ("--json", tmp_path / "b.json", "--seconds", "1", "--rates", "400", "--page", page)
-    done = subprocess.run(
-        ["unshare", "--net", sys.executable, "-m", "scripts.benchmarks.program", *map(str, arguments)],
-        cwd=ROOT, env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "TMPDIR": str(tmp_path)},
-        capture_output=True, text=True, check=False, timeout=400,
+    done = completed(
+        "unshare", "--net", sys.executable, "-m", "scripts.benchmarks.program", *arguments, cwd=ROOT,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "TMPDIR": str(tmp_path)}, timeout=400,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     text = Path(page).read_text()

@@ -7,7 +7,6 @@ import pty
 import re
 import shutil
 import signal
-import subprocess
 import tomllib
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +14,7 @@ from typing import Any, Final
 import pytest
 
 from scripts import completions
+from tests.ended import completed
 from tests.ros_package.package_files import ROOT
 
 PYPROJECTS: Final = ("pyproject.toml", "clients/pyproject.toml")
@@ -103,7 +103,7 @@ def test_every_option_of_every_program_is_completed_and_in_its_man_page(share: P
 def test_groff_reads_the_man_pages_without_a_warning(share: Path) -> None:
     for path in sorted(share.glob("man/man1/*")):
         options = ("-man", "-Kutf8", "-Tutf8", "-P-cbou", "-ww")
-        done = subprocess.run(["groff", *options, path], capture_output=True, text=True, check=True)
+        done = completed("groff", *options, path, check=True)
         assert (done.stderr, "NAME" in done.stdout) == ("", True)
 
 

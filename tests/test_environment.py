@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Final
 
 import pytest
 
+from tests.ended import completed
 from tests.rights import NOBODY, needs_another_user
 from tests.server.running import needs_bus
 
@@ -24,10 +24,7 @@ until [ -e "$1/seen" ]; do sleep 0.02; done
 
 def run(script: str, folder: Path, *before: str) -> tuple[int, str]:
     source = f'source "{ROOT}/scripts/environment"; filling={folder} every=0.05\n'
-    done = subprocess.run(
-        [*before, "bash", "-c", source + script, "demo", folder],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = completed(*before, "bash", "-c", source + script, "demo", folder)
     return done.returncode, done.stderr
 
 
@@ -59,9 +56,7 @@ def test_an_activated_environment_does_not_make_the_next_one(tmp_path: Path) -> 
     ],
 )
 def test_the_demo_knows_its_arguments_before_it_installs(arguments: str, words: str) -> None:
-    done = subprocess.run(
-        [ROOT / "scripts/demo", *arguments.split()], capture_output=True, text=True, check=False
-    )
+    done = completed(ROOT / "scripts/demo", *arguments.split())
     assert (done.returncode, done.stdout, done.stderr) == (2, "", f"demo: {words}\n")
 
 
@@ -139,11 +134,9 @@ def test_the_demo_without_ros_ends_with_what_the_monitor_knows_and_leaves_nothin
     own = tmp_path / "own"
     own.mkdir()
     paths = os.pathsep.join(map(str, (blocked, *sys.path[1:])))
-    command = ["unshare", "--net", sys.executable, "-m", "scripts.demonstration.monitor"]
-    ended = subprocess.run(
-        [*command, "--seconds", "0.5"], check=False, cwd=ROOT, capture_output=True, text=True, timeout=100,
-        env={**os.environ, "PYTHONPATH": paths, "DEMO_DIRECTORY": str(own)},
-    )  # fmt: skip
+    command = ("unshare", "--net", sys.executable, "-m", "scripts.demonstration.monitor", "--seconds", "0.5")
+    environment = {**os.environ, "PYTHONPATH": paths, "DEMO_DIRECTORY": str(own)}
+    ended = completed(*command, cwd=ROOT, timeout=100, env=environment)
     assert "of 800 Hz" in ended.stdout, ended
     assert "BFT-SENS-ECAT-M8" in ended.stdout
     assert ended.returncode == ("\nTrouble: " in ended.stdout)

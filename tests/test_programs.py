@@ -21,7 +21,7 @@ import pytest
 from bota_clients.identify.cli import main as identify
 from bota_ethercat.program.arguments import Parser
 from ethercat_server import programs
-from tests.ended import run_here
+from tests.ended import completed, run_here
 from tests.simulation import more_if_long
 
 ROOT: Final = Path(__file__).parent.parent
@@ -48,10 +48,7 @@ def interrupted(name: str, number: int, at: str, arguments: str) -> tuple[int, s
     """A process, which gets the signal where it imports a module, or at an audit event."""
     package, _, entry = PROGRAMS[name].partition(":")
     script = INTERRUPTED.format(at=at, number=number, arguments=arguments, package=package, entry=entry)
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        env={**os.environ, "TERM": "xterm"}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = completed(sys.executable, "-c", script, env={**os.environ, "TERM": "xterm"})
     return done.returncode, done.stderr, done.stdout
 
 
@@ -145,8 +142,7 @@ sys.argv = ["program"]
 from {package} import {entry}
 sys.exit({entry}())
 """
-    done = subprocess.run([sys.executable, "-S", "-c", script], env={**os.environ, "PYTHONPATH": PATHS},
-                          capture_output=True, text=True, check=False)  # fmt: skip
+    done = completed(sys.executable, "-S", "-c", script, env={**os.environ, "PYTHONPATH": PATHS})
     assert (done.returncode, done.stderr, len(done.stdout.split())) == (-signal.SIGINT, "", 1)
 
 
@@ -225,7 +221,7 @@ for name, entry in {[(name, PROGRAMS[name]) for name in CLIENTS]!r}:
         except SystemExit as ended:
             assert ended.code == 0, name
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    done = completed(sys.executable, "-c", script)
     assert (done.returncode, done.stderr) == (0, "")
     for name in CLIENTS:
         assert f"usage: {name}" in done.stdout

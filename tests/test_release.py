@@ -18,6 +18,7 @@ import pytest
 
 from bota_ethercat.program.version import VERSION
 from scripts import completions, ros_packages
+from tests.ended import completed
 from tests.ros_package.package_files import PACKAGES, ROOT, commands, shared_files
 from tests.server.running import free_port, needs_bus
 
@@ -72,11 +73,7 @@ def checkout(folder: Path, changelog: str, repository: str = REPOSITORY) -> Path
 
 
 def build(source: Path, into: Path) -> subprocess.CompletedProcess[str]:
-    return run_quietly(source / "scripts/release", into)
-
-
-def run_quietly(*command: str | Path, check: bool = False, **how: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command, capture_output=True, text=True, check=check, **how)
+    return completed(source / "scripts/release", into)
 
 
 @pytest.fixture(scope="module")
@@ -101,16 +98,16 @@ def release(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def install(release: Path, interpreter: str, environment: Path, distribution: str) -> set[str]:
     """Everything that installing this one brings into an environment of its own."""
-    subprocess.run([interpreter, "-m", "venv", environment], check=True)
+    completed(interpreter, "-m", "venv", environment, check=True)
     pip = [f"{environment}/bin/python", "-m", "pip"]
-    before = run_quietly(*pip, "freeze", "--all", check=True).stdout
-    subprocess.run([*pip, "install", "--quiet", "--find-links", str(release), distribution], check=True)
-    after = run_quietly(*pip, "freeze", "--all", check=True).stdout
+    before = completed(*pip, "freeze", "--all", check=True).stdout
+    completed(*pip, "install", "--quiet", "--find-links", release, distribution, check=True)
+    after = completed(*pip, "freeze", "--all", check=True).stdout
     return {re.split(r"[=@ ]", line)[0].lower() for line in set(after.split("\n")) - set(before.split("\n"))}
 
 
 def versions(environment: Path, programs: dict[str, str]) -> set[str]:
-    return {run_quietly(environment / "bin" / name, "--version", check=True).stdout for name in programs}
+    return {completed(environment / "bin" / name, "--version", check=True).stdout for name in programs}
 
 
 @pytest.mark.long
@@ -119,7 +116,7 @@ def test_the_same_commit_gives_the_same_bytes(release: Path, tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr
     sums = (release / "SHA256SUMS").read_text()
     assert (tmp_path / "again" / "SHA256SUMS").read_text() == sums
-    run_quietly("sha256sum", "--check", "--quiet", "SHA256SUMS", check=True, cwd=release)
+    completed("sha256sum", "--check", "--quiet", "SHA256SUMS", check=True, cwd=release)
     kinds = {name.split("-")[0] + name[name.index("0.1.0") + 5 :] for name in re.findall(r"\S+$", sums, re.M)}
     wheel, source = "-py3-none-any.whl", ".tar.gz"
     names = {f"bota_ethercat{part}{kind}" for part in ("", "_bridge") for kind in (wheel, source)}
@@ -147,7 +144,7 @@ def test_what_is_no_release_is_refused(
     source = checkout(tmp_path / "source", changelog, repository)
     if left:
         (source / left).touch()
-    done = run_quietly(source / "scripts/release", tmp_path / "made", *arguments)
+    done = completed(source / "scripts/release", tmp_path / "made", *arguments)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert complaint in done.stderr
 
@@ -175,7 +172,7 @@ def test_each_distribution_in_an_environment_of_its_own(release: Path, version: 
         for line in server.stderr:
             if "streaming" in line:
                 break
-        read = run_quietly(client / "bin/python", "-c", READ.format(port))
+        read = completed(client / "bin/python", "-c", READ.format(port))
         server.terminate()
         server.stderr.read()
     assert (server.returncode, read.returncode) == (0, 0), read.stderr
@@ -205,5 +202,5 @@ def test_the_bridge_has_its_files_where_ros_looks(release: Path, tmp_path: Path)
     (export,) = [command for command in commands("ros2-workspace.md") if command.startswith("export")]
     shell = f'{export}; cd "${{AMENT_PREFIX_PATH%%:*}}" && for each in lib/*/client; do $each --help; done'
     environment = os.environ | {"HOME": str(tmp_path)}
-    used = run_quietly("bash", "-c", shell, env=environment, check=True)
+    used = completed("bash", "-c", shell, env=environment, check=True)
     assert used.stdout.count("usage: ros2 run bridge client") == 2

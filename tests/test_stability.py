@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import subprocess
 import sys
 from operator import attrgetter
 
 import pytest
 
+from tests.ended import completed
 from tests.public_names import listed, public_names
 
 
@@ -43,5 +43,5 @@ def test_an_old_package_name_gives_the_modules_of_the_new_one(
 
 def test_an_old_package_name_runs_a_program() -> None:
     command = [sys.executable, "-m", "bridge.client", "--help"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = completed(*command, check=True)
     assert "\nusage: ros2 run bridge client" in done.stdout

@@ -24,6 +24,7 @@ from bota_clients.recording.reader import RecordedDescription, RecordedEvent, op
 from bota_clients.report.cli import main as report
 from bota_ethercat.address import Address
 from bota_ethercat.framing import DataMessage, encode_data
+from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.signals import MOVE_LENGTH, POSE_LENGTH
 from tests.bridge.scripted_server import ScriptedServer
@@ -84,9 +85,10 @@ class Recorded(NamedTuple):
 @pytest.fixture(scope="module")
 def heard(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     folder = tmp_path_factory.mktemp("heard")
-    server = Simulation(SensorOptions(signal="poses"), settings={"sinc_length": 512})
+    poses = SensorOptions(signal="poses")
+    server = Simulation(poses, machine=Machine(), settings={"sinc_length": 512})
     server.run(0.1)
-    poses = recorded(folder / "poses.mcap", server, 6 * CYCLE_S, (2 * CYCLE_S + 1, tare(TARED)))
+    identified = recorded(folder / "poses.mcap", server, 6 * CYCLE_S, (2 * CYCLE_S + 1, tare(TARED)))
     asking = server.connect()
     offset = asking.described()["offset"]
     server.run(0.5)
@@ -97,7 +99,7 @@ def heard(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
         (3.5, tare([9.0] * 6)), (5.2, write_fz(-3.5)), (6.0, cut_power),
     )  # fmt: skip
     server.close()
-    return Recorded(poses, run, offset)
+    return Recorded(identified, run, offset)
 
 
 @pytest.fixture(scope="module")

@@ -277,7 +277,7 @@ def test_a_tare_says_what_is_left_and_is_undone_and_cleared() -> None:
 
 
 def test_tare_says_why_not() -> None:
-    with simulated_bus() as bus, simulated_server(bus) as server:
+    with simulated_bus("--signal", "scene") as bus, simulated_server(bus) as server:
         text, bad = tare(Address("localhost", 1), 0)
         assert bad
         assert re.match("Sensor 0 was not tared: .*not at rest", text)

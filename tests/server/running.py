@@ -29,6 +29,7 @@ from tests.rights import socket_of
 Test = TypeVar("Test", bound=Callable[..., None])
 OLD = int(DataFlag.REPEATED | DataFlag.INVALID)  # flags of frames that carry no new sample
 START_TIMEOUT_S = 40.0
+SLOW = ("--set", "sinc_length=512")  # of a server: 100 Hz take little of the machine
 HERE, THERE = "10.77.12.1", "10.77.12.2"  # the ends of a Veth between two machines
 PATIENCE_S = 30.0
 
@@ -233,10 +234,6 @@ class Server(Program):
         """The bus's interface, which for `virtual` is named after the process."""
         return f"ecat{self.process.pid}"
 
-    def wait_streaming(self) -> Server:
-        self.wait_for("streaming")
-        return self
-
     def connect(self, uid: int | None = None) -> Client:
         return Client(self.port, uid)
 
@@ -249,11 +246,17 @@ def server(
     under: Sequence[str] = (),
     python: str | Path = sys.executable,
 ) -> Iterator[Server]:
-    running = _streaming(ifname, *arguments, port=port, under=under, python=python)
-    try:
-        yield running
-    finally:
-        running.close()
+    """One that streams; started again where the sensor was starved."""
+    for attempt in range(ATTEMPTS):
+        with contextlib.closing(Server(ifname, *arguments, port=port, under=under, python=python)) as running:
+            try:
+                running.wait_for("streaming")
+            except BaseException:
+                if attempt == ATTEMPTS - 1 or not starved(running.said()):
+                    raise
+                continue
+            yield running
+            return
 
 
 # What it says at start where a busy machine lets the virtual sensor's process wait for too long.
@@ -276,20 +279,6 @@ ATTEMPTS = 5
 def starved(said: str, signs: Sequence[str] = STARVED) -> bool:
     """Whether the sensor may have been."""
     return any(words in said for words in signs)
-
-
-def _streaming(ifname: str, *arguments: str, port: int, under: Sequence[str], python: str | Path) -> Server:
-    """A server that streams; started again where the sensor was starved."""
-    for attempt in range(ATTEMPTS):
-        running = Server(ifname, *arguments, port=port, under=under, python=python)
-        try:
-            return running.wait_streaming()
-        except BaseException:
-            said = running.said()
-            running.close()
-            if attempt == ATTEMPTS - 1 or not starved(said):
-                raise
-    raise AssertionError("unreachable")
 
 
 WATCHDOG_US = 600_000
@@ -386,11 +375,11 @@ def another_machine(veth: Veth) -> Iterator[list[str]]:
 
 @contextlib.contextmanager
 def virtual_sensor(
-    *arguments: str, module: str = "ethercat_server.virtual_sensor.cli", first: tuple[str, ...] = ()
+    *arguments: str, module: str = "ethercat_server.virtual_sensor.cli"
 ) -> Iterator[tuple[Veth, VirtualSensor]]:
-    """A veth pair with a virtual sensor on its far end: `module first... IFACE arguments...`."""
+    """A veth pair with a virtual sensor on its far end: `module IFACE --signal rest arguments...`."""
     with Veth() as veth:
-        sensor = VirtualSensor(module, [*first, veth.far, *arguments])
+        sensor = VirtualSensor(module, [veth.far, "--signal", "rest", *arguments])
         try:
             sensor.wait_for("ready")
             yield veth, sensor

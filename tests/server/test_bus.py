@@ -20,7 +20,7 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
-from tests.simulation import Asked, Exchange, Simulation, check_frames, fresh, life_of, more_if_long
+from tests.simulation import Asked, Simulation, check_frames, fresh, life_of, more_if_long
 
 STATION = 0x1001
 LRW_OR_NOT = pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
@@ -69,13 +69,6 @@ def done(frame: bytearray, data: bytes = b"", wkc: int = 1) -> bytes:
     frame[datagram.data : datagram.data + len(data)] = data
     frame[datagram.end : datagram.end + 2] = wkc.to_bytes(2, "little")
     return bytes(frame)
-
-
-def test_a_datagram_brings_back_its_data() -> None:
-    bus, _ = scripted(lambda frame: [done(frame, b"\x08\x00")])
-    assert bus.finish(bus.read_register(0, 0x0130, 2)) == b"\x08\x00"
-    assert bus.finish(bus.read_at(0, 0x0130, 2)) == b"\x08\x00"
-    assert bus.count_slaves() == 1
 
 
 def test_what_is_on_the_wire_is_a_datagram_of_the_standard() -> None:
@@ -152,20 +145,6 @@ def operational(
     bus = Bus(backend)
     bring_up(bus, Asked(), lambda: None)
     return bus, backend
-
-
-@LRW_OR_NOT
-def test_an_exchange_brings_every_sensors_process_data(lrw: bool) -> None:
-    sensors = [
-        SensorOptions(serial=n, pdo_size=size, signal="constant") for n, size in enumerate((61, 77, 61))
-    ]
-    bus, backend = operational(*sensors, lrw=lrw)
-    exchange = Exchange(bus)
-    assert exchange() == 9
-    assert bus.process_data.counters == [(3,)] * 3
-    for position, options in enumerate(sensors):
-        assert exchange.inputs[position] == life_of(backend, position).inputs()
-        assert len(exchange.inputs[position]) == options.pdo_size
 
 
 def answers(bus: Bus, backend: MemoryBackend) -> bytes:

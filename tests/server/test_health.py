@@ -125,7 +125,7 @@ def flood(simulation: Simulation, seconds: float, every_s: float, codes: int = 1
 
 
 def test_an_emergency_is_told_logged_and_kept(log: pytest.LogCaptureFixture) -> None:
-    simulation = Simulation(CLOCK, CLOCK)
+    simulation = Simulation(CLOCK, CLOCK, settings=SLOW)
     client = simulation.subscribe()
     simulation.run(1.0)
     assert client.ask("status")["sensors"][1]["emergencies"] == 0
@@ -149,12 +149,12 @@ def test_an_emergency_is_told_logged_and_kept(log: pytest.LogCaptureFixture) -> 
 
 def test_a_flood_floods_neither_log_nor_clients_nor_the_bus(log: pytest.LogCaptureFixture) -> None:
     simulation = Simulation(CLOCK, settings=SLOW)
-    flood(simulation, 61.0, 0.02)
+    flood(simulation, 31.0, 0.02)
     counted = simulation.status()["sensors"][0]["emergencies"]
-    assert counted == pytest.approx(580, rel=0.1), "ten a second are read, where exchanges allow"
-    assert len(told(simulation)) == 7, "one in ten seconds"
-    assert told(simulation)[-1]["count"] > 500
-    assert len(said(log, "reports emergency")) == 7
+    assert counted == pytest.approx(295, rel=0.1), "ten a second are read, where exchanges allow"
+    assert len(told(simulation)) == 4, "one in ten seconds"
+    assert told(simulation)[-1]["count"] > 250
+    assert len(said(log, "reports emergency")) == 4
     assert simulation.streams[0].lost_samples == 0
 
 
@@ -172,23 +172,23 @@ def test_no_answer_is_taken_from_a_job_and_no_emergency_is_lost_to_it() -> None:
     simulation = Simulation(CLOCK)
     client = simulation.connect()
     simulation.run(1.0)
-    for n in range(100):
+    for n in range(50):
         simulation.at(n * 0.025, HOT)
-    for _ in range(100):
+    for _ in range(50):
         asked_ns = simulation.clock.now_ns
         assert client.ask("sdo_read", index=0x8011, type="u16")["value"] == 800
         assert simulation.clock.now_ns - asked_ns < 400_000_000
-    simulation.run_until(lambda: simulation.status()["sensors"][0]["emergencies"] == 100, "all of them")
+    simulation.run_until(lambda: simulation.status()["sensors"][0]["emergencies"] == 50, "all of them")
     assert simulation.streams[0].lost_samples == 0
 
 
 def test_emergencies_before_an_answer_are_read_by_the_job() -> None:
-    simulation = Simulation()
+    simulation = Simulation(settings=SLOW)
     client = simulation.connect()
     simulation.run(1.0)
     for n in range(30):
         simulation.command(f"emergency {n}")
-    assert client.ask("sdo_read", index=0x8011, type="u16")["value"] == 800
+    assert client.ask("sdo_read", index=0x8011, type="u16")["value"] == 100
     row = client.ask("status")["sensors"][0]
     assert row["emergencies"] == 30
     simulation.run(1.0)
@@ -196,7 +196,7 @@ def test_emergencies_before_an_answer_are_read_by_the_job() -> None:
 
 
 def test_each_change_is_told_and_the_end_of_an_error_is_no_warning(log: pytest.LogCaptureFixture) -> None:
-    simulation = Simulation()
+    simulation = Simulation(settings=SLOW)
     simulation.run(1.0)
     for code in (0x4210, 0, 0x4210, 0):
         simulation.command(f"emergency {code}")

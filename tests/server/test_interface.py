@@ -29,6 +29,7 @@ from ethercat_server.ethercat.nic import Routes, claimed, look_up, network_troub
 from ethercat_server.ethercat.soem import SoemBackend, packet_sockets
 from tests import rights
 from tests.doctor.running import doctor_here
+from tests.ended import completed
 from tests.rights import NOBODY, as_user, needs_another_user
 from tests.server.running import (
     Veth,
@@ -218,10 +219,7 @@ with claimed("near0", allow_ip=True):
 
 def test_the_default_route_is_refused_unless_it_is_allowed() -> None:
     """Only in a network namespace of its own may a test have one, so this is a process."""
-    done = subprocess.run(
-        ["unshare", "--net", "bash", "-c", IN_A_NETWORK, "bash", sys.executable, "-c", REFUSE],
-        check=False, capture_output=True, text=True,
-    )  # fmt: skip
+    done = completed("unshare", "--net", "bash", "-c", IN_A_NETWORK, "bash", sys.executable, "-c", REFUSE)
     refused, allowed = done.stdout.splitlines()
     assert "near0 has the machine's default route" in refused, done.stderr
     assert "'ethercat-sensor adapters' lists them" in refused

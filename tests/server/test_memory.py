@@ -64,7 +64,7 @@ def any_request(chance: random.Random, action: str) -> dict[str, object]:
     }
 
 
-@pytest.mark.parametrize("seed", more_if_long(range(3), range(40)))
+@pytest.mark.parametrize("seed", more_if_long(range(2), range(40)))
 def test_requests_refusals_losses_and_recoveries_leave_nothing_to_collect(seed: int) -> None:
     chance = random.Random(seed)
     simulation = Simulation(SensorOptions(signal="rest"), SensorOptions(signal="rest"))
@@ -102,7 +102,7 @@ class DefectError(Exception):
 
 
 def test_what_a_defect_leaves_in_cycles_is_freed_within_a_second() -> None:
-    simulation, left = Simulation(), list[weakref.ref[DefectError]]()
+    simulation, left = Simulation(settings={"sinc_length": 512}), list[weakref.ref[DefectError]]()
 
     def defective(_connection: Connection, _message: JsonObject) -> JsonObject:
         try:

@@ -11,7 +11,6 @@ import os
 import pwd
 import signal
 import socket
-import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -28,8 +27,10 @@ from ethercat_server.errors import ServerError, StopRequestedError, UsageError
 from ethercat_server.process import privileges, realtime
 from ethercat_server.process.privileges import User, user_to_become
 from tests import rights
+from tests.ended import completed, run_here
 from tests.rights import IPC_LOCK, NOBODY, SYS_NICE, needs_another_user, without
 from tests.server.running import (
+    SLOW,
     Server,
     Veth,
     VirtualSensor,
@@ -105,13 +106,9 @@ def test_what_needs_root_is_done_before_a_frame_is_read(monkeypatch: pytest.Monk
     monkeypatch.setattr(realtime, "prepare", prepare)
     monkeypatch.setattr(daemon, "forbid_new_privileges", lambda: done.append("forbade new ones"))
     monkeypatch.setattr(daemon, "become", lambda user: done.append(f"became {user}"))
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
-        with pytest.raises(StopRequestedError):
-            daemon.serve(parse_options(["ens5", str(free_port()), "--user", "nobody"]), Signals())
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    words = ["ens5", str(free_port()), "--user", "nobody"]
+    with pytest.raises(StopRequestedError):
+        run_here(lambda _: daemon.serve(parse_options(words), Signals()))
     prepared = "prepared, becomes user: True"
     assert done == ["forbade new ones", "opened ens5", prepared, "became nobody", "brought up"]
 
@@ -203,7 +200,7 @@ def test_only_the_loop_has_real_time_priority(running: tuple[Server, Path]) -> N
 @pytest.mark.parametrize("stuck", [False, True])
 def test_the_virtual_sensor_becomes_the_same_user_and_goes_with_the_server(stuck: bool) -> None:
     """A stopped process does not end by itself; that of another user could not be killed."""
-    with server("virtual", "--user", "nobody") as found:
+    with server("virtual", *SLOW, "--user", "nobody") as found:
         process = found.process.pid
         (child,) = Path(f"/proc/{process}/task/{process}/children").read_text().split()
         for each in (process, int(child)):
@@ -222,7 +219,7 @@ def test_the_virtual_sensor_becomes_the_same_user_and_goes_with_the_server(stuck
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
 @on_a_bus
 def test_root_without_sudo_stays_root_and_is_told_how_not_to() -> None:
-    with server("virtual") as found:
+    with server("virtual", *SLOW) as found:
         assert rows_of(found.process.pid)["Uid"].split() == ["0"] * 4
         assert found.said().count("running as root: name a user with --user") == 1
         found.signal(signal.SIGTERM)
@@ -285,7 +282,7 @@ def test_an_ordinary_user_has_a_virtual_bus_in_namespaces_of_its_own() -> None:
 def test_the_units_capabilities_are_enough_for_everything(spare: Veth) -> None:
     (ambient,) = values(SERVER_UNIT, "AmbientCapabilities")
     expected = sum(1 << getattr(rights, name.removeprefix("CAP_")) for name in ambient.split())
-    with server(spare.near, **confined(ambient.split())) as found:
+    with server(spare.near, *SLOW, **confined(ambient.split())) as found:
         process = rows_of(found.process.pid)
         assert process["Uid"].split() == [str(NOBODY.pw_uid)] * 4
         for kind in ("CapEff", "CapPrm", "CapBnd", "CapAmb"):
@@ -337,10 +334,8 @@ print(json.dumps(dict(own=scheduling(), thread=left, locked=int(locked), slack=s
 def probe(priority: int, cpu: int | None, *, capable: bool = True) -> tuple[dict[str, Any], str]:
     """What the process then has, and what it said."""
     drop = None if capable else without(IPC_LOCK, SYS_NICE)
-    done = subprocess.run(
-        [sys.executable, "-c", PROBE.format(priority=priority, cpu=cpu)],
-        capture_output=True, text=True, check=True, preexec_fn=drop,
-    )  # fmt: skip
+    program = PROBE.format(priority=priority, cpu=cpu)
+    done = completed(sys.executable, "-c", program, check=True, preexec_fn=drop)
     return json.loads(done.stdout), done.stderr.strip()
 
 

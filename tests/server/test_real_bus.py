@@ -28,6 +28,7 @@ from ethercat_server.sensor.sensor import Sensor
 from tests.server.running import (
     ATTEMPTS,
     PATIENCE_S,
+    SLOW,
     Client,
     Manager,
     Server,
@@ -149,7 +150,7 @@ def test_a_server_outlives_losses_by_every_name_of_its_interface() -> None:
     other, renamed = "alternative-name-of-the-interface", f"er{free_port()}"
     with virtual_sensor("--signal", "clock") as (veth, sensor):
         veth.ip("link", "property", "add", "dev", veth.near, "altname", other)
-        with server(other) as running, running.connect() as client:
+        with server(other, *SLOW) as running, running.connect() as client:
             assert client.ask("subscribe")["interface"] == veth.near
             assert f"streaming {veth.near} on port" in running.said()
             pull_cable(Bench(veth, sensor, running), client)
@@ -182,15 +183,15 @@ def test_sensors_among_other_devices(text: str) -> None:
     others = [at for at, kind in enumerate(text.split(",")) if kind != "BOTA"]
     with (
         virtual_sensor("--chain", text, "--signal", "clock") as (veth, sensor),
-        server(veth.near) as running,
+        server(veth.near, *SLOW) as running,
         running.connect() as client,
     ):
         assert [row["position"] for row in client.ask("subscribe")["others"]] == others
-        assert len(client.fresh(200)) == 200
+        assert len(client.fresh(50)) == 50
         before = [sensor.stats_of_foreign(at) for at in others]
         pull_cable(Bench(veth, sensor, running), client)
         client.wait_event("sensor_back")
-        assert len(client.fresh(200)) == 200
+        assert len(client.fresh(50)) == 50
         assert [sensor.stats_of_foreign(at) for at in others] == before
         assert {row["al_state"] for row in before} <= {"INIT", "PREOP"}
 
@@ -272,7 +273,7 @@ def test_killed_and_started_again_at_once_on_the_same_port_beside_another(shared
     with contextlib.ExitStack() as stack:
         bystander = stack.enter_context(shared.running.connect())
         bystander.ask("subscribe")
-        killed = stack.enter_context(server("virtual"))
+        killed = stack.enter_context(server("virtual", *SLOW))
         client = stack.enter_context(killed.connect())
         client.ask("subscribe")
         assert len(client.fresh(20)) == 20
@@ -284,7 +285,7 @@ def test_killed_and_started_again_at_once_on_the_same_port_beside_another(shared
         killed.wait()
         client.receive_all()
 
-        again = stack.enter_context(server("virtual", port=killed.port))
+        again = stack.enter_context(server("virtual", *SLOW, port=killed.port))
         wait_until(lambda: not interface_exists(killed.ifname), "the virtual bus to be gone")
         with Client(killed.port) as client:
             assert client.ask("subscribe")["ok"]
@@ -447,12 +448,12 @@ def test_whoever_was_first_keeps_all_others_out_before_it_has_opened_the_bus(odd
     with claimed(veth.near):
         said = one_sentence(tool("objects", veth.near, code=1))
         assert f"{veth.near} is in use by another EtherCAT master" in said
-    with server(veth.near) as running:
+    with server(veth.near, *SLOW) as running:
         with contextlib.closing(Server(veth.near)) as second:
             assert second.wait() == 1
             assert f"{veth.near} is in use by another EtherCAT master" in second.said()
         running.process.kill()
         running.wait()
-        with server(veth.near):
+        with server(veth.near, *SLOW):
             pass
     assert tool("objects", veth.near).code == 0

@@ -12,7 +12,6 @@ import re
 import signal
 import socket
 import struct
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -42,7 +41,7 @@ from ethercat_server.virtual_sensor import virtual_bus
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.foreign import ForeignSlave
 from ethercat_server.virtual_sensor.options import SensorOptions, parse_chain, slaves_in
-from tests.ended import run_here
+from tests.ended import completed, run_here
 from tests.rights import NET_ADMIN, NET_RAW, without
 from tests.server.running import (
     ATTEMPTS,
@@ -114,7 +113,7 @@ def test_wrong_arguments(caplog: pytest.LogCaptureFixture, arguments: str, code:
 def test_too_few_open_files() -> None:
     """A process, whose listening sockets are too many."""
     command = f"ulimit -n 6; exec {sys.executable} -m ethercat_server.daemon.cli lo {free_port()}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False, timeout=60)
+    done = completed("bash", "-c", command, timeout=60)
     sentence = "the server may open too few files (ulimit -n): allow it 256 at least"
     assert (done.returncode, done.stderr) == (1, f"ethercat-server: {sentence}\n")
 
@@ -345,10 +344,8 @@ def test_settings_for_a_sensor_that_is_not_switched_on_yet(tmp_path: Path) -> No
 def test_without_rights_the_capabilities_are_named() -> None:
     """The kernel's rights, and a real exit code."""
     with Veth() as veth:
-        done = subprocess.run(
-            [sys.executable, "-m", "ethercat_server.daemon.cli", veth.near, str(free_port())],
-            preexec_fn=without(NET_ADMIN, NET_RAW), capture_output=True, text=True, check=False, timeout=60,
-        )  # fmt: skip
+        server = (sys.executable, "-m", "ethercat_server.daemon.cli", veth.near, free_port())
+        done = completed(*server, preexec_fn=without(NET_ADMIN, NET_RAW), timeout=60)
     assert done.returncode == 1
     (said,) = done.stderr.splitlines()
     assert said.startswith("ethercat-server: not allowed to open ")

@@ -195,7 +195,7 @@ def test_an_answer_that_was_overtaken_is_not_handed_out() -> None:
     wait_for(simulation, "OP")
     backend.become(machine)
     client.terminal_frames.clear()
-    simulation.run(10.0)
+    simulation.run(3.0)
     assert not check_digital(client.terminal_frames)
     check_frames(simulation.frames)
 

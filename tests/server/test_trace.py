@@ -71,7 +71,7 @@ def check_replay(simulation: Simulation, numbers: Sequence[int] = (0,)) -> Trace
 )
 def test_a_replay_makes_the_same_decisions(machine: Machine, dc: str) -> None:
     simulation = Simulation(SensorOptions(signal="clock", ppm=150.0, dc=dc), machine=machine)
-    simulation.run(3.0)
+    simulation.run(2.0)
     trace = check_replay(simulation)
     assert any(record.latched for record in trace.records) == (dc == "")
 
@@ -81,13 +81,13 @@ def test_a_replay_begins_anew_where_a_sensor_came_back_and_where_event_times_are
         SensorOptions(signal="clock", ppm=150.0), SensorOptions(signal="clock", serial=2, dc="stuck")
     )
     simulation.at(1.0, "power cycle 0.1 @0")
-    simulation.run(4.0)
+    simulation.run(3.0)
     assert simulation.status()["sensors"][0]["recoveries"]
     check_replay(simulation, (0, 1))
 
 
 def test_the_ring_has_the_last_minute_and_is_read_while_it_goes_on() -> None:
-    simulation = Simulation(SensorOptions(sinc_length=512), settings={"sinc_length": 512})
+    simulation = Simulation(settings={"sinc_length": 1024})
     simulation.run(100.0)
     size = simulation.cycle.tracing.part(0)["size"]
     parts = []
@@ -124,7 +124,7 @@ def test_a_file_is_hostile() -> None:
         for _ in range(chance.randint(1, 5)):
             mutated[chance.randrange(len(mutated))] = chance.randrange(256)
         try:
-            for _ in itertools.islice(Trace(bytes(mutated)).replay(), 300):
+            for _ in itertools.islice(Trace(bytes(mutated)).replay(), 100):
                 pass
         except TraceError:
             pass
@@ -169,7 +169,7 @@ def test_a_loss_that_nothing_explains_leaves_a_trace_and_few_of_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    simulation = Simulation()
+    simulation = Simulation(settings={"sinc_length": 512})
     traces = Traces(simulation.server)
     written = []
 
