@@ -22,7 +22,7 @@ from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor import models
 from ethercat_server.sensor.guard import GuardedSdo
 from ethercat_server.sensor.objects import dictionary
-from ethercat_server.sensor.scan import Slave, look_safely
+from ethercat_server.sensor.scan import Slave, scan_if_free
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState, is_known_model
 from ethercat_server.sensor.set_up import identify, read_in_force, read_offset, set_up
 
@@ -121,7 +121,7 @@ def bring_up(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Start
 def _find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> Started:
     """Find the sensors on the open `bus`, in PREOP, and ask them who they are; nothing is written."""
     ours = named_positions(wanted.terminals)
-    slaves = look_safely(bus, check_interrupt, force=wanted.force, ours=ours)
+    slaves = scan_if_free(bus, check_interrupt, force=wanted.force, ours=ours)
     of_sensors = [slave for slave in slaves if slave.is_sensor]
     others = [slave for slave in slaves if not slave.is_sensor]
     unread = next((slave for slave in others if slave.sii is None), None)

@@ -21,7 +21,7 @@ from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.process.privileges import User, become, forbid_new_privileges, user_to_become
 from ethercat_server.server import Server
-from ethercat_server.serving.connection import Limits
+from ethercat_server.serving.connection import Timeouts
 from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import SocketTransport
@@ -47,7 +47,7 @@ def serve(
     permissions = Permissions(
         options.server["control_users"], options.server["control_groups"], user and user.uid
     )
-    notifier = Notifier()
+    notifier = SystemdNotifier()
     with contextlib.ExitStack() as cleanup:
         hub = Hub(SocketTransport(options.server["hosts"], options.port))
         hub.permissions = permissions
@@ -58,7 +58,9 @@ def serve(
         bus = cleanup.enter_context(open_bus(ifname, allow_ip=options.allow_ip))
         realtime.prepare(priority, options.server["cpu"], becomes_user=user is not None)
         _give_up_root(user, options)
-        hub.limits = Limits(*(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s")))
+        hub.timeouts = Timeouts(
+            *(options.server[name] * 1e9 for name in ("stall_timeout_s", "idle_timeout_s"))
+        )
 
         def check_interrupt() -> None:
             if signals.asked:
@@ -87,7 +89,7 @@ def serve(
         log.info("shutting down: the sensors go to INIT")
 
 
-def every_second(server: Server, notifier: Notifier, traces: Traces) -> None:
+def every_second(server: Server, notifier: SystemdNotifier, traces: Traces) -> None:
     """What the loop has done once a second.
 
     Nothing should be left in reference cycles. For what is all the same, a look at what was made since the
@@ -108,7 +110,7 @@ def _give_up_root(user: User | None, options: ServerOptions) -> None:
     log.info("running as user %s from here on, without privileges", user)
 
 
-class Notifier:
+class SystemdNotifier:
     """The service manager's socket (sd_notify(3)); sending never blocks and never fails.
 
     Without systemd it does nothing.

@@ -81,7 +81,7 @@ class Slave(NamedTuple):
         return f"{self.name!r} at position {self.position} ({who})"
 
 
-def look_safely(
+def scan_if_free(
     bus: Bus, check_interrupt: CheckInterrupt, *, force: bool = False, ours: Mapping[int, Kind | None] = {}
 ) -> list[Slave]:
     """All slaves, in their order on the wire, with their SIIs; NoSlaveError if there are none.

@@ -25,7 +25,9 @@ NO_SENSOR: Final = -1
 _IDLE_FRAME_NS: Final = 10_000_000
 _REPEATED: Final = int(DataFlag.REPEATED)
 _GAP: Final = int(DataFlag.GAP)
-_UNFINISHED_NS: Final = 10_000_000_000  # timeout for the rest of a message whose first part has arrived
+_INCOMPLETE_MESSAGE_NS: Final = (
+    10_000_000_000  # timeout for the rest of a message whose first part has arrived
+)
 _LAST_REPLY_NS: Final = 1_000_000_000  # timeout for a connection that is being closed
 
 
@@ -57,7 +59,7 @@ TRANSITIONS: Final = {
 }
 
 
-class Limits(NamedTuple):
+class Timeouts(NamedTuple):
     """Timeouts after which a client is closed."""
 
     stall_ns: float = 10e9  # while something waits to be sent: nothing of it was accepted
@@ -382,21 +384,21 @@ class Connection:
 
     # -- ending
 
-    def complaint(self, now_ns: int, limits: Limits) -> str | None:
+    def reason_to_close(self, now_ns: int, timeouts: Timeouts) -> str | None:
         """Why this client is to be closed, None if it is not."""
         if self.state.ending:
             return None
         if self.outbox.waiting:
-            if now_ns - self.outbox.progress_ns > limits.stall_ns:
-                return f"it has read nothing for {limits.stall_ns / 1e9:g} s"
-        elif self._begun_ns and now_ns - self._begun_ns > _UNFINISHED_NS:
-            return f"its message is still incomplete after {_UNFINISHED_NS / 1e9:g} s"
+            if now_ns - self.outbox.progress_ns > timeouts.stall_ns:
+                return f"it has read nothing for {timeouts.stall_ns / 1e9:g} s"
+        elif self._begun_ns and now_ns - self._begun_ns > _INCOMPLETE_MESSAGE_NS:
+            return f"its message is still incomplete after {_INCOMPLETE_MESSAGE_NS / 1e9:g} s"
         elif (
             self.subscription is None
             and self.state is not ConnectionState.ANSWERING
-            and now_ns - self._heard_ns > limits.idle_ns
+            and now_ns - self._heard_ns > timeouts.idle_ns
         ):
-            return f"it is not subscribed and has sent no request for {limits.idle_ns / 1e9:g} s"
+            return f"it is not subscribed and has sent no request for {timeouts.idle_ns / 1e9:g} s"
         return None
 
     def finish(self) -> None:

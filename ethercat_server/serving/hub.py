@@ -21,7 +21,7 @@ from bota_ethercat.control import ErrorCode, error_reply
 from bota_ethercat.errors import RequestError
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import OutgoingFrame
-from ethercat_server.serving.connection import Connection, ConnectionState, Limits, Unreadable, Watched
+from ethercat_server.serving.connection import Connection, ConnectionState, Timeouts, Unreadable, Watched
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import Transport
 
@@ -45,7 +45,7 @@ class Hub:
 
     def __init__(self, transport: Transport, monotonic_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self.connections: dict[int, Connection] = {}  # by file descriptor
-        self.limits = Limits()
+        self.timeouts = Timeouts()
         self.permissions = Permissions()
         self._transport = transport
         self._monotonic_ns = monotonic_ns
@@ -209,7 +209,7 @@ class Hub:
         """Close those that are beyond a timeout, have received their last reply, or are broken."""
         self._sweep_at_ns = now_ns + _SWEEP_NS
         for connection in self.connections.values():
-            if complaint := connection.complaint(now_ns, self.limits):
+            if complaint := connection.reason_to_close(now_ns, self.timeouts):
                 log.warning("%s closed: %s", connection, complaint)
                 if connection.outbox.waiting:
                     connection.fail()

@@ -16,7 +16,7 @@ from ethercat_server.errors import BusError, ServerError
 from ethercat_server.ethercat.nic import network_trouble
 from ethercat_server.ethercat.slave import sii
 from ethercat_server.process.command_line import FAILED
-from ethercat_server.sensor.scan import NoSlaveError, look_safely, read_image
+from ethercat_server.sensor.scan import NoSlaveError, read_image, scan_if_free
 from ethercat_server.sensor.sensor import FoundSensor, Identity
 from ethercat_server.tool.command import DONE, Subcommand, chosen, columns, say, say_json, sensor_arguments
 
@@ -76,7 +76,7 @@ def _search(row: Adapter) -> dict[str, Any]:
         else:
             # Frames of another master are waited for first; nothing is asked if there are some.
             with open_interface(row.name) as bus:
-                slaves = look_safely(bus, lambda: None)
+                slaves = scan_if_free(bus, lambda: None)
             for slave in slaves:
                 if slave.is_sensor and slave.sii is not None:
                     sensor = {"sensor": len(sensors), "position": slave.position, "name": slave.name}
@@ -99,7 +99,7 @@ def _eeprom(args: argparse.Namespace) -> int:
             slaves = {number: _decoded(sii.read_image, partial(_words, server, number)) for number in numbers}
     else:
         with open_interface(args.iface, allow_ip=args.allow_ip) as bus:
-            positions = [slave.position for slave in look_safely(bus, lambda: None, force=args.take_over)]
+            positions = [slave.position for slave in scan_if_free(bus, lambda: None, force=args.take_over)]
             slaves = {position: _decoded(read_image, bus, position) for position in positions}
         if args.sensor is not None:
             identities = (

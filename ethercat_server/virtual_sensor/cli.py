@@ -17,8 +17,8 @@ from bota_ethercat.program.signals import signals_call
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
 from ethercat_server.sensor.models import MODELS
-from ethercat_server.virtual_sensor.commands import PPM_LIMIT
 from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_clock
+from ethercat_server.virtual_sensor.fault import PPM_LIMIT
 from ethercat_server.virtual_sensor.faults import COMMANDS
 from ethercat_server.virtual_sensor.options import (
     FAULT,

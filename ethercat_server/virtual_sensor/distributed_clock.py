@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from bota_ethercat.program.arguments import number
 from ethercat_server.ethercat.slave import registers as reg
-from ethercat_server.virtual_sensor.commands import PPM_LIMIT, Fault
+from ethercat_server.virtual_sensor.fault import PPM_LIMIT, Fault
 from ethercat_server.virtual_sensor.options import UsageError
 
 RATE_SCALE: Final = 10**12  # rates are in parts of this

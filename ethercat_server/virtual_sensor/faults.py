@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 from bota_ethercat.program.arguments import number, whole
 from ethercat_server.ethercat.slave.al import AlState
-from ethercat_server.virtual_sensor.commands import PPM_LIMIT, Fault
 from ethercat_server.virtual_sensor.distributed_clock import parse_clock_word
+from ethercat_server.virtual_sensor.fault import PPM_LIMIT, Fault
 from ethercat_server.virtual_sensor.options import UsageError, model_name
 from ethercat_server.virtual_sensor.signals import CHANNELS, SIGNALS
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from bota_clients.export.cli import main
-from bota_clients.export.table import COLUMNS
+from bota_clients.export.csv_table import COLUMNS
 from bota_clients.recording.reader import Recording
 from bota_ethercat.framing import DataFlag
 from tests.clients.recordings import PERIOD_NS, START_NS, frame, record

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from bota_clients.export.cli import main
+from bota_clients.export.csv_table import COLUMNS
 from bota_clients.export.dataset import Periodic, Stamped, windows_of
 from bota_clients.export.samples import samples_of
-from bota_clients.export.table import COLUMNS
 from bota_clients.export.windows import Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage

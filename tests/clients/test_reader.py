@@ -15,7 +15,7 @@ import zstandard
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_clients.recording.columns import columns
-from bota_clients.recording.container import MAX_CHUNK, McapFile
+from bota_clients.recording.mcap_file import MAX_CHUNK, McapFile
 from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import SampleDecoder

@@ -13,7 +13,7 @@ import sys
 
 from ethercat_server.virtual_sensor import cli, faults
 from ethercat_server.virtual_sensor.application import Application
-from ethercat_server.virtual_sensor.commands import Fault
+from ethercat_server.virtual_sensor.fault import Fault
 from ethercat_server.virtual_sensor.faults import Call
 
 al_control = Application.al_control

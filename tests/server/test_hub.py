@@ -24,7 +24,7 @@ from ethercat_server.serving.connection import (
     MAX_REQUEST_LENGTH,
     Connection,
     ConnectionState,
-    Limits,
+    Timeouts,
 )
 from ethercat_server.serving.hub import Hub
 from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
@@ -462,7 +462,7 @@ def test_what_was_queued_and_sent_does_not_count_for_ever(served: Served) -> Non
 
 def test_who_waits_for_an_answer_is_not_idle(served: Served) -> None:
     """A tare of 20,000 samples at 25 Hz takes longer than the idle timeout."""
-    served.hub.limits = Limits(idle_ns=60e9)
+    served.hub.timeouts = Timeouts(idle_ns=60e9)
     served.hub.start(lambda _connection, _message: None)
     client = served.connect(sent=encode_json({"action": "tare", "id": 1}))
     served.serve(800.0)
@@ -487,7 +487,7 @@ def test_a_client_that_asks_and_never_reads_is_closed(served: Served) -> None:
 
 
 def test_a_client_that_reads_nothing_is_closed_after_the_stall_timeout(served: Served) -> None:
-    served.hub.limits = Limits(stall_ns=3e9)
+    served.hub.timeouts = Timeouts(stall_ns=3e9)
     client, other = served.subscribe(), served.subscribe()
     for _ in range(60):
         served.publish(count=50)
@@ -500,7 +500,7 @@ def test_a_client_that_reads_nothing_is_closed_after_the_stall_timeout(served: S
 
 
 def test_a_client_that_reads_a_little_now_and_then_stays(served: Served) -> None:
-    served.hub.limits = Limits(stall_ns=1.5e9)
+    served.hub.timeouts = Timeouts(stall_ns=1.5e9)
     client = served.subscribe()
     for _ in range(20):
         served.publish(count=600)
@@ -510,7 +510,7 @@ def test_a_client_that_reads_a_little_now_and_then_stays(served: Served) -> None
 
 
 def test_idle_and_unfinished_connections_are_closed_with_a_reason(served: Served) -> None:
-    served.hub.limits = Limits(idle_ns=60e9)
+    served.hub.timeouts = Timeouts(idle_ns=60e9)
     subscriber, unfinished = served.subscribe(), served.connect()
     idle = served.connect(sent=b'{"action":"describe"}\n')
     assert served.read_lines(idle) == [ANSWER]

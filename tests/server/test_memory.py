@@ -15,7 +15,7 @@ import pytest
 
 from bota_ethercat.control import ACTIONS, Parameter
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.daemon.server import Notifier, every_second
+from ethercat_server.daemon.server import SystemdNotifier, every_second
 from ethercat_server.daemon.traces import Traces
 from ethercat_server.serving.connection import Connection
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -114,7 +114,7 @@ def test_what_a_defect_leaves_in_cycles_is_freed_within_a_second() -> None:
 
     simulation.hub.start(defective)
     traces = Traces(simulation.server)
-    simulation.cycle.every_second = partial(every_second, simulation.server, Notifier(), traces)
+    simulation.cycle.every_second = partial(every_second, simulation.server, SystemdNotifier(), traces)
     client = simulation.connect()
     for _ in range(5):
         for _ in range(10):

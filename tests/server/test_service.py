@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ethercat_server.daemon.server import Notifier
+from ethercat_server.daemon.server import SystemdNotifier
 from tests.server.running import WATCHDOG_US, Manager
 from tests.simulation import Bench
 
@@ -27,7 +27,7 @@ class Administered(Bench):
 
     def __init__(self) -> None:
         super().__init__()
-        self.notifier = self.cycle._watchdog = Notifier()
+        self.notifier = self.cycle._watchdog = SystemdNotifier()
         self.notifier.send("READY=1")
         self.notifier.update(self.server)
 
@@ -69,7 +69,7 @@ def test_without_systemd_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     monkeypatch.setenv("WATCHDOG_USEC", "600000")
     monkeypatch.setenv("WATCHDOG_PID", "1")
-    notifier = Notifier()
+    notifier = SystemdNotifier()
     notifier.send("READY=1")
     notifier.feed()
     assert notifier.feed_every_ns > 10**15, "the watchdog is another process's"

@@ -34,7 +34,7 @@ from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build
 from ethercat_server.process import realtime
 from ethercat_server.sensor import scan
 from ethercat_server.sensor.objects.dictionary import BY_SETTING
-from ethercat_server.sensor.scan import look_safely
+from ethercat_server.sensor.scan import scan_if_free
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor import virtual_bus
@@ -474,10 +474,10 @@ def test_another_master_is_left_alone() -> None:
     backend = OthersFrames(0.01, 1000)
     before = registers(backend)
     with pytest.raises(BusError, match=r"another EtherCAT master is sending on .*: stop it"):
-        look_safely(Bus(backend), lambda: None)
+        scan_if_free(Bus(backend), lambda: None)
     assert registers(backend) == before
     # The last frames of one that was killed are no obstacle.
-    assert len(look_safely(Bus(OthersFrames(0.001, 2)), lambda: None)) == 1
+    assert len(scan_if_free(Bus(OthersFrames(0.001, 2)), lambda: None)) == 1
 
 
 def test_a_slave_that_stops_answering_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -490,7 +490,7 @@ def test_a_slave_that_stops_answering_is_said(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(backend, "send", lose_single_reads)
     with pytest.raises(BusError, match="slave 0 on memory does not answer: check cable and power"):
-        look_safely(Bus(backend), lambda: None)
+        scan_if_free(Bus(backend), lambda: None)
 
 
 # -- a start that is given up at any moment: the sensors go to INIT, the other devices are as they were

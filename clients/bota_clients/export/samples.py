@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.table import REGISTERS, VECTORS, new_samples
+from bota_clients.export.csv_table import REGISTERS, VECTORS, new_samples
 from bota_clients.export.windows import Array, Arrays, Windows, interpolated
 from bota_clients.recording.columns import RECORD, Columns, joined
 from bota_clients.recording.reader import Recording

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
-from bota_clients.recording.container import McapFile
+from bota_clients.recording.mcap_file import McapFile
 from bota_ethercat import replies
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.replies import SensorInfo, position_of
