@@ -18,7 +18,7 @@ from typing import Final
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
 from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.nic import VIRTUAL_INTERFACE
+from ethercat_server.ethercat.options import VIRTUAL_INTERFACE
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.server import Server

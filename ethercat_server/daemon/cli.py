@@ -12,7 +12,7 @@ from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.signals import Signals
 from ethercat_server.daemon.options import parse_options
 from ethercat_server.errors import ServerError, StopRequestedError
-from ethercat_server.ethercat.nic import VIRTUAL_INTERFACE
+from ethercat_server.ethercat.options import VIRTUAL_INTERFACE
 from ethercat_server.process.logs import set_up_logging
 
 log = logging.getLogger(__name__)

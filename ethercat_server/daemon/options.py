@@ -25,7 +25,7 @@ from bota_ethercat.settings import (
 from bota_ethercat.text.did_you_mean import did_you_mean
 from ethercat_server.acquisition.terminal_choice import CHOICE
 from ethercat_server.errors import UsageError
-from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP, VIRTUAL_INTERFACE
+from ethercat_server.ethercat.options import ALLOW_IP, ALLOW_IP_HELP, VIRTUAL_INTERFACE
 from ethercat_server.process import realtime
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from bota_ethercat.program import server_choice
 from bota_ethercat.program.arguments import Parser, number
 from bota_ethercat.program.output import ends_with_its_reader
 from ethercat_server.daemon.options import SERVER_SETTINGS
-from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
+from ethercat_server.ethercat.options import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.process import command_line
 
 _PROGRAM: Final = "ethercat-doctor"

@@ -27,15 +27,14 @@ from ethercat_server.doctor.report import (
     warning,
 )
 from ethercat_server.ethercat.nic import (
-    ALLOW_IP,
     NEEDED_CAPABILITIES,
-    VIRTUAL_INTERFACE,
     XDP,
     Routes,
     missing_capabilities,
     network_trouble,
     xdp_removal,
 )
+from ethercat_server.ethercat.options import ALLOW_IP, VIRTUAL_INTERFACE
 
 Look = Callable[[Host], CheckResult | Iterable[CheckResult]]
 

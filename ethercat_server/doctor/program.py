@@ -19,7 +19,8 @@ from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.machine_checks import examine_machine
 from ethercat_server.doctor.report import CannotLookError, CheckResult, Report, as_json, is_bus_unknown, worst
 from ethercat_server.errors import ServerError, UsageError
-from ethercat_server.ethercat.nic import VIRTUAL_INTERFACE, name_trouble, own_name
+from ethercat_server.ethercat.nic import name_trouble, own_name
+from ethercat_server.ethercat.options import VIRTUAL_INTERFACE
 from ethercat_server.process import command_line
 from ethercat_server.virtual_sensor.virtual_bus import VirtualBus
 

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.options import ALLOW_IP, VIRTUAL_INTERFACE
 from ethercat_server.ethercat.wire import ETHERTYPE
 
 
@@ -104,12 +105,8 @@ def _sockets(process: Path) -> Iterator[int]:
                     yield int(target[8:-1])
 
 
-VIRTUAL_INTERFACE: Final = "virtual"  # what stands for a virtual bus with a virtual sensor on it
 LEAST_MTU: Final = 1500  # bytes: an EtherCAT frame may be as long as any Ethernet frame
 CHECK_CABLE: Final = "check cable and power"
-# The option that has the server or a program use an interface with the default route or a leased address.
-ALLOW_IP: Final = "--allow-ip"
-ALLOW_IP_HELP: Final = "use IFACE although it has the machine's default route or an IP address by DHCP"
 
 _GET_LINK, _GET_ADDRESS, _GET_ROUTE = 18, 22, 26
 _REQUEST, _DUMP = 0x1, 0x300

@@ -13,7 +13,7 @@ from bota_ethercat.program.server_choice import HELP
 from bota_ethercat.text.json_text import finite
 from ethercat_server.access.sensors import Sensors, choose, find_server
 from ethercat_server.errors import BusError
-from ethercat_server.ethercat.nic import ALLOW_IP, ALLOW_IP_HELP
+from ethercat_server.ethercat.options import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.sensor.sensor import FoundSensor
 
 DONE: Final = 0
