@@ -116,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
     """
     from bota_clients.recording.reader import open_recording  # noqa: PLC0415 - needs the extra
 
-    module = "whole" if options.mcap else "dataset" if options.suffix in DATASETS else "table"
+    module = "whole" if options.mcap else "dataset" if options.suffix in DATASETS else "csv_table"
     write = import_module(f"bota_clients.export.{module}").write
     interrupt_on_signals()
     try:
