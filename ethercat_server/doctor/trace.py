@@ -146,7 +146,7 @@ def _table(decisions: Sequence[Decision]) -> Iterator[str]:
     seconds = (decisions[-1].record.sent_ns - decisions[0].record.sent_ns) * 1e-9
     yield (
         f"  {seconds:.1f} s: {len(new)} samples, {sum(max(0, decision.steps - 1) for decision in new)} lost, "
-        f"{kinds[RecordKind.READ]} early polls, {kinds[RecordKind.INVALID]} invalid exchanges"
+        f"{kinds[RecordKind.READ]} polls without a new sample, {kinds[RecordKind.INVALID]} invalid exchanges"
     )
     if new:
         ages = [

@@ -30,7 +30,7 @@ def decisions(name: str) -> dict[str, int]:
     )
     return {
         "samples": len(new),
-        "early_polls": kinds[RecordKind.READ],
+        "polls_without_sample": kinds[RecordKind.READ],
         "invalid": kinds[RecordKind.INVALID],
         "lost": sum(max(0, step.steps - 1) for step in new),
         "put_right": sum(step.steps < 1 for step in new),
