@@ -316,6 +316,13 @@ def test_subscription_filters(served: Served) -> None:
     assert served.sequences(newcomer) == [11], "it has had nothing yet"
 
 
+def test_what_a_client_has_had_that_leaves_out_frames_is_what_it_was_sent(served: Served) -> None:
+    client, now_ns = served.subscribe(every=3), served.clock.now_ns
+    for after_ns, flags in ((0, 0), (8_000_000, 0), *((10_000_000 + n, DataFlag.REPEATED) for n in (0, 1))):
+        served.publish(0, flags, now_ns + after_ns)
+    assert served.sequences(client) == [0, 3], "the sample of 8 ms was not sent"
+
+
 def test_gap_is_kept_for_a_client_that_skips_the_frame_that_had_it(served: Served) -> None:
     client = served.subscribe(every=2)
     for flags in (0, DataFlag.GAP, 0, 0, 0):
