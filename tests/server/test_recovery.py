@@ -576,3 +576,13 @@ def test_a_single_late_answer_makes_the_loop_wait_longer_for_some_exchanges_only
         simulation.command("lose 1")
         client.fresh(20)
     assert simulation.status()["sensors"][0]["lost_samples"] - before <= 1
+
+
+def test_an_incomplete_answer_is_forgotten_if_complete_ones_follow() -> None:
+    """So two that are far apart are no reason to read the sensors' states."""
+    running = Simulation()
+    running.run(0.2)
+    running.recovery.check_answer(complete=False)
+    assert running.recovery.incomplete
+    running.run(0.05)
+    assert not running.recovery.incomplete
