@@ -92,6 +92,15 @@ def test_the_same_recording_gives_the_same_values_always_in_its_original_timing(
     assert len(first) == COUNT
 
 
+def test_a_sensor_that_was_silent_is_shown_every_10_ms(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    record(path, [frame(n, flags=DataFlag.REPEATED if n > 10 else 0) for n in range(60)])
+    with Replay(path) as served, listen(served.port) as client:
+        played = list(client.frames())
+    assert [item.sequence for item in played if not item.flags] == [*range(11)]
+    assert len(played) in range(11 + 2, 11 + 7)
+
+
 def test_it_loops_with_numbers_that_go_on(path: Path) -> None:
     with Replay("--loop", "--speed", "50", path) as served, listen(served.port, sensors=[1]) as client:
         played = []

@@ -12,7 +12,7 @@ from bota_ethercat.framing import DataFlag
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.exchange import DUPLICATE, FIRST_INDEX
+from ethercat_server.ethercat.exchange import DUPLICATE, FIRST_INDEX, MOST_IN_FLIGHT
 from ethercat_server.ethercat.exchange import Exchange as Taken
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build, parse
@@ -191,6 +191,24 @@ def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() 
     assert process_data.match(late, 1) is None
     assert awaited(process_data.match(current, 1)).frame == current
     assert process_data.duplicates == 0, "it was given up, not taken"
+
+
+def test_exchanges_are_counted_when_they_are_sent_and_when_they_are_answered() -> None:
+    bus, backend = operational()
+    process_data = bus.process_data
+    backend.become(Machine(frame_jitter_ns=0))
+    sent, answered = process_data.sent, process_data.answered
+    answers(bus, backend)  # which is not taken: its index stays in use for 100 ms
+    for _ in range(INDICES + 5):
+        assert awaited(process_data.match(answers(bus, backend), 1))
+    assert process_data.sent - sent == INDICES + 6
+    assert process_data.answered - answered == INDICES + 5
+    backend.clock.sleep(0.2)
+    assert (process_data.lost, process_data.answered - answered) == (1, INDICES + 5), "a lost one is none"
+    for _ in range(2 * MOST_IN_FLIGHT):
+        process_data.send()
+    assert process_data.in_flight == MOST_IN_FLIGHT
+    assert process_data.sent - sent == INDICES + 6 + MOST_IN_FLIGHT, "no more are sent"
 
 
 @pytest.mark.parametrize(("late_s", "wait_s"), [(0.06, 0.16), (10.0, 0.25)])

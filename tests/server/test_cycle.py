@@ -281,6 +281,8 @@ def test_status_distributions_count_every_cycle() -> None:
         everything, recent = status[name], status["last_10s"][name]
         assert set(everything) == {"p50", "p99", "p999", "max"}
         assert everything == recent, "a short run lies within the last ten seconds"
+    assert status["sensors"][0]["age_us"] == status["last_10s"]["age_us"][0]
+    assert 0 < status["sensors"][0]["age_us"]["p50"] < PERIOD_NS / 1000
 
 
 def test_a_run_is_repeated_by_its_seed() -> None:

@@ -316,6 +316,12 @@ def test_subscription_filters(served: Served) -> None:
     assert served.sequences(newcomer) == [11], "it has had nothing yet"
 
 
+def test_of_an_exchange_of_several_sensors_each_frame_has_its_own_flags(served: Served) -> None:
+    client, now_ns = served.subscribe(), served.clock.now_ns
+    served.hub.publish([one_frame(0, 0, 0, now_ns), one_frame(0, 1, DataFlag.REPEATED, now_ns)], now_ns)
+    assert [frame.sensor for frame in served.read(client)] == [0], "the other is silent for a moment only"
+
+
 def test_what_a_client_has_had_that_leaves_out_frames_is_what_it_was_sent(served: Served) -> None:
     client, now_ns = served.subscribe(every=3), served.clock.now_ns
     for after_ns, flags in ((0, 0), (8_000_000, 0), *((10_000_000 + n, DataFlag.REPEATED) for n in (0, 1))):
