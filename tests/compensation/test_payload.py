@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import random
 import re
@@ -507,7 +506,9 @@ def test_the_interval_of_an_offset_holds_it_and_shrinks_with_more_poses() -> Non
 
 @pytest.mark.parametrize(
     ("degrees", "count"),
-    more_if_long([(0.1, 20), (1.5, 20)], itertools.product((0.0, 0.1, 0.5, 1.5), (20, 60))),
+    more_if_long(
+        [(0.1, 20), (1.5, 20)], [(0.1, 20), (1.5, 20), *((each, 60) for each in (0.0, 0.1, 0.5, 1.5))]
+    ),
 )
 def test_a_mounting_turned_against_the_robot_is_found_told_and_in_the_intervals(
     degrees: float, count: int

@@ -474,11 +474,11 @@ def test_the_uncertainty_covers_an_excess_on_one_side(
     """Which side cannot be told; the shortest round trip is a rare one."""
     card = Card(16e3, spread=0, jitter_ns=2e3, excess_ns=excess_ns, outward=outward)
     told, outside = [], 0
-    for seed in SEEDS:
+    for seed in range(1, 5):
         simulation = run(controller, card=card, seconds=8.0, seed=seed)
         outcome = simulation.outcome(3.0)
         assert simulation.clock.by_events is bool(controller)
         outside += outcome.outside
         told.append(percentile(sorted(sample.uncertainty_ns for sample in outcome.samples), 99))
-    assert outside < 0.01 * len(SEEDS) * len(outcome.samples), "it has two standard deviations"
+    assert outside < 0.01 * len(told) * len(outcome.samples), "it has two standard deviations"
     assert min(told) < (16e3 + excess_ns) / 2 + 12e3, "where short ones are seen"
