@@ -59,7 +59,8 @@ class VirtualBus:
         return self._process.pid if self._process else 0
 
     def start(self) -> None:
-        """Start the sensor's process, without waiting for it."""
+        """Start the sensor's process, without waiting for it; UsageError if there is no such user."""
+        user_to_become(self._user or None)  # else its process would say so, too
         command = [sys.executable, "-P", "-m", "ethercat_server.virtual_sensor.virtual_bus"]
         command += [self.ifname, str(self._priority), self._user, str(self._number), *self._arguments]
         # A session of its own: Ctrl-C is for the server, which then ends the sensor. Its standard input

@@ -12,6 +12,7 @@ import re
 import signal
 import socket
 import struct
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ import pytest
 from ethercat_server.acquisition.start_up import Started, Wanted, bring_up
 from ethercat_server.daemon.cli import main
 from ethercat_server.daemon.options import parse_options
-from ethercat_server.errors import BusError, ServerError, SetUpError, StopRequestedError
+from ethercat_server.errors import BusError, ServerError, SetUpError, StopRequestedError, UsageError
 from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
@@ -357,6 +358,13 @@ def test_a_virtual_sensor_that_does_not_start(caplog: pytest.LogCaptureFixture) 
     """Its process and its exit code."""
     said = fails(caplog, "virtual", "PORT", "--virtual", "--sensors 0")
     assert said.startswith("the virtual sensor did not start (exit code 2): see its message above")
+
+
+def test_no_virtual_sensor_is_started_for_a_user_that_there_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its process would say the same once more."""
+    monkeypatch.setattr(subprocess, "Popen", pytest.fail)
+    with pytest.raises(UsageError, match="there is no such user"):
+        virtual_bus.VirtualBus(user="no-such-user").start()
 
 
 @on_a_bus
