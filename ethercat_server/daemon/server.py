@@ -8,7 +8,6 @@ import ipaddress
 import logging
 import os
 import socket
-from contextlib import AbstractContextManager
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -34,9 +33,7 @@ _NEVER_NS: Final = 1 << 62
 log = logging.getLogger(__name__)
 
 
-def serve(
-    options: ServerOptions, signals: Signals, virtual: AbstractContextManager[VirtualBus] | None = None
-) -> None:
+def serve(options: ServerOptions, signals: Signals, virtual: VirtualBus | None = None) -> None:
     """Start up, stream until asked to stop, shut down; ServerError says what failed.
 
     On the bus `virtual`, if there is one, in place of the interface of the options.

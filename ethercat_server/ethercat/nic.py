@@ -171,9 +171,8 @@ class Interface:
     namespace: bytes = b""  # of that, as the kernel numbers namespaces; empty if it is this one
     ethernet: bool = True
     stats: bytes = b""  # struct rtnl_link_stats64
-    xdp: tuple[
-        str, ...
-    ] = ()  # where XDP programs are attached, as ip calls it: xdpdrv, xdpgeneric, xdpoffload
+    # Where XDP programs are attached, as ip calls it: xdpdrv, xdpgeneric, xdpoffload.
+    xdp: tuple[str, ...] = ()
 
 
 def look_up(interface: str | int) -> Interface:
