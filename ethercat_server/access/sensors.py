@@ -171,17 +171,14 @@ class Sensors:
             self.clock.sleep(_IDLE_S)
         return "; it is back with its old offset"
 
-    def stream(self, **subscription: Any) -> Iterator[tuple[list[DataMessage], list[JsonObject]]]:
-        """Subscribe; every 50 ms or sooner the frames that have come, and the server's events. Never ends."""
+    def stream(self, **subscription: Any) -> Iterator[list[DataMessage]]:
+        """Subscribe; every 50 ms or sooner the frames that have come. Never ends."""
         self.ask("subscribe", **subscription)
         while True:
             try:
-                frames = self.client.poll(_IDLE_S)
+                yield self.client.poll(_IDLE_S)
             except ConnectionFailedError as error:
                 raise self._closed(error) from None
-            events = [event for event in self.client.events if isinstance(event, dict)]
-            self.client.events.clear()
-            yield frames, events
 
     def wait_settled(self, numbers: Collection[int]) -> None:
         deadline = Deadline(self.clock, _SETTLED_WITHIN_S)

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
+from bota_ethercat.stream.usable import FORCE_TORQUE
 from ethercat_server.ethercat.clock import Clock
 from ethercat_server.sensor.history import History
 from ethercat_server.sensor.sensor import Sensor
@@ -33,7 +34,8 @@ from ethercat_server.sensor.tare import (
 )
 
 _FIELDS: Final = LAYOUTS[min(LAYOUTS)]
-_SATURATED: Final = _FIELDS.index("force_torque_saturated")
+_SATURATED, _WARNINGS = (_FIELDS.index(name) for name in ("force_torque_saturated", "warnings"))
+_SATURATING: Final = FORCE_TORQUE.saturating
 _ACCELERATION: Final = slice(_FIELDS.index("acceleration.x"), _FIELDS.index("acceleration.z") + 1)
 _TEMPERATURE: Final = _FIELDS.index("temperature")
 _GRAVITY: Final = slice(
@@ -71,7 +73,8 @@ class Drift:
             return
         load = columns[LOAD]
         self._part.add([*load, *columns[RATE], *columns[_ACCELERATION], columns[_TEMPERATURE]])
-        self.history.see(load, saturated=any(columns[_SATURATED]))
+        is_saturated = any(columns[_SATURATED]) or any(int(each) & _SATURATING for each in columns[_WARNINGS])
+        self.history.see(load, saturated=is_saturated)
         if self._full:
             self._examine()
 

@@ -20,7 +20,7 @@ from bota_ethercat.health import sentences
 from bota_ethercat.health.judge import judge
 from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.health.observer import StreamObserver, by_sensor
-from bota_ethercat.replies import DistributionStatus, Status, position_of
+from bota_ethercat.replies import DistributionStatus, Status
 from ethercat_server.access.adapters import Holder, find_holder, links
 from ethercat_server.access.private_server import open_interface
 from ethercat_server.access.sensors import Sensors
@@ -308,11 +308,8 @@ class ServerView:
             }
             self.before = self._read_status(sensors)
             end = Deadline(clock, seconds)
-            for frames, events in sensors.stream(fresh_only=False) if seconds else ():
+            for frames in sensors.stream(fresh_only=False) if seconds else ():
                 self._observe(frames, clock.monotonic_ns(), same_machine=sensors.client.session.same_machine)
-                for event in events:
-                    if (position := position_of(event)) in self._observers:
-                        self._observers[position].add_event(event)
                 unread = sensors.client.take_unread()
                 for each in self._observers.values():
                     each.note_unread(unread, clock.monotonic_ns())
@@ -323,9 +320,8 @@ class ServerView:
             self._end_ns = clock.monotonic_ns()
             self.after = self._read_status(sensors)
             self.described = sensors.describe().sensors
-        for info in self.described:
-            if info.sensor in self._observers:
-                self._observers[info.sensor].info = info
+        for position, observer in self._observers.items():
+            observer.in_force = sensors.client.session.timeline[position]
         self._when = "" if self.own else " in the last 10 s"
         self._summaries = self.after if self.own else self.after.last_10s
 

@@ -22,7 +22,8 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.control import ErrorCode
 from bota_ethercat.errors import RequestError
-from bota_ethercat.pdo import layout_for
+from bota_ethercat.pdo import SampleDecoder
+from bota_ethercat.stream.usable import ANGULAR_RATE, FORCE_TORQUE, judge
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.clock import Clock, Deadline
 from ethercat_server.ethercat.datagrams import Steps
@@ -176,7 +177,8 @@ def channel_statistics(parts: Sequence[Part], channel: int, start: float = 0.0) 
 
 def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[list[ChannelStatistics]]:
     """Over the next samples."""
-    unpack = layout_for(sensor.pdo_size).struct.unpack
+    decoder = SampleDecoder(sensor.pdo_size)
+    unpack = decoder.layout.struct.unpack
     deadline = _patience(clock, sensor, samples)
     seen, taken = stream.fresh, 0
     parts = [Part() for _ in range(PARTS)]
@@ -192,10 +194,8 @@ def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Ste
         seen = stream.fresh
         values = unpack(stream.process_data)
         row = [*values[LOAD], *values[RATE]]
-        if not all(map(math.isfinite, row)):
-            raise RequestError(
-                ErrorCode.NOT_READY, f"sensor {sensor.number} is overloaded: it gives no finite numbers"
-            )
+        if why := judge(decoder.sample(values), (FORCE_TORQUE, ANGULAR_RATE))[1]:
+            raise RequestError(ErrorCode.NOT_READY, f"sensor {sensor.number} cannot be tared: {why}")
         first = first or row
         # From the first on, so that a large load does not drown its small changes.
         parts[PARTS * taken // samples].add([(v - start,) for v, start in zip(row, first, strict=True)])

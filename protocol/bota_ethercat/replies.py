@@ -68,6 +68,23 @@ class SensorInfo(NamedTuple):
         found = cls(position, name, serial, hardware, firmware, size, state, settling is True)
         return found.changed_by(row)
 
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """Of the sensor and its firmware."""
+        return self.name, self.serial, self.hardware, self.firmware
+
+    @property
+    def in_force(self) -> tuple[object, ...]:
+        """Of its samples."""
+        return self.settings, self.rate_hz, self.delay_ns, self.offset
+
+    def as_message(self) -> dict[str, Any]:
+        """The same as a description or an event carries it, without what is not known."""
+        delays = {name: None if ns is None else ns * 1e-6 for name, ns in self.delay_ns._asdict().items()}
+        known: dict[str, Any] = {"settings": dict(self.settings), "rate_hz": self.rate_hz}
+        known |= {"offset": self.offset and list(self.offset), "delay_ms": any(self.delay_ns) and delays}
+        return {key: value for key, value in known.items() if value}
+
     def changed_by(self, message: Mapping[str, Any]) -> SensorInfo:
         """The same with what a description or an event says to be in force; the rest stays as it was."""
         rate_hz, delay_ms = number(message.get("rate_hz")), message.get("delay_ms")

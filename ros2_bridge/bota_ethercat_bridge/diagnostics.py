@@ -172,7 +172,7 @@ class DiagnosticsPublisher:
         self._age_us = None
         if ages and link.is_connected and link.client.session.same_machine:
             self._age_us = ages[len(ages) // 2] / 1e3, (p99(ages) or 0) / 1e3
-        if link.epoch != self._epoch:
+        if link.in_force.epoch != self._epoch:
             return
         (fresh, from_s, from_ns), elapsed_s = self._rate_from, now_s - self._rate_from[1]
         self._begin_rate(now_s)
@@ -196,13 +196,11 @@ class DiagnosticsPublisher:
             said.connected(self._clock.monotonic_ns())
         for action in [action for action, reply in self._waiting.items() if reply.done()]:
             reply = self._waiting.pop(action)
-            if reply.exception() is None and (content := reply.result()).get("ok") is True:
-                if action == "status":
-                    self._server = Status.parse(content)
-                    said.add_status(self._server, link.sensor, self._clock.monotonic_ns())
-                else:
-                    link.described(content)
-        said.info, said.lost = link.info, link.lost
+            is_granted = reply.exception() is None and reply.result().get("ok") is True
+            if is_granted and action == "status":  # a description is in the link already
+                self._server = Status.parse(reply.result())
+                said.add_status(self._server, link.sensor, self._clock.monotonic_ns())
+        said.in_force = link.in_force
 
     def _count(self, withheld: int) -> Counter[str]:
         seen, reader = self._reader.counts, self._reader
@@ -217,8 +215,8 @@ class DiagnosticsPublisher:
         counts = self._counts = self._count(withheld)
         self._new = Counter({name: max(counts[name] - then[name], 0) for name in counts})
         self._flags = self._reader.pop_flags(self._flags)
-        if link.epoch != self._epoch:
-            self._epoch, self._rate_hz = link.epoch, None
+        if link.in_force.epoch != self._epoch:
+            self._epoch, self._rate_hz = link.in_force.epoch, None
             self._begin_rate(now_s)
         self._unread = max(self._unread, link.client.take_unread())
         if counts["samples"] != before:

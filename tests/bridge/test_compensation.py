@@ -408,7 +408,8 @@ def test_saturated_samples_can_be_left_out(weighed: Node, fresh: Server) -> None
     weighed.until("3 samples were not compensated: force or torque was saturated", compensation="warn")
     fresh.changes = {"process_data": with_bits(force_torque_saturated=0b100)}
     array = weighed.until(
-        "has stopped: force or torque was saturated, and on_saturation is stop", compensation="error"
+        "has stopped: force or torque was saturated or out of range, and on_saturation is stop",
+        compensation="error",
     )
     assert int(values(array["sensor"])["saturated_samples"]) > 6
 

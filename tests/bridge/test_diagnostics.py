@@ -83,6 +83,7 @@ def test_it_is_published_every_second_and_at_once_when_a_level_changes(node: Nod
     assert len(node.fresh(arrays, 5.0)) in (4, 5)
     node.statuses()
     arrays.clear()
+    server.paused = True
     server.send_json({"event": "sensor_lost", "sensor": 0, "message": "no power"})
     node.run(0.2)
     assert len(arrays) == 1

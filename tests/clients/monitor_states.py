@@ -7,11 +7,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from bota_clients.monitor.model import Model, State
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import encode
+from bota_ethercat.stream.timeline import Timeline
 from bota_ethercat.text.json_text import JsonObject
 from tests import descriptions
 from tests.descriptions import sensor_row
@@ -52,6 +54,27 @@ def status(sensors: int = 1, mode: str = "locked", sent: int = 0) -> dict[str, A
         "last_10s": {"wake_us": spread, "exchange_us": spread, "age_us": [spread] * sensors},
         "sensors": [{"sensor": position, **row} for position in range(sensors)], "clients": clients,
     }  # fmt: skip
+
+
+_TIMELINES: WeakKeyDictionary[Model, Timeline] = WeakKeyDictionary()
+
+
+def connect(model: Model, described: JsonObject, peer: str, at_s: float) -> None:
+    """As the monitor's reader does what a client hands out."""
+    model.connected(described, peer, at_s)
+    for in_force in _TIMELINES.setdefault(model, Timeline()).connected(described):
+        model.tell(in_force, at_s)
+
+
+def describe(model: Model, described: JsonObject, at_s: float) -> None:
+    for in_force in _TIMELINES[model].describe(described):
+        model.tell(in_force, at_s)
+
+
+def happen(model: Model, event: JsonObject, at_s: float) -> None:
+    model.add_event(event, at_s)
+    for in_force in _TIMELINES[model].event(event):
+        model.tell(in_force, at_s)
 
 
 def process_data(values: Values) -> bytes:
@@ -110,7 +133,7 @@ def fed(model: Model, sensors: int, frames: Mapping[int, Values] | None = None) 
 def healthy() -> State:
     """One sensor, all well."""
     model = Model(ADDRESS)
-    model.connected(description(), OWN_PEER, START_S)
+    connect(model, description(), OWN_PEER, START_S)
     model.add_status(status(), START_S + 6.9)
     end_s = fed(model, 1)
     model.add_status(status(sent=800), START_S + 7.9)
@@ -121,7 +144,7 @@ def healthy() -> State:
 def troubled() -> State:
     """Two sensors: the first is overloaded, too warm now and was out of sync; four frames did not come."""
     model = Model(ADDRESS)
-    model.connected(description(("BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8")), OWN_PEER, START_S)
+    connect(model, description(("BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8")), OWN_PEER, START_S)
     overload = {"force.z": -412.0, "force_torque_saturated": 4, "warnings": 0b10001}
     frames: dict[int, Values] = {6390: overload, 3000: {"warnings": 0b1000}}
     frames |= {k: {**frames.get(k, {}), "warnings": 0b100000 | int(frames.get(k, {}).get("warnings", 0))}
@@ -139,8 +162,8 @@ def troubled() -> State:
 def gone() -> State:
     """The server is gone for a minute."""
     model = Model(ADDRESS)
-    model.connected(description(), OWN_PEER, START_S)
+    connect(model, description(), OWN_PEER, START_S)
     end_s = fed(model, 1)
-    model.add_event({"event": Event.SHUTTING_DOWN}, end_s)
+    happen(model, {"event": Event.SHUTTING_DOWN}, end_s)
     model.gone("no server answers (Connection refused)", end_s)
     return replace(model.state(end_s + 65), events=())

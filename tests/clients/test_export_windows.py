@@ -120,7 +120,7 @@ def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> N
     with open_recording(path) as recording:
         recorded = joined(windows_of(recording, Periodic(30.0), Windows(32, tool=TOOL)))
     live = Windows(32, tool=TOOL)
-    live.configure(recording.sensors[0].info.settings, RATE_HZ, row["name"])
+    live.configure(recording.sensors[0].changes[0].in_force)
     sent, asked, blocks = [each for each in frames if not each.flags & DataFlag.REPEATED], 0, []
     while sent:
         size = chance.randrange(1, 40)

@@ -22,7 +22,7 @@ class Stage:
     def __init__(self) -> None:
         self.model = Model(made.ADDRESS)
         names = ("BFT-SENS-ECAT-M8", "BFT-ROKS-ECAT-M8")
-        self.model.connected(made.description(names), made.OWN_PEER, made.START_S)
+        made.connect(self.model, made.description(names), made.OWN_PEER, made.START_S)
         self.now_s = made.fed(self.model, 2)
         # Nothing listens there.
         self.address = Address("localhost", free_port())

@@ -34,7 +34,7 @@ REST = {"force.z": -8.0, "acceleration.z": 1.0, "temperature": 30.0}
 def model() -> Model:
     """Connected to a server with one sensor."""
     fresh = Model(made.ADDRESS)
-    fresh.connected(description(), made.OWN_PEER, START_S)
+    made.connect(fresh, description(), made.OWN_PEER, START_S)
     return fresh
 
 
@@ -108,7 +108,7 @@ def test_the_rate_is_that_of_the_samples_and_falls_when_they_stop(model: Model) 
 def test_a_new_connection_is_no_loss_and_keeps_the_peaks_of_the_same_sensor(model: Model) -> None:
     take(model, *run(1000, 10, **{"force.x": 7.0}))
     model.gone("no server answers", now(1010))
-    model.connected(description(), made.OWN_PEER, now(2000))
+    made.connect(model, description(), made.OWN_PEER, now(2000))
     [finding] = only(model, now(2000)).verdict.findings
     assert finding.found == "The connection to the server was interrupted", "and no silence"
     sensor = take(model, *run(0, 10))
@@ -116,7 +116,7 @@ def test_a_new_connection_is_no_loss_and_keeps_the_peaks_of_the_same_sensor(mode
     assert peaks(sensor)[0] == (0, 7)
     other = description()
     other["sensors"][0]["serial"] = 99
-    model.described(other, now(10))
+    made.describe(model, other, now(10))
     assert only(model, now(10)).peaks is None, "another sensor"
 
 
@@ -124,7 +124,7 @@ def test_a_new_connection_is_no_loss_and_keeps_the_peaks_of_the_same_sensor(mode
 def test_a_tare_and_a_reset_forget_the_peaks_and_a_reset_past_warnings(model: Model, tared: bool) -> None:
     take(model, *run(0, 10, **{"force.x": 7.0, "warnings": 8}))
     if tared:
-        model.add_event({"event": Event.OFFSET_CHANGED, "sensor": 0}, now(10))
+        made.happen(model, {"event": Event.OFFSET_CHANGED, "sensor": 0, "offset": [1.0] * 6}, now(10))
     else:
         model.reset()
     sensor = take(model, *run(10, 10))
@@ -134,7 +134,7 @@ def test_a_tare_and_a_reset_forget_the_peaks_and_a_reset_past_warnings(model: Mo
 
 def test_a_replay_is_told_from_a_server(model: Model) -> None:
     assert model.state(now(0)).server.replay == ""
-    model.described({**description(), "replay": {"files": ["run.mcap"]}}, now(0))
+    made.connect(model, {**description(), "replay": {"files": ["run.mcap"]}}, made.OWN_PEER, now(0))
     state = model.state(now(0))
     assert state.server.replay == "run.mcap"
     assert "REPLAY run.mcap" in render(state, ViewOptions(), 80).head[0].plain
@@ -209,11 +209,11 @@ def test_a_lost_sensor_is_told_until_it_is_back_and_later_too(model: Model) -> N
         ("sensor 0 is lost: no carrier", "Check its cable and power (sensor 0 is lost: no carrier)"),
         (said, said),
     ):
-        model.add_event({"event": Event.SENSOR_LOST, "sensor": 0, "message": message}, now(10))
+        made.happen(model, {"event": Event.SENSOR_LOST, "sensor": 0, "message": message}, now(10))
         (alert,) = only(model, now(10)).alerts
         assert (alert.text, alert.remedy) == ("The server has lost the sensor", remedy)
     assert (only(model, now(10)).al_state, alert.level) == ("LOST", Level.TROUBLE)
-    model.add_event({"event": Event.SENSOR_BACK, "sensor": 0}, now(20))
+    made.happen(model, {"event": Event.SENSOR_BACK, "sensor": 0}, now(20))
     assert (only(model, now(20)).al_state, only(model, now(20)).verdict.level) == ("OP", Level.GOOD)
     after = status()
     after["missed_deadlines"] += 240
@@ -292,7 +292,7 @@ TOOL = {
 
 def test_with_a_tool_the_newest_sample_is_without_it_and_contact_is_told() -> None:
     model = Model(made.ADDRESS, compensated=partial(CompensatedStream, TOOL, ImuUnits.G_DPS))
-    model.connected(description(offset=[0.0] * 6), made.OWN_PEER, START_S)
+    made.connect(model, description(offset=[0.0] * 6), made.OWN_PEER, START_S)
     still = {"force.x": 1.0, "force.z": -0.8 * STANDARD_GRAVITY, "acceleration.z": 1.0}
     pressed = still | {"force.z": still["force.z"] - 20.0, "torque.y": 0.2}  # 10 mm off the axis
     turned = pressed | {"torque.z": 3.0}
@@ -318,7 +318,7 @@ def test_with_a_tool_the_newest_sample_is_without_it_and_contact_is_told() -> No
             point and pytest.approx(point, abs=1e-4),
         )
         assert problems("monitor", json.loads(json_line(state, 0.0))) == []
-    model.add_event({"event": Event.OFFSET_CHANGED, "sensor": 0, "offset": [2.0, *[0.0] * 5]}, now(120))
+    made.happen(model, {"event": Event.OFFSET_CHANGED, "sensor": 0, "offset": [2.0, *[0.0] * 5]}, now(120))
     found = take(model, *(frame(k, still | {"force.x": 3.0}) for k in range(120, 200))).compensated
     assert found is not None
     assert found.force == pytest.approx((0.0, 0.0, 0.0), abs=1e-4), "the bias follows the sensor's own offset"
@@ -329,14 +329,14 @@ def test_with_a_tool_the_newest_sample_is_without_it_and_contact_is_told() -> No
     assert any(
         row.startswith("Compensated  not known of the newest sample: it is not finite") for row in rows
     )
-    model.connected(description(), made.OWN_PEER, START_S)  # a server that does not tell the offset
+    made.connect(model, description(), made.OWN_PEER, START_S)  # a server that does not tell the offset
     sensor = take(model, *(frame(k, still) for k in range(240, 280)))
     assert sensor.not_compensated.endswith("is no longer known: the bias may be wrong, tare")
 
 
 def test_what_cannot_be_compensated_is_told() -> None:
     model = Model(made.ADDRESS, compensated=partial(CompensatedStream, TOOL, ImuUnits.G_DPS))
-    model.connected(description(calibration_matrix=False), made.OWN_PEER, START_S)
+    made.connect(model, description(calibration_matrix=False), made.OWN_PEER, START_S)
     sensor = take(model, *run(0, 40))
     assert sensor.compensated is None
     assert sensor.not_compensated.startswith(

@@ -113,7 +113,7 @@ def _texts(svg: str) -> list[str]:
 def test_whatever_a_sensor_sends_is_shown() -> None:
     noise = random.Random(1)
     model = Model(made.ADDRESS)
-    model.connected(made.description(), made.OWN_PEER, made.START_S)
+    made.connect(model, made.description(), made.OWN_PEER, made.START_S)
     for k in range(120):
         data = noise.randbytes(77)
         sequence, stamp_ns, monotonic_ns = (noise.getrandbits(64) for _ in range(3))

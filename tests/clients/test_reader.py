@@ -80,7 +80,9 @@ def test_settings_are_known_over_time(path: Path) -> None:
         (sensor,) = recording.sensors
         assert sensor.info.serial == 2**32 - 1
         assert sensor.info.settings == {"sinc_length": 64, "chop": False}
-        history = [(at - START_NS, info.settings["sinc_length"], info.rate_hz) for at, info in sensor.history]
+        history = [
+            (at - START_NS, now.info.settings["sinc_length"], now.info.rate_hz) for at, now in sensor.history
+        ]
         assert history == [(0, 64, 800), (8 * PERIOD_NS, 32, 1600)]
         assert [type(item) for item in recording.everything()] == [
             RecordedDescription, DataMessage, RecordedEvent, RecordedDescription, DataMessage,

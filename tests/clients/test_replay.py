@@ -20,8 +20,8 @@ import pytest
 
 from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_clients.replay import cli
+from bota_clients.replay.pacing import Pacing
 from bota_clients.replay.sensors import ReplayedSensors
-from bota_clients.replay.timeline import Timeline
 from bota_ethercat.client import Client, connect
 from bota_ethercat.control import ACTIONS, ErrorCode
 from bota_ethercat.errors import RefusedError
@@ -258,10 +258,12 @@ def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
     with open_recording(path) as recording:
         sensors = ReplayedSensors(recording)
     assert sensors.sensors[0].describe()["offset"] == [1.0] * 6
-    for event, state in (("sensor_lost", "LOST"), ("sensor_back", "OP")):
+    sensors.follow(RecordedEvent(0, {"event": "sensor_lost", "sensor": 1}))
+    assert [sensor.describe()["state"] for sensor in sensors.sensors] == ["OP", "LOST"]
+    for event, state in (("reconfigured", "OP"), ("sensor_back", "OP")):
         row = {"event": event, "sensor": 1, "settings": {"sinc_length": 32}, "rate_hz": 1600}
         row |= {"offset": [1.0] * 6, "delay_ms": {"force_torque": 1.0}}
-        sensors.apply(RecordedEvent(0, row))
+        sensors.follow(RecordedEvent(0, row))
         described = [sensor.describe() for sensor in sensors.sensors]
         assert [sensor["rate_hz"] for sensor in described] == [800, 1600]
         assert described[1]["offset"] == row["offset"]
@@ -269,13 +271,14 @@ def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
             ("OP", 64),
             (state, 32),
         ]
-    sensors.apply(RecordedEvent(0, {"event": "sensor_lost", "sensor": 1, "reason": "different_sensor"}))
+    sensors.follow(RecordedEvent(0, {"event": "sensor_lost", "sensor": 1, "reason": "different_sensor"}))
     assert sensors.sensors[1].describe()["state"] == "REFUSED"
-    sensors.apply(RecordedEvent(0, {"event": "offset_changed", "sensor": 1, "offset": [2.0] * 6}))
+    sensors.follow(RecordedEvent(0, {"event": "offset_changed", "sensor": 1, "offset": [2.0] * 6}))
     assert sensors.sensors[1].describe()["offset"] == [2.0] * 6
     reply = describe(0)
     reply["sensors"][0]["settling"] = True  # it did when it was described; the node's tare waits for the end
-    sensors.describe(RecordedDescription(0, reply))
+    (told,) = sensors.follow(RecordedDescription(0, reply))  # only the recorder connected again
+    assert told == {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 64}, "rate_hz": 800}
     assert not sensors.sensors[0].describe()["settling"]
     for flags in (0, 0, 0, DataFlag.REPEATED, DataFlag.INVALID, DataFlag.INVALID | DataFlag.REPEATED):
         sensors.count(frame(0, flags=flags))
@@ -300,9 +303,9 @@ class Clock:
         return REAL_NS + self.passed_ns
 
 
-def timeline(speed: float = 1.0, *, clock: Clock | None = None) -> Timeline:
+def timeline(speed: float = 1.0, *, clock: Clock | None = None) -> Pacing:
     clock = clock or Clock()
-    return Timeline(speed, monotonic_ns=clock.monotonic_ns, realtime_ns=clock.realtime_ns)
+    return Pacing(speed, monotonic_ns=clock.monotonic_ns, realtime_ns=clock.realtime_ns)
 
 
 def test_speed_divides_all_times() -> None:

@@ -174,7 +174,7 @@ def test_a_page_that_comes_later_gets_the_last_minute_and_a_slow_one_begins_anew
     assert times(newest) == pytest.approx([1105])
     web.handle(later, sensor=5)
     assert web.points(later) == []
-    web.model.connected(made.description(("one", "two")), made.OWN_PEER, START_S)
+    made.connect(web.model, made.description(("one", "two")), made.OWN_PEER, START_S)
     pass_by(-500, -490)  # a restarted machine
     web.handle(later, sensor=1)
     assert times(*web.points(later)) == pytest.approx(range(500, 510))
@@ -316,7 +316,7 @@ def test_a_page_says_what_the_monitor_says() -> None:
 @pytest.mark.skipif(NODE is None, reason="no Node here: apt install nodejs")
 def test_the_page_shows_what_it_is_sent_as_text_and_tares(web: Harness, tmp_path: Path) -> None:
     evil = "<img src=x onerror=alert(1)>"
-    web.model.connected(made.description((evil, "two")), made.OWN_PEER, START_S)
+    made.connect(web.model, made.description((evil, "two")), made.OWN_PEER, START_S)
     web.model.add_frames(
         [frame(k, {**moving(k), "warnings": 16 * (k == 30)}) for k in range(400)], made.now(400)
     )

@@ -28,7 +28,7 @@ class Web:
 
     def __init__(self, *names: str) -> None:
         self.model = WebModel(made.ADDRESS)
-        self.model.connected(made.description(*[names] * bool(names)), made.OWN_PEER, START_S)
+        made.connect(self.model, made.description(*[names] * bool(names)), made.OWN_PEER, START_S)
         self.recorder = MonitorRecording(Address("localhost", 1))
         self.pages = Pages(self.model, self.tare, self.recorder)
         self.port = 0

@@ -101,9 +101,13 @@ def test_a_refusal_says_what_moved_by_how_much_and_what_the_limit_is(moved: Move
         ({"temperature": math.inf}, "not finite"),
         ({"force_torque_saturated": 4}, "saturated or out of range"),
         ({"warnings": int(WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)}, "saturated or out of range"),
-        ({"warnings": int(WarningFlag.ADC_OUT_OF_SYNC)}, "saturated or out of range"),
-        ({"acceleration_saturated": 1}, "IMU was saturated"),
-        ({"angular_rate_saturated": 1}, "IMU was saturated"),
+        (
+            {"warnings": int(WarningFlag.ADC_OUT_OF_SYNC)},
+            "not finite, or of a sensor that reports a fault",
+        ),
+        ({"warnings": int(WarningFlag.ACCELERATION_SATURATED)}, "acceleration was saturated or out of range"),
+        ({"acceleration_saturated": 1}, "acceleration was saturated or out of range"),
+        ({"angular_rate_saturated": 1}, "angular rate was saturated or out of range"),
     ],
 )
 def test_one_bad_sample_spoils_the_window(bad: dict[str, Any], message: str) -> None:

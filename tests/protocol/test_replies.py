@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bota_ethercat.replies import Delays, Description, SensorInfo, SensorStatus, Status
+from bota_ethercat.stream.timeline import Timeline
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor.bus_checks import watched
 from ethercat_server.doctor.report import ok
@@ -80,7 +81,7 @@ def test_the_doctor_and_the_tool_survive_what_a_server_makes_up(row: Any) -> Non
     replies = {"describe": described, "status": {"sensors": [row], "clients": [row], "last_10s": row}}
     client: Any = SimpleNamespace(
         description=described, ask=lambda action, *_, **__: replies[action], close=lambda: None,
-        session=SimpleNamespace(same_machine=True),
+        session=SimpleNamespace(same_machine=True, timeline=Timeline()),
     )  # fmt: skip
     sensors = Sensors(client, "a server", "a server")
     assert [found.number for found in sensors.sensors] == [0]

@@ -272,10 +272,10 @@ def run(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     with open_recording(options.recording) as recording:
         rows = []
-        for info, frames in recording.batches(choose(recording, options.sensor).sensor):
+        for in_force, frames in recording.batches(choose(recording, options.sensor).sensor):
             table = columns(frames, options.imu_units)
             table = table.where(table.fresh & np.isfinite(table.angular_rate).all(axis=1))
-            delay_s = angular_rate_response(info.settings).delay_s or 0.0
+            delay_s = angular_rate_response(in_force.info.settings).delay_s or 0.0
             rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
     instants, rates = map(np.concatenate, zip(*rows, strict=True))
     if (np.diff(instants) <= 0).any():

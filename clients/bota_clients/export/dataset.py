@@ -35,7 +35,7 @@ from bota_clients.export.windows import Array, Arrays, Windows, interpolated, of
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
-from bota_clients.recording.reader import Offset, Recording
+from bota_clients.recording.reader import Recording, Since
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.new_file import EXISTS
@@ -335,10 +335,10 @@ def windows_of(
     if stamped is not None:
         stamped.begin(recording, sensor)
     done, first, clocks, waiting = 0, *(np.zeros((2, 0), np.int64) for _ in range(3))
-    for info, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
+    for in_force, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
         until_ns = windows.until_ns
-        if info is not None:
-            windows.configure(info.settings, info.rate_hz, info.name, info.offset)
+        if in_force is not None:
+            windows.configure(in_force)
             samples = windows.add(batch)
             clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
             if clocks.size:
@@ -398,7 +398,7 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
             }
             for row in sensor.history
         ],
-        "offsets": [row._asdict() for row in sensor.offsets],
+        "offsets": [{"stamp_ns": row.stamp_ns, "offset": row.info.offset} for row in sensor.offsets],
         "units": _UNITS,
         "frames": {"force_torque": "ft_sensor", "imu": "ft_sensor_imu"},
         "clock": clock and clock._asdict(),
@@ -437,7 +437,7 @@ def _tallied(blocks: Iterable[Arrays], valid: list[Array]) -> Iterator[Arrays]:
 
 
 def _check_offsets(
-    path: Path, tool: Mapping[str, Any], recording: Recording, offsets: Sequence[Offset]
+    path: Path, tool: Mapping[str, Any], recording: Recording, offsets: Sequence[Since]
 ) -> None:
     """RecordingError unless it is known what the bias is with the sensor's own offset in the recording."""
     if offset_of(tool) is None:
@@ -445,7 +445,7 @@ def _check_offsets(
             f"{path} does not say with which offset of the sensor its bias was measured: identify the tool "
             "again, add sensor_offset if you know it, or leave the bias out"
         )
-    if all(row.offset is None for row in offsets):
+    if all(row.info.offset is None for row in offsets):
         raise RecordingError(
             f"{recording.path} does not have the sensor's own offset, so the bias of {path} is not known: "
             "record with a newer server, or leave the bias out"

@@ -31,12 +31,12 @@ def samples_of(recording: Recording, windows: Windows, sensor: int = 0) -> Itera
     """
     held, first_ns, gaps = list[Columns](), 0, dict[int, int]()
     begin, taken = 0, 0  # samples: number of the first that is held, and how many were taken
-    for info, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
-        if info is not None:
-            windows.configure(info.settings, info.rate_hz, info.name, info.offset)
+    for in_force, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
+        if in_force is not None:
+            windows.configure(in_force)
             samples = windows.add([*new_samples(batch, gaps)])
             held = [joined([*held, samples])]
-        slots = windows.take(rest=info is None)
+        slots = windows.take(rest=in_force is None)
         if not len(slots):
             continue
         first_ns = first_ns if taken else windows.begin_ns

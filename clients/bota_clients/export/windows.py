@@ -22,14 +22,15 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.identify.tool_file import tool_parameters
-from bota_clients.recording.columns import DOUBT_AFTER, Columns, Ints, columns, doubt_ns
+from bota_clients.recording.columns import Columns, Ints, columns
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.replies import Delays
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.sensor.response import delays_ms
-from bota_ethercat.settings import known_settings
+from bota_ethercat.stream.timeline import InForce
+from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
 from bota_ethercat_bridge.ft_compensation.alignment import align
 from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
 from bota_ethercat_bridge.ft_compensation.compensator import Compensator
@@ -44,12 +45,11 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Wrench,
 )
 from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
-from bota_ethercat_bridge.ft_compensation.stationary import BAD_WRENCH
 from bota_ethercat_bridge.ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
 
 Array = npt.NDArray[Any]
 Arrays = dict[str, Array]
-_CHANNELS: Final = dict(zip(Delays._fields, (slice(0, 6), slice(6, 9), slice(9, 12)), strict=True))
+_CHANNELS: Final = {FORCE_TORQUE: slice(0, 6), ACCELERATION: slice(6, 9), ANGULAR_RATE: slice(9, 12)}
 _UNKNOWN: Final = (math.nan,) * 3
 _SLOT: Final = np.dtype([
     ("measured_ns", "i8", 3),  # by channel; of an empty slot by its place between two samples
@@ -103,7 +103,8 @@ class Windows:
         self._slots = np.zeros(0, _SLOT)
         self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._taken = 0  # samples
-        self._in_force: tuple[Mapping[str, object], float] | None = None
+        self._made_of: tuple[Mapping[str, object], float] | None = None
+        self._doubt_ns = 0
         self._doubted_until_ns = -1
         if tool is None:
             return
@@ -116,27 +117,24 @@ class Windows:
         self.accelerometer = Accelerometer(**{name: tuple(row) for name, row in imu.items()})
         self._imu_position: Vector3 = tuple(tool.get("imu_position", ZERO))
 
-    def configure(
-        self,
-        settings: Mapping[str, object],
-        rate_hz: float,
-        name: str = "",
-        offset: Sequence[float] | None = None,
-    ) -> None:
-        """Settings and rate of what follows, as `describe` has them; the sensor's `name`; RecordingError.
+    def configure(self, in_force: InForce) -> None:
+        """What is in force for what follows; RecordingError.
 
-        Also the sensor's own `offset`, N and Nm, which a bias is shifted with; where only one of this and the
-        tool's `sensor_offset` is known there is no compensated wrench.
+        A bias is shifted with the sensor's own offset; where only one of this and the tool's `sensor_offset`
+        is known there is no compensated wrench.
         """
+        name, rate_hz, settings, offset = (
+            getattr(in_force.info, key) for key in ("name", "rate_hz", "settings", "offset")
+        )
         if self._compensator is not None:
-            self._follow(None if offset is None else Wrench.of(offset), rate_hz)
-        if (settings, rate_hz) == self._in_force:
+            self._follow(None if offset is None else Wrench.of(offset), in_force)
+        if (settings, rate_hz) == self._made_of:
             return
         if not rate_hz:
             raise RecordingError("the sampling rate is not known, so lost samples have no place")
-        self._in_force, self._known, self._rate_hz = (settings, rate_hz), known_settings(settings), rate_hz
+        self._made_of, self._known, self._rate_hz = (settings, rate_hz), settings, rate_hz
         # Where a delay is unknown, a sample counts as measured only when it was stamped: never too early.
-        self._delay_ns = np.array([delay or 0 for delay in Delays.parse(delays_ms(self._known, rate_hz))])
+        self._delay_ns = np.array([delay or 0 for delay in Delays.parse(delays_ms(settings, rate_hz))])
         if self._compensator is None:
             return
         (cx, cy, cz), position = self._payload.center, self._imu_position
@@ -148,9 +146,9 @@ class Windows:
         if why:
             raise RecordingError(f"the wrench cannot be compensated: {why}; or omit --tool")
 
-    def _follow(self, offset: Wrench | None, rate_hz: float) -> None:
+    def _follow(self, offset: Wrench | None, in_force: InForce) -> None:
         """The sensor's own offset of what follows."""
-        self._offset = offset
+        self._offset, self._doubt_ns = offset, in_force.doubt_ns
         if (shift := self._own_offset.follow(offset)) is None:
             return
         self._bias = self._bias.plus(shift)
@@ -158,7 +156,7 @@ class Windows:
         if self.begin_ns >= 0:
             since_ns = newest_ns - self.doubt_ns - self._delay_ns[0]
             self._slots["compensated"][self._slots["measured_ns"][:, 0] >= since_ns] = math.nan
-            self._doubted_until_ns = newest_ns + round(DOUBT_AFTER * 1e9 / (rate_hz or self._rate_hz))
+            self._doubted_until_ns = newest_ns + in_force.doubt_after_ns
 
     @property
     def has_tool(self) -> bool:
@@ -178,9 +176,7 @@ class Windows:
     @property
     def doubt_ns(self) -> int:
         """How long before an offset was reported samples may have part of it; 0 without a tool."""
-        if self._compensator is None or self._in_force is None:
-            return 0
-        return doubt_ns(self._rate_hz)
+        return self._doubt_ns
 
     @property
     def until_ns(self) -> int:
@@ -221,13 +217,9 @@ class Windows:
         slots["values"] = math.nan
         slots["values"][end] = np.where(np.isfinite(values), values, math.nan)
         is_off = self._known.get("imu_active") == 0
-        wrong = (
-            samples.force_torque_saturated | samples.warnings & int(BAD_WRENCH),
-            samples.acceleration_saturated | is_off,
-            samples.angular_rate_saturated | is_off,
-        )
-        for channel, (part, bits) in enumerate(zip(_CHANNELS.values(), wrong, strict=True)):
-            slots["valid"][end, channel] = (bits == 0) & np.isfinite(values[:, part]).all(axis=1)
+        for place, (channel, part) in enumerate(_CHANNELS.items()):
+            is_good = (channel.flagged(samples) == 0) & np.isfinite(values[:, part]).all(axis=1)
+            slots["valid"][end, place] = is_good & (channel is FORCE_TORQUE or not is_off)
         slots["compensated"][end], slots["bounds"][end] = self._compensated(samples)
         self._slots = np.concatenate([self._slots, slots])
         return samples
@@ -269,7 +261,7 @@ class Windows:
         if (instants_ns > self.until_ns).any():
             raise ValueError(f"after {self.until_ns} ns not all samples are here: take more")
         slots, found = self._slots, Arrays()
-        for channel, (name, part) in enumerate(_CHANNELS.items()):
+        for channel, ((name, *_), part) in enumerate(_CHANNELS.items()):
             index = self._ends(instants_ns, channel)[:, np.newaxis] + np.arange(-self._length, 0)
             is_there, index = index >= 0, np.maximum(index, 0)
             valid = slots["valid"][index, channel] & is_there

@@ -15,9 +15,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_clients.recording.columns import Bools, Columns, Floats
+from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
 from bota_ethercat_bridge.ft_compensation.quantities import StationaryLimits
 from bota_ethercat_bridge.ft_compensation.stationary import (
-    BAD_WRENCH,
     CHANCE,
     NotStationaryError,
     StationaryMeans,
@@ -69,11 +69,10 @@ def find_stationary_periods(
 
 
 def usable_rows(columns: Columns) -> tuple[Floats, Bools]:
-    """(n, 12) force, torque, acceleration, angular rate; (n,) whether they are finite and not saturated."""
+    """(n, 12) force, torque, acceleration, angular rate; (n,) whether they may be used."""
     rows = np.hstack([columns.force, columns.torque, columns.acceleration, columns.angular_rate])
-    saturated = columns.force_torque_saturated | columns.acceleration_saturated
-    saturated = saturated | columns.angular_rate_saturated | (columns.warnings & int(BAD_WRENCH))
-    good: Bools = np.isfinite(rows).all(axis=1) & (saturated == 0)
+    flagged = sum(channel.flagged(columns) for channel in (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE))
+    good: Bools = np.isfinite(rows).all(axis=1) & (flagged == 0)
     return rows, good
 
 

@@ -11,6 +11,7 @@ from bota_clients.export.windows import Windows
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.replies import SensorInfo
+from bota_ethercat.stream.timeline import InForce
 from bota_ethercat_bridge.ft_compensation.contact import Contact, ContactDetector, detector_of, surface_of
 from bota_ethercat_bridge.ft_compensation.identification.parameter_file import payload_of
 from bota_ethercat_bridge.ft_compensation.quantities import CompensationError
@@ -46,10 +47,10 @@ class CompensatedStream:
         self.latest: Compensated | None = None
         self.problem = ""  # why there is none, a sentence
 
-    def add(self, frames: Sequence[DataMessage], info: SensorInfo) -> None:
-        windows = self._windows
+    def add(self, frames: Sequence[DataMessage], in_force: InForce) -> None:
+        windows, info = self._windows, in_force.info
         try:
-            windows.configure(info.settings, info.rate_hz, info.name, info.offset)
+            windows.configure(in_force)
             windows.add(frames)
         except RecordingError as error:
             self.begin()

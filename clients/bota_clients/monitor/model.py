@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import sentences
 from bota_ethercat.health.judge import judge, saturated_axes
@@ -28,9 +27,9 @@ from bota_ethercat.replies import (
     SensorInfo,
     SensorStatus,
     Status,
-    position_of,
 )
 from bota_ethercat.sensor.response import delays_ms
+from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import mapping, text
 
@@ -165,6 +164,7 @@ class _Sensor:
         self._imu_units = imu_units
         self.observer = StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
         self._hand_out = DistributionStatus()
+        self._begins = True  # nothing has been told since it was connected
         self._newest: bytes | None = None
         self._verdict = NOTHING_WRONG
         self._saturated: frozenset[str] = frozenset()
@@ -175,19 +175,25 @@ class _Sensor:
         self.peaks, self._seen = None, {}
         self.observer.forget()
 
-    def describe(self, info: SensorInfo, now_s: float, *, anew: bool) -> None:
-        """Take its row of `describe`; `anew`: after connecting; nothing before counts as lost."""
-        before, now_ns = self.observer.info, _ns(now_s)
-        if anew:
-            self.observer.connected(now_ns)
-        if self.compensated is not None and (anew or info.serial != before.serial):
-            self.compensated.begin()
-        self.observer.info = info
-        if info.serial != before.serial and before != SensorInfo():
+    def connected(self, now_s: float) -> None:
+        """A connection was made: nothing before its first frame counts as lost."""
+        self.observer.connected(_ns(now_s))
+        self._begins = True
+
+    def tell(self, now: InForce, now_s: float) -> None:
+        """What is in force from here on."""
+        was, self.observer.in_force = self.observer.in_force, now
+        is_other = now.info.identity != was.info.identity
+        if is_other and was.is_described:
             self.reset()
             self._newest = None
-        if anew or (info.rate_hz, info.serial) != (before.rate_hz, before.serial):
-            self.observer.begin(info.rate_hz, now_ns)
+        elif now.info.offset != was.info.offset:  # the zero has moved
+            self.peaks = None
+        if self._begins or is_other or now.info.rate_hz != was.info.rate_hz:
+            self.observer.begin(now.info.rate_hz, _ns(now_s))
+        if self.compensated is not None and (self._begins or is_other):
+            self.compensated.begin()
+        self._begins = False
 
     def add_status(self, status: Status, now_s: float) -> None:
         self.observer.add_status(status, self.position, _ns(now_s))
@@ -196,7 +202,7 @@ class _Sensor:
     def add_frames(self, frames: Sequence[DataMessage], now_s: float) -> None:
         samples = self.observer.add_frames(frames, _ns(now_s))
         if self.compensated is not None:
-            self.compensated.add(frames, self.observer.info)
+            self.compensated.add(frames, self.observer.in_force)
         self._judge(now_s)
         if not samples:
             return
@@ -206,7 +212,7 @@ class _Sensor:
         self.peaks = tuple(_range([*was, *columns[i]]) for was, i in zip(before, _WRENCH, strict=True))
 
     def _judge(self, now_s: float) -> None:
-        seen, lost = self.observer.observation(_ns(now_s), _JUDGED_NS), self.observer.lost
+        seen, lost = self.observer.observation(_ns(now_s), _JUDGED_NS), self.observer.in_force.lost
         self._verdict = judge(seen)
         self._saturated = frozenset(axis for axes in saturated_axes(seen).values() for axis in axes)
         self._now = []
@@ -233,7 +239,7 @@ class _Sensor:
             for key, (finding, at_s) in latest
             if key not in keys
         ]
-        info, status, lost = self.observer.info, self.observer.status, self.observer.lost
+        (info, lost, *_), status = self.observer.in_force, self.observer.status
         sample = self._newest and SampleDecoder(len(self._newest), self._imu_units).decode(self._newest)
         return SensorView(
             position=self.position,
@@ -301,11 +307,13 @@ class Model:
             self._server = replace(self._server, connected=True, reason="")
             self._since_s = self._heard_s = now_s
             self._own_peer, self._status, self._clients = own_peer, Status(), ()
-            self._describe(description, now_s, anew=True)
+            self._describe(description, now_s)
 
-    def described(self, description: JsonObject, now_s: float) -> None:
+    def tell(self, in_force: InForce, now_s: float) -> None:
+        """What is in force for the sensor's frames from here on."""
         with self._lock:
-            self._describe(description, now_s, anew=False)
+            if (sensor := self._sensors.get(in_force.sensor)) is not None:
+                sensor.tell(in_force, now_s)
 
     def gone(self, reason: str, now_s: float) -> None:
         """Disconnected, for this reason."""
@@ -355,11 +363,6 @@ class Model:
     def add_event(self, event: JsonObject, now_s: float) -> None:
         with self._lock:
             self._heard_s = now_s
-            position = position_of(event)
-            if position is not None and (sensor := self._sensors.get(position)) is not None:
-                sensor.observer.add_event(event)
-                if event.get("event") == Event.OFFSET_CHANGED:  # the zero has moved
-                    sensor.peaks = None
             self._events.append(f"{clock_text()} {event_sentence(event)}")
 
     def reset(self) -> None:
@@ -398,7 +401,7 @@ class Model:
                 tuple(self._events),
             )
 
-    def _describe(self, description: JsonObject, now_s: float, *, anew: bool) -> None:
+    def _describe(self, description: JsonObject, now_s: float) -> None:
         replay = description.get("replay")
         files = mapping(replay).get("files")
         name = text(files[0]) if isinstance(files, list) and files else "a recording"
@@ -411,7 +414,7 @@ class Model:
                 info.sensor, self._imu_units, self._compensated and self._compensated()
             )
             self._sensors[info.sensor] = sensor
-            sensor.describe(info, now_s, anew=anew)
+            sensor.connected(now_s)
 
 
 def clock_text() -> str:

@@ -14,11 +14,12 @@ from typing import Final
 
 from bota_clients.monitor.model import Model
 from bota_ethercat.address import Address
-from bota_ethercat.client import Client, ClientEvent, Connected, Disconnected
-from bota_ethercat.control import Event
+from bota_ethercat.client import Client, Connected, Disconnected
+from bota_ethercat.client.session import Item
 from bota_ethercat.errors import ConnectionFailedError, RefusedError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.sentences import no_server
+from bota_ethercat.stream.timeline import InForce
 
 BATCH_S: Final = 0.05
 _STATUS_EVERY_S: Final = 1.0
@@ -53,33 +54,34 @@ class MonitorReader(threading.Thread):
                     self._ask_status(client)
 
     def _take(self, client: Client) -> None:
-        piled_up = self._sort(client, client.poll_all())
-        fresh = self._sort(client, client.poll_all(_NEXT_SAMPLE_S))
+        piled_up, fresh = client.poll_all(), client.poll_all(_NEXT_SAMPLE_S)
         now_ns = time.monotonic_ns()
         self._model.note_unread(*client.take_unread(), now_ns * 1e-9)
-        self._model.add_frames(piled_up + fresh, now_ns * 1e-9)
+        self._hand_on(client, piled_up + fresh, now_ns * 1e-9)
         # What arrived while this thread decoded waited for it: its age is not that of the server.
         if len(piled_up) < _MOST_PILED and client.session.same_machine:
-            first = {frame.sensor: frame for frame in reversed(fresh)}
+            first = {frame.sensor: frame for frame in reversed(fresh) if isinstance(frame, DataMessage)}
             for frame in first.values():
                 self._model.note_age(frame, now_ns)
 
-    def _sort(self, client: Client, items: Sequence[DataMessage | ClientEvent]) -> list[DataMessage]:
-        """The frames; the model gets the events."""
-        frames, now_s = [], time.monotonic()
+    def _hand_on(self, client: Client, items: Sequence[Item], now_s: float) -> None:
+        """All in its order: frames before an event are from before it."""
+        frames = list[DataMessage]()
         for item in items:
             if isinstance(item, DataMessage):
                 frames.append(item)
-            elif isinstance(item, Connected):
+                continue
+            self._model.add_frames(frames, now_s)
+            frames = []
+            if isinstance(item, Connected):
                 self._model.connected(item.description, str(Address(*client.channel.own)), now_s)
             elif isinstance(item, Disconnected):
                 self._failed(item, now_s)
+            elif isinstance(item, InForce):
+                self._model.tell(item, now_s)
             else:
                 self._model.add_event(item, now_s)
-                if item.get("event") in {Event.SENSOR_BACK, Event.RECONFIGURED}:
-                    with contextlib.suppress(ConnectionFailedError):
-                        self._model.described(client.ask("describe", _ANSWER_TIMEOUT_S), time.monotonic())
-        return frames
+        self._model.add_frames(frames, now_s)
 
     def _failed(self, end: Disconnected, now_s: float) -> None:
         if not self._closing.is_set():

@@ -7,7 +7,6 @@ fit is counted, and an event marks where it is missing.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import queue
@@ -30,11 +29,10 @@ from bota_clients.recording.writer import DiskFile, RecordingWriter
 from bota_ethercat.accounting import StreamAccounting, StreamCounts
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client, Connected, Disconnected
-from bota_ethercat.control import Event
-from bota_ethercat.errors import ProtocolError
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.replies import SensorInfo
+from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
@@ -44,8 +42,6 @@ Batch = list[DataMessage | RecordedDescription | RecordedEvent]
 BATCH_S: Final = 0.02  # two sensors at 1600 Hz make 64 frames in this time
 # Bytes that the kernel may buffer, as far as it allows: seconds in which nothing is lost.
 _RECEIVE_BUFFER: Final = 4 * 1024 * 1024
-# After these events the server is asked to describe itself again.
-_CHANGES: Final = frozenset({Event.RECONFIGURED, Event.SENSOR_BACK})
 FLUSH_S: Final = 0.4  # longest time until received frames are in the file
 # Maximum number of queued frames: a minute of two sensors at 1600 Hz, some 80 MB.
 MAX_BACKLOG: Final = 200_000
@@ -66,10 +62,7 @@ class RecordingClient(Client):
         self._problem = ""
 
     def batch(self, timeout_s: float = 0.0) -> Batch:
-        """Everything received meanwhile, waiting at most `timeout_s` for the first.
-
-        Blocks to have the server describe what has changed, too.
-        """
+        """Everything received meanwhile, waiting at most `timeout_s` for the first."""
         batch: Batch = []
         for item in self.poll_all(timeout_s):
             if isinstance(item, DataMessage):
@@ -88,13 +81,10 @@ class RecordingClient(Client):
                     # A server that was started again without one of its sensors, say: it is tried again.
                     self._problem = item.reason
                     batch.append(_noted("refused", message=item.reason))
-            else:
+            elif not isinstance(item, InForce):
                 if item.get("source") == RECORDER:
                     del item["source"]  # reserved for the recorder's own events
                 batch.append(RecordedEvent(time.time_ns(), item))
-                if item["event"] in _CHANGES:
-                    with contextlib.suppress(ProtocolError):
-                        batch.append(RecordedDescription(time.time_ns(), self.ask("describe")))
         return batch
 
 

@@ -30,9 +30,6 @@ Bools = npt.NDArray[np.bool_]
 _SIZE: Final = max(LAYOUTS)
 RECORD: Final = np.dtype([(field.name, "<" + field.type.value) for field in LAYOUTS[_SIZE].fields])
 _MAX: Final = (1 << 63) - 1
-# Writing one takes twelve requests, each of one or two exchanges, or a few ms of a real mailbox.
-_DOUBT_S, _DOUBT_PERIODS = 0.1, 24
-DOUBT_AFTER: Final = 2  # sample periods: one may have been measured before the last number was written
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,11 +111,6 @@ def joined(parts: Sequence[Columns]) -> Columns:
     return Columns(*(np.concatenate([getattr(part, name) for part in parts]) for name in Columns.__slots__))
 
 
-def doubt_ns(rate_hz: float) -> int:
-    """How long before a change was reported samples may have part of it."""
-    return round(max(_DOUBT_S, _DOUBT_PERIODS / rate_hz) * 1e9)
-
-
 def at_last_offset(
     recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits
 ) -> tuple[Columns, tuple[float, ...] | None]:
@@ -127,7 +119,7 @@ def at_last_offset(
     Without the samples in which a change was being written. None: the recording does not say the offset.
     RecordingError if it says so in part only.
     """
-    told = [row.offset for row in sensor.offsets]
+    told = [row.info.offset for row in sensor.offsets]
     if not told or set(told) == {None}:
         return columns(recording.frames(sensor.sensor), imu_units), None
     if None in told:
@@ -137,11 +129,11 @@ def at_last_offset(
         )
     last = np.array(told[-1])
     parts, in_doubt, before = list[Columns](), list[tuple[int, int]](), last
-    for info, batch in recording.batches(sensor.sensor):
-        part, shift = columns(batch, imu_units), last - info.offset
+    for in_force, batch in recording.batches(sensor.sensor):
+        part, shift = columns(batch, imu_units), last - in_force.info.offset
         if parts and (shift != before).any():
-            at_ns, rate_hz = batch[0].monotonic_ns, info.rate_hz or 1.0
-            in_doubt.append((at_ns - doubt_ns(rate_hz), at_ns + round(DOUBT_AFTER * 1e9 / rate_hz)))
+            at_ns = batch[0].monotonic_ns
+            in_doubt.append((at_ns - in_force.doubt_ns, at_ns + in_force.doubt_after_ns))
         part.force[:] += shift[:3]
         part.torque[:] += shift[3:]
         parts.append(part)

@@ -11,7 +11,7 @@ chunk; `cut_off` says so. `columns.py` gives NumPy arrays.
 from __future__ import annotations
 
 import itertools
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
@@ -19,9 +19,9 @@ from typing import Any, Final, NamedTuple, cast
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_clients.recording.mcap_file import McapFile
-from bota_ethercat import replies
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.replies import SensorInfo, position_of
+from bota_ethercat.replies import SensorInfo
+from bota_ethercat.stream.timeline import InForce, Timeline
 from bota_ethercat.text.json_text import JsonObject
 
 _MAX_NOTES: Final = 1_000_000  # descriptions and events
@@ -52,24 +52,15 @@ class RecordedEvent(NamedTuple):
         return self.event.get("source") == file_format.RECORDER
 
 
-class InForce(NamedTuple):
-    """What a sensor was from a time on: its identity, settings, rate, and its latest own offset."""
+class Since(NamedTuple):
+    """What was in force from a time on."""
 
     stamp_ns: int
-    info: SensorInfo
+    in_force: InForce
 
-    def is_changed(self, info: SensorInfo) -> bool:
-        """Whether `info` is of another sensor, or has other settings."""
-        before = self.info
-        is_other = _identity(before) not in (_identity(info), _identity(SensorInfo()))
-        return is_other or before.settings != info.settings
-
-
-class Offset(NamedTuple):
-    """What a sensor itself adds to every sample (object 0x8000) from a time on."""
-
-    stamp_ns: int
-    offset: tuple[float, ...] | None  # N and Nm; None if unknown
+    @property
+    def info(self) -> SensorInfo:
+        return self.in_force.info
 
 
 class RecordedSensor(NamedTuple):
@@ -77,52 +68,35 @@ class RecordedSensor(NamedTuple):
 
     sensor: int  # position on the bus, from 0
     info: SensorInfo  # as first described
-    history: tuple[InForce, ...]  # over time, oldest first; empty if it was never described
+    changes: tuple[Since, ...]  # all that was in force, oldest first; empty if it was never described
     frames: int  # number of its frames in the recording
-    offsets: tuple[Offset, ...]  # over time, oldest first
 
-
-class Histories:
-    """The histories of all sensors, built from descriptions and events in file order."""
-
-    def __init__(self) -> None:
-        self._of: dict[int, list[InForce]] = {}
-        self._offsets: dict[int, list[Offset]] = {}
-
-    def apply(self, note: RecordedDescription | RecordedEvent) -> None:
-        """Take the next description or event of the file."""
-        if isinstance(note, RecordedDescription):
-            for info in replies.Description.parse(note.reply).sensors:
-                self._learn(note.stamp_ns, info)
-        elif (position := position_of(note.event)) is not None and {"settings", "offset"} & note.event.keys():
-            self._learn(note.stamp_ns, self.newest(position).changed_by(note.event))
-
-    def newest(self, position: int) -> SensorInfo:
-        """What the sensor at this position is by all that was taken."""
-        history = self._of.get(position)
-        return history[-1].info if history else SensorInfo(position)
-
-    def sensors(self, frames: Mapping[int, int]) -> tuple[RecordedSensor, ...]:
-        """All sensors that were described or that have `frames`, which are counts by position."""
-        found = []
-        for position in sorted(self._of.keys() | frames.keys()):
-            history, offsets = tuple(self._of.get(position, ())), tuple(self._offsets.get(position, ()))
-            first = history[0].info if history else SensorInfo(position)
-            found.append(RecordedSensor(position, first, history, frames.get(position, 0), offsets))
+    @property
+    def history(self) -> tuple[Since, ...]:
+        """By identity and settings, each as it was known last."""
+        found: list[Since] = []
+        for each in self.changes:
+            same = found and found[-1].info
+            if same and (same.identity, same.settings) == (each.info.identity, each.info.settings):
+                found[-1] = Since(found[-1].stamp_ns, each.in_force)
+            else:
+                found.append(each)
         return tuple(found)
 
-    def _learn(self, stamp_ns: int, info: SensorInfo) -> None:
-        known, offsets = self._of.setdefault(info.sensor, []), self._offsets.setdefault(info.sensor, [])
-        if not offsets or offsets[-1].offset != info.offset:
-            offsets.append(Offset(stamp_ns, info.offset))
-        if not known or known[-1].is_changed(info):
-            known.append(InForce(stamp_ns, info))
-        else:  # the description that follows an event completes the same entry
-            known[-1] = known[-1]._replace(info=info)
+    @property
+    def offsets(self) -> tuple[Since, ...]:
+        """By what the sensor itself adds to every sample (object 0x8000)."""
+        firsts = (next(same) for _, same in itertools.groupby(self.changes, lambda each: each.info.offset))
+        return tuple(firsts)
 
 
-def _identity(info: SensorInfo) -> tuple[object, ...]:
-    return info.name, info.serial, info.hardware, info.firmware
+def follow(timeline: Timeline, note: RecordedDescription | RecordedEvent) -> list[InForce]:
+    """Feed the next description or event of a file; what it changed."""
+    if isinstance(note, RecordedDescription):
+        return timeline.describe(note.reply)
+    if note.by_recorder:  # the description of a new connection follows
+        return timeline.connected({}) if note.name == "connected" else []
+    return timeline.event(note.event)
 
 
 class Recording(McapFile):
@@ -161,15 +135,24 @@ class Recording(McapFile):
                 self._noted.add(number)
         self.frame_count = counts.total()
         self.events: list[RecordedEvent] = []
-        histories = Histories()
+        timeline, changes = Timeline(), defaultdict[int, list[Since]](list)
         for taken, note in enumerate(self._read(self._noted)):
             if taken == _MAX_NOTES:
                 raise RecordingError(f"{self.path} has more than {_MAX_NOTES} events")
             if not isinstance(note, DataMessage):
-                histories.apply(note)
+                for now in follow(timeline, note):
+                    changes[now.sensor].append(Since(note.stamp_ns, now))
             if isinstance(note, RecordedEvent):
                 self.events.append(note)
-        self.sensors: tuple[RecordedSensor, ...] = histories.sensors(counts)
+        self.sensors: tuple[RecordedSensor, ...] = tuple(
+            RecordedSensor(
+                position,
+                changes[position][0].info if position in changes else SensorInfo(position),
+                tuple(changes.get(position, ())),
+                counts[position],
+            )
+            for position in sorted(changes.keys() | counts.keys())
+        )
 
     def frames(self, sensor: int | None = None) -> Iterator[DataMessage]:
         """The frames of the sensor at this position, or of all, in the order in which they came.
@@ -185,21 +168,20 @@ class Recording(McapFile):
         """Descriptions, events and the frames of the sensor at this position, or of all, as they came."""
         return self._read(self._channels(sensor) | self._noted)
 
-    def batches(self, sensor: int) -> Iterator[tuple[SensorInfo, list[DataMessage]]]:
+    def batches(self, sensor: int) -> Iterator[tuple[InForce, list[DataMessage]]]:
         """Frames of the sensor at this position, a few thousand at once, with what was in force."""
-        histories, info = Histories(), SensorInfo(sensor)
-        for known in self.sensors:
-            if known.sensor == sensor and known.history:  # in force before it was told
-                info = known.info._replace(offset=known.offsets[0].offset)
+        timeline, known = Timeline(), [each for each in self.sensors if each.sensor == sensor]
+        in_force = timeline[sensor]
+        if known and known[0].changes:  # in force before it was told
+            in_force = known[0].changes[0].in_force
         for kind, items in itertools.groupby(self.everything(sensor), type):
             while batch := cast(Any, [*itertools.islice(items, _BATCH)]):
                 if kind is DataMessage:
-                    yield info, batch
-                else:
-                    for note in batch:
-                        histories.apply(note)
-                    newest = histories.newest(sensor)
-                    info = info if newest == SensorInfo(sensor) else newest
+                    yield in_force, batch
+                    continue
+                for note in batch:
+                    for now in follow(timeline, note):
+                        in_force = now if now.sensor == sensor else in_force
 
     def _channels(self, sensor: int | None) -> set[int]:
         return {number for number, position in self._sensor_of.items() if sensor in (None, position)}

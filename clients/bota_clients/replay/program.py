@@ -14,8 +14,8 @@ from typing import Any, Final, NoReturn
 from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
 from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording, open_recording
+from bota_clients.replay.pacing import Pacing
 from bota_clients.replay.sensors import ReplayedSensors, needs_sensor
-from bota_clients.replay.timeline import Timeline
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, DataMessage, encode_data
 from ethercat_server.errors import ServerError
@@ -60,7 +60,7 @@ class Player:
         self._recording = recording
         self._options = options
         self._signals = signals
-        self._timeline = Timeline(options.speed)
+        self._pacing = Pacing(options.speed)
         self._serve_by = 0
         self._newest_ns: dict[int, int] = {}  # by sensor, when a frame of it that is not REPEATED was sent
 
@@ -83,7 +83,7 @@ class Player:
             while not (self._signals.asked or self._has_subscriber()):
                 hub.serve(time.monotonic_ns() + _SLICE_NS)
             while self._play_once() and options.loop:
-                self._timeline.begin_again()
+                self._pacing.begin_again()
             self._drain()
         finally:
             hub.broadcast(event(Event.SHUTTING_DOWN))
@@ -108,8 +108,6 @@ class Player:
                 return False
             if isinstance(item, DataMessage):
                 self._send(item)
-            elif isinstance(item, RecordedDescription):
-                self.sensors.describe(item)
             else:
                 self._happen(item)
         return self.sensors.sent > before
@@ -117,23 +115,19 @@ class Player:
     def _has_subscriber(self) -> bool:
         return any(c.subscription is not None for c in self.hub.connections.values())
 
-    def _happen(self, event: RecordedEvent) -> None:
-        if event.by_recorder:
-            if event.name == "connected":
-                self._timeline.reconnected()
-            return
-        self.sensors.apply(event)
-        # It was the recorded server that shut down, not this one.
-        if event.name != Event.SHUTTING_DOWN:
-            self.hub.broadcast(event.event)
+    def _happen(self, note: RecordedDescription | RecordedEvent) -> None:
+        if isinstance(note, RecordedEvent) and note.by_recorder and note.name == "connected":
+            self._pacing.reconnected()
+        for message in self.sensors.follow(note):
+            self.hub.broadcast(message)
 
     def _send(self, frame: DataMessage) -> None:
         due_ns = 0
         if math.isinf(self._options.speed):  # as fast as the clients read: none has a frame queued
             self._drain()
-            frame = self._timeline.now(frame)
+            frame = self._pacing.now(frame)
         else:
-            due_ns, frame = self._timeline.due(frame)
+            due_ns, frame = self._pacing.due(frame)
         self._wait(due_ns)
         if self._signals.asked:
             return

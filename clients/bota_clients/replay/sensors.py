@@ -7,18 +7,18 @@ from collections import Counter
 from itertools import takewhile
 from typing import Any, Final, NoReturn
 
-from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording
+from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording, follow
 from bota_ethercat.accounting import NOT_NEW
-from bota_ethercat.control import ErrorCode, Event, Request
+from bota_ethercat.control import ErrorCode, Event, Request, event
 from bota_ethercat.errors import RequestError
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import is_finite
+from bota_ethercat.stream.timeline import InForce, Timeline
+from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import rows, whole
 from ethercat_server.serving.connection import Connection
 
 _NO_BUS: Final = {"p50": 0.0, "p99": 0.0, "p999": 0.0, "max": 0.0}
-# Keys of events and descriptions alike.
-_IN_FORCE: Final = ("settings", "rate_hz", "delay_ms", "offset")
 
 
 class ReplayedSensor:
@@ -29,6 +29,7 @@ class ReplayedSensor:
             "sensor": position, "name": "?", "serial": 0, "hardware": "?", "firmware": "?", "pdo_size": 0,
             "rate_hz": 0.0, "settings": {}, "state": "OP",
         }  # fmt: skip
+        self.in_force: InForce | None = None  # if the recording says so
         self._frames = Counter[int]()  # by the flags that say that they are not new
         self._not_finite = 0
         self._emergencies = 0
@@ -41,11 +42,6 @@ class ReplayedSensor:
             self._emergencies += 1
             self._emergency = {key: said.get(key) for key in ("code", "text", "register", "data")}
             self._emergency_at = time.monotonic()
-        self.row |= {key: said[key] for key in _IN_FORCE if key in said}
-        if event.name == Event.SENSOR_LOST:
-            self.row["state"] = "REFUSED" if said.get("reason") == "different_sensor" else "LOST"
-        elif event.name == Event.SENSOR_BACK:
-            self.row["state"] = "OP"
 
     def count(self, frame: DataMessage) -> None:
         old = frame.flags & NOT_NEW
@@ -53,10 +49,18 @@ class ReplayedSensor:
         self._not_finite += not old and not is_finite(frame.process_data)
 
     def describe(self) -> dict[str, Any]:
-        return self.row
+        if self.in_force is None:
+            return self.row
+        # Its data was settling, if it was, when it was described.
+        return self.row | self.said() | {"state": self.in_force.info.state, "settling": False}
+
+    def said(self) -> dict[str, Any]:
+        """What replies and events carry of what is in force."""
+        assert self.in_force is not None
+        return self.in_force.info.as_message()
 
     def status(self) -> dict[str, Any]:
-        rate_hz = self.row.get("rate_hz")
+        rate_hz = self.in_force.info.rate_hz if self.in_force else 0.0
         ago_s = round(time.monotonic() - self._emergency_at, 3)
         return {
             "sensor": self.row["sensor"],
@@ -75,7 +79,7 @@ class ReplayedSensor:
             "clock": {
                 "mode": "locked",
                 "stamps": "polling",
-                "period_us": 1e6 / rate_hz if isinstance(rate_hz, int | float) and rate_hz > 0 else None,
+                "period_us": 1e6 / rate_hz if rate_hz else None,
                 "offset_ppm": 0.0,
                 "uncertainty_us": 0.0,
             },
@@ -101,20 +105,33 @@ class ReplayedSensors:
         count = max((sensor.sensor + 1 for sensor in recording.sensors), default=0)
         self.sensors = [ReplayedSensor(position) for position in range(count)]
         # As the first subscriber finds them: their description comes before their first frame.
+        self._timeline = Timeline()
         for item in takewhile(lambda item: not isinstance(item, DataMessage), recording.everything()):
             if isinstance(item, RecordedDescription):
-                self.describe(item)
+                self.follow(item)
         self.sent = 0
         self._started = time.monotonic()
 
-    def describe(self, description: RecordedDescription) -> None:
-        for row in rows(description.reply.get("sensors")):
+    def follow(self, note: RecordedDescription | RecordedEvent) -> list[JsonObject]:
+        """Take the next description or event of the recording; the events to send."""
+        changed = [now for now in follow(self._timeline, note) if self._at(now.sensor)]
+        before = {now.sensor: self.sensors[now.sensor].in_force for now in changed}
+        for now in changed:
+            self.sensors[now.sensor].in_force = now
+        if isinstance(note, RecordedEvent):
+            if (sensor := self._at(note.event.get("sensor"))) is not None:
+                sensor.apply(note)
+            # It was the recorded server that shut down, not this one.
+            hidden = note.by_recorder or note.name == Event.SHUTTING_DOWN
+            return [] if hidden else [note.event]
+        for row in rows(note.reply.get("sensors")):
             if (sensor := self._at(row.get("sensor"))) is not None:
-                sensor.row |= {**row, "settling": False}  # it was, when it was described
-
-    def apply(self, event: RecordedEvent) -> None:
-        if (sensor := self._at(event.event.get("sensor"))) is not None:
-            sensor.apply(event)
+                sensor.row |= row
+        return [
+            event(Event.RECONFIGURED, sensor=now.sensor, **self.sensors[now.sensor].said())
+            for now in changed
+            if (was := before[now.sensor]) and was.info.in_force != now.info.in_force
+        ]
 
     def count(self, frame: DataMessage) -> None:
         self.sent += 1

@@ -60,7 +60,7 @@ class Noise(NamedTuple):
 def _measure_noise(series: Series) -> Noise:
     length = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
     limit = _limits(series)
-    usable = series.finite & ~series.saturated
+    usable = series.usable
     number = np.floor(series.time / length).astype(np.int64)
     # A clock that jumps back must not join samples that are far apart.
     edges = [0, *(np.flatnonzero(np.diff(number) != 0) + 1), series.count]
@@ -303,7 +303,7 @@ def _stuck(series: Series, _: Noise) -> Check:
     stuck, longest = [], 0
     for n, (channel, values) in enumerate(zip(CHANNELS, series.values.T, strict=True)):
         # Values that are saturated or not finite belong to other checks: each is a run of its own.
-        apart = ~series.finite[:, n] | series.saturated[:, n]
+        apart = ~series.usable[:, n]
         changed = (values[1:] != values[:-1]) | apart[1:] | apart[:-1] | (series.intervals <= 0)
         starts = np.append(0, np.flatnonzero(changed) + 1)
         ends = np.append(starts[1:], series.count) - 1

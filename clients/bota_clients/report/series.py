@@ -18,13 +18,14 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count, listing, moment
 from bota_clients.recording.columns import Bools, Columns, Floats, Ints, columns, joined
-from bota_clients.recording.reader import InForce, RecordedSensor, Recording, open_recording
+from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.health.limits import LIMITS
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.filters import LONG_SINC, SHORT_SINC, noise_limit
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue, rate_divisor
+from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
 from bota_ethercat.text.untrusted import printable
 
 _HIGHEST_RATE_HZ: Final = 100_000.0
@@ -91,8 +92,9 @@ def _subject(recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) 
     """Its longest stretch without a change of settings or sensor."""
     # The order in the file decides what came first, because clocks differ.
     stretches: list[tuple[SensorInfo, list[Columns]]] = [(sensor.info, [columns([])])]
-    for info, frames in recording.batches(sensor.sensor):
-        if InForce(0, stretches[-1][0]).is_changed(info):
+    for in_force, frames in recording.batches(sensor.sensor):
+        was, info = stretches[-1][0], in_force.info
+        if (was.identity, was.settings) != (info.identity, info.settings):
             stretches.append((info, []))
         stretches[-1][1].append(columns(frames, imu_units))
     longest = max(range(len(stretches)), key=lambda number: sum(map(len, stretches[number][1])))
@@ -144,6 +146,7 @@ class Group(NamedTuple):
     is_imu: bool = False
 
 
+_OF_GROUP: Final = (FORCE_TORQUE, FORCE_TORQUE, ACCELERATION, ANGULAR_RATE)  # by GROUPS
 _IMU: Final = (0.1, 0.1, 0.1)  # the only figure published, for all filters
 GROUPS: Final = (
     Group("force", "Force", "N", "force_torque_saturated", 0, (0.6, 0.6, 0.6), (0.1, 0.1, 0.08)),
@@ -211,6 +214,8 @@ class Series:
         self.finite: Bools = np.isfinite(self.values)  # (n, 12)
         fields = [getattr(samples, channel.group.saturation) & channel.bit != 0 for channel in CHANNELS]
         self.saturated: Bools = np.column_stack(fields)  # (n, 12) as the sensor says
+        flagged = [channel.flagged(samples) != 0 for channel in _OF_GROUP]
+        self.usable: Bools = self.finite & ~np.repeat(np.column_stack(flagged), 3, axis=1)  # (n, 12)
         self.not_finite: Bools = ~self.finite.all(axis=1) | ~np.isfinite(samples.temperature)  # (n,)
         self.imu_off = subject.settings.get("imu_active") == 0
         self.intervals: Floats = np.diff(self.time)  # (n - 1,) s

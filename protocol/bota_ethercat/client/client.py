@@ -26,12 +26,13 @@ from typing import Final
 from bota_ethercat.address import Address
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
 from bota_ethercat.client.reading import WARNINGS, Condition, Reading
-from bota_ethercat.client.session import ClientEvent, Session, check_granted
+from bota_ethercat.client.session import ClientEvent, Item, Session, check_granted
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, ProtocolError, UnreachableError
 from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import did_not_read, no_server
 from bota_ethercat.pdo import ImuUnits, Sample
 from bota_ethercat.program.real_time import Scheduling, make_real_time
+from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.terminal import decode_terminal
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import rows
@@ -253,8 +254,8 @@ class Client:
         self._gather(timeout_s)
         return self._pop_frames()
 
-    def poll_all(self, timeout_s: float = 0.0) -> list[DataMessage | ClientEvent]:
-        """As `poll`, with the events in their places between the frames."""
+    def poll_all(self, timeout_s: float = 0.0) -> list[Item]:
+        """As `poll`, with events, and what is in force from there on, in their places between the frames."""
         self._gather(timeout_s)
         return self.session.pop_items()
 
@@ -320,7 +321,7 @@ class Client:
 
     def measured_ns(self, frame: DataMessage, channel: str = "force_torque") -> int | None:
         """As `Reading.measured_ns`, with the filters as of now."""
-        delay_ns = getattr(self.session.state(frame.sensor).info.delay_ns, channel)
+        delay_ns = getattr(self.session.timeline[frame.sensor].info.delay_ns, channel)
         return None if delay_ns is None else frame.stamp_ns - delay_ns
 
     # -- requests
@@ -402,7 +403,7 @@ class Client:
         for item in self.session.pop_items():
             if isinstance(item, DataMessage):
                 frames.append(item)
-            else:
+            elif not isinstance(item, InForce):
                 self.events.append(item)
         return frames
 

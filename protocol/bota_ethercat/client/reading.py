@@ -14,12 +14,12 @@ from bota_ethercat.accounting import FrameKind, StreamAccounting
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import LAYOUTS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.replies import Delays, SensorInfo
-from bota_ethercat.sensor.warnings_register import WarningFlag
+from bota_ethercat.stream.timeline import InForce
+from bota_ethercat.stream.usable import FORCE_TORQUE
 
 _REPEATED, _INVALID, _GAP = int(DataFlag.REPEATED), int(DataFlag.INVALID), int(DataFlag.GAP)
 _CLOCK_TOLERANCE_NS: Final = 1_000_000
 _MIN_SILENCE_NS: Final = 30_000_000  # three times the pace of REPEATED frames
-_SATURATED: Final = int(WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE)
 _WARNINGS_AT: Final = LAYOUTS[min(LAYOUTS)].offsets["warnings"]
 WARNINGS: Final = slice(_WARNINGS_AT, _WARNINGS_AT + 4)
 _NO_WARNINGS: Final = bytes(4)
@@ -34,7 +34,7 @@ class Condition(IntEnum):
     meaning: str
     FRESH = 0, "fresh"
     SATURATED = 1, "saturated: the sensor is overloaded"
-    NOT_FINITE = 2, "not finite: the sensor sends NaN or infinity"
+    NOT_FINITE = 2, "faulty: the sensor sends NaN or infinity, or reports that its ADC or supply is at fault"
     LATE = 3, "late: what arrives is too old"
     BAD_CLOCK = 4, "bad clock: the server's stamps are ahead of this machine's"
     REPEATED = 5, "repeated: the sensor gives nothing new"
@@ -51,6 +51,10 @@ class Condition(IntEnum):
 
     def __str__(self) -> str:
         return self.meaning
+
+
+# Of a recent sample, by its usability.
+_USABILITY: Final = (Condition.FRESH, Condition.SATURATED, Condition.NOT_FINITE)
 
 
 class Reading(NamedTuple):
@@ -87,7 +91,6 @@ class ReceivedSensor:
 
     def __init__(self, sensor: int, *, every: int, fresh_only: bool, imu_units: ImuUnits) -> None:
         self.accounting = StreamAccounting(every=every, fresh_only=fresh_only)
-        self.lost = False  # the server says so
         self.sensor = sensor
         self.unread = 0  # new samples since the last reading
         self.told_ns = -1  # up to this instant, of the server's clock, it was told to be silent
@@ -98,19 +101,23 @@ class ReceivedSensor:
         self._same_clock = self._reconnected = self._gap = False
         self._carried = 0
         self._warnings = 0
-        self.info = SensorInfo(sensor)
+        self.in_force = InForce(SensorInfo(sensor))
         self._sampled_delay_ns = Delays()
 
-    def update(self, info: SensorInfo) -> None:
+    @property
+    def in_force(self) -> InForce:
         """What the server says of it now."""
-        self.info = info
-        self.accounting.rate_hz = info.rate_hz or self.accounting.rate_hz
+        return self._in_force
+
+    @in_force.setter
+    def in_force(self, now: InForce) -> None:
+        self._in_force, self.lost = now, now.lost is not None
+        self.accounting.rate_hz = now.info.rate_hz or self.accounting.rate_hz
 
     def begin(self) -> None:
         """A new connection."""
         self._reconnected = self.accounting.counts.frames > 0  # what was lost meanwhile is not known
         self.accounting.begin()
-        self.lost = False
 
     def add(self, frame: DataMessage, received_ns: int, same_clock: bool) -> DataMessage | None:
         """A frame that arrived at `received_ns`; itself if it brings a new, valid sample.
@@ -134,10 +141,9 @@ class ReceivedSensor:
             if self._carried:
                 frame, self._carried = frame._replace(flags=flags | self._carried), 0
             self._gap = self._gap or frame.flags & _GAP != 0
-            self.lost = False
         self._flags, self._same_clock = flags, same_clock
         self._sampled, self._received_ns, self._sampled_received_ns = frame, received_ns, received_ns
-        self._sampled_delay_ns = self.info.delay_ns
+        self._sampled_delay_ns = self._in_force.info.delay_ns
         self.unread += 1
         if (warnings := process_data[WARNINGS]) != _NO_WARNINGS:
             self._warnings |= int.from_bytes(warnings, "little")
@@ -168,7 +174,7 @@ class ReceivedSensor:
             ahead = since_ns < -_CLOCK_TOLERANCE_NS
             age_ns = math.inf if ahead else max(0, since_ns)
         if sample is not None and age_ns <= max_age_ns:
-            condition = _condition_of(sample)
+            condition = _USABILITY[FORCE_TORQUE.judge(sample)]
         else:
             silence_ns = max(2 * max_age_ns, _MIN_SILENCE_NS)
             condition = self.why_old(silence_ns, now_ns, connected=connected, ahead=ahead)
@@ -193,11 +199,3 @@ class ReceivedSensor:
         if self._flags & _REPEATED:
             return Condition.REPEATED
         return Condition.BAD_CLOCK if ahead else Condition.LATE
-
-
-def _condition_of(sample: Sample) -> Condition:
-    """The condition of a recent sample, by force and torque."""
-    if not math.isfinite(sum(sample.force) + sum(sample.torque)):
-        return Condition.NOT_FINITE
-    saturated = sample.force_torque_saturated or sample.warnings & _SATURATED
-    return Condition.SATURATED if saturated else Condition.FRESH

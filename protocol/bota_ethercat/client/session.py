@@ -9,6 +9,7 @@ The rules it keeps:
 - After a connection that ended the next attempt is due at `retry_at_ns`: later each time, and soon after one
   that lasted.
 - What is known of a sensor is kept over connections; the first sample of a new one has GAP.
+- What is in force for a sensor is folded by one `Timeline`, in the order in which it came, whoever asked.
 - Frames that are no news are not handed out, unless `raw`.
 """
 
@@ -22,7 +23,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.address import boot_id
 from bota_ethercat.client.reading import ReceivedSensor
-from bota_ethercat.control import Event, check_version, request
+from bota_ethercat.control import check_version, request
 from bota_ethercat.errors import (
     BadMessageError,
     ConnectionFailedError,
@@ -39,7 +40,8 @@ from bota_ethercat.framing import (
     encode_json,
 )
 from bota_ethercat.pdo import ImuUnits
-from bota_ethercat.replies import Description, position_of
+from bota_ethercat.replies import Description
+from bota_ethercat.stream.timeline import InForce, Timeline
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
@@ -51,8 +53,6 @@ _MAX_ITEMS: Final = 65536  # kept until they are taken; a tare of 20,000 samples
 _HANDSHAKE_NS: Final = 5_000_000_000
 _MIN_TIMEOUT_S: Final = 0.02
 _TIMEOUT_PERIODS: Final = 5
-# Events that say what is in force from then on.
-_IN_FORCE: Final = frozenset({Event.SENSOR_BACK, Event.RECONFIGURED, Event.OFFSET_CHANGED})
 
 
 class Connected(NamedTuple):
@@ -73,6 +73,7 @@ class Disconnected(NamedTuple):
 
 # What the client tells of its connection, and the server's events as they came.
 ClientEvent = Connected | Disconnected | JsonObject
+Item = DataMessage | ClientEvent | InForce
 
 
 class Session:
@@ -82,7 +83,9 @@ class Session:
         connected: whether there is a connection and its subscription is granted.
         description: the server's newest description; empty before the first connection.
         items: what has arrived and was not taken yet, in order: new and valid frames, or all of them if
-            `raw`; the server's events; `Connected` and `Disconnected`.
+            `raw`; the server's events; `Connected` and `Disconnected`; and where something changes what is in
+            force for a sensor, `InForce` behind what says it.
+        timeline: what is in force after all that was received, taken or not.
         terminal_frames: the last thousand of terminals, likewise.
         same_machine: whether the server's CLOCK_MONOTONIC is this machine's.
         sensors: by position on the bus.
@@ -108,7 +111,8 @@ class Session:
         self.terminal_frames: deque[TerminalMessage] = deque(maxlen=_MAX_ITEMS // 64)
         self.connected = self.same_machine = False
         self.description: JsonObject = {}
-        self.items: deque[DataMessage | ClientEvent] = deque()
+        self.items: deque[Item] = deque()
+        self.timeline = Timeline()
         self._dropped: set[int] = set()  # sensors whose frames were dropped from `items`
         self.sensors: dict[int, ReceivedSensor] = {}
         self.connections = 0
@@ -156,7 +160,7 @@ class Session:
         self.items.append(Disconnected(reason, reachable, was_connected))
         self._drop_oldest()
 
-    def pop_items(self) -> list[DataMessage | ClientEvent]:
+    def pop_items(self) -> list[Item]:
         """`items`, which are taken; GAP in the first frame of a sensor whose frames were dropped."""
         items = list(self.items)
         self.items.clear()
@@ -215,7 +219,12 @@ class Session:
         sensors, items, batch, same = self.sensors, self.items, self._batch, self.same_machine
         for frame in batch:
             state = sensors.get(frame.sensor)
-            new = state.add(frame, now_ns, same) if state is not None else None
+            new = None
+            if state is not None:
+                is_lost = state.lost
+                new = state.add(frame, now_ns, same)
+                if is_lost and new is not None:
+                    self._tell(self.timeline.sampled(frame.sensor))
             if self._raw:
                 items.append(frame)
             elif new is not None:
@@ -241,10 +250,14 @@ class Session:
         """Take a JSON message; what to send."""
         if "event" in message:
             if isinstance(message["event"], str):
-                self._handle_event(message)
+                self.items.append(message)
+                self._tell(self.timeline.event(message))
             return b""
         identifier = message.get("id")
         future = self._replies.pop(identifier, None) if type(identifier) is int else None
+        if self.connected and message.get("reply") in ("describe", "subscribe") and message.get("ok") is True:
+            self.description = message
+            self._tell(self.timeline.describe(message))  # before who asked knows, and in its place
         if future is not None:
             future.set_result(message)
         if future is None or self._handshake is None or future is not self._handshake[0]:
@@ -264,7 +277,7 @@ class Session:
             self.same_machine = theirs == ours
         if not self._stream:
             return self._granted(reply)
-        self.describe(reply)
+        self.description = reply
         there = [info.sensor for info in Description.parse(reply).sensors]
         values: dict[str, Any] = {"every": self._every, "fresh_only": self._fresh_only}
         if self.wanted is not None:
@@ -281,7 +294,7 @@ class Session:
         return self._ask_first(self._granted, "subscribe", **values)
 
     def _granted(self, reply: JsonObject) -> bytes:
-        self.describe(reply)
+        self.description = reply
         self._handshake = None
         self._begun_ns = -1
         for state in self.sensors.values():
@@ -289,24 +302,13 @@ class Session:
         self.connected, self.problem = True, ""
         self.connections += 1
         self.items.append(Connected(self.description, self.connections > 1, self._missing))
+        self._tell(self.timeline.connected(reply))
         return b""
 
-    def describe(self, description: JsonObject) -> None:
-        """Take a description of the server, which may be newer than that of the connection."""
-        self.description = description
-        for info in Description.parse(description).sensors:
-            self.state(info.sensor).update(info)
-
-    def _handle_event(self, message: JsonObject) -> None:
-        kind, position = message["event"], position_of(message)
-        state = None if position is None else self.sensors.get(position)
-        if state is not None and kind in _IN_FORCE:
-            state.lost = state.lost and kind == Event.OFFSET_CHANGED
-            said = message if kind != Event.OFFSET_CHANGED else {"offset": message.get("offset")}
-            state.update(state.info.changed_by(said))
-        elif state is not None and kind == Event.SENSOR_LOST:
-            state.lost = True
-        self.items.append(message)
+    def _tell(self, changed: list[InForce]) -> None:
+        for in_force in changed:
+            self.state(in_force.sensor).in_force = in_force
+        self.items.extend(changed)
 
     # -- what is known
 

@@ -9,17 +9,17 @@ import functools
 import math
 import operator
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.accounting import NOT_NEW, FrameKind, StreamAccounting, StreamCounts
-from bota_ethercat.control import Event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health.judge import Observation, emergency
 from bota_ethercat.health.limits import LIMITS, StreamLimits
-from bota_ethercat.health.sentences import drift, event_sentence
+from bota_ethercat.health.sentences import drift
 from bota_ethercat.pdo import LAYOUTS, PdoLayout, is_finite
 from bota_ethercat.replies import SensorInfo, SensorStatus, Status
+from bota_ethercat.stream.timeline import InForce
 
 COMMON: Final[PdoLayout] = LAYOUTS[min(LAYOUTS)]  # the fields of every size of process data
 _FLAGS: Final = tuple(
@@ -66,14 +66,12 @@ class SensorObserver:
     """What the server says of one sensor, and what came of it in some time.
 
     Attributes:
-        info: its row of the newest description.
+        in_force: what is in force for its samples.
         status: its row of the newest `status`; nothing is known before the first of a connection.
-        lost: why the server has lost it, if it has.
     """
 
     def __init__(self) -> None:
-        self.info, self.status = SensorInfo(), SensorStatus()
-        self.lost: str | None = None
+        self.in_force, self.status = InForce(SensorInfo()), SensorStatus()
         self._missed_deadlines: int | None = None
         self._grown: deque[tuple[int, str, int]] = deque()  # when, what, and by how much
         self._unread: deque[tuple[int, tuple[float, bool]]] = deque()  # when, and of `Client.take_unread`
@@ -83,23 +81,13 @@ class SensorObserver:
 
     def connected(self, now_ns: int) -> None:
         """A connection was made."""
-        if self.info != SensorInfo():
+        if self.in_force.is_described:
             self._grown.append((now_ns, "reconnects", 1))
         self.disconnected()
 
     def disconnected(self) -> None:
         """Counts are not compared with those of another connection."""
-        self.lost, self.status, self._missed_deadlines = None, SensorStatus(), None
-
-    def add_event(self, event: Mapping[str, Any]) -> None:
-        """An event of this sensor."""
-        kind = event.get("event")
-        if kind == Event.SENSOR_LOST:
-            self.lost = event_sentence(event)
-        elif kind in (Event.SENSOR_BACK, Event.RECONFIGURED):
-            self.lost = None
-        elif kind == Event.OFFSET_CHANGED:
-            self.info = self.info.changed_by(event)
+        self.status, self._missed_deadlines = SensorStatus(), None
 
     def add_status(self, status: Status, position: int, now_ns: int) -> None:
         """A reply to `status`, in which it is the sensor at `position`."""
@@ -149,11 +137,11 @@ class SensorObserver:
             missed_deadlines=self.grown("missed_deadlines", since_ns),
             reconnects=self.grown("reconnects", since_ns),
             locked=mode == "locked" if mode else None,
-            is_lost=self.lost is not None,
-            state=self.info.state,
+            is_lost=self.in_force.lost is not None,
+            state=self.in_force.info.state,
             emergency=said if 0 <= now_ns - at_ns < limits.emergency_s * 1e9 else "",
             drift=drift(self.status, limits),
-            settings=self.info.settings,
+            settings=self.in_force.info.settings,
         )
 
 

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import WRENCH, Sample, Values, Vector3
 from bota_ethercat.replies import SensorInfo
+from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE, Usability, judge
 from bota_ethercat_bridge.compensating.sources import Source
 from bota_ethercat_bridge.ft_compensation.bias import BiasRamp
 from bota_ethercat_bridge.ft_compensation.compensator import Compensator, Stages
@@ -28,7 +29,7 @@ from bota_ethercat_bridge.publishing.messages import Stamps, decoder
 from bota_ethercat_bridge.publishing.wrenches import FilteredTopic, TfFrames, WrenchTopic, make_frames
 from bota_ethercat_bridge.stream.link import NodeClock
 
-_SATURATED: Final = "force or torque was saturated, and on_saturation is stop"
+_BY_IMU: Final = (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE)  # what is needed of a sample
 _STAGES: Final = {"wrench_compensated": "final", "compensation/bias": "bias", "compensation/tool": "tool"}
 
 
@@ -146,17 +147,32 @@ class Compensation:
         """Compensate a sample and publish its stages; nothing if the tool's weight is not known."""
         plan, sample = self.plan, self.decode(values)
         specific_force = self._specific_force(plan, sample, frame)
-        is_saturated = self._stops_on_saturation and sample.force_torque_saturated != 0
-        if specific_force is None or self.hold or is_saturated:
+        why = self.hold
+        if (
+            sample.warnings
+            or sample.force_torque_saturated
+            or sample.acceleration_saturated
+            or sample.angular_rate_saturated
+        ):
+            why = why or self._why_unusable(plan, sample)
+        if specific_force is None or why:
             self.is_stopped = True
             self.withheld += 1
-            self.why_withheld = self.hold or (_SATURATED if is_saturated else "")
+            self.why_withheld = why
             return
         self.is_stopped = False
         stages = self._stages(plan, sample, specific_force)
         for topic in self._wanted:
             topic.send(*stages[topic.index], frame)
         self.published += 1
+
+    def _why_unusable(self, plan: Plan, sample: Sample) -> str:
+        """Why this sample is not to be compensated; empty if it is."""
+        channels = _BY_IMU if plan.has_tool and plan.source.is_imu else _BY_IMU[:1]
+        usability, why = judge(sample, channels)
+        if usability is Usability.SATURATED:
+            return f"{why}, and on_saturation is stop" if self._stops_on_saturation else ""
+        return why
 
     def observe(self, values: Values, frame: DataMessage) -> None:
         """Give source, open window and filter a sample that is not published."""

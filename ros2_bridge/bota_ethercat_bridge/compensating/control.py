@@ -168,12 +168,12 @@ class CompensationControl:
     def conflict(self, *, needs_tool: bool = False) -> str:
         """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
         specific force in the frame of the wrench, a sentence that says what to do."""
-        settings, has_tool = self.link.info.settings, self.parameters.tool_mass > 0
+        settings, has_tool = self.link.settings, self.parameters.tool_mass > 0
         return not_newtons(settings, has_tool=has_tool) or (self._why_unknown() if needs_tool else "")
 
     def _why_unknown(self) -> str:
         """Why these settings of the sensor hide the specific force, a sentence; empty if they do not."""
-        return hides_gravity(self.link.info.settings) if self.parameters.gravity_source == "imu" else ""
+        return hides_gravity(self.link.settings) if self.parameters.gravity_source == "imu" else ""
 
     def _hold(self) -> None:
         """Publish nothing while the bias may be another sensor's, or a needed specific force is unknown."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.pdo import Sample, Vector3
-from bota_ethercat.sensor.warnings_register import WarningFlag
+from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE, judge
 from bota_ethercat_bridge.ft_compensation.quantities import (
     NO_WRENCH,
     ZERO,
@@ -32,10 +32,6 @@ _NO_LIMIT: Final = 1e-12
 _NAMES: Final = ("force", "torque", "acceleration", "angular rate")
 _UNITS: Final = ("N", "Nm", "m/s²", "rad/s")
 Array = NDArray[np.float64]
-# Warnings with which force and torque must not be used.
-BAD_WRENCH: Final = (
-    WarningFlag.FORCE_TORQUE_SATURATED | WarningFlag.ADC_OUT_OF_SYNC | WarningFlag.FORCE_TORQUE_OUT_OF_RANGE
-)
 
 
 class NotStationaryError(CompensationError):
@@ -147,11 +143,7 @@ def _check(values: Array, limits: tuple[float, ...], shown: Array, how: str) -> 
 def _what_is_wrong(sample: Sample) -> str | None:
     if not sample.is_finite:
         return "a sample has numbers that are not finite"
-    if sample.force_torque_saturated or sample.warnings & BAD_WRENCH:
-        return "force or torque was saturated or out of range"
-    if sample.acceleration_saturated or sample.angular_rate_saturated:
-        return "the IMU was saturated"
-    return None
+    return judge(sample, (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE))[1] or None
 
 
 def triple(values: Array) -> Vector3:

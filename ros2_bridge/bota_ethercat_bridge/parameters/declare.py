@@ -205,7 +205,7 @@ class NodeParameters:
 
     def _follow(self) -> None:
         """Make the parameters what the settings are."""
-        in_force = self.link.info.settings if self.link else {}
+        in_force = self.link.settings if self.link else {}
         with self._node.setting:
             self._following = True
             try:

@@ -7,7 +7,6 @@ attributes are replaced, never changed in place. What the server says is not tru
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -20,6 +19,7 @@ from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedErr
 from bota_ethercat.health.sentences import event_sentence, no_server
 from bota_ethercat.replies import Description, SensorInfo
 from bota_ethercat.settings import SettingValue, known_settings
+from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable
 from bota_ethercat_bridge.ft_compensation.quantities import Wrench, wrench_text
@@ -27,7 +27,6 @@ from bota_ethercat_bridge.ft_compensation.quantities import Wrench, wrench_text
 CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0
 SHUTDOWN_TIMEOUT_S: Final = 3.0
-_NEWER_IN_DESCRIPTIONS: Final = ("name", "serial", "state", "hardware", "firmware", "rate_hz", "settling")
 
 
 class NodeClock:
@@ -60,22 +59,38 @@ class Link:
         self.sensor = sensor
         self.on_change: Callable[[], object] = lambda: None
         self.is_connected = False
-        self.info = SensorInfo()  # of the sensor that is or was there
-        self._changing = threading.Lock()  # `info`
+        self.in_force = InForce(SensorInfo(sensor))  # of the sensor that is or was there
         self.problem = client.session.problem  # why there is no connection
         # Whether there is a server there for all that; it may be too old, or have no such sensor.
         self.is_reachable = False
-        self.lost: str | None = None  # the server's words, while the sensor is lost
         self.connects = 0
         self.since_s = clock.monotonic()  # CLOCK_MONOTONIC when the connection was made or lost
         self.ending = False  # the node ends: services that wait give up
-        self.epoch = 0  # raised by everything that interrupts the stream or changes its rate
 
-    def connected(self, description: JsonObject) -> None:
-        self.info, self.lost = find_sensor(description, self.sensor), None
-        self.connects, self.epoch = self.connects + 1, self.epoch + 1
+    def connected(self) -> None:
+        """There is a connection; what is in force follows."""
+        self.connects += 1
         self.since_s, self.is_connected = self.clock.monotonic(), True
+
+    def tell(self, in_force: InForce) -> None:
+        """What is in force from here on."""
+        self.in_force = in_force
         self.on_change()
+
+    @property
+    def info(self) -> SensorInfo:
+        """Of the sensor that is or was there."""
+        return self.in_force.info
+
+    @property
+    def settings(self) -> Mapping[str, SettingValue]:
+        """Those in force; none are known without a connection."""
+        return self.info.settings if self.is_connected else {}
+
+    @property
+    def lost(self) -> str | None:
+        """The server's words, while the sensor is lost."""
+        return self.in_force.lost if self.is_connected else None
 
     @property
     def absence(self) -> str:
@@ -86,40 +101,12 @@ class Link:
 
     def disconnected(self, event: Disconnected) -> None:
         had, self.is_connected = self.is_connected, False
-        self._change(settings={})
-        self.problem, self.lost = event.reason, None
+        self.problem = event.reason
         # One that has just gone away is not there, whatever it said last.
         self.is_reachable = event.reachable and not had
         if had:
             self.since_s = self.clock.monotonic()
             self.on_change()
-
-    def handle_event(self, message: JsonObject) -> bool:
-        """Learn from an event; False if it is of another sensor."""
-        if message.get("sensor", self.sensor) != self.sensor:
-            return False
-        event = message.get("event")
-        if event in (Event.SENSOR_LOST, Event.SENSOR_BACK, Event.RECONFIGURED):
-            self.lost = event_sentence(message) if event == Event.SENSOR_LOST else None
-            self.epoch += 1
-        elif event != Event.OFFSET_CHANGED:
-            return True
-        with self._changing:
-            self.info = self.info.changed_by(message)
-        self.on_change()
-        return True
-
-    def _change(self, **values: Any) -> None:
-        with self._changing:
-            self.info = self.info._replace(**values)
-
-    def described(self, description: JsonObject) -> None:
-        """Take a later reply to `describe`. What events carry may be newer."""
-        self.client.session.describe(description)
-        with contextlib.suppress(RequestFailedError):  # not there any more: its frames will say so
-            info = find_sensor(description, self.sensor)
-            self.epoch += info.rate_hz != self.info.rate_hz
-            self._change(**{name: getattr(info, name) for name in _NEWER_IN_DESCRIPTIONS})
 
     # -- requests, from other threads than the reader's: every one answered, refused or timed out
 

@@ -21,7 +21,8 @@ from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.framing import DataMessage, TerminalMessage
 from bota_ethercat.health.sentences import no_server
 from bota_ethercat.pdo import LAYOUTS, Values, flags_of
-from bota_ethercat.replies import MAX_DELAY_MS
+from bota_ethercat.replies import MAX_DELAY_MS, Description
+from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.text.untrusted import rows
 from bota_ethercat_bridge.parameters.table import Parameters
 from bota_ethercat_bridge.process import Worker
@@ -179,7 +180,10 @@ class Reader:
             if frames:
                 self._select(frames)
                 frames = []
-            self._handle_event(item)
+            if not isinstance(item, InForce):
+                self._handle_event(item)
+            elif item.sensor == self._sensor:
+                self.link.tell(item)
         if frames:
             self._select(frames)
         while self.client.terminal_frames:
@@ -249,9 +253,10 @@ class Reader:
             self._selector = FrameSelector(
                 self.counts, same_clock=self.client.session.same_machine, limit_hz=self._limit_hz
             )
-            link.connected(event.description)
+            link.connected()
             again = " again" if event.again else ""
-            self._log.info(f"connected{again} to {link.address}: {link.info}")
+            found = Description.parse(event.description).find(self._sensor)
+            self._log.info(f"connected{again} to {link.address}: {found}")
             if (read := len(rows(event.description.get("terminals")))) < self._terminals:
                 self._log.warning(f"the server reads {read} of {self._terminals} terminals: name them there")
             self._problem = None
@@ -260,11 +265,8 @@ class Reader:
                 event = event._replace(reason=f"{event.reason}: set the parameter 'sensor' to one it has")
             link.disconnected(event)
             self._log_problem(event)
-        else:
-            before = link.info.settings
-            if not link.handle_event(event):
-                return
-            text = sentence(event, before)
+        elif event.get("sensor", self._sensor) == self._sensor:
+            text = sentence(event, link.info.settings)
             # A line of source has one severity: rclpy insists.
             if event["event"] in (Event.SENSOR_LOST, Event.EMERGENCY):
                 self._log.warning(text)

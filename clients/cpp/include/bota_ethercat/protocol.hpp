@@ -96,6 +96,9 @@ struct Sample {
     bool wrench_is_saturated() const noexcept {
         return (warnings & (kForceTorqueSaturated | kForceTorqueOutOfRange)) != 0 || force_torque_saturated != 0;
     }
+    /// Whether the sensor says that its values mean nothing: the ADC of force and torque is out of sync, or the supply is wrong.
+    bool wrench_is_faulty() const noexcept { return (warnings & (kAdcOutOfSync | kWrongSupplyVoltage)) != 0; }
+    bool imu_is_faulty() const noexcept { return (warnings & kWrongSupplyVoltage) != 0; }
     /// Whether acceleration or angular rate went beyond the range that is set.
     bool imu_is_saturated() const noexcept {
         return (warnings & (kAccelerationSaturated | kAngularRateSaturated)) != 0 || acceleration_saturated != 0 ||

@@ -19,7 +19,7 @@ namespace bota_ethercat {
 enum class Condition : std::uint8_t {
     fresh = 0,         ///< use it
     saturated = 1,     ///< the sensor was overloaded: force and torque are wrong, but `sample` has them
-    not_finite = 2,    ///< a value is NaN or infinite
+    not_finite = 2,    ///< a value is NaN or infinite, or the sensor reports that its ADC or supply is at fault
     late = 3,          ///< samples arrive, but too old: a backlog, or a machine that is too slow
     bad_clock = 4,     ///< stamps ahead of this machine's clock: an age cannot be known
     repeated = 5,      ///< the sensor gives the same process data again and again
@@ -33,7 +33,7 @@ inline const char* to_string(Condition condition) noexcept {
     switch (condition) {
         case Condition::fresh: return "fresh";
         case Condition::saturated: return "saturated: the sensor is overloaded";
-        case Condition::not_finite: return "not finite: the sensor sends NaN or infinity";
+        case Condition::not_finite: return "faulty: the sensor sends NaN or infinity, or reports that its ADC or supply is at fault";
         case Condition::late: return "late: what arrives is too old";
         case Condition::bad_clock: return "bad clock: the server's stamps are ahead of this machine's";
         case Condition::repeated: return "repeated: the sensor gives nothing new";
@@ -252,9 +252,10 @@ private:
     static constexpr std::uint64_t kClockToleranceNs = 1'000'000;
     static constexpr std::int64_t kMinSilenceNs = 30'000'000;  // three times the pace of REPEATED frames
 
-    /// The condition of a recent sample.
+    /// The condition of a recent sample, by the table of protocol/bota_ethercat/stream/usable.py.
     static Condition condition_of(const Sample& sample, bool judge_imu) noexcept {
-        if (!sample.wrench_is_finite() || (judge_imu && !sample.imu_is_finite())) return Condition::not_finite;
+        if (!sample.wrench_is_finite() || sample.wrench_is_faulty()) return Condition::not_finite;
+        if (judge_imu && (!sample.imu_is_finite() || sample.imu_is_faulty())) return Condition::not_finite;
         if (sample.wrench_is_saturated() || (judge_imu && sample.imu_is_saturated())) return Condition::saturated;
         return Condition::fresh;
     }

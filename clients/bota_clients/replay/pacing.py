@@ -25,7 +25,7 @@ class Due(NamedTuple):
     frame: DataMessage
 
 
-class Timeline:
+class Pacing:
     """Turns recorded frames into those to send."""
 
     def __init__(
