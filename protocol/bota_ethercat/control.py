@@ -18,7 +18,7 @@ from bota_ethercat.sensor.sdo_types import sdo_type
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import check_settings
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import printable
+from bota_ethercat.text.untrusted import number, printable, text, whole
 
 PROTOCOL_VERSION: Final = 1
 MAX_SDO_BYTES: Final = 112  # largest SDO that fits a mailbox of 128 bytes unsegmented
@@ -53,6 +53,16 @@ class Event(_Text):
     OFFSET_CHANGED = "offset_changed"
     EMERGENCY = "emergency"
     SHUTTING_DOWN = "shutting_down"
+
+
+_EVENTS: Final[Mapping[str, str]] = {
+    Event.SENSOR_LOST: "{} is lost",
+    Event.SENSOR_BACK: "{} is back",
+    Event.RECONFIGURED: "the settings of {} have changed",
+    Event.OFFSET_CHANGED: "the offset of {} has changed",
+    Event.EMERGENCY: "{} reports an emergency",
+    Event.SHUTTING_DOWN: "the server is shutting down",
+}
 
 
 # Returns the checked value; raises SettingError, or ValueError whose text is what is allowed.
@@ -305,3 +315,14 @@ def error_reply(message: JsonObject | None, code: str, text: str, **extra: objec
 def event(name: Event, **values: object) -> JsonObject:
     """An event to send."""
     return {"event": str(name), **values}
+
+
+def event_sentence(event: Mapping[str, Any]) -> str:
+    """What an event of the server says: its own message, or what it means."""
+    if told := text(event.get("message")):
+        return told
+    kind, sensor, lost_s = str(event.get("event")), whole(event.get("sensor")), number(event.get("lost_s"))
+    if kind not in _EVENTS:
+        return f"the server sent the event {printable(kind, 40)}, which this version does not know"
+    said = _EVENTS[kind].format("the sensor" if sensor is None else f"sensor {sensor}")
+    return said if lost_s is None else f"{said} after {lost_s:g} s"

@@ -40,6 +40,9 @@ class Clock(Protocol):
     def time_ns(self) -> int: ...
 
 
+_IN_FORCE = ("settings", "rate_hz", "delay_ms", "offset")
+
+
 class Script:
     """What the server says; how is for those below."""
 
@@ -60,6 +63,10 @@ class Script:
         raise NotImplementedError
 
     def send_json(self, message: JsonObject) -> None:
+        """An event changes what it describes, as a server's does."""
+        for row in self.description["sensors"] if "event" in message else ():
+            if row["sensor"] == message.get("sensor"):
+                row |= {key: message[key] for key in _IN_FORCE if key in message}
         self.send_raw(encode_json(message))
 
     def send_sample(self, number: float, flags: int = 0, **changes: Any) -> None:
@@ -230,7 +237,7 @@ class ScriptedServer(Script):
     def send(self, *messages: bytes | JsonObject) -> None:
         wait_until(lambda: bool(self.streams), "a subscriber")
         for message in messages:
-            self.send_raw(message if isinstance(message, bytes) else encode_json(message))
+            self.send_raw(message) if isinstance(message, bytes) else self.send_json(message)
 
     def reconfigure(self, **sensor: Any) -> None:
         row = sensor_row(**sensor)

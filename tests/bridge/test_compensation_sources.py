@@ -7,7 +7,6 @@ import math
 import sys
 import time
 from collections.abc import Iterator
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +17,9 @@ from sensor_msgs.msg import Imu
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import SettingValue
-from bota_ethercat_bridge.compensating.sources import ImuSource, RobotSource
+from bota_ethercat.stream.timeline import InForce
+from bota_ethercat_bridge.compensating.sources import RobotSource
+from bota_ethercat_bridge.ft_compensation.imu import ImuSource
 from bota_ethercat_bridge.node import StartError
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import (
@@ -42,7 +43,6 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 ROLLED = (1.0, 0.0, 0.0, 0.0)  # half a turn about x: what was up is down
 # A quarter of a turn about -y: the sensor's x axis points up.
 TILTED = (0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5))
-LINK: Any = SimpleNamespace(info=SensorInfo())
 POSE: dict[str, Any] = {
     "tool_mass": TOOL.mass,
     "tool_center_of_gravity": [*TOOL.center],
@@ -276,7 +276,7 @@ def test_the_source_tf(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque() -> None:
-    source, number = ImuSource(DEFAULTS, LINK), itertools.count(1)
+    source, number = ImuSource(), itertools.count(1)
 
     def felt(count: int = 1) -> float:
         found = None
@@ -287,9 +287,9 @@ def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque()
 
     assert felt() == 1.0, "nothing is known of them"
     known: dict[str, SettingValue] = {"sinc_length": 512, "fir": False, "acceleration_filter": 1}
-    LINK.info = SensorInfo(settings=known, rate_hz=100)
+    source.configure(InForce(SensorInfo(settings=known, rate_hz=100)))
     assert felt(20) == pytest.approx(21 - (15 - 1.94) / 10)
-    LINK.info = SensorInfo(settings={**known, "chop": True}, rate_hz=100)
+    source.configure(InForce(SensorInfo(settings={**known, "chop": True}, rate_hz=100)))
     assert felt() == 22.0, "how long CHOP delays is not known"
 
 

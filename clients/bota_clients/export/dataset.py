@@ -31,7 +31,7 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import DATASETS, PROGRAM
 from bota_clients.export.samples import MOST_LOST, samples_of
-from bota_clients.export.windows import Array, Arrays, Windows, interpolated, offset_of, read_tool
+from bota_clients.export.windows import Array, Arrays, Windows, interpolated, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
@@ -42,6 +42,7 @@ from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.text.json_text import parse_json_object
+from bota_ethercat_bridge.ft_compensation.identification.parameter_file import offset_of
 
 _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
 _CHUNK: Final = 1024  # frames, in a file

@@ -40,7 +40,7 @@ def samples_of(recording: Recording, windows: Windows, sensor: int = 0) -> Itera
         if not len(slots):
             continue
         first_ns = first_ns if taken else windows.begin_ns
-        yield _rows(slots, held[0], slots["number"] - begin, first_ns, tool=windows.has_tool)
+        yield _rows(slots, held[0], slots["number"] - begin, first_ns, tool=windows.stream is not None)
         taken = int(slots["number"].max(initial=taken - 1)) + 1
         keep = max(taken - 1, 0)  # lost samples that follow are between this one and the next
         held, begin = [held[0].where(np.arange(begin, begin + len(held[0])) >= keep)], keep

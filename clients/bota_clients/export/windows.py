@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,27 +25,15 @@ from bota_clients.identify.tool_file import tool_parameters
 from bota_clients.recording.columns import Columns, Ints, columns
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.pdo import ImuUnits, Vector3
+from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import Delays
-from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import payload_of
-from bota_ethercat_bridge.ft_compensation.quantities import (
-    EXACT,
-    NO_WRENCH,
-    STILL,
-    ZERO,
-    Accelerometer,
-    Turning,
-    Wrench,
+from bota_ethercat_bridge.ft_compensation.identification.parameter_file import stream_of
+from bota_ethercat_bridge.ft_compensation.stream import (
+    CompensatedStream,
 )
-from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
-from bota_ethercat_bridge.ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
 
 Array = npt.NDArray[Any]
 Arrays = dict[str, Array]
@@ -69,12 +57,6 @@ def interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
     return np.asarray(there[0] + np.rint(passed).astype(np.int64))
 
 
-def offset_of(tool: Mapping[str, Any]) -> Wrench | None:
-    """The sensor's own offset that the bias of a tool's parameters goes with; None if they do not say."""
-    found = tool.get("sensor_offset")
-    return Wrench.of(found) if found is not None and np.isfinite(found).all() else None
-
-
 def read_tool(path: Path) -> Mapping[str, Any]:
     """Parameters of the ROS 2 node, as `ethercat-identify --yaml` writes them; RecordingError."""
     with tool_parameters(path) as found:
@@ -87,7 +69,7 @@ class Windows:
 
     Attributes:
         begin_ns: stamp of the first sample; -1 before it.
-        accelerometer: what the tool's parameters know of it.
+        stream: what compensates; None without a tool.
     """
 
     def __init__(
@@ -99,23 +81,15 @@ class Windows:
     ) -> None:
         """Of `length` samples. With a `tool`, parameters of the ROS 2 node, there is a compensated wrench."""
         self.begin_ns = -1
-        self._length, self._units, self._compensator = length, imu_units, None
+        self._length, self._units = length, imu_units
+        self.stream: CompensatedStream | None = None
         self._slots = np.zeros(0, _SLOT)
         self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._taken = 0  # samples
         self._made_of: tuple[Mapping[str, object], float] | None = None
         self._doubt_ns = 0
-        self._doubted_until_ns = -1
-        if tool is None:
-            return
-        self._payload = payload_of(tool)
-        self._bias, offset = Wrench.of(tool.get("bias", NO_WRENCH.values)), offset_of(tool)
-        self._compensator, self._own_offset = Compensator(self._payload, self._bias), OwnOffset()
-        self._own_offset.begin(self._bias, offset, is_measured=offset is not None)
-        self._offset: Wrench | None = None
-        imu = {name: tool.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
-        self.accelerometer = Accelerometer(**{name: tuple(row) for name, row in imu.items()})
-        self._imu_position: Vector3 = tuple(tool.get("imu_position", ZERO))
+        if tool is not None:
+            self.stream = stream_of(tool)
 
     def configure(self, in_force: InForce) -> None:
         """What is in force for what follows; RecordingError.
@@ -123,11 +97,9 @@ class Windows:
         A bias is shifted with the sensor's own offset; where only one of this and the tool's `sensor_offset`
         is known there is no compensated wrench.
         """
-        name, rate_hz, settings, offset = (
-            getattr(in_force.info, key) for key in ("name", "rate_hz", "settings", "offset")
-        )
-        if self._compensator is not None:
-            self._follow(None if offset is None else Wrench.of(offset), in_force)
+        settings, rate_hz = in_force.info.settings, in_force.info.rate_hz
+        if self.stream is not None:
+            self._follow(in_force, self.stream)
         if (settings, rate_hz) == self._made_of:
             return
         if not rate_hz:
@@ -135,43 +107,19 @@ class Windows:
         self._made_of, self._known, self._rate_hz = (settings, rate_hz), settings, rate_hz
         # Where a delay is unknown, a sample counts as measured only when it was stamped: never too early.
         self._delay_ns = np.array([delay or 0 for delay in Delays.parse(delays_ms(settings, rate_hz))])
-        if self._compensator is None:
-            return
-        (cx, cy, cz), position = self._payload.center, self._imu_position
-        x, y, z = position if any(position) else (0.0, 0.0, IMU_HEIGHTS.get(name[4:8], 0.0))
-        alignment = align(self._known, rate_hz)
-        self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), self.accelerometer, alignment)
-        has_tool = self._payload.mass > 0
-        why = not_newtons(self._known, has_tool=has_tool) or (has_tool and hides_gravity(self._known))
-        if why:
+        if self.stream is not None and (why := self.stream.obstacle):
             raise RecordingError(f"the wrench cannot be compensated: {why}; or omit --tool")
 
-    def _follow(self, offset: Wrench | None, in_force: InForce) -> None:
-        """The sensor's own offset of what follows."""
-        self._offset, self._doubt_ns = offset, in_force.doubt_ns
-        if (shift := self._own_offset.follow(offset)) is None:
+    def _follow(self, in_force: InForce, stream: CompensatedStream) -> None:
+        """What is in force for what follows, the sensor's own offset too."""
+        stream.configure(in_force)
+        self._doubt_ns = in_force.doubt_ns
+        if stream.follow_offset() is None:
             return
-        self._bias = self._bias.plus(shift)
         newest_ns = self._newest[0]
         if self.begin_ns >= 0:
             since_ns = newest_ns - self.doubt_ns - self._delay_ns[0]
             self._slots["compensated"][self._slots["measured_ns"][:, 0] >= since_ns] = math.nan
-            self._doubted_until_ns = newest_ns + in_force.doubt_after_ns
-
-    @property
-    def has_tool(self) -> bool:
-        """Whether there is a compensated wrench."""
-        return self._compensator is not None
-
-    @property
-    def turning(self) -> Turning:
-        """Of the newest sample, rad/s and rad/s²; with a tool."""
-        return self._imu.turning
-
-    @property
-    def doubt(self) -> str:
-        """Why the bias may not fit, a sentence, and nothing is compensated; empty if it does; with a tool."""
-        return self._own_offset.doubt(self._offset)
 
     @property
     def doubt_ns(self) -> int:
@@ -220,36 +168,11 @@ class Windows:
         for place, (channel, part) in enumerate(_CHANNELS.items()):
             is_good = (channel.flagged(samples) == 0) & np.isfinite(values[:, part]).all(axis=1)
             slots["valid"][end, place] = is_good & (channel is FORCE_TORQUE or not is_off)
-        slots["compensated"][end], slots["bounds"][end] = self._compensated(samples)
+        slots["compensated"][end], slots["bounds"][end] = (
+            (math.nan, math.nan) if self.stream is None else self.stream.compensate(samples)
+        )
         self._slots = np.concatenate([self._slots, slots])
         return samples
-
-    def _compensated(self, samples: Columns) -> tuple[Array | float, Array | float]:
-        """(n, 6) N, Nm, as the ROS 2 node has it; (n, 2) its bounds. NaN without a tool."""
-        if self._compensator is None:
-            return math.nan, math.nan
-        felt, turning = np.zeros((len(samples), 3)), cast(Any, STILL)
-        if self._payload.mass:
-            rows, turned, follow = list[Vector3](), list[Turning](), self._imu.follow
-            times = samples.monotonic_ns * 1e-9
-            each = (column.tolist() for column in (samples.acceleration, samples.angular_rate, times))
-            for acceleration, rate, time_s in zip(*each, strict=True):
-                rows.append((any(acceleration) and follow(acceleration, rate, time_s)) or _UNKNOWN)
-                turned.append(self._imu.turning)
-            felt = np.array(rows)
-            turning = np.moveaxis(np.array(turned), 0, 2)
-        self._compensator.bias = self._bias
-        compensate = cast(Any, self._compensator.compensate)  # of arrays as of numbers
-        found = np.vstack(compensate(samples.force.T, samples.torque.T, felt.T, turning).final).T
-        if self.doubt:
-            return math.nan, math.nan
-        found[samples.monotonic_ns <= self._doubted_until_ns] = math.nan
-        torque = torque_bound_95(
-            self._payload, self.accelerometer, None, cast(Any, felt.T), turning,
-            torque_noise_95(self._payload, self._imu.alignment),
-        )  # fmt: skip
-        force = force_bound_95(self._payload, self.accelerometer)
-        return found, np.stack([np.full(len(found), force), np.broadcast_to(torque, len(found))], axis=1)
 
     def at(self, instants_ns: Ints) -> Arrays:
         """Windows of these f instants; the last sample of each is the newest.
@@ -269,7 +192,7 @@ class Windows:
             values, wrench = slots["values"][index, part], slots["compensated"][index]
             age_s[~valid] = values[~valid] = wrench[~valid] = math.nan
             found |= {name: values, f"{name}_age": age_s.astype(np.float32), f"{name}_valid": valid}
-            if self.has_tool and not channel:
+            if self.stream is not None and not channel:
                 found[f"{name}_compensated"] = wrench
                 found[f"{name}_compensated_valid"] = valid & np.isfinite(wrench).all(axis=2)
         found["imu"] = np.concatenate([found.pop("acceleration"), found.pop("angular_rate")], axis=2)

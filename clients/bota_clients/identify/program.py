@@ -26,7 +26,6 @@ from bota_clients.recording.columns import Columns, at_last_offset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
-from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat_bridge.ft_compensation.alignment import align
 from bota_ethercat_bridge.ft_compensation.identification.free_motion import identify_in_motion
 from bota_ethercat_bridge.ft_compensation.identification.inertia import Turned, identify_inertia, turn
@@ -34,6 +33,7 @@ from bota_ethercat_bridge.ft_compensation.identification.parameter_file import w
 from bota_ethercat_bridge.ft_compensation.identification.payload import Fit, Identified, identify, summary
 from bota_ethercat_bridge.ft_compensation.identification.poses import MOST_POSES, Pose, coverage, pose_of
 from bota_ethercat_bridge.ft_compensation.identification.weighted import CONFIDENCE
+from bota_ethercat_bridge.ft_compensation.imu import imu_position
 from bota_ethercat_bridge.ft_compensation.quantities import (
     CROSS_AXES,
     ELEMENTS,
@@ -43,7 +43,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Wrench,
     length,
 )
-from bota_ethercat_bridge.ft_compensation.stream import hides_gravity, not_newtons
+from bota_ethercat_bridge.ft_compensation.stream import obstacle
 
 _WIDTH: Final = 80  # every table fits
 Poses = Sequence[tuple[StationaryPeriod, Pose]]
@@ -156,8 +156,7 @@ def run(options: argparse.Namespace) -> int:
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
         for row in sensor.history:
-            known = row.info.settings
-            if why := not_newtons(known, has_tool=True) or hides_gravity(known):
+            if why := obstacle(row.info.settings, has_tool=True, by_imu=True):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")
         data, offset = at_last_offset(recording, sensor, options.imu_units)
     periods, rejected = find_stationary_periods(data)
@@ -227,7 +226,7 @@ def _inertia(result: Identified, data: Columns, sensor: RecordedSensor) -> Ident
 
 
 def _imu(sensor: RecordedSensor) -> Vector3:
-    return 0.0, 0.0, IMU_HEIGHTS.get(sensor.info.name[4:8], 0.0)
+    return imu_position(sensor.info.name)
 
 
 def _turned(data: Columns, sensor: RecordedSensor, calibration: Accelerometer) -> Turned:

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.windows import Windows
+from bota_clients.recording.columns import columns
+from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import ImuUnits, Vector3
-from bota_ethercat.replies import SensorInfo
 from bota_ethercat.stream.timeline import InForce
-from bota_ethercat_bridge.ft_compensation.contact import Contact, ContactDetector, detector_of, surface_of
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import payload_of
+from bota_ethercat_bridge.ft_compensation.contact import Contact, ContactDetector, surface_of
+from bota_ethercat_bridge.ft_compensation.identification.parameter_file import stream_of
 from bota_ethercat_bridge.ft_compensation.quantities import CompensationError
 
 
@@ -27,8 +27,8 @@ class Compensated(NamedTuple):
     contact: Contact | None = None  # None without a surface, `contact.surface`
 
 
-class CompensatedStream:
-    """Of one sensor; as `ethercat-export --tool` and the ROS 2 node compensate."""
+class NewestCompensated:
+    """Of one sensor's `CompensatedStream` the newest sample."""
 
     def __init__(self, tool: Mapping[str, Any], imu_units: ImuUnits) -> None:
         """`tool`: parameters of the node; RecordingError if its `contact.surface` is wrong."""
@@ -41,44 +41,40 @@ class CompensatedStream:
 
     def begin(self) -> None:
         """What comes next is of another connection, or another sensor."""
-        self._windows = Windows(1, tool=self._tool, imu_units=self._units)
+        self._stream = stream_of(self._tool)
         self._detector: ContactDetector | None = None
         self._made_of: object = None
         self.latest: Compensated | None = None
         self.problem = ""  # why there is none, a sentence
 
     def add(self, frames: Sequence[DataMessage], in_force: InForce) -> None:
-        windows, info = self._windows, in_force.info
-        try:
-            windows.configure(in_force)
-            windows.add(frames)
-        except RecordingError as error:
-            self.begin()
-            self.problem = str(error)
+        stream = self._stream
+        stream.configure(in_force)
+        stream.follow_offset()
+        samples = columns([each for each in frames if not each.flags & NOT_NEW], self._units)
+        if not len(samples):
             return
-        slots = windows.take(rest=True)
-        if not (slots := slots[slots["number"] >= 0]).size:
+        wrenches, bounds = stream.compensate(samples)
+        if stream.obstacle:
+            self.latest, self.problem = None, f"the wrench cannot be compensated: {stream.obstacle}"
             return
-        newest = slots[-1]
-        wrench, (force_bound, torque_bound) = newest["compensated"].tolist(), newest["bounds"].tolist()
+        wrench, (force_bound, torque_bound) = wrenches[-1].tolist(), bounds[-1].tolist()
         if not math.isfinite(sum(wrench)):
-            why = windows.doubt or "it is not finite, or came after lost samples"
+            why = stream.doubt or "it may not be used, or came after lost samples"
             self.latest, self.problem = None, f"not known of the newest sample: {why}"
             return
         force, torque = (wrench[0], wrench[1], wrench[2]), (wrench[3], wrench[4], wrench[5])
-        contact = self._contact(force, torque, info)
+        contact = self._contact(force, torque, in_force)
         self.latest, self.problem = Compensated(force, torque, force_bound, torque_bound, contact), ""
 
-    def _contact(self, force: Vector3, torque: Vector3, info: SensorInfo) -> Contact | None:
+    def _contact(self, force: Vector3, torque: Vector3, in_force: InForce) -> Contact | None:
         if self._surface is None:
             return None
-        if self._detector is None or (info.settings, info.rate_hz) != self._made_of:
-            self._made_of = info.settings, info.rate_hz
-            noise = self._tool.get("contact.noise", ())
-            self._detector = detector_of(
-                self._surface, payload_of(self._tool), info.settings, info.rate_hz,
-                noise=noise if any(noise) else (), accelerometer=self._windows.accelerometer,
-                alarms_per_hour=self._tool.get("contact.false_alarms", 1.0),
-            )  # fmt: skip
-        self._detector.update(force, torque, self._windows.turning)
-        return self._detector.locate(force, torque, self._windows.turning)
+        made_of = in_force.info.settings, in_force.info.rate_hz
+        if self._detector is None or made_of != self._made_of:
+            noise, alarms = self._tool.get("contact.noise", ()), self._tool.get("contact.false_alarms", 1.0)
+            self._made_of, noise = made_of, noise if any(noise) else ()
+            self._detector = self._stream.contact_detector(self._surface, noise, alarms)
+        turning = self._stream.plan.source.turning
+        self._detector.update(force, torque, turning)
+        return self._detector.locate(force, torque, turning)

@@ -14,12 +14,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from bota_ethercat.control import event_sentence
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import sentences
 from bota_ethercat.health.judge import judge, saturated_axes
 from bota_ethercat.health.limits import LIMITS, NOTHING_WRONG, Finding, Level, Verdict
 from bota_ethercat.health.observer import COMMON, StreamObserver, by_sensor
-from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.pdo import PDO_FIELDS, ImuUnits, Sample, SampleDecoder
 from bota_ethercat.replies import (
     Description,
@@ -34,7 +34,7 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import mapping, text
 
 if TYPE_CHECKING:  # NumPy is loaded only where there is a tool
-    from bota_clients.monitor.compensated import Compensated, CompensatedStream
+    from bota_clients.monitor.compensated import Compensated, NewestCompensated
 
 SILENT_S: Final = LIMITS.stale_after  # a server normally sends a frame per sample period
 _WRENCH: Final = tuple(COMMON.index(f.name) for f in PDO_FIELDS if f.name.startswith(("force.", "torque.")))
@@ -158,7 +158,7 @@ class State:
 class _Sensor:
     """One sensor, judged whenever something arrives: no finding between two refreshes is missed."""
 
-    def __init__(self, position: int, imu_units: ImuUnits, compensated: CompensatedStream | None) -> None:
+    def __init__(self, position: int, imu_units: ImuUnits, compensated: NewestCompensated | None) -> None:
         self.position, self.compensated = position, compensated
         self.peaks: tuple[Range, ...] | None = None
         self._imu_units = imu_units
@@ -283,7 +283,7 @@ class Model:
 
     def __init__(
         self, address: str, imu_units: ImuUnits = ImuUnits.G_DPS,
-        compensated: Callable[[], CompensatedStream] | None = None,
+        compensated: Callable[[], NewestCompensated] | None = None,
     ) -> None:  # fmt: skip
         """`compensated` makes what compensates the samples of a sensor."""
         self._lock = threading.Lock()

@@ -20,7 +20,7 @@ from bota_ethercat.health.limits import Level
 from bota_ethercat.health.sentences import no_server
 
 if TYPE_CHECKING:
-    from bota_clients.monitor.compensated import CompensatedStream
+    from bota_clients.monitor.compensated import NewestCompensated
 
 _PERIOD_S: Final = 1.0
 _ONCE_S: Final = 1.0
@@ -64,14 +64,14 @@ def _in_terminal(options: argparse.Namespace) -> int:
         reader.close()
 
 
-def _compensating(options: argparse.Namespace) -> Callable[[], CompensatedStream] | None:
+def _compensating(options: argparse.Namespace) -> Callable[[], NewestCompensated] | None:
     """What makes what compensates a sensor's samples; RecordingError."""
     if options.tool is None:
         return None
     from bota_clients.export.windows import read_tool  # noqa: PLC0415
-    from bota_clients.monitor.compensated import CompensatedStream  # noqa: PLC0415
+    from bota_clients.monitor.compensated import NewestCompensated  # noqa: PLC0415
 
-    make = partial(CompensatedStream, read_tool(options.tool), options.imu_units)
+    make = partial(NewestCompensated, read_tool(options.tool), options.imu_units)
     make()  # whether it can be
     return make
 

@@ -19,8 +19,8 @@ from bota_clients.numbers import duration
 from bota_clients.program import Signals, say
 from bota_clients.record.recorder import NAME, Batch, Recorder, RecordingClient, notes, record
 from bota_clients.recording.reader import RecordedEvent
+from bota_ethercat.control import event_sentence
 from bota_ethercat.errors import RefusedError
-from bota_ethercat.health.sentences import event_sentence
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ethercat.text.untrusted import printable
 

@@ -7,23 +7,12 @@ What is wrong with a stream is in `judge`; why a request is denied is said by th
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
-from bota_ethercat.control import Event
 from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.pdo import AXES
 from bota_ethercat.replies import SensorStatus
-from bota_ethercat.text.untrusted import number, printable, text, whole
 
-_EVENTS: Final[Mapping[str, str]] = {
-    Event.SENSOR_LOST: "{} is lost",
-    Event.SENSOR_BACK: "{} is back",
-    Event.RECONFIGURED: "the settings of {} have changed",
-    Event.OFFSET_CHANGED: "the offset of {} has changed",
-    Event.EMERGENCY: "{} reports an emergency",
-    Event.SHUTTING_DOWN: "the server is shutting down",
-}
 _UNITS: Final = ("N", "N", "N", "Nm", "Nm", "Nm")
 _SINCE: Final = {"tare": "the tare", "change": "its settings changed", "return": "it came back"}
 _LAST_DAY: Final = 4e9  # s of the Unix epoch
@@ -45,17 +34,6 @@ def did_not_read(seconds: float, *, busy: bool | None = None) -> tuple[str, str]
         f"this computer did not run this program {lasted}",
         "Give it a priority, or the computer less to do",
     )
-
-
-def event_sentence(event: Mapping[str, Any]) -> str:
-    """What an event of the server says: its own message, or what it means."""
-    if told := text(event.get("message")):
-        return told
-    kind, sensor, lost_s = str(event.get("event")), whole(event.get("sensor")), number(event.get("lost_s"))
-    if kind not in _EVENTS:
-        return f"the server sent the event {printable(kind, 40)}, which this version does not know"
-    said = _EVENTS[kind].format("the sensor" if sensor is None else f"sensor {sensor}")
-    return said if lost_s is None else f"{said} after {lost_s:g} s"
 
 
 def drift(row: SensorStatus, limits: StreamLimits | None = None) -> str:

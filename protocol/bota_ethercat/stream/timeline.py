@@ -18,8 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
-from bota_ethercat.control import Event
-from bota_ethercat.health.sentences import event_sentence
+from bota_ethercat.control import Event, event_sentence
 from bota_ethercat.replies import Description, SensorInfo, position_of
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import text

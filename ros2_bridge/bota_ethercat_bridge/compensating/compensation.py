@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A sample on its way from the stream to the topics of compensated wrenches, in the reader's thread.
 
-The `Plan` says what is done with a sample; the executor's thread replaces it as a whole, so there are no
-locks. Nothing is done unless somebody has subscribed or a window is open.
+The stream's `Plan` says what is done with a sample; the executor's thread replaces it as a whole, so there
+are no locks. Nothing is done unless somebody has subscribed or a window is open.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from rclpy.node import Node
@@ -17,27 +17,17 @@ from rclpy.node import Node
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import WRENCH, Sample, Values, Vector3
 from bota_ethercat.replies import SensorInfo
-from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE, Usability, judge
-from bota_ethercat_bridge.compensating.sources import Source
-from bota_ethercat_bridge.ft_compensation.bias import BiasRamp
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator, Stages
+from bota_ethercat_bridge.ft_compensation.imu import Source
 from bota_ethercat_bridge.ft_compensation.quantities import ZERO, CompensationError, StationaryLimits
 from bota_ethercat_bridge.ft_compensation.stationary import StationaryWindow, triple
+from bota_ethercat_bridge.ft_compensation.stream import CompensatedStream
 from bota_ethercat_bridge.parameters.table import Parameters
 from bota_ethercat_bridge.publishing.contact import ContactTopic
 from bota_ethercat_bridge.publishing.messages import Stamps, decoder
 from bota_ethercat_bridge.publishing.wrenches import FilteredTopic, TfFrames, WrenchTopic, make_frames
 from bota_ethercat_bridge.stream.link import NodeClock
 
-_BY_IMU: Final = (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE)  # what is needed of a sample
 _STAGES: Final = {"wrench_compensated": "final", "compensation/bias": "bias", "compensation/tool": "tool"}
-
-
-class Plan(NamedTuple):
-    source: Source = Source()
-    compensator: Compensator = Compensator()
-    ramp: BiasRamp = BiasRamp()
-    has_tool: bool = False  # whether anything has weight
 
 
 class RestWindow(StationaryWindow):
@@ -66,8 +56,7 @@ class Compensation:
     """Compensates the reader's samples, and hands them to the topics.
 
     Attributes:
-        plan, window: what is done with a sample, and the window that is open.
-        hold: why nothing may be published for now, whatever else is known; empty if it may.
+        stream: what compensates, and what is done with a sample; the window that is open.
         has_subscribers: as of the last look.
         published, withheld: samples since the node started that were compensated, and that were not.
         why_withheld: of the latest of these; empty: the source knew nothing.
@@ -85,6 +74,7 @@ class Compensation:
         info: Callable[[], SensorInfo],
         clock: NodeClock,
     ) -> None:
+        self.stream = CompensatedStream()
         frames = make_frames(node, parameters, stamps, clock)
         self.frames = TfFrames(node, frames)
         final, *subtracted = (
@@ -97,14 +87,13 @@ class Compensation:
         )
         filtered = [self._filtered] if self._filtered else []
         self.contact = (
-            ContactTopic(node, parameters, stamps, info, lambda: self.plan)
+            ContactTopic(node, parameters, stamps, self.stream)
             if parameters.contact_surface.strip()
             else None
         )
         touched = [self.contact] if self.contact else []
         self.topics: list[WrenchTopic] = [final, *frames, *filtered, *touched, *subtracted]
         self._wanted: list[WrenchTopic] = []
-        self.plan, self.hold = Plan(), ""
         self.window: RestWindow | None = None
         self.has_subscribers = self.is_stopped = False
         self.published = self.withheld = 0
@@ -127,62 +116,39 @@ class Compensation:
         return "; ".join(topic.problem for topic in self.topics if topic.problem)
 
     def configure(self, parameters: Parameters) -> None:
-        self._stops_on_saturation = parameters.on_saturation == "stop"
+        self.stream.use_saturated = parameters.on_saturation != "stop"
         for topic in self.topics:
             topic.configure(parameters)
 
-    def _specific_force(self, plan: Plan, sample: Sample, frame: DataMessage) -> Vector3 | None:
+    def _feel(self, sample: Sample, frame: DataMessage) -> Vector3 | None:
         """The specific force as far as it is needed, None if it is not known; the window takes the sample."""
         self.sample, time_s, stamp_s = sample, frame.monotonic_ns * 1e-9, frame.stamp_ns * 1e-9
         self.time_s, self.stamp_s = time_s, stamp_s
-        window = self.window
-        if not plan.has_tool and window is None:
-            return ZERO
-        specific_force = plan.source.specific_force(sample, time_s, stamp_s)
-        if window is not None and not window.done.is_set():
-            window.observe(sample, time_s, stamp_s, specific_force)
-        return specific_force if plan.has_tool else ZERO
+        window, stream = self.window, self.stream
+        if window is None or window.done.is_set():
+            return stream.feel(sample, time_s, stamp_s)
+        felt = stream.feel(sample, time_s, stamp_s, always=True)
+        window.observe(sample, time_s, stamp_s, felt)
+        return felt if stream.plan.has_tool else ZERO
 
     def publish(self, values: Values, frame: DataMessage) -> None:
         """Compensate a sample and publish its stages; nothing if the tool's weight is not known."""
-        plan, sample = self.plan, self.decode(values)
-        specific_force = self._specific_force(plan, sample, frame)
-        why = self.hold
-        if (
-            sample.warnings
-            or sample.force_torque_saturated
-            or sample.acceleration_saturated
-            or sample.angular_rate_saturated
-        ):
-            why = why or self._why_unusable(plan, sample)
-        if specific_force is None or why:
+        stream, sample = self.stream, self.decode(values)
+        felt, why = self._feel(sample, frame), stream.why_not(sample)
+        if felt is None or why:
             self.is_stopped = True
             self.withheld += 1
             self.why_withheld = why
             return
         self.is_stopped = False
-        stages = self._stages(plan, sample, specific_force)
+        stages = stream.stages(sample, self.time_s, felt)
         for topic in self._wanted:
             topic.send(*stages[topic.index], frame)
         self.published += 1
 
-    def _why_unusable(self, plan: Plan, sample: Sample) -> str:
-        """Why this sample is not to be compensated; empty if it is."""
-        channels = _BY_IMU if plan.has_tool and plan.source.is_imu else _BY_IMU[:1]
-        usability, why = judge(sample, channels)
-        if usability is Usability.SATURATED:
-            return f"{why}, and on_saturation is stop" if self._stops_on_saturation else ""
-        return why
-
     def observe(self, values: Values, frame: DataMessage) -> None:
         """Give source, open window and filter a sample that is not published."""
-        plan, sample = self.plan, self.decode(values)
-        specific_force = self._specific_force(plan, sample, frame)
-        filtered = self._filtered
-        if filtered in self._wanted and filtered and specific_force is not None and not self.hold:
-            filtered.note(*self._stages(plan, sample, specific_force).final, frame)
-
-    def _stages(self, plan: Plan, sample: Sample, specific_force: Vector3) -> Stages:
-        compensator = plan.compensator
-        compensator.bias = plan.ramp.at(self.time_s)
-        return compensator.compensate(sample.force, sample.torque, specific_force, plan.source.turning)
+        stream, sample = self.stream, self.decode(values)
+        felt, filtered = self._feel(sample, frame), self._filtered
+        if filtered in self._wanted and filtered and felt is not None and not stream.why_not(sample):
+            filtered.note(*stream.stages(sample, self.time_s, felt).final, frame)

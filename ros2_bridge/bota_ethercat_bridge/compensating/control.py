@@ -18,12 +18,11 @@ from typing import Any, Final, NamedTuple
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 
-from bota_ethercat_bridge.compensating.compensation import Compensation, Plan
-from bota_ethercat_bridge.compensating.sources import ImuSource, Source, check_source, open_source
+from bota_ethercat_bridge.compensating.compensation import Compensation
+from bota_ethercat_bridge.compensating.sources import check_source, open_source
 from bota_ethercat_bridge.diagnostics import CompensationState
 from bota_ethercat_bridge.ft_compensation.bias import BiasRamp, TareBasis
-from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
+from bota_ethercat_bridge.ft_compensation.imu import Source
 from bota_ethercat_bridge.ft_compensation.outputs import cutoff_problem
 from bota_ethercat_bridge.ft_compensation.quantities import (
     NO_WRENCH,
@@ -33,7 +32,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Wrench,
     wrench_text,
 )
-from bota_ethercat_bridge.ft_compensation.stream import OwnOffset, hides_gravity, not_newtons
+from bota_ethercat_bridge.ft_compensation.stream import OwnOffset, Plan, obstacle
 from bota_ethercat_bridge.parameters.declare import NodeParameters
 from bota_ethercat_bridge.parameters.table import ParameterError, Parameters
 from bota_ethercat_bridge.stream.reader import Reader
@@ -42,7 +41,7 @@ _FROM_PARAMETER: Final = "parameter"
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero
 _SHOWN: Final = 5e-5  # N, Nm: less is that a file has fewer digits than the sensor
 _NOTHING_CURRENT: Final = "no current orientation"
-# What a source depends on, besides the sensor's model.
+# What a source depends on.
 _DEPENDS_ON: Final = (
     "gravity_source", "gravity", "payload", "accelerometer", "imu_position", "orientation_topic",
     "orientation_base_frame", "orientation_mounting", "orientation_stale_after",
@@ -72,12 +71,11 @@ class CompensationControl:
         # Of the sensor that the bias in force is for; "": none was there yet.
         self._serial: int | str | None = ""
         self._is_other_sensor = False  # whether the bias may be another sensor's
-        self.own_offset = OwnOffset()
         self._changes: deque[BiasChange] = deque()
         self._is_showing = False  # whether parameters are being made what is in force
         check_source(node, parameters)
-        self._ramp = BiasRamp(Wrench.of(parameters.bias))
-        self._replacing = threading.Lock()  # guards `_ramp` and the plan
+        output.stream.plan = Plan(ramp=BiasRamp(Wrench.of(parameters.bias)))
+        self._replacing = threading.Lock()  # guards the plan
         live.check = self._check
         self._guard = node.create_guard_condition(self._follow_sensor)
 
@@ -95,7 +93,8 @@ class CompensationControl:
         self.source, self._source_of = Source(), None
 
     def link_changed(self) -> None:
-        """There is another connection, or none, or settings or offset changed; for the reader's thread."""
+        """What is in force, or the connection, has changed; for the reader's thread."""
+        self.output.stream.configure(self.link.in_force)
         if self._is_same_sensor():
             self._follow_offset()
             self._hold()
@@ -105,6 +104,15 @@ class CompensationControl:
             self._guard.trigger()
 
     @property
+    def own_offset(self) -> OwnOffset:
+        """How that of the sensor changes the bias."""
+        return self.output.stream.own_offset
+
+    @property
+    def _ramp(self) -> BiasRamp:
+        return self.output.stream.plan.ramp
+
+    @property
     def bias(self) -> Wrench:
         """The one in force, or being ramped in."""
         return self._ramp.target
@@ -112,8 +120,7 @@ class CompensationControl:
     @property
     def offset(self) -> Wrench | None:
         """The sensor's own, as it is now; None if it is not known."""
-        offset = self.link.info.offset
-        return None if offset is None else Wrench.of(offset)
+        return self.output.stream.offset
 
     @property
     def _sample_s(self) -> float:
@@ -132,8 +139,7 @@ class CompensationControl:
             good if has_subscribers else f"{good}; nobody has subscribed",
             self._values,
             stopped=self._why_stopped() or output.problem,
-            doubtful=self.conflict()
-            or (self.own_offset.doubt(self.offset) if self.link.is_connected else "")
+            doubtful=(self.own_offset.doubt(self.offset) if self.link.is_connected else "")
             or self._ramp.taken.doubt(payload),
             follows_imu=source.is_imu and payload.mass > 0.0,
             withheld=output.withheld,
@@ -142,13 +148,10 @@ class CompensationControl:
 
     def _values(self) -> dict[str, object]:
         output, source, payload = self.output, self.source, self.parameters.payload
-        has_subscribers, bounds = output.has_subscribers, ["", ""]
-        if isinstance(source, ImuSource):
-            known = payload, self.parameters.accelerometer, self._ramp.taken
-            turning = source.turning if has_subscribers else STILL
-            noise = torque_noise_95(payload, source.alignment)
-            torque = torque_bound_95(*known, turning=turning, noise=noise)
-            bounds = [f"{force_bound_95(*known):.3f}", f"{torque:.4f}"]
+        has_subscribers, bounds = output.has_subscribers, ("", "")
+        if source.is_imu:
+            force, torque = output.stream.bounds(turning=None if has_subscribers else STILL)
+            bounds = f"{force:.3f}", f"{torque:.4f}"
         age_s = source.age_s(output.time_s) if payload.mass and has_subscribers else math.inf
         return {
             "gravity_source": source.name,
@@ -168,23 +171,19 @@ class CompensationControl:
     def conflict(self, *, needs_tool: bool = False) -> str:
         """A setting of the sensor that conflicts with compensation or, if `needs_tool`, with knowing the
         specific force in the frame of the wrench, a sentence that says what to do."""
-        settings, has_tool = self.link.settings, self.parameters.tool_mass > 0
-        return not_newtons(settings, has_tool=has_tool) or (self._why_unknown() if needs_tool else "")
-
-    def _why_unknown(self) -> str:
-        """Why these settings of the sensor hide the specific force, a sentence; empty if they do not."""
-        return hides_gravity(self.link.settings) if self.parameters.gravity_source == "imu" else ""
+        by_imu, has_tool = self.parameters.gravity_source == "imu", self.parameters.tool_mass > 0
+        return obstacle(self.link.settings, has_tool=has_tool or needs_tool, by_imu=by_imu)
 
     def _hold(self) -> None:
-        """Publish nothing while the bias may be another sensor's, or a needed specific force is unknown."""
+        """Publish nothing while the bias may be another sensor's, or the settings conflict."""
         why = "the bias may be another sensor's" if self._is_other_sensor else ""
-        self.output.hold = why or (self._why_unknown() if self.parameters.tool_mass else "")
+        self.output.stream.hold = why or self.conflict()
 
     def _why_stopped(self) -> str:
         """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
         output, source, reader = self.output, self.source, self.reader
         if not output.has_subscribers:
-            why = output.hold
+            why = output.stream.hold
             if not why and self.parameters.tool_mass and reader.values is not None:
                 why = source.why_none(output.decode(reader.values), reader.stamp_ns * 1e-9)
             return why and f"wrench_compensated could not be published if somebody subscribed: {why}"
@@ -242,11 +241,11 @@ class CompensationControl:
             self._show()
 
     def _change(self, change: Callable[[BiasRamp], BiasRamp] = lambda ramp: ramp) -> None:
-        """Replace the ramp, and the plan with it; from any thread."""
-        payload = self.parameters.payload
+        """Replace the plan; from any thread."""
+        parameters = self.parameters
         with self._replacing:
-            self._ramp = change(self._ramp)
-            self.output.plan = Plan(self.source, Compensator(payload), self._ramp, payload.mass > 0.0)
+            ramp = change(self._ramp)
+            self.output.stream.plan = Plan(self.source, parameters.payload, ramp, parameters.accelerometer)
 
     def _apply_changes(self, ramp: BiasRamp) -> BiasRamp:
         """Of this ramp the one for the present tool that leads to the bias that waits."""
@@ -313,12 +312,12 @@ class CompensationControl:
 
     def _open_source(self, *, is_late: bool = False) -> None:
         """Open the source that is wanted, unless it is open. ParameterError, if it is not too `late`."""
-        depends_on = [getattr(self.parameters, name) for name in _DEPENDS_ON] + [self.link.info.name]
+        depends_on = [getattr(self.parameters, name) for name in _DEPENDS_ON]
         if depends_on == self._source_of:
             return
         self._close_source()
         try:
-            self.source = open_source(self._node, self.parameters, self._group, self.link)
+            self.source = open_source(self._node, self.parameters, self._group)
             self._source_of = depends_on
         except ParameterError as error:
             self.source = Source(str(error))
@@ -348,7 +347,6 @@ class CompensationControl:
                     offset = _known(self.parameters.sensor_offset)
                 self.own_offset.begin(ramp.target, offset or self.offset, is_measured=offset is not None)
                 self._serial = serial
-                self._open_source(is_late=True)
                 self._change(partial(lambda ramp, _: ramp, ramp))
             self._follow_offset()
             self._show()
@@ -359,9 +357,9 @@ class CompensationControl:
 
     def _follow_offset(self) -> None:
         """Shift the bias by the change of the sensor's own offset, from the next sample on; any thread."""
-        change = self.own_offset.follow(self.offset)
+        with self._replacing:
+            change = self.output.stream.follow_offset()
         if change is not None:
-            self._change(lambda ramp: ramp.shifted(change))
             if max(map(abs, change.values)) > _SHOWN:
                 text = f"the sensor's own offset was changed by {wrench_text(change)}"
                 self._log.info(f"{text}: the bias is shifted by that")

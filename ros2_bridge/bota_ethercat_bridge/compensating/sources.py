@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The specific force at the tool, sample by sample: from the sensor's IMU, or from the robot (messages, TF).
+"""The specific force at the tool from the robot's orientation: messages and TF. The sensor's IMU is in
+`ft_compensation.imu`.
 
 Messages of the robot have a callback group of their own, which waits for no service. TF is looked up at
 intervals.
@@ -7,9 +8,8 @@ intervals.
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from operator import attrgetter
 from typing import Any, Final
 
@@ -20,14 +20,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from bota_ethercat.pdo import Sample, Vector3
-from bota_ethercat.sensor.frames import IMU_HEIGHTS
-from bota_ethercat.settings import SettingValue
-from bota_ethercat_bridge.ft_compensation.alignment import Alignment, align
-from bota_ethercat_bridge.ft_compensation.quantities import STILL, Quaternion, Turning, unit_quaternion
-from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
-from bota_ethercat_bridge.ft_compensation.stream import IMU_IS_OFF
+from bota_ethercat_bridge.ft_compensation.imu import ImuSource, Source
+from bota_ethercat_bridge.ft_compensation.quantities import Quaternion, unit_quaternion
+from bota_ethercat_bridge.ft_compensation.specific_force import QuaternionGravity
 from bota_ethercat_bridge.parameters.table import TOPIC_SOURCES, ParameterError, Parameters
-from bota_ethercat_bridge.stream.link import Link
 from bota_ethercat_bridge.tf import TF_PERIOD_S, Tf, UnusableError, check_tf, stale_text, stamp_ns
 
 # How long an executor may take to release the previous subscription: DDS has one type per topic.
@@ -38,74 +34,6 @@ TOPIC_KINDS: Final[dict[str, tuple[Any, Callable[[Any], Any]]]] = {
     "topic_quaternion": (QuaternionStamped, attrgetter("quaternion")),
     "topic_imu": (Imu, attrgetter("orientation")),
 }
-
-
-class Source:
-    """The specific force at the tool's center of gravity, m/s² in the sensor's frame. Of this class: none.
-
-    The reader alone calls `specific_force`; the others are for the diagnostics' thread too.
-    """
-
-    name = "none"  # for people
-    is_imu = False  # whether it is the sensor's own, with the tool's acceleration; else it is minus gravity
-    turning: Turning = STILL  # of the latest sample, if `is_imu`
-
-    def __init__(self, why: str = "gravity_source is none") -> None:
-        self._why = why
-        self.close: Callable[[], object] = lambda: None
-
-    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
-        """None if what is known is too old. `time_s` is by a monotonic clock, `stamp_s` since 1970."""
-        return None
-
-    def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
-        """Why there is none for this sample, a sentence; empty if nothing is known to be wrong."""
-        return (
-            f"{self._why}, so the weight of the tool is not known: set gravity_source to a source, or set "
-            "tool_mass to 0"
-        )
-
-    def age_s(self, time_s: float) -> float:  # noqa: ARG002
-        """How old the robot's orientation is; infinite where there is none."""
-        return math.inf
-
-
-class ImuSource(Source):
-    """The sensor's own accelerometer and gyroscope, at the instant of its force and torque."""
-
-    name = "imu"
-    is_imu = True
-
-    def __init__(self, parameters: Parameters, link: Link) -> None:
-        super().__init__()
-        x, y, z = parameters.imu_position
-        if not (x or y or z):  # as the drawings of the model have it
-            z = IMU_HEIGHTS.get(link.info.name[4:8], 0.0)
-        cx, cy, cz = parameters.tool_center_of_gravity
-        self._imu = ImuSpecificForce((cx - x, cy - y, cz - z), parameters.accelerometer)
-        self._link = link
-        self._settings: Mapping[str, SettingValue] | None = None  # those of the alignment
-
-    @property
-    def alignment(self) -> Alignment:
-        """With the settings as they are, whether samples have come with them or not."""
-        info = self._link.info
-        if info.settings is self._settings:
-            return self._imu.alignment
-        return align(info.settings, info.rate_hz)
-
-    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
-        if self._link.info.settings is not self._settings:
-            self._settings = self._link.info.settings
-            self._imu.align(align(self._settings, self._link.info.rate_hz))
-        found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
-        self.turning = self._imu.turning
-        return found if any(sample.acceleration) else None
-
-    def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
-        if not any(sample.acceleration):
-            return IMU_IS_OFF
-        return "" if sample.is_finite else "the IMU sends NaN or infinity: see the status stream"
 
 
 class RobotSource(Source):
@@ -170,10 +98,10 @@ def check_source(node: Node, wanted: Parameters) -> None:
         raise ParameterError(text) from None
 
 
-def open_source(node: Node, wanted: Parameters, group: CallbackGroup, link: Link) -> Source:
-    """The source that is wanted, of the sensor that is or was there; ParameterError if that cannot be."""
+def open_source(node: Node, wanted: Parameters, group: CallbackGroup) -> Source:
+    """The source that is wanted; ParameterError if that cannot be."""
     if wanted.gravity_source == "imu":
-        return ImuSource(wanted, link)
+        return ImuSource(wanted.tool_center_of_gravity, wanted.imu_position, wanted.accelerometer)
     if wanted.gravity_source == "tf":
         return _open_tf(node, wanted, group)
     return Source() if wanted.gravity_source == "none" else _open_topic(node, wanted, group)

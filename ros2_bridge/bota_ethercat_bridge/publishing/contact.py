@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
@@ -13,9 +12,9 @@ from std_msgs.msg import Bool, Header
 
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Vector3
-from bota_ethercat.replies import SensorInfo
 from bota_ethercat_bridge.ft_compensation.compensator import Stages
-from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Why, detector_of
+from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Why
+from bota_ethercat_bridge.ft_compensation.stream import CompensatedStream
 from bota_ethercat_bridge.parameters.table import Parameters, parse_surface
 from bota_ethercat_bridge.publishing.messages import Stamps, Topic, create_publisher
 from bota_ethercat_bridge.publishing.wrenches import WrenchTopic
@@ -32,15 +31,14 @@ class ContactTopic(WrenchTopic):
         node: Node,
         parameters: Parameters,
         stamps: Stamps,
-        info: Callable[[], SensorInfo],
-        plan: Callable[[], Any],
+        stream: CompensatedStream,
     ) -> None:
         Topic.__init__(self, node, PoseWithCovarianceStamped, "contact")
         message = PoseWithCovarianceStamped(header=Header(frame_id=parameters.frame_id))
         self._pack = packing(message, 43)
         self._stamps, self.index = stamps, Stages._fields.index("final")
         self._detected = create_publisher(node, Bool, "contact/detected")
-        self._info, self._plan = info, plan
+        self._stream = stream
         self.noise: tuple[float, ...] = ()  # of the latest tare, N and Nm
         self.why = Why.NO_CONTACT  # of the latest point
         self._detector: ContactDetector | None = None
@@ -53,30 +51,26 @@ class ContactTopic(WrenchTopic):
 
     def is_wanted(self) -> bool:
         wanted = super().is_wanted() or bool(self._detected.get_subscription_count())
-        if wanted and self._info().rate_hz:
-            self._follow(self._parameters, self._plan())
+        if wanted and self._stream.in_force.info.rate_hz:
+            self._follow(self._parameters)
         return wanted
 
-    def _follow(self, parameters: Parameters, plan: Any) -> None:
+    def _follow(self, parameters: Parameters) -> None:
         """Another detector where parameters, bias or settings are others."""
-        info, tool = self._info(), parameters.payload
+        plan, info = self._stream.plan, self._stream.in_force.info
         made_of = parameters, plan.ramp.taken, plan.source.is_imu, info.settings, info.rate_hz, self.noise
         if made_of == self._made_of:
             return
         self._made_of = made_of
         surface = parse_surface(parameters.contact_surface)
         assert surface is not None  # there is no topic without one
-        self._detector = detector_of(
-            surface, tool, info.settings, info.rate_hz,
-            noise=parameters.contact_noise if any(parameters.contact_noise) else self.noise,
-            accelerometer=parameters.accelerometer if plan.source.is_imu else None, taken=plan.ramp.taken,
-            alarms_per_hour=parameters.contact_false_alarms,
-        )  # fmt: skip
+        noise = parameters.contact_noise if any(parameters.contact_noise) else self.noise
+        self._detector = self._stream.contact_detector(surface, noise, parameters.contact_false_alarms)
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         if (detector := self._detector) is None:
             return
-        turning, was = self._plan().source.turning, detector.is_contact
+        turning, was = self._stream.plan.source.turning, detector.is_contact
         if detector.update(force, torque, turning) is was and frame.monotonic_ns < self._next_ns:
             return
         self._next_ns = frame.monotonic_ns + _PERIOD_NS

@@ -14,9 +14,9 @@ from typing import Any, Final
 
 from bota_ethercat.client.client import Client
 from bota_ethercat.client.session import Disconnected
-from bota_ethercat.control import Event, known_six
+from bota_ethercat.control import Event, event_sentence, known_six
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError
-from bota_ethercat.health.sentences import event_sentence, no_server
+from bota_ethercat.health.sentences import no_server
 from bota_ethercat.replies import Description, SensorInfo
 from bota_ethercat.settings import SettingValue, known_settings
 from bota_ethercat.stream.timeline import InForce

@@ -3,14 +3,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.program.new_file import NewFile
+from bota_ethercat_bridge.ft_compensation.bias import BiasRamp
 from bota_ethercat_bridge.ft_compensation.identification.payload import Identified
-from bota_ethercat_bridge.ft_compensation.quantities import NO_PAYLOAD, Payload, Wrench
+from bota_ethercat_bridge.ft_compensation.imu import ImuSource
+from bota_ethercat_bridge.ft_compensation.quantities import (
+    EXACT,
+    NO_PAYLOAD,
+    NO_WRENCH,
+    ZERO,
+    Accelerometer,
+    Payload,
+    Wrench,
+)
+from bota_ethercat_bridge.ft_compensation.stream import CompensatedStream, Plan
 
 _Row = tuple[str, Sequence[float], str]  # parameter, values, comment
 
@@ -67,6 +79,27 @@ def payload_of(parameters: Mapping[str, Any]) -> Payload:
     rows = zip(names, NO_PAYLOAD[2:], strict=True)
     mass, center = float(parameters["tool_mass"]), tuple(parameters["tool_center_of_gravity"])
     return Payload(mass, center, *(tuple(parameters.get(f"tool_{name}", row)) for name, row in rows))
+
+
+def stream_of(parameters: Mapping[str, Any]) -> CompensatedStream:
+    """What compensates with the tool, the bias and the accelerometer in a node's parameters, by the IMU.
+
+    LookupError, TypeError or ValueError if there is no tool. Without `sensor_offset` a bias is not known.
+    """
+    payload, bias = payload_of(parameters), Wrench.of(parameters.get("bias", NO_WRENCH.values))
+    rows = {name: parameters.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
+    accelerometer = Accelerometer(**{name: tuple(row) for name, row in rows.items()})
+    source = ImuSource(payload.center, tuple(parameters.get("imu_position", ZERO)), accelerometer)
+    stream = CompensatedStream(Plan(source, payload, BiasRamp(bias), accelerometer), use_saturated=False)
+    offset = offset_of(parameters)
+    stream.own_offset.begin(bias, offset, is_measured=offset is not None)
+    return stream
+
+
+def offset_of(parameters: Mapping[str, Any]) -> Wrench | None:
+    """The sensor's own offset that a bias in a node's parameters goes with; None if they do not say."""
+    found = parameters.get("sensor_offset")
+    return Wrench.of(found) if found is not None and all(map(math.isfinite, found)) else None
 
 
 def _number(value: float) -> str:

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the specific force at the tool is from: `Source`, and the sensor's own IMU on its lever arm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from bota_ethercat.pdo import Sample, Vector3
+from bota_ethercat.replies import SensorInfo
+from bota_ethercat.sensor.frames import IMU_HEIGHTS
+from bota_ethercat.stream.timeline import InForce
+from bota_ethercat_bridge.ft_compensation.alignment import Alignment, align
+from bota_ethercat_bridge.ft_compensation.quantities import EXACT, STILL, ZERO, Accelerometer, Turning
+from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
+
+IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
+
+
+def imu_position(name: str, given: Vector3 = ZERO) -> Vector3:
+    """Of the IMU from the wrench origin, m: `given`, or of zeros by the drawings of the model `name`."""
+    return given if any(given) else (0.0, 0.0, IMU_HEIGHTS.get(name[4:8], 0.0))
+
+
+class Source:
+    """The specific force at the tool's center of gravity, m/s² in the sensor's frame. Of this class: none.
+
+    One thread, which has the samples, calls `configure` and `specific_force`; the others are for any.
+    """
+
+    name = "none"  # for people
+    is_imu = False  # whether it is the sensor's own, with the tool's acceleration; else it is minus gravity
+    turning: Turning = STILL  # of the latest sample, if `is_imu`
+    in_force = InForce(SensorInfo())  # of the latest `configure`
+
+    def __init__(self, why: str = "gravity_source is none") -> None:
+        self._why = why
+        self.close: Callable[[], object] = lambda: None
+
+    def configure(self, in_force: InForce) -> None:
+        """What is in force for the samples that follow."""
+        self.in_force = in_force
+
+    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
+        """None if what is known is too old. `time_s` is by a monotonic clock, `stamp_s` since 1970."""
+        return None
+
+    def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
+        """Why there is none for this sample, a sentence; empty if nothing is known to be wrong."""
+        return (
+            f"{self._why}, so the weight of the tool is not known: set gravity_source to a source, or set "
+            "tool_mass to 0"
+        )
+
+    def age_s(self, time_s: float) -> float:  # noqa: ARG002
+        """How old the robot's orientation is; infinite where there is none."""
+        return math.inf
+
+
+class ImuSource(Source):
+    """The sensor's own accelerometer and gyroscope, at the instant of its force and torque."""
+
+    name = "imu"
+    is_imu = True
+
+    def __init__(
+        self, center: Vector3 = ZERO, position: Vector3 = ZERO, accelerometer: Accelerometer = EXACT
+    ) -> None:
+        """`center` of gravity and the IMU's `position` from the wrench origin, m; zeros: as it was made."""
+        super().__init__()
+        self._center, self._position = center, position
+        self._imu = ImuSpecificForce(accelerometer=accelerometer)
+
+    def configure(self, in_force: InForce) -> None:
+        before, now, self.in_force = self.in_force.info, in_force.info, in_force
+        (x, y, z), (cx, cy, cz) = imu_position(now.name, self._position), self._center
+        self._imu.lever = cx - x, cy - y, cz - z
+        if (before.settings, before.rate_hz) != (now.settings, now.rate_hz):
+            self._imu.align(align(now.settings, now.rate_hz))
+
+    @property
+    def alignment(self) -> Alignment:
+        """By the settings that are in force."""
+        return self._imu.alignment
+
+    def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
+        return self.follow(sample.acceleration, sample.angular_rate, time_s)
+
+    def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
+        """As `specific_force`, of a sample's m/s² and rad/s."""
+        found = self._imu.follow(acceleration, angular_rate, time_s)
+        self.turning = self._imu.turning
+        return found if any(acceleration) else None
+
+    def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
+        if not any(sample.acceleration):
+            return IMU_IS_OFF
+        return "" if sample.is_finite else "the IMU sends NaN or infinity: see the status stream"
