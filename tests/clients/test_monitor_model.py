@@ -23,6 +23,7 @@ from bota_ethercat.control import Event
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.limits import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
+from bota_ethercat.stream.timeline import Timeline
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S, description, frame, now, status
 from tests.json_schema import problems
@@ -264,6 +265,25 @@ def test_an_age_is_noted_only_of_what_was_waited_for(
         MonitorReader(Address("localhost", 1), model)._take(cast("Client", client))
     assert ages == noted
     assert only(model, now(4)).samples >= 4
+
+
+def test_what_came_before_a_tare_is_no_peak_after_it(model: Model) -> None:
+    """All of it in one batch, whichever way it is cut."""
+    tared = {"event": Event.OFFSET_CHANGED, "sensor": 0, "offset": [9.75, *[0.0] * 5]}
+    timeline = Timeline()
+    timeline.connected(description())
+    before = [frame(0, {"force.x": -9.75}), frame(1, {"force.x": -9.75})]
+    items = [*before, tared, *timeline.event(tared), frame(2, {"force.x": 0.5})]
+    for cut in range(len(items) + 1):
+        batches = iter([items[:cut], items[cut:]])
+        client = SimpleNamespace(
+            poll_all=lambda _=0, batches=batches: next(batches), take_unread=lambda: (0.0, False),
+            session=SimpleNamespace(same_machine=False),
+        )  # fmt: skip
+        fresh = Model(made.ADDRESS)
+        made.connect(fresh, description(), made.OWN_PEER, START_S)
+        MonitorReader(Address("localhost", 1), fresh)._take(cast("Client", client))
+        assert peaks(only(fresh, now(3)))[0] == (0.5, 0.5), cut
 
 
 def test_the_servers_clients_have_rates_and_one_of_them_is_this(model: Model) -> None:

@@ -127,6 +127,15 @@ def test_before_the_first_rest_and_of_raw_counts_nothing_is_said() -> None:
     assert (arm.moved, arm.drift.history.peak[2] < 11) == (None, True)
 
 
+@pytest.mark.parametrize(("register", "saturations"), [(1, 1), (16, 1), (8, 0), (2, 0)])
+def test_an_overload_is_one_by_the_warnings_register_too(register: int, saturations: int) -> None:
+    arm = Arm()
+    arm.rest(2)
+    arm.drift.add([[register] if name == "warnings" else [0.0] for name in NAMES])
+    arm.drift.each_second()
+    assert arm.drift.history.saturations == saturations
+
+
 def test_overload_is_counted_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
     simulation = Simulation(SensorOptions(signal="constant"), settings={"sinc_length": 1024})
