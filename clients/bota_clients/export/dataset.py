@@ -387,6 +387,10 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     if tool and any(tool.get("bias", ())):
         _check_offsets(options.tool, tool, recording, sensor.offsets)
     windows = Windows(length if frames else MOST_LOST, tool=tool, imu_units=options.imu_units)
+    if (stream := windows.stream) is not None:  # else what is compensated is marked, stretch by stretch
+        whys = {stream.obstacle_of(row.info.settings) for row in sensor.history}
+        if whys and "" not in whys:
+            raise RecordingError(f"the wrench cannot be compensated: {min(whys)}; or omit --tool")
     about = {
         "program": f"{PROGRAM} {VERSION}",
         "options": vars(options) | {"imu_units": options.imu_units.value},

@@ -107,8 +107,6 @@ class Windows:
         self._made_of, self._known, self._rate_hz = (settings, rate_hz), settings, rate_hz
         # Where a delay is unknown, a sample counts as measured only when it was stamped: never too early.
         self._delay_ns = np.array([delay or 0 for delay in Delays.parse(delays_ms(settings, rate_hz))])
-        if self.stream is not None and (why := self.stream.obstacle):
-            raise RecordingError(f"the wrench cannot be compensated: {why}; or omit --tool")
 
     def _follow(self, in_force: InForce, stream: CompensatedStream) -> None:
         """What is in force for what follows, the sensor's own offset too."""

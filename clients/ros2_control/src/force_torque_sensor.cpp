@@ -50,7 +50,7 @@ public:
         std::string why;
         if (parameters_.on_activate_tare && !loop_->tare(why)) return refuse(why, CallbackReturn::FAILURE);
         if (!loop_->wait_until_usable(why)) return refuse(why, CallbackReturn::FAILURE);
-        if (loop_->age_is_lower_bound())
+        if (loop_->reading().age_is_lower_bound)
             log(Level::warning, "the server is on another machine: the age counts from the arrival, without network latency");
         show();
         is_active_ = true;

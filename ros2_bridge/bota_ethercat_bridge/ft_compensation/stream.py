@@ -172,9 +172,11 @@ class CompensatedStream:
 
     @property
     def obstacle(self) -> str:
-        """As the function: by what is in force."""
-        plan = self.plan
-        return obstacle(self.in_force.info.settings, has_tool=plan.has_tool, by_imu=plan.source.is_imu)
+        """Of the settings that are in force, as the function."""
+        return self.obstacle_of(self.in_force.info.settings)
+
+    def obstacle_of(self, settings: Settings) -> str:
+        return obstacle(settings, has_tool=self.plan.has_tool, by_imu=self.plan.source.is_imu)
 
     def feel(self, sample: Sample, time_s: float, stamp_s: float, *, always: bool = False) -> Vector3 | None:
         """The specific force at the tool in this sample, m/s²; None if it is not known.
@@ -242,7 +244,7 @@ class CompensatedStream:
         found = np.vstack(self.stages(columns, math.inf, cast(Any, felt.T), turning).final).T
         flagged = sum(channel.flagged(samples) for channel in self._needed)
         found[(times <= self._doubted_until_s) | (flagged != 0)] = math.nan
-        if self.doubt:
+        if self.doubt or self.obstacle:
             found[:] = math.nan
         self._newest_s = times[-1] if len(times) else self._newest_s
         return found, np.column_stack(np.broadcast_arrays(*self.bounds(felt.T, turning), times)[:2])

@@ -47,9 +47,9 @@ void keep(Level level, const std::string& text) {
     lines.push_back(kLevels[static_cast<int>(level)] + text);
 }
 
-std::string text_of(bool good, const Values& values) {
+std::string text_of(bool good, const Values& values, std::uint64_t sequence = 0) {
     Object told;
-    told("allocated", allocations)("good", good);
+    told("allocated", allocations)("good", good)("sequence", sequence);
     for (std::size_t i = 0; i < values.size(); ++i) told(kSignals[i], values[i]);
     return told.text();
 }
@@ -207,8 +207,9 @@ int main() {
             else ok = command == "tare" ? maybe->tare(why) : maybe->wait_until_usable(why, static_cast<double>(ms) / 1e3);
             told = Object()("ok", ok)("why", ok ? "" : why).text();
         } else if (command == "read") {
+            const std::uint64_t sequence = maybe->reading().sequence;
             const bool good = watched_read(*maybe);
-            told = text_of(good, maybe->values());
+            told = text_of(good, maybe->values(), sequence);
         } else if (command == "max_age") {
             told = json_text(maybe->max_age());
         } else if (command == "run") {

@@ -219,6 +219,9 @@ inline std::string objection(const Parameters& parameters, const SensorInfo& sen
         return "has its IMU switched off: set imu_active to 1, or leave linear_acceleration, angular_velocity and payload out of the URDF";
     if (parameters.has_payload && sensor.inertia_compensation == true)
         return "subtracts gravity and inertia itself: switch its setting inertia_compensation off, or leave the payload out";
+    if (parameters.has_payload && sensor.coordinate_system == true)
+        return "gives force and torque in a frame configured in it, and how that is turned to its IMU is not known: switch its "
+               "setting coordinate_system off, or leave the payload out";
     for (const auto& [name, setting] : {std::pair("coordinate_system", &SensorInfo::coordinate_system),
                                         std::pair("inertia_compensation", &SensorInfo::inertia_compensation)})
         if (before.*setting && sensor.*setting && before.*setting != sensor.*setting)
@@ -265,8 +268,8 @@ public:
     const SensorInfo& sensor() const { return *sensor_; }
     /// s up to which a sample is fresh now: another rate may make it another.
     double max_age() noexcept { return seconds(latest_.newest().max_age_ns); }
-    /// Whether the age counts from the arrival: the server is on another machine.
-    bool age_is_lower_bound() noexcept { return latest_.newest().reading.age_is_lower_bound; }
+    /// The newest reading, which the next `read` shows, or a newer one.
+    const bota_ethercat::Reading& reading() noexcept { return latest_.newest().reading; }
 
     /// Set the sensor's offset so that it reads the load of the tool now, or zero where that is not known. Waits for samples.
     bool tare(std::string& why) {
@@ -315,6 +318,7 @@ private:
     static constexpr int kPaceMs = 5;  // without anything from the server: how soon it is seen that nothing comes
     static constexpr std::int64_t kQuietNs = 1'000'000'000;
     static constexpr int kMaxSamples = 1000;  // until they are handed over
+    static constexpr double kDoubtAfter = 2.0;  // sample periods, as protocol/bota_ethercat/stream/timeline.py
     static constexpr int kLoads = 100;         // samples of the load before a tare
 
     /// The load of the tool, N and Nm: the mean of some samples.
@@ -368,7 +372,7 @@ private:
             if (!received.reading.is_new) break;
             if (tool_) load_ = tool_->follow(received.reading.sample, seconds(static_cast<std::int64_t>(received.reading.monotonic_ns)));
             if (const SensorInfo* const found = client_.description().find(parameters_.sensor()))
-                bias_change_ = own_offset_.follow(found->offset);
+                follow(*found, received.reading.monotonic_ns);
         }
         received.tool = load_;
         received.bias_change = bias_change_;
@@ -383,6 +387,16 @@ private:
         received.is_checked = objection_.empty() && received.reading.received_ns >= checked_ns_;
         received.max_age_ns = max_age_ns_;
         latest_.publish();
+    }
+
+    /// The bias of the newest sample; the samples after a change of the sensor's offset may not have all of it yet.
+    void follow(const SensorInfo& sensor, std::uint64_t monotonic_ns) noexcept {
+        const Wrench before = std::exchange(bias_change_, own_offset_.follow(sensor.offset));
+        if (before != bias_change_ && sensor.rate_hz > 0.0)
+            doubted_until_ns_ = newest_ns_ + static_cast<std::uint64_t>(std::llround(kDoubtAfter * 1e9 / sensor.rate_hz));
+        newest_ns_ = monotonic_ns;
+        if (newest_ns_ <= doubted_until_ns_) load_.fill(NAN);
+        else if (!tool_) load_ = {};
     }
 
     /// Whether this is the sensor that is wanted, and set so that its numbers mean what they should: `objection_`.
@@ -448,6 +462,7 @@ private:
     Wrench load_{}, bias_change_{};     // of the tool, and of the bias, in the newest sample
     std::string objection_, trouble_;   // why the sensor is not used; why there is no connection
     std::pair<std::uint32_t, std::uint32_t> checked_{};  // connections and reconfigurations
+    std::uint64_t newest_ns_ = 0, doubted_until_ns_ = 0;  // by the samples' CLOCK_MONOTONIC
     std::int64_t checked_ns_ = 0, max_age_ns_ = 0, quiet_until_ns_ = 0;
     int logged_ = 0;  // the condition
     // Of both:
