@@ -251,7 +251,8 @@ def test_a_clock_that_is_shifted_is_another_one(server: PlayedServer) -> None:
         ({"acceleration__x": NAN}, "not_finite"), ({"angular_rate__z": INF}, "not_finite"),
         ({"size": 77, "orientation__w": NAN}, "not_finite"), ({"warnings": 2}, "saturated"),
         ({"warnings": 4}, "saturated"), ({"acceleration_saturated": 1}, "saturated"),
-        ({"angular_rate_saturated": 4}, "saturated"), ({"warnings": 104, "temperature": NAN}, "fresh"),
+        ({"angular_rate_saturated": 4}, "saturated"), ({"warnings": 160, "temperature": NAN}, "fresh"),
+        ({"warnings": 64}, "not_finite"), ({"warnings": 8}, "not_finite"),
     ],
 )  # fmt: skip
 def test_a_recent_sample_whose_imu_is_judged_too(

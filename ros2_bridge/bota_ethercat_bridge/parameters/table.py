@@ -193,7 +193,7 @@ class Parameters:
     imu_position: Vector3 = _row(ZERO,
         "Position of the sensor's IMU in frame_id, m; zeros = that of its model", 0, 1)
     on_saturation: str = _row("publish",
-        "What wrench_compensated does on samples whose force or torque is saturated",
+        "What wrench_compensated does on samples that are saturated: force, torque, the IMU if it is used",
         choices=("publish", "stop"))
     gravity_source: str = _row("imu",
         "Where the tool's weight and inertia are from: the sensor's IMU, or the robot (topics, TF)",
