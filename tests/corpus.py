@@ -17,7 +17,7 @@ from bota_ethercat.pdo import encode
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import sampling_rate_hz
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat_bridge.ft_compensation.quantities import Wrench
+from bota_ft_compensation.quantities import Wrench
 from tests.compensation.making import BIAS, TOOL, load
 from tests.descriptions import description, sensor_row
 

@@ -15,10 +15,13 @@ ROOT: Final = Path(__file__).parent.parent
 ROOTS: Final = {
     "bota_ethercat": ROOT / "protocol",
     "bota_clients": ROOT / "clients",
-    **dict.fromkeys(("bota_ethercat_bridge", "bridge", "ft_compensation"), ROOT / "ros2_bridge"),
+    **dict.fromkeys(
+        ("bota_ethercat_bridge", "bota_ft_compensation", "bridge", "ft_compensation"), ROOT / "ros2_bridge"
+    ),
 }
 S: Final = "ethercat_server"
 B: Final = "bota_ethercat_bridge"
+C: Final = "bota_ft_compensation"
 ROS: Final = {
     "rclpy", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", "diagnostic_msgs", "rcl_interfaces",
     "tf2_ros", "bota_ethercat_msgs",
@@ -30,6 +33,7 @@ PROTOCOL: Final = {
     "bota_ethercat.sensor",
     "bota_ethercat.health",
     "bota_ethercat.program",
+    "bota_ethercat.stream",
 }
 ETHERCAT: Final = {S, f"{S}.ethercat", f"{S}.sampling"}
 SENSOR: Final = ETHERCAT | {f"{S}.sensor"} | PROTOCOL
@@ -47,6 +51,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     "bota_ethercat.program": {"bota_ethercat", "bota_ethercat.program", "bota_ethercat.sensor"},
     "bota_ethercat.text": {"bota_ethercat.text", "bota_ethercat.errors"},
     "bota_ethercat.sensor": PROTOCOL - {"bota_ethercat.health", "bota_ethercat.program"},
+    "bota_ethercat.stream": PROTOCOL - {"bota_ethercat.health", "bota_ethercat.program"},
     "bota_ethercat.health": PROTOCOL,
     "bota_ethercat.client": PROTOCOL | {"bota_ethercat.client"},
     # The server: ethercat <- sensor <- acquisition <- serving <- daemon.
@@ -66,22 +71,22 @@ ROOMS: Final[dict[str, set[str]]] = {
     f"{S}.tool": ACCESS | {f"{S}.daemon", f"{S}.tool"},
     f"{S}.doctor": ACCESS | {f"{S}.daemon", f"{S}.doctor"},
     # ROS 2.
-    f"{B}.ft_compensation": {f"{B}.ft_compensation"} | PROTOCOL,
-    f"{B}.parameters.table": {f"{B}.ft_compensation"} | PROTOCOL,
-    B: {B, f"{B}.ft_compensation", f"{B}.parameters.table", "bota_ethercat.client"} | PROTOCOL,
+    C: {C} | PROTOCOL,
+    f"{B}.ft_compensation": {"bota_ethercat.renamed"},
+    f"{B}.parameters.table": {C} | PROTOCOL,
+    B: {B, C, f"{B}.parameters.table", "bota_ethercat.client"} | PROTOCOL,
     "bridge": {"bota_ethercat.renamed"},  # the old names
     "ft_compensation": {"bota_ethercat.renamed"},
     # Programs that are ordinary clients of the server.
     "bota_clients": {"bota_clients"} | PROTOCOL,
     "bota_clients.recording": CLIENTS,
-    "bota_clients.export": CLIENTS | {"bota_clients.export", "bota_clients.identify", f"{B}.ft_compensation"},
+    "bota_clients.export": CLIENTS | {"bota_clients.export", "bota_clients.identify", C},
     "bota_clients.record": CLIENTS | {"bota_clients.record"},
     "bota_clients.report": CLIENTS | {"bota_clients.report", "bota_clients.record"},
     "bota_clients.monitor": CLIENTS
-    | {"bota_clients.monitor", "bota_clients.record", "bota_clients.export", f"{B}.ft_compensation"},
+    | {"bota_clients.monitor", "bota_clients.record", "bota_clients.export", C},
     "bota_clients.replay": CLIENTS | {"bota_clients.replay", f"{S}.serving", S},
-    "bota_clients.identify": CLIENTS
-    | {"bota_clients.identify", f"{B}.ft_compensation", f"{B}.parameters.table"},
+    "bota_clients.identify": CLIENTS | {"bota_clients.identify", C, f"{B}.parameters.table"},
 }
 """A room, and the rooms it may import. A room without a line of its own belongs to the one above it."""
 
@@ -113,7 +118,7 @@ THREADS: Final = {"threading", "_thread", "multiprocessing", "concurrent", "subp
 
 def modules() -> Iterator[tuple[str, Path]]:
     """Every module of the product: its dotted name and its file."""
-    for package in ("bota_ethercat", S, B, "bridge", "ft_compensation", "bota_clients"):
+    for package in ("bota_ethercat", S, B, C, "bridge", "ft_compensation", "bota_clients"):
         root = ROOTS.get(package, ROOT)
         for path in sorted((root / package).rglob("*.py")):
             if "ros2_control" in path.parts:  # a ROS package in C++; this is its launch file

@@ -30,25 +30,6 @@ from bota_ethercat.pdo import Vector3
 from bota_ethercat.program import state
 from bota_ethercat_bridge.compensating.compensation import RestWindow
 from bota_ethercat_bridge.compensating.control import CompensationControl
-from bota_ethercat_bridge.ft_compensation.bias import TareBasis, check_at_rest, estimate_bias
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import write_yaml
-from bota_ethercat_bridge.ft_compensation.identification.payload import (
-    Identified,
-    accelerometer_text,
-    identify,
-    summary,
-)
-from bota_ethercat_bridge.ft_compensation.identification.poses import Pose, coverage, pose_of
-from bota_ethercat_bridge.ft_compensation.identification.weighted import CONFIDENCE
-from bota_ethercat_bridge.ft_compensation.quantities import (
-    NO_WRENCH,
-    ZERO,
-    CompensationError,
-    Wrench,
-    length,
-    vector,
-    wrench_text,
-)
 from bota_ethercat_bridge.parameters.declare import NodeParameters
 from bota_ethercat_bridge.parameters.table import AUTO, ParameterError
 from bota_ethercat_bridge.rclpy_internals import filling
@@ -59,6 +40,25 @@ from bota_ethercat_bridge.stream.link import (
     RequestFailedError,
     find_sensor,
     offset_text,
+)
+from bota_ft_compensation.bias import TareBasis, check_at_rest, estimate_bias
+from bota_ft_compensation.identification.parameter_file import write_yaml
+from bota_ft_compensation.identification.payload import (
+    Identified,
+    accelerometer_text,
+    identify,
+    summary,
+)
+from bota_ft_compensation.identification.poses import Pose, coverage, pose_of
+from bota_ft_compensation.identification.weighted import CONFIDENCE
+from bota_ft_compensation.quantities import (
+    NO_WRENCH,
+    ZERO,
+    CompensationError,
+    Wrench,
+    length,
+    vector,
+    wrench_text,
 )
 
 TYPED: dict[str, Any] = {}

@@ -9,8 +9,8 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat_bridge.ft_compensation.quantities import Quaternion, unit_quaternion
 from bota_ethercat_bridge.parameters.table import ParameterError
+from bota_ft_compensation.quantities import Quaternion, unit_quaternion
 
 TF_PERIOD_S: Final = 0.005  # how often poses are looked up
 

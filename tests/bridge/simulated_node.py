@@ -32,8 +32,8 @@ from bota_ethercat.errors import ConnectionFailedError
 from bota_ethercat.pdo import encode
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat_bridge.diagnostics import TICK_S
-from bota_ethercat_bridge.ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from bota_ethercat_bridge.parameters.table import PARAMETERS, gather
+from bota_ft_compensation.quantities import NO_WRENCH, Payload, Wrench
 from tests.bridge.real_node import PATIENCE_S, Asking, LoggedNode, retire
 from tests.bridge.scripted_server import MemoryServer, ScriptedChannel
 from tests.compensation.making import TOOL, load

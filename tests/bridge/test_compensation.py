@@ -15,11 +15,11 @@ from rclpy.parameter import Parameter
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode, layout_for
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.bias import TareBasis
-from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
-from bota_ethercat_bridge.ft_compensation.identification.weighted import Array
-from bota_ethercat_bridge.ft_compensation.quantities import Accelerometer, Payload
+from bota_ft_compensation.alignment import align
+from bota_ft_compensation.bias import TareBasis
+from bota_ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
+from bota_ft_compensation.identification.weighted import Array
+from bota_ft_compensation.quantities import Accelerometer, Payload
 from tests.bridge.simulated_node import (
     OVER,
     QUICK,

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from bota_ethercat_bridge.ft_compensation.quantities import NO_PAYLOAD, Wrench
 from bota_ethercat_bridge.parameters.table import Parameters
+from bota_ft_compensation.quantities import NO_PAYLOAD, Wrench
 from tests.bridge.simulated_node import QUICK, UP, ZERO6, Node, Server, Stages, six, values
 from tests.compensation.making import BIAS
 

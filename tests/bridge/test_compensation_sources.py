@@ -19,8 +19,8 @@ from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.stream.timeline import InForce
 from bota_ethercat_bridge.compensating.sources import RobotSource
-from bota_ethercat_bridge.ft_compensation.imu import ImuSource
 from bota_ethercat_bridge.node import StartError
+from bota_ft_compensation.imu import ImuSource
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.simulated_node import (
     DEFAULTS,

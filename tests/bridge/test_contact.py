@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bota_ethercat_bridge.ft_compensation.contact import Capsule, Plane
 from bota_ethercat_bridge.parameters.table import PARAMETERS, ParameterError, gather, parse_surface
+from bota_ft_compensation.contact import Capsule, Plane
 from tests.bridge.simulated_node import UP, Node, Server, stamp_ns
 from tests.compensation.making import SEED, TOOL
 

@@ -19,9 +19,9 @@ from std_srvs.srv import Trigger
 
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat_bridge import rclpy_internals
-from bota_ethercat_bridge.ft_compensation.quantities import Wrench
 from bota_ethercat_bridge.node import SERVER_NOT_STOPPED, StartError, run
 from bota_ethercat_bridge.rclpy_internals import RIGHT_FOR
+from bota_ft_compensation.quantities import Wrench
 from tests.bridge.real_node import PATIENCE_S, Listener, Start, StartProcess
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import Node, Server

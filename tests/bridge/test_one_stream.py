@@ -25,7 +25,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.framing import DataMessage, encode_data, encode_json
 from bota_ethercat.pdo import ImuUnits
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import write_payload
+from bota_ft_compensation.identification.parameter_file import write_payload
 from tests.bridge.scripted_server import MemoryServer, ScriptedChannel, ScriptedServer
 from tests.bridge.simulated_node import STEP_S, Node, Server, Stages, six, stamp_ns
 from tests.clients.cpp_programs import end_driver, needs_gxx, patient

@@ -19,9 +19,9 @@ from rosbags.typesys import Stores, get_typestore
 from bota_ethercat.framing import MessageType, encode_data
 from bota_ethercat.pdo import encode
 from bota_ethercat_bridge import rclpy_internals
-from bota_ethercat_bridge.ft_compensation.outputs import WrenchFilter
 from bota_ethercat_bridge.node import StartError
 from bota_ethercat_bridge.parameters.table import ParameterError, parse_frames
+from bota_ft_compensation.outputs import WrenchFilter
 from tests.bridge.fake_tf import FakeTf
 from tests.bridge.scripted_server import process_data
 from tests.bridge.simulated_node import (

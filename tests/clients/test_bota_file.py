@@ -12,7 +12,7 @@ import pytest
 from bota_clients.identify.cli import main
 from bota_clients.identify.tool_file import read_bota, write_bota
 from bota_ethercat.pdo import Vector3
-from bota_ethercat_bridge.ft_compensation.quantities import ELEMENTS, Payload
+from bota_ft_compensation.quantities import ELEMENTS, Payload
 from tests.compensation.making import written_parameters
 from tests.ended import run_here
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Plane, Uncertainty, Why
-from bota_ethercat_bridge.ft_compensation.quantities import ZERO, Turning
-from bota_ethercat_bridge.ft_compensation.stationary import triple
+from bota_ft_compensation.contact import ContactDetector, Plane, Uncertainty, Why
+from bota_ft_compensation.quantities import ZERO, Turning
+from bota_ft_compensation.stationary import triple
 from tests.clients.cpp_programs import FAST, SANITIZED, driver_program, needs_gxx, patient
 from tests.compensation.making import SEED
 from tests.compensation.test_contact import NOISE, PLACES, TOOL, pushed

@@ -22,7 +22,7 @@ from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
 from bota_ethercat.settings import start_up_defaults
-from bota_ethercat_bridge.ft_compensation.quantities import Payload
+from bota_ft_compensation.quantities import Payload
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor import signals
 from ethercat_server.virtual_sensor.dictionary import Flash

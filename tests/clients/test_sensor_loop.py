@@ -21,12 +21,12 @@ from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.bias import TareBasis
-from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
-from bota_ethercat_bridge.ft_compensation.quantities import ZERO, Accelerometer, Payload
-from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
+from bota_ft_compensation.alignment import align
+from bota_ft_compensation.bias import TareBasis
+from bota_ft_compensation.bounds import force_bound_95, torque_bound_95
+from bota_ft_compensation.compensator import Compensator
+from bota_ft_compensation.quantities import ZERO, Accelerometer, Payload
+from bota_ft_compensation.specific_force import ImuSpecificForce
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.cpp_programs import (
     FAST,

@@ -12,8 +12,8 @@ import numpy as np
 import yaml
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
-from bota_ethercat_bridge.ft_compensation.identification.poses import Pose
-from bota_ethercat_bridge.ft_compensation.quantities import Payload, Wrench
+from bota_ft_compensation.identification.poses import Pose
+from bota_ft_compensation.quantities import Payload, Wrench
 
 SEED = int(os.environ.get("TEST_SEED", "0"))  # another one in every long run
 TOOL = Payload(0.8, (0.004, -0.006, 0.055))

@@ -23,9 +23,9 @@ from bota_ethercat.sensor.response import (
     fir_taps,
 )
 from bota_ethercat.settings import SettingValue
-from bota_ethercat_bridge.ft_compensation.alignment import Alignment
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.alignment import Alignment
+from bota_ft_compensation.compensator import Compensator
+from bota_ft_compensation.quantities import (
     EXACT,
     NO_WRENCH,
     OFFSET_PRIOR,
@@ -35,7 +35,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Turning,
     Wrench,
 )
-from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
+from bota_ft_compensation.specific_force import ImuSpecificForce
 
 Array = NDArray[np.float64]
 # Times (n,), s, to position (n, 3), m, and three angles (n, 3), rad.

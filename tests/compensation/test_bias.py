@@ -12,8 +12,8 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.sensor.warnings_register import WarningFlag
-from bota_ethercat_bridge.ft_compensation.bias import BiasRamp, TareBasis, check_at_rest, estimate_bias
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.bias import BiasRamp, TareBasis, check_at_rest, estimate_bias
+from bota_ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
     ZERO,
@@ -22,7 +22,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     StationaryLimits,
     Wrench,
 )
-from bota_ethercat_bridge.ft_compensation.stationary import (
+from bota_ft_compensation.stationary import (
     NotStationaryError,
     StationaryMeans,
     StationaryWindow,

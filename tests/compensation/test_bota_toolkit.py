@@ -20,8 +20,8 @@ from bota_clients.errors import RecordingError
 from bota_clients.identify.cli import main
 from bota_clients.identify.tool_file import read_bota, write_bota
 from bota_ethercat.settings import start_up_defaults
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.quantities import Accelerometer, Payload, Wrench
+from bota_ft_compensation.alignment import align
+from bota_ft_compensation.quantities import Accelerometer, Payload, Wrench
 from tests.clients.test_identify import record_felt
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, written_parameters

@@ -13,9 +13,9 @@ from bota_ethercat.pdo import Vector3
 from bota_ethercat.sensor.response import fir_taps, healthy_noise, imu_noise
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.world import Felt
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.bounds import IMU_BELOW
-from bota_ethercat_bridge.ft_compensation.contact import (
+from bota_ft_compensation.alignment import align
+from bota_ft_compensation.bounds import IMU_BELOW
+from bota_ft_compensation.contact import (
     Capsule,
     ContactDetector,
     Plane,
@@ -25,7 +25,7 @@ from bota_ethercat_bridge.ft_compensation.contact import (
     correlation,
     detector_of,
 )
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.quantities import (
     NO_PAYLOAD,
     ZERO,
     Accelerometer,
@@ -33,7 +33,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Payload,
     length,
 )
-from bota_ethercat_bridge.ft_compensation.stationary import triple
+from bota_ft_compensation.stationary import triple
 from tests.compensation import motion
 from tests.compensation.making import SEED
 from tests.compensation.motion import Array, Imperfection

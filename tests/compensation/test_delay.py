@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bota_ethercat.sensor.response import acceleration_response, force_torque_response
-from bota_ethercat_bridge.ft_compensation.identification.delay import Lag, check_held_out, find_lag
-from bota_ethercat_bridge.ft_compensation.quantities import CompensationError, Payload
+from bota_ft_compensation.identification.delay import Lag, check_held_out, find_lag
+from bota_ft_compensation.quantities import CompensationError, Payload
 from tests.compensation import motion
 from tests.compensation.making import SEED
 from tests.compensation.motion import Felt, Imperfection, settings

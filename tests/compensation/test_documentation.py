@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
-from bota_ethercat_bridge.ft_compensation.quantities import NO_WRENCH, Payload
+from bota_ft_compensation.compensator import Compensator
+from bota_ft_compensation.quantities import NO_WRENCH, Payload
 from tests.compensation.making import BIAS, TOOL, gravity_for, load
 
 ROOT = Path(__file__).parent.parent.parent

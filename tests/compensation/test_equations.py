@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
-from bota_ethercat_bridge.ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
+from bota_ft_compensation.compensator import Compensator
+from bota_ft_compensation.quantities import NO_WRENCH, ZERO, Payload, Wrench
 from tests.compensation.making import gravity_for, load
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.identification.free_motion import identify_in_motion
-from bota_ethercat_bridge.ft_compensation.identification.inertia import Turned, identify_inertia, turn
-from bota_ethercat_bridge.ft_compensation.identification.payload import Identified
-from bota_ethercat_bridge.ft_compensation.quantities import EXACT, Accelerometer, CompensationError
+from bota_ft_compensation.alignment import align
+from bota_ft_compensation.identification.free_motion import identify_in_motion
+from bota_ft_compensation.identification.inertia import Turned, identify_inertia, turn
+from bota_ft_compensation.identification.payload import Identified
+from bota_ft_compensation.quantities import EXACT, Accelerometer, CompensationError
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED
 from tests.compensation.motion import IMU, Felt, imperfect, settings

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.bounds import torque_bound_95, torque_noise_95
-from bota_ethercat_bridge.ft_compensation.identification.inertia import identify_inertia, turn
-from bota_ethercat_bridge.ft_compensation.identification.payload import Identified, identify
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.alignment import align
+from bota_ft_compensation.bounds import torque_bound_95, torque_noise_95
+from bota_ft_compensation.identification.inertia import identify_inertia, turn
+from bota_ft_compensation.identification.payload import Identified, identify
+from bota_ft_compensation.quantities import (
     EXACT,
     Accelerometer,
     CompensationError,

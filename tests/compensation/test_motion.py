@@ -14,11 +14,11 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.sensor.response import imu_noise
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.bias import TareBasis, estimate_bias
-from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.alignment import align
+from bota_ft_compensation.bias import TareBasis, estimate_bias
+from bota_ft_compensation.bounds import force_bound_95
+from bota_ft_compensation.compensator import Compensator
+from bota_ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
     NO_PAYLOAD,
@@ -28,8 +28,8 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Payload,
     Wrench,
 )
-from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
-from bota_ethercat_bridge.ft_compensation.stationary import StationaryMeans
+from bota_ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
+from bota_ft_compensation.stationary import StationaryMeans
 from tests.compensation import motion
 from tests.compensation.making import SEED
 from tests.compensation.motion import Felt, Imperfection, imperfect, left_over, settings

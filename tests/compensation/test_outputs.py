@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat_bridge.ft_compensation.outputs import WrenchFilter, WrenchTransform, low_pass
-from bota_ethercat_bridge.ft_compensation.quantities import ZERO, Quaternion
+from bota_ft_compensation.outputs import WrenchFilter, WrenchTransform, low_pass
+from bota_ft_compensation.quantities import ZERO, Quaternion
 
 RATE_HZ = 800.0
 STEP_NS = 1_250_000

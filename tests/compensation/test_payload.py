@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
-from bota_ethercat_bridge.ft_compensation.identification.estimation import Estimate, Value, estimate
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import write_yaml
-from bota_ethercat_bridge.ft_compensation.identification.payload import IdentificationError, identify
-from bota_ethercat_bridge.ft_compensation.identification.poses import Pose, coverage, pose_of
-from bota_ethercat_bridge.ft_compensation.identification.weighted import Array, students_t
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.compensator import Compensator
+from bota_ft_compensation.identification.estimation import Estimate, Value, estimate
+from bota_ft_compensation.identification.parameter_file import write_yaml
+from bota_ft_compensation.identification.payload import IdentificationError, identify
+from bota_ft_compensation.identification.poses import Pose, coverage, pose_of
+from bota_ft_compensation.identification.weighted import Array, students_t
+from bota_ft_compensation.quantities import (
     NO_WRENCH,
     SCALE_PRIOR,
     CompensationError,
     Payload,
     Wrench,
 )
-from bota_ethercat_bridge.ft_compensation.stationary import StationaryMeans, triple
+from bota_ft_compensation.stationary import StationaryMeans, triple
 from tests.compensation.making import AXES, BIAS, SEED, TOOL, gravity_for, load, pose, written_parameters
 from tests.simulation import more_if_long
 
@@ -136,7 +136,7 @@ def test_as_much_of_the_accelerometer_is_fitted_as_the_poses_tell(
         poses = [pose_of(each) for each in means[:24]]
         with pytest.MonkeyPatch.context() as patch:
             ours = identify(poses)
-            patch.setattr("bota_ethercat_bridge.ft_compensation.identification.payload._FEWEST_IN_TIME", 99)
+            patch.setattr("bota_ft_compensation.identification.payload._FEWEST_IN_TIME", 99)
             every = identify(poses)
         for found in (ours, every):
             assert found.accelerometer is not None

@@ -123,7 +123,7 @@ def test_everything_that_is_imported_is_a_dependency_once() -> None:
     packages = {"tf2_ros": "tf2_ros_py", "numpy": "python3-numpy"}
     needed = {
         packages.get(name, name)
-        for folder in ("bota_ethercat_bridge", "bridge", "ft_compensation", "launch")
+        for folder in ("bota_ethercat_bridge", "bota_ft_compensation", "bridge", "ft_compensation", "launch")
         for path in (PACKAGE / folder).rglob("*.py")
         for name in {imported.split(".")[0] for imported in imports(path)} - ours
     }
@@ -179,7 +179,7 @@ def test_both_install_the_same_everything_in_the_shared_folders() -> None:
     assert generated < pip.keys()
     # A new folder has to be named in both, or it is installed by neither.
     folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] not in "._"}
-    code = {"bota_ethercat_bridge", "bridge", "ft_compensation", "resource"}
+    code = {"bota_ethercat_bridge", "bota_ft_compensation", "bridge", "ft_compensation", "resource"}
     assert {name for name in folders if not name.endswith(".egg-info")} == {*SHARED_FOLDERS, *code}
 
 

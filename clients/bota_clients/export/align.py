@@ -32,7 +32,7 @@ from bota_clients.program import interrupt_on_signals, say
 from bota_clients.recording.columns import Ints, columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import angular_rate_response
-from bota_ethercat_bridge.ft_compensation.identification.delay import at_times, hann_window, lowest, smoothed
+from bota_ft_compensation.identification.delay import at_times, hann_window, lowest, smoothed
 
 Array = npt.NDArray[np.float64]
 _SMOOTH_S: Final = 0.1

@@ -42,7 +42,7 @@ from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.text.json_text import parse_json_object
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import offset_of
+from bota_ft_compensation.identification.parameter_file import offset_of
 
 _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
 _CHUNK: Final = 1024  # frames, in a file

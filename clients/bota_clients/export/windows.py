@@ -30,8 +30,8 @@ from bota_ethercat.replies import Delays
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import stream_of
-from bota_ethercat_bridge.ft_compensation.stream import (
+from bota_ft_compensation.identification.parameter_file import stream_of
+from bota_ft_compensation.stream import (
     CompensatedStream,
 )
 

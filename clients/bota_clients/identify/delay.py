@@ -17,9 +17,9 @@ from bota_clients.recording.columns import Columns, at_last_offset
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import force_lag_s
 from bota_ethercat.settings import SettingValue
-from bota_ethercat_bridge.ft_compensation.alignment import gyroscope_later_s
-from bota_ethercat_bridge.ft_compensation.identification.delay import Lag, check_held_out, find_lag
-from bota_ethercat_bridge.ft_compensation.quantities import CompensationError
+from bota_ft_compensation.alignment import gyroscope_later_s
+from bota_ft_compensation.identification.delay import Lag, check_held_out, find_lag
+from bota_ft_compensation.quantities import CompensationError
 
 
 def run(options: argparse.Namespace) -> int:

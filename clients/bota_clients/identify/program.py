@@ -26,15 +26,15 @@ from bota_clients.recording.columns import Columns, at_last_offset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.identification.free_motion import identify_in_motion
-from bota_ethercat_bridge.ft_compensation.identification.inertia import Turned, identify_inertia, turn
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import write_yaml
-from bota_ethercat_bridge.ft_compensation.identification.payload import Fit, Identified, identify, summary
-from bota_ethercat_bridge.ft_compensation.identification.poses import MOST_POSES, Pose, coverage, pose_of
-from bota_ethercat_bridge.ft_compensation.identification.weighted import CONFIDENCE
-from bota_ethercat_bridge.ft_compensation.imu import imu_position
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.alignment import align
+from bota_ft_compensation.identification.free_motion import identify_in_motion
+from bota_ft_compensation.identification.inertia import Turned, identify_inertia, turn
+from bota_ft_compensation.identification.parameter_file import write_yaml
+from bota_ft_compensation.identification.payload import Fit, Identified, identify, summary
+from bota_ft_compensation.identification.poses import MOST_POSES, Pose, coverage, pose_of
+from bota_ft_compensation.identification.weighted import CONFIDENCE
+from bota_ft_compensation.imu import imu_position
+from bota_ft_compensation.quantities import (
     CROSS_AXES,
     ELEMENTS,
     EXACT,
@@ -43,7 +43,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Wrench,
     length,
 )
-from bota_ethercat_bridge.ft_compensation.stream import obstacle
+from bota_ft_compensation.stream import obstacle
 
 _WIDTH: Final = 80  # every table fits
 Poses = Sequence[tuple[StationaryPeriod, Pose]]

@@ -16,8 +16,8 @@ import numpy as np
 
 from bota_clients.recording.columns import Bools, Columns, Floats
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
-from bota_ethercat_bridge.ft_compensation.quantities import StationaryLimits
-from bota_ethercat_bridge.ft_compensation.stationary import (
+from bota_ft_compensation.quantities import StationaryLimits
+from bota_ft_compensation.stationary import (
     CHANCE,
     NotStationaryError,
     StationaryMeans,

@@ -21,16 +21,16 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.program import say
 from bota_ethercat.program.new_file import NewFile, refuse_existing
-from bota_ethercat_bridge.ft_compensation.identification.inertia import possible_inertia
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import payload_of, write_payload
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ethercat_bridge.parameters.table import PARAMETERS, ParameterError
+from bota_ft_compensation.identification.inertia import possible_inertia
+from bota_ft_compensation.identification.parameter_file import payload_of, write_payload
+from bota_ft_compensation.quantities import (
     ELEMENTS,
     CompensationError,
     Payload,
     likely_inertia,
     vector,
 )
-from bota_ethercat_bridge.parameters.table import PARAMETERS, ParameterError
 
 _say = partial(say, "ethercat-identify")
 _ROWS: Final = {row.name: row for row in PARAMETERS}

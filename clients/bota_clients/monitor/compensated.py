@@ -12,9 +12,9 @@ from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.stream.timeline import InForce
-from bota_ethercat_bridge.ft_compensation.contact import Contact, ContactDetector, surface_of
-from bota_ethercat_bridge.ft_compensation.identification.parameter_file import stream_of
-from bota_ethercat_bridge.ft_compensation.quantities import CompensationError
+from bota_ft_compensation.contact import Contact, ContactDetector, surface_of
+from bota_ft_compensation.identification.parameter_file import stream_of
+from bota_ft_compensation.quantities import CompensationError
 
 
 class Compensated(NamedTuple):

@@ -12,7 +12,7 @@ from bota_ethercat.text.json_text import finite
 
 if TYPE_CHECKING:
     from bota_clients.monitor.compensated import Compensated
-    from bota_ethercat_bridge.ft_compensation.contact import Contact
+    from bota_ft_compensation.contact import Contact
 
 DIGITS = {"N": 2, "Nm": 3, "counts": 0, "m/s²": 2, "rad/s": 3}  # decimals by unit
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from bota_ethercat.client import Reading
-from bota_ethercat_bridge.ft_compensation.identification.payload import Identified, identify
-from bota_ethercat_bridge.ft_compensation.identification.poses import Pose, pose_of
-from bota_ethercat_bridge.ft_compensation.stationary import NotStationaryError, StationaryWindow
+from bota_ft_compensation.identification.payload import Identified, identify
+from bota_ft_compensation.identification.poses import Pose, pose_of
+from bota_ft_compensation.stationary import NotStationaryError, StationaryWindow
 
 if TYPE_CHECKING:  # the task does without MuJoCo
     from docs.examples.mujoco.arm import Arm

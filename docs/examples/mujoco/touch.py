@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.client import Condition, Reading
-from bota_ethercat_bridge.ft_compensation.contact import Capsule, Contact, ContactDetector, Uncertainty
-from bota_ethercat_bridge.ft_compensation.quantities import Payload
-from bota_ethercat_bridge.ft_compensation.stationary import triple
+from bota_ft_compensation.contact import Capsule, Contact, ContactDetector, Uncertainty
+from bota_ft_compensation.quantities import Payload
+from bota_ft_compensation.stationary import triple
 
 if TYPE_CHECKING:  # the controller does without MuJoCo
     from docs.examples.mujoco.arm import Arm

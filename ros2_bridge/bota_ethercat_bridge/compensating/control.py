@@ -21,10 +21,13 @@ from rclpy.node import Node
 from bota_ethercat_bridge.compensating.compensation import Compensation
 from bota_ethercat_bridge.compensating.sources import check_source, open_source
 from bota_ethercat_bridge.diagnostics import CompensationState
-from bota_ethercat_bridge.ft_compensation.bias import BiasRamp, TareBasis
-from bota_ethercat_bridge.ft_compensation.imu import Source
-from bota_ethercat_bridge.ft_compensation.outputs import cutoff_problem
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ethercat_bridge.parameters.declare import NodeParameters
+from bota_ethercat_bridge.parameters.table import ParameterError, Parameters
+from bota_ethercat_bridge.stream.reader import Reader
+from bota_ft_compensation.bias import BiasRamp, TareBasis
+from bota_ft_compensation.imu import Source
+from bota_ft_compensation.outputs import cutoff_problem
+from bota_ft_compensation.quantities import (
     NO_WRENCH,
     STILL,
     Accelerometer,
@@ -32,10 +35,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Wrench,
     wrench_text,
 )
-from bota_ethercat_bridge.ft_compensation.stream import OwnOffset, Plan, obstacle
-from bota_ethercat_bridge.parameters.declare import NodeParameters
-from bota_ethercat_bridge.parameters.table import ParameterError, Parameters
-from bota_ethercat_bridge.stream.reader import Reader
+from bota_ft_compensation.stream import OwnOffset, Plan, obstacle
 
 _FROM_PARAMETER: Final = "parameter"
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero

@@ -20,11 +20,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from bota_ethercat.pdo import Sample, Vector3
-from bota_ethercat_bridge.ft_compensation.imu import ImuSource, Source
-from bota_ethercat_bridge.ft_compensation.quantities import Quaternion, unit_quaternion
-from bota_ethercat_bridge.ft_compensation.specific_force import QuaternionGravity
 from bota_ethercat_bridge.parameters.table import TOPIC_SOURCES, ParameterError, Parameters
 from bota_ethercat_bridge.tf import TF_PERIOD_S, Tf, UnusableError, check_tf, stale_text, stamp_ns
+from bota_ft_compensation.imu import ImuSource, Source
+from bota_ft_compensation.quantities import Quaternion, unit_quaternion
+from bota_ft_compensation.specific_force import QuaternionGravity
 
 # How long an executor may take to release the previous subscription: DDS has one type per topic.
 _RELEASE_S: Final = 1.0

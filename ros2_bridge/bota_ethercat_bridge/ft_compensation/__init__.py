@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bias, tool and payload of a force/torque sensor: NumPy, no ROS.
+"""Deprecated name of `bota_ft_compensation`."""
 
-`compensator` subtracts, `bias` and `specific_force` tell what, `stationary` whether the sensor
-is at rest, `identification` finds the payload. docs/compensation.md.
-"""
+from bota_ethercat.renamed import forward
+
+forward(__name__, "bota_ft_compensation")

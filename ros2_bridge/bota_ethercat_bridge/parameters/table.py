@@ -17,9 +17,9 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.program.real_time import HIGHEST_PRIORITY
-from bota_ethercat_bridge.ft_compensation.contact import FARTHEST_M, Surface, surface_of
-from bota_ethercat_bridge.ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.contact import FARTHEST_M, Surface, surface_of
+from bota_ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
+from bota_ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
     NO_PAYLOAD,

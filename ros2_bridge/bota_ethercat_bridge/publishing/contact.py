@@ -12,13 +12,13 @@ from std_msgs.msg import Bool, Header
 
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Vector3
-from bota_ethercat_bridge.ft_compensation.compensator import Stages
-from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Why
-from bota_ethercat_bridge.ft_compensation.stream import CompensatedStream
 from bota_ethercat_bridge.parameters.table import Parameters, parse_surface
 from bota_ethercat_bridge.publishing.messages import Stamps, Topic, create_publisher
 from bota_ethercat_bridge.publishing.wrenches import WrenchTopic
 from bota_ethercat_bridge.rclpy_internals import packing
+from bota_ft_compensation.compensator import Stages
+from bota_ft_compensation.contact import ContactDetector, Why
+from bota_ft_compensation.stream import CompensatedStream
 
 _PERIOD_NS: Final = 40_000_000  # of the point, which takes as long as two samples take to compensate
 

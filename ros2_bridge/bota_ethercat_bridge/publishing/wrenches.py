@@ -13,14 +13,14 @@ from std_msgs.msg import Header
 
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import Vector3
-from bota_ethercat_bridge.ft_compensation.compensator import Stages
-from bota_ethercat_bridge.ft_compensation.outputs import WrenchFilter, WrenchTransform
-from bota_ethercat_bridge.ft_compensation.quantities import CompensationError
 from bota_ethercat_bridge.parameters.table import Parameters
 from bota_ethercat_bridge.publishing.messages import Stamps, Topic
 from bota_ethercat_bridge.rclpy_internals import packing
 from bota_ethercat_bridge.stream.link import NodeClock
 from bota_ethercat_bridge.tf import TF_PERIOD_S, Tf, UnusableError, check_tf, stale_text
+from bota_ft_compensation.compensator import Stages
+from bota_ft_compensation.outputs import WrenchFilter, WrenchTransform
+from bota_ft_compensation.quantities import CompensationError
 
 _PATIENCE_S: Final = 1.0  # without a pose before it is a problem: TF has to arrive first
 

@@ -22,7 +22,7 @@ from bota_ethercat.settings import SettingValue, known_settings
 from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable
-from bota_ethercat_bridge.ft_compensation.quantities import Wrench, wrench_text
+from bota_ft_compensation.quantities import Wrench, wrench_text
 
 CONFIGURE_TIMEOUT_S: Final = 10.0
 DESCRIBE_TIMEOUT_S: Final = 3.0

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Contact: whether something touches the tool, and where on its surface, from a compensated wrench. No allocation, no locks.
-// As ros2_bridge/bota_ethercat_bridge/ft_compensation/contact.py, which has the method; docs/compensation.md.
+// As ros2_bridge/bota_ft_compensation/contact.py, which has the method; docs/compensation.md.
 #pragma once
 
 #include <algorithm>

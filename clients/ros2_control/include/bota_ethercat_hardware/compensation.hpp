@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Weight and inertia of the tool, to be subtracted from force and torque, at their instant. docs/compensation.md has the model.
-// As ros2_bridge/bota_ethercat_bridge/ft_compensation: alignment, specific_force, compensator, stream.
+// As ros2_bridge/bota_ft_compensation: alignment, specific_force, compensator, stream.
 #pragma once
 
 #include <algorithm>
@@ -34,7 +34,7 @@ struct Payload {
     std::array<double, 6> cross_axis_interval{0.0098, 0.0098, 0.0098, 0.0098, 0.0098, 0.0098}, inertia_interval{};
 };
 
-/// What the compensated wrench is wrong by without contact, in 95 % of samples: as ft_compensation/bounds.py, which explains it.
+/// What the compensated wrench is wrong by without contact, in 95 % of samples: as bota_ft_compensation/bounds.py, which explains it.
 /// `tared`: the bias is of a tare by this accelerometer. `felt`, m/s^2, at the center of gravity; `rate`, rad/s; `spin`, rad/s^2.
 struct Bounds {
     double force, torque;  ///< N, Nm
@@ -106,7 +106,7 @@ inline double imu_height(std::string_view model) noexcept {
 }
 
 /// Weights of the IMU's latest samples, the newest first, that bring it to the instant and the bandwidth of force and torque: as
-/// ft_compensation/alignment.py, which explains them.
+/// bota_ft_compensation/alignment.py, which explains them.
 struct Alignment {
     using Taps = std::vector<double>;
 

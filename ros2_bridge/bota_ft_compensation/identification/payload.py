@@ -16,16 +16,16 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from bota_ethercat_bridge.ft_compensation.identification.estimation import (
+from bota_ft_compensation.identification.estimation import (
     FULL_CALIBRATION,
     Estimate,
     Value,
     calibration_prior,
     estimate,
 )
-from bota_ethercat_bridge.ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
-from bota_ethercat_bridge.ft_compensation.identification.weighted import CONFIDENCE, Array
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
+from bota_ft_compensation.identification.weighted import CONFIDENCE, Array
+from bota_ft_compensation.quantities import (
     NORMAL_95,
     OFFSET_PRIOR,
     SCALE_PRIOR,
@@ -36,7 +36,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     length,
     likely_inertia,
 )
-from bota_ethercat_bridge.ft_compensation.stationary import triple
+from bota_ft_compensation.stationary import triple
 
 LARGEST_MASS: Final = 500.0  # kg: no sensor of the family carries more
 LARGEST_CENTRE: Final = 2.0  # m

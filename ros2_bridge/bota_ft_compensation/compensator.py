@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
     STILL,

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, fir_taps
-from bota_ethercat_bridge.ft_compensation.alignment import Alignment, Array
-from bota_ethercat_bridge.ft_compensation.identification.delay import at_times, hann_window, smoothed
-from bota_ethercat_bridge.ft_compensation.identification.payload import Identified
-from bota_ethercat_bridge.ft_compensation.identification.weighted import students_t
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.alignment import Alignment, Array
+from bota_ft_compensation.identification.delay import at_times, hann_window, smoothed
+from bota_ft_compensation.identification.payload import Identified
+from bota_ft_compensation.identification.weighted import students_t
+from bota_ft_compensation.quantities import (
     ELEMENTS,
     NORMAL_95,
     Accelerometer,

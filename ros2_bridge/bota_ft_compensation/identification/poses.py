@@ -13,9 +13,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from bota_ethercat_bridge.ft_compensation.bias import check_at_rest
-from bota_ethercat_bridge.ft_compensation.quantities import ZERO, CompensationError, Wrench, length
-from bota_ethercat_bridge.ft_compensation.stationary import Array, StationaryMeans, triple
+from bota_ft_compensation.bias import check_at_rest
+from bota_ft_compensation.quantities import ZERO, CompensationError, Wrench, length
+from bota_ft_compensation.stationary import Array, StationaryMeans, triple
 
 _LEAST_POSES: Final = 4
 MOST_POSES: Final = 1000

@@ -29,13 +29,13 @@ from bota_ethercat.stream.usable import (
     Usability,
     judge,
 )
-from bota_ethercat_bridge.ft_compensation.alignment import Array, align
-from bota_ethercat_bridge.ft_compensation.bias import BiasRamp
-from bota_ethercat_bridge.ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator, Stages
-from bota_ethercat_bridge.ft_compensation.contact import ContactDetector, Surface, detector_of
-from bota_ethercat_bridge.ft_compensation.imu import IMU_IS_OFF, ImuSource, Source
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.alignment import Array, align
+from bota_ft_compensation.bias import BiasRamp
+from bota_ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
+from bota_ft_compensation.compensator import Compensator, Stages
+from bota_ft_compensation.contact import ContactDetector, Surface, detector_of
+from bota_ft_compensation.imu import IMU_IS_OFF, ImuSource, Source
+from bota_ft_compensation.quantities import (
     EXACT,
     NO_PAYLOAD,
     NO_WRENCH,

@@ -20,9 +20,9 @@ from typing import Final
 import numpy as np
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat_bridge.ft_compensation.alignment import Alignment, Array, align
-from bota_ethercat_bridge.ft_compensation.outputs import WrenchTransform
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.alignment import Alignment, Array, align
+from bota_ft_compensation.outputs import WrenchTransform
+from bota_ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
     STILL,

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.settings import SettingValue
-from bota_ethercat_bridge.ft_compensation.alignment import Alignment, align
-from bota_ethercat_bridge.ft_compensation.quantities import CompensationError
+from bota_ft_compensation.alignment import Alignment, align
+from bota_ft_compensation.quantities import CompensationError
 
 Array = NDArray[np.float64]
 

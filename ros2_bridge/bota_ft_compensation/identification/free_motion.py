@@ -14,20 +14,20 @@ from typing import Final
 import numpy as np
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from bota_ethercat_bridge.ft_compensation.identification.estimation import (
+from bota_ft_compensation.identification.estimation import (
     CROSS_COLUMN,
     CROSS_ROW,
     FULL_CALIBRATION,
     Value,
 )
-from bota_ethercat_bridge.ft_compensation.identification.inertia import (
+from bota_ft_compensation.identification.inertia import (
     Turned,
     crossing,
     divided,
     solve_pieces,
     untouched,
 )
-from bota_ethercat_bridge.ft_compensation.identification.payload import (
+from bota_ft_compensation.identification.payload import (
     ARM,
     NEGLIGIBLE,
     Fit,
@@ -37,9 +37,9 @@ from bota_ethercat_bridge.ft_compensation.identification.payload import (
     check_mass,
     too_vague,
 )
-from bota_ethercat_bridge.ft_compensation.identification.poses import Coverage
-from bota_ethercat_bridge.ft_compensation.identification.weighted import Array, students_t
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.identification.poses import Coverage
+from bota_ft_compensation.identification.weighted import Array, students_t
+from bota_ft_compensation.quantities import (
     ZERO,
     CompensationError,
     Payload,
@@ -47,7 +47,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     length,
     likely_inertia,
 )
-from bota_ethercat_bridge.ft_compensation.stationary import triple
+from bota_ft_compensation.stationary import triple
 
 _ROUNDS: Final = 8
 _LIGHTEST: Final = 1e-3  # kg

@@ -11,9 +11,9 @@ from bota_ethercat.pdo import Sample, Vector3
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.stream.timeline import InForce
-from bota_ethercat_bridge.ft_compensation.alignment import Alignment, align
-from bota_ethercat_bridge.ft_compensation.quantities import EXACT, STILL, ZERO, Accelerometer, Turning
-from bota_ethercat_bridge.ft_compensation.specific_force import ImuSpecificForce
+from bota_ft_compensation.alignment import Alignment, align
+from bota_ft_compensation.quantities import EXACT, STILL, ZERO, Accelerometer, Turning
+from bota_ft_compensation.specific_force import ImuSpecificForce
 
 IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 

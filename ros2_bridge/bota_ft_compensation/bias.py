@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from bota_ethercat_bridge.ft_compensation.compensator import Compensator
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.compensator import Compensator
+from bota_ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
     ZERO,
@@ -23,7 +23,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     length,
     wrench_text,
 )
-from bota_ethercat_bridge.ft_compensation.stationary import StationaryMeans
+from bota_ft_compensation.stationary import StationaryMeans
 
 
 def check_at_rest(acceleration: Vector3, magnitude: float, tolerance: float = 0.5) -> None:

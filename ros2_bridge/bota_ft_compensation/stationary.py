@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bota_ethercat.pdo import Sample, Vector3
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE, judge
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.quantities import (
     NO_WRENCH,
     ZERO,
     CompensationError,

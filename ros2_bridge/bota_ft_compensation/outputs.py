@@ -14,7 +14,7 @@ import math
 from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.quantities import (
     CompensationError,
     Quaternion,
     Wrench,

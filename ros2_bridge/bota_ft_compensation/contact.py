@@ -17,16 +17,16 @@ from typing import Final, NamedTuple
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.sensor.response import fir_taps, healthy_noise, imu_noise
 from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
-from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.bias import TareBasis
-from bota_ethercat_bridge.ft_compensation.bounds import (
+from bota_ft_compensation.alignment import align
+from bota_ft_compensation.bias import TareBasis
+from bota_ft_compensation.bounds import (
     IMU_BELOW,
     force_bound_95,
     inertia_halves,
     inertia_noise,
     off_center_95,
 )
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.quantities import (
     EXACT,
     STILL,
     ZERO,

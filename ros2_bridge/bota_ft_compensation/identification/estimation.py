@@ -19,14 +19,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from bota_ethercat_bridge.ft_compensation.identification.weighted import (
+from bota_ft_compensation.identification.weighted import (
     Array,
     Known,
     Solution,
     solve,
     students_t,
 )
-from bota_ethercat_bridge.ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
+from bota_ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
 
 # m/s²: what is assumed of the length of a mean acceleration beyond offset and sensitivities, ...
 _LENGTH_DEVIATION: Final = 0.002

@@ -13,9 +13,9 @@ from typing import Final
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.sensor.response import healthy_noise
-from bota_ethercat_bridge.ft_compensation.alignment import Alignment
-from bota_ethercat_bridge.ft_compensation.bias import TareBasis
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.alignment import Alignment
+from bota_ft_compensation.bias import TareBasis
+from bota_ft_compensation.quantities import (
     NORMAL_95,
     STILL,
     Accelerometer,

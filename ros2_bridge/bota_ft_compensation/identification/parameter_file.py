@@ -10,10 +10,10 @@ from typing import Any
 
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.program.new_file import NewFile
-from bota_ethercat_bridge.ft_compensation.bias import BiasRamp
-from bota_ethercat_bridge.ft_compensation.identification.payload import Identified
-from bota_ethercat_bridge.ft_compensation.imu import ImuSource
-from bota_ethercat_bridge.ft_compensation.quantities import (
+from bota_ft_compensation.bias import BiasRamp
+from bota_ft_compensation.identification.payload import Identified
+from bota_ft_compensation.imu import ImuSource
+from bota_ft_compensation.quantities import (
     EXACT,
     NO_PAYLOAD,
     NO_WRENCH,
@@ -22,7 +22,7 @@ from bota_ethercat_bridge.ft_compensation.quantities import (
     Payload,
     Wrench,
 )
-from bota_ethercat_bridge.ft_compensation.stream import CompensatedStream, Plan
+from bota_ft_compensation.stream import CompensatedStream, Plan
 
 _Row = tuple[str, Sequence[float], str]  # parameter, values, comment
 
