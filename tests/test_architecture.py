@@ -93,7 +93,7 @@ ROOMS: Final[dict[str, set[str]]] = {
 PACKAGES: Final[dict[str, set[str]]] = {
     "pysoem": {f"{S}.ethercat.soem"},
     "pyroute2": {S},
-    "numpy": {B, "bota_clients"},
+    "numpy": {B, C, "bota_clients"},
     "matplotlib": {"bota_clients.report"},
     "mcap": {"bota_clients.recording"},
     "zstandard": {"bota_clients.recording"},

@@ -23,6 +23,7 @@ def test_the_public_names_are_those_listed() -> None:
         # The table is loaded already, by its new name; others are loaded by their old one.
         ("bridge", "bota_ethercat_bridge", ("process", "parameters.table")),
         ("ft_compensation", "bota_ft_compensation", ("bias", "identification.delay")),
+        ("bota_ethercat_bridge.ft_compensation", "bota_ft_compensation", ("contact",)),
     ],
 )
 def test_an_old_package_name_gives_the_modules_of_the_new_one(

@@ -8,8 +8,8 @@ errors of the difference of the two means. The standard error of a mean is the l
 single samples, and from the means of eight parts of its window, which covers noise that the sensor's filters
 have correlated.
 
-Rest is judged here (`why_moving`), not as in `bota_ft_compensation`: in raw units, and by sums, which delay no
-exchange.
+Rest is judged here (`why_moving`), not as in `bota_ft_compensation`: in raw units, and by sums, which delay
+no exchange.
 """
 
 from __future__ import annotations
