@@ -232,21 +232,28 @@ class SocketTransport:
 def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
     """A non-blocking listener for each address of `hosts`; ServerError says why it cannot be had.
 
-    ::1 is left out on a machine without it if there is another address. Duplicates count once.
+    A loopback address, or a family, is left out on a machine without it if there is another address.
+    Duplicates count once.
     """
     listeners: list[socket.socket] = []
+    missing = ""
     for host in _distinct(hosts):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             listener = socket.create_server((host, port), family=family, backlog=_BACKLOG)
         except OSError as error:
-            if error.errno == errno.EAFNOSUPPORT or (error.errno == errno.EADDRNOTAVAIL and listeners):
-                continue  # no IPv6, or no address ::1, on this machine
+            problem = f"port {port} on {host} {_reason(error, port)}"
+            loopback = error.errno == errno.EADDRNOTAVAIL and ipaddress.ip_address(host).is_loopback
+            if loopback or error.errno == errno.EAFNOSUPPORT:
+                missing = missing or problem
+                continue
             for other in listeners:
                 other.close()
-            raise ServerError(f"port {port} on {host} {_reason(error, port)}") from None
+            raise ServerError(problem) from None
         listener.setblocking(False)
         listeners.append(listener)
+    if missing and not listeners:
+        raise ServerError(missing)
     return listeners
 
 
