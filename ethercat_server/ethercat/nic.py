@@ -581,12 +581,25 @@ def _owner(lock: int) -> int:
     return 0
 
 
-def _in_use(ifname: str, process: int = 0) -> InterfaceError:
+def _in_use(ifname: str, process: int = 0, who: str = "another EtherCAT master") -> InterfaceError:
     """The error to be raised; `process` has the interface, 0 if that is not known."""
-    who = "another EtherCAT master"
     if process > 0 and (name := _name_of(Path(f"/proc/{process}"))):
         who += f", process {process} ({name})"
     return InterfaceError(f"{ifname} is in use by {who}: stop that one first")
+
+
+def check_unused(ifname: str) -> None:
+    """InterfaceError if an EtherCAT master or a virtual sensor has the interface, which may not be there."""
+    if not (inodes := master_sockets(ifname)):
+        return
+    index = look_up(ifname).ifindex
+    of_slaves = {
+        row.inode for row in packet_sockets() if (row.protocol, row.ifindex) == (_ALL_PROTOCOLS, index)
+    }
+    for process in users_of(inodes):
+        what = "a virtual sensor" if process.sockets & of_slaves else "another EtherCAT master"
+        raise _in_use(ifname, process.pid, what)
+    raise _in_use(ifname, 0, "another EtherCAT master, or a virtual sensor")
 
 
 _MAX_NAME_LENGTH: Final = 15  # of a name that is no alternative one
@@ -604,8 +617,7 @@ def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
     index = _check_allowed(ifname, allow_ip=allow_ip)
     # Of two that start at once neither has the bus open yet, so looking for that is not enough.
     with locked(ifname, index):
-        if inodes := master_sockets(ifname):
-            raise _in_use(ifname, next((process.pid for process in users_of(inodes)), 0))
+        check_unused(ifname)
         _wait_usable(ifname)
         yield
 

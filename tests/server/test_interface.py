@@ -418,15 +418,15 @@ def test_the_lock_that_root_made_is_the_services_too(veth: Veth, monkeypatch: py
         nic.locked(*which).__enter__()
 
 
-@pytest.mark.parametrize("trap", ["link", "fifo", "writable"])
-def test_a_lock_that_may_be_anothers_is_not_used(veth: Veth, directory: Path, trap: str) -> None:
+@pytest.mark.parametrize("trap", ["link", "fifo", 0o777, 0o720, 0o702])
+def test_a_lock_that_may_be_anothers_is_not_used(veth: Veth, directory: Path, trap: str | int) -> None:
     directory.mkdir(mode=0o700)
     if trap == "link":
         (directory / "lock").symlink_to(directory.parent)
     elif trap == "fifo":
         os.mkfifo(directory / "lock")
-    else:
-        directory.chmod(0o777)
+    elif isinstance(trap, int):
+        directory.chmod(trap)
     with claimed(veth.near), pytest.raises(OSError):  # noqa: PT011 - any
         nic._open_lock("lock")
 

@@ -5,6 +5,7 @@ After that nothing is left behind, and the devices of others are as they were.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import random
@@ -28,10 +29,12 @@ from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import Steps
+from ethercat_server.ethercat.nic import claimed
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE, SYNC_MANAGER, pack_sync_manager
+from ethercat_server.ethercat.soem import SoemBackend
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build
 from ethercat_server.process import realtime
 from ethercat_server.sensor import scan
@@ -53,6 +56,7 @@ from tests.server.running import (
     Server,
     Veth,
     free_port,
+    needs_bus,
     on_a_bus,
     starved,
     virtual_sensor,
@@ -141,7 +145,21 @@ def test_a_port_that_is_taken(caplog: pytest.LogCaptureFixture) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         said = fails(caplog, "virtual", str(port))
-    assert f"port {port} on 127.0.0.1 is in use by another program" in said
+    assert f"port {port} on 127.0.0.1 is in use by another program, process {os.getpid()} (" in said
+    assert said.endswith(f"): stop that one, or choose port {port % 65535 + 1}")
+
+
+@needs_bus
+def test_an_interface_that_is_taken_is_said_before_a_port_that_is(caplog: pytest.LogCaptureFixture) -> None:
+    """Another port would lead to the next error only."""
+    with virtual_sensor() as (veth, sensor), socket.create_server(("127.0.0.1", 0)) as other:
+        port = str(other.getsockname()[1])
+        said = fails(caplog, veth.far, port, "--user", "root")
+        assert said.startswith(f"{veth.far} is in use by a virtual sensor, process {sensor.process.pid} (")
+        with claimed(veth.near), contextlib.closing(backend := SoemBackend(veth.near)):
+            backend.open()
+            said = fails(caplog, veth.near, port, "--user", "root")
+        assert said.startswith(f"{veth.near} is in use by another EtherCAT master, process {os.getpid()} (")
 
 
 # -- sensors that are not what they must be, in memory
@@ -355,7 +373,8 @@ def test_no_request_is_slow_whatever_counter_a_master_left(
         simulation.run(0.2)
         for number in range(2):
             task = simulation.recovery.acyclic.start(leave_counter(simulation.bus, number, last))
-            simulation.run_until(lambda task=task: task.finished, "the other master's request")
+            simulation.run(0.05)
+            assert task.finished
     client.ask("subscribe")
     for number in range(2):
         simulation.command(f"power cycle 0.2 @{number}")
