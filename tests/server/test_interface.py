@@ -213,6 +213,7 @@ exec "$@"
 """In a network namespace, where a route to elsewhere hurts nobody."""
 LOOK = """
 import contextlib
+import os
 import sys
 from ethercat_server.access.adapters import adapters
 from ethercat_server.doctor.machine import Host
@@ -227,10 +228,11 @@ except InterfaceError as error:
     print(error)
 with claimed("near0", allow_ip=True):
     print(*(row.unfit for row in adapters() if row.name == "near0"))
-found = CHECKS["other software", "addresses"](Host("near0"))
-print(found.level.name, found.found, *found.commands)
+look = CHECKS["other software", "addresses"]
+refused, allowed = (look(Host("near0", allow_ip=yes)) for yes in (False, True))
+print(refused.level.name, refused.found, *refused.commands, *allowed.commands)
 with contextlib.redirect_stderr(sys.stdout):
-    print(main(["near0", "--exit-on-eof"]))
+    print(main(["near0", "--exit-on-eof", "--control", f"/tmp/control-{os.getpid()}"]))
 """
 
 
@@ -266,6 +268,7 @@ with contextlib.redirect_stderr(sys.stdout):
         ("ip route add 10.1.0.0/16 dev near0", ""),
         ("ip route add 224.0.0.0/4 dev near0", ""),
         ("ip route add default via 198.51.100.1; ip -6 route add default via 2001:db8:1::1", ""),
+        ("ip route add default nexthop via 198.51.100.1 nexthop via 198.51.100.2", ""),
         ("ip route add unreachable default; ip -6 route add blackhole default", ""),
     ],
 )

@@ -396,6 +396,19 @@ def test_a_load_that_creeps_is_not_rest_and_noise_is() -> None:
         assert abs(tared["residual"][0]) < 1
 
 
+def test_a_load_that_moves_by_more_than_the_limit_during_a_tare_is_noticed() -> None:
+    """By 0.3 N, between the samples before the offset and those after it; the offset is taken back."""
+    for change, refused in ((0.28, False), (0.32, True), (-0.28, False), (-0.32, True)):
+        sdo = ScriptedSdo()
+        force = itertools.chain(itertools.repeat(5.0, 22), itertools.repeat(5.0 + change))
+        if not refused:
+            assert run_tare(sdo, 20, [0.0] * 6, force)["residual"][0] == pytest.approx(change)
+            continue
+        with pytest.raises(RequestError, match="Fx"):
+            run_tare(sdo, 20, [0.0] * 6, force)
+        assert sdo.held[0x8000, 1] == bytes(4)
+
+
 def test_a_sensor_that_turns_fast_is_not_at_rest_however_steadily() -> None:
     with pytest.raises(RequestError, match="it turns by 30 deg/s"):
         run_tare(ScriptedSdo(), 100, [0.0] * 6, itertools.repeat(1.0), rate_dps=30.0)
