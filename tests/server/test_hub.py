@@ -498,7 +498,8 @@ def test_a_request_in_two_parts_is_complete_once_both_are_there(served: Served) 
     assert answer["reply"] == "describe"
     served.only.subscribe([True], 1, fresh_only=True)
     served.serve(60.0)
-    assert not client.at_end
+    assert served.read(client) == []
+    assert not served.only.state.ending
 
 
 def test_a_client_that_asks_and_never_reads_is_closed(served: Served) -> None:
