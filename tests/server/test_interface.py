@@ -292,6 +292,14 @@ def test_the_interface_with_a_route_to_elsewhere_is_refused_by_all(routes: str, 
     assert virtual == [f"ethercat-virtual-sensor: {server}", "1"]
 
 
+def test_no_service_is_installed_for_one() -> None:
+    routes = "ip route add default nexthop via 192.0.2.1 nexthop via 192.0.2.2"
+    install = Path(__file__).parents[2] / "scripts/install-service"
+    done = completed("unshare", "--net", "bash", "-c", ROUTED, "bash", routes, install, "--dry-run", "near0")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("install-service: near0 has the machine's default route")
+
+
 @contextlib.contextmanager
 def address(veth: Veth, *options: str) -> Iterator[None]:
     with steady_addresses(fcntl.LOCK_EX):
