@@ -18,6 +18,7 @@ import pytest
 from hypothesis import settings
 
 from scripts.chain import loopback_up
+from tests.ended_with_the_run import end_all_with_this_process
 from tests.exception_cycles import no_exception_cycles
 
 _DOMAINS = 101
@@ -33,6 +34,7 @@ def _choose_domain() -> None:
 
 
 _choose_domain()
+end_all_with_this_process()
 # Programs started here have the signals of a shell's, also where nohup ignores this one.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # The servers started here stay the user that the tests are, whose files they read.

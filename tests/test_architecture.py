@@ -203,6 +203,31 @@ def test_there_is_no_import_cycle() -> None:
     assert not arrows
 
 
+def test_no_check_is_an_assert() -> None:
+    """PYTHONOPTIMIZE leaves them out: they may only tell mypy a type, or that something is not None."""
+    checks = [
+        f"{path}:{node.lineno}"
+        for folder in ("protocol", "ethercat_server", "clients", "ros2_bridge", "scripts", "docs/examples")
+        for path in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_bytes()))
+        if isinstance(node, ast.Assert) and not _narrows(node.test)
+    ]
+    assert checks == []
+
+
+def _narrows(test: ast.expr) -> bool:
+    match test:
+        case ast.Call(func=ast.Name("isinstance")):
+            return True
+        case ast.UnaryOp(ast.Not(), operand):
+            return _narrows(operand)
+        case ast.BoolOp(_, values):
+            return all(map(_narrows, values))
+        case ast.Compare(ast.Name() | ast.Attribute(), [ast.IsNot()], [ast.Constant(None)]):
+            return True
+    return False
+
+
 def test_the_protocol_is_sans_io_but_for_its_client() -> None:
     """Of the client, two files alone have sockets; futures start no thread."""
     may_have = {

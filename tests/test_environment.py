@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 
 from tests.ended import completed
 from tests.rights import NOBODY, needs_another_user
-from tests.server.running import needs_bus
+from tests.server.running import needs_bus, wait_until
 
 ROOT: Final = Path(__file__).parent.parent
 PIP: Final = """
@@ -141,3 +142,23 @@ def test_the_demo_without_ros_ends_with_what_the_monitor_knows_and_leaves_nothin
     assert "BFT-SENS-ECAT-M8" in ended.stdout
     assert ended.returncode == ("\nTrouble: " in ended.stdout)
     assert not own.exists()
+
+
+RUN: Final = """
+import subprocess, time
+from tests.ended_with_the_run import end_all_with_this_process
+end_all_with_this_process()
+for _ in range(2):
+    print(subprocess.Popen(("sleep", "600"), start_new_session=True).pid, flush=True)
+    end_all_with_this_process()  # as a worker of pytest does
+time.sleep(600)
+"""
+
+
+def test_a_run_that_is_killed_leaves_nothing_behind() -> None:
+    with subprocess.Popen((sys.executable, "-c", RUN), cwd=ROOT, stdout=subprocess.PIPE, text=True) as killed:
+        assert killed.stdout is not None
+        started = [Path("/proc", killed.stdout.readline().strip(), "cwd") for _ in range(2)]
+        assert all(process.exists() for process in started)
+        killed.kill()
+    wait_until(lambda: not any(process.exists() for process in started), "all that it started to be gone")

@@ -16,6 +16,7 @@ from ethercat_server.daemon.histories import kept
 from ethercat_server.daemon.options import ServerOptions
 from ethercat_server.daemon.traces import Traces
 from ethercat_server.errors import StopRequestedError
+from ethercat_server.ethercat.nic import check_unused
 from ethercat_server.ethercat.soem import open_bus
 from ethercat_server.process import realtime
 from ethercat_server.process.privileges import User, become, forbid_new_privileges, user_to_become
@@ -46,6 +47,8 @@ def serve(options: ServerOptions, signals: Signals, virtual: VirtualBus | None =
     )
     notifier = SystemdNotifier()
     with contextlib.ExitStack() as cleanup:
+        if virtual is None:  # whoever has it may have the port, too, and another port would not help
+            check_unused(options.ifname)
         hub = Hub(SocketTransport(options.server["hosts"], options.port))
         hub.permissions = permissions
         cleanup.callback(hub.close)

@@ -315,15 +315,15 @@ def _addresses(machine: Host) -> CheckResult:
     found: Routes = machine.fact("routes")
     name, delays = machine.shown, "IP traffic delays the sensor's frames"
     text = ", ".join([*found.addresses, *(f"route to {route}" for route in found.others)])
-    mend = () if found.default else (f"sudo ip address flush dev {name}",)
+    mend = () if found.elsewhere else (f"sudo ip address flush dev {name}",)
     shown = text or (f"only {', '.join(found.link_local)}" if found.link_local else "no address, no route")
     refused = not machine.allow_ip and network_trouble(name, found)
     another = f"the server refuses it (without {ALLOW_IP}): use another interface"
     return graded(
-        f"the machine's default route ({text or 'no address'})" if found.default else shown,
-        (refused and found.default, bad, another, _LIST),
+        f"{found.elsewhere} ({text or 'no address'})" if found.elsewhere else shown,
+        (refused and found.elsewhere, bad, another, _LIST),
         (refused, bad, f"{another}, or remove its addresses", *mend),
-        (text or found.default, warning, delays, *mend),
+        (text or found.elsewhere, warning, delays, *mend),
         (found.link_local, note,
          "the kernel's own IPv6 address: now and then it asks for routers and neighbors there",
          f"echo 1 | sudo tee /proc/sys/net/ipv6/conf/{name}/disable_ipv6"),

@@ -105,6 +105,8 @@ class Bus(Datagrams):
             self.finish(slave.sdo.drain(_MOST_EMERGENCIES), check_interrupt)
         if self._soem is not None:
             self._soem.map_process_data(check_interrupt)
+            for slave in self.slaves:
+                self.finish(slave.sdo.synchronize(), check_interrupt)
         else:
             logical = self._free_logical()
             for slave, content in zip(self.slaves, self._sensors_sii(), strict=True):

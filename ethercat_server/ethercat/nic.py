@@ -139,9 +139,13 @@ _IFA_ADDRESS, _IFA_LOCAL = 1, 2
 _IFA_F_PERMANENT: Final = 0x80
 # Family, length of the destination, of the source, TOS, table, who made it, scope, kind, flags.
 _ROUTE: Final = struct.Struct("=BBBBBBBBI")
-_RTA_DST, _RTA_OIF = 1, 4
-_MAIN_TABLE: Final = 254
+_RTA_DST, _RTA_OIF, _RTA_MULTIPATH = 1, 4, 9
+_RTA_GATEWAYS: Final = frozenset({5, 18})  # the second: one of the other family
+_NEXT_HOP: Final = struct.Struct("=HxxI")  # length, interface
+_UNICAST, _CACHED = 1, 0x200
 _MADE_BY_KERNEL: Final = 2
+# The shortest prefix of a single network; the whole address space is also routed by halves, or other parts.
+_NETWORK_BITS: Final[dict[int, int]] = {socket.AF_INET: 8, socket.AF_INET6: 7}
 _LINK_SCOPE: Final = 253
 _SIOCETHTOOL: Final = 0x8946
 _IFREQ: Final = struct.Struct("16sP16x")
@@ -380,49 +384,94 @@ class Routes(NamedTuple):
 
     addresses: tuple[str, ...] = ()  # with the length of their prefix; link-local ones are not among them
     link_local: tuple[str, ...] = ()  # those that every interface may give itself, without a network
-    default: bool = False  # the machine's default route goes here
-    others: tuple[str, ...] = ()  # destinations of the routes that the kernel did not make
+    # A default route goes here, in any table, by one of several next hops, or through an interface on top.
+    default: bool = False
+    others: tuple[str, ...] = ()  # destinations of the other routes that the kernel did not make
     # Those of the addresses that a network gave for some time: DHCP, or an IPv6 router.
     leased: tuple[str, ...] = ()
+    beyond: tuple[str, ...] = ()  # those of the others that are behind a gateway
 
     def __str__(self) -> str:
         """What makes it part of a network; empty if nothing does."""
-        return ", ".join(("default route",) * self.default + self.addresses)
+        beyond = tuple(f"route to {destination}" for destination in self.beyond)
+        return ", ".join((*("default route",) * self.default, *beyond, *self.addresses))
+
+    @property
+    def elsewhere(self) -> str:
+        """The route to other networks that goes here; empty if none does."""
+        if self.default:
+            return "the machine's default route"
+        return f"the route to {self.beyond[0]}, through a gateway" if self.beyond else ""
 
 
 def find_routes(index: int) -> Routes:
     """What is on the interface now; OSError if the kernel does not say."""
     try:
+        carried = _carried_by(index)
         addresses = [
             (f"{ipaddress.ip_address(found.get(_IFA_LOCAL) or found[_IFA_ADDRESS])}/{length}", scope, flags)
             for (family, length, flags, scope, its), found in _ask(_GET_ADDRESS, _ADDRESS, *(0,) * 5)
             if its == index and family in _FAMILIES
         ]
         routes = [
-            (length and f"{ipaddress.ip_address(found[_RTA_DST])}/{length}", made_by)
-            for (family, length, _, _, table, made_by, *_), found in _ask(_GET_ROUTE, _ROUTE, *(0,) * 9)
-            if found.get(_RTA_OIF) == index.to_bytes(4, sys.byteorder)
-            if table == _MAIN_TABLE and family in _FAMILIES
+            (_destination(family, length, found), made_by, gateway)
+            for (family, length, _, _, _, made_by, _, kind, flags), found in _ask(
+                _GET_ROUTE, _ROUTE, *(0,) * 9
+            )
+            if family in _FAMILIES and kind == _UNICAST and not flags & _CACHED
+            for gateway in _ways(found, carried)
         ]
     except (LookupError, ValueError, struct.error) as error:
         raise OSError(f"unknown answer: {error}") from error
+    others = {text: gateway for text, made_by, gateway in routes if text and made_by != _MADE_BY_KERNEL}
     return Routes(
         addresses=tuple(text for text, scope, _ in addresses if scope != _LINK_SCOPE),
         link_local=tuple(sorted(text for text, scope, _ in addresses if scope == _LINK_SCOPE)),
-        default=any(not text for text, _ in routes),
-        others=tuple(text for text, made_by in routes if text and made_by != _MADE_BY_KERNEL),
+        default=any(not text for text, *_ in routes),
+        others=tuple(others),
         leased=tuple(
             text for text, scope, flags in addresses if scope != _LINK_SCOPE and not flags & _IFA_F_PERMANENT
         ),
+        beyond=tuple(text for text, gateway in others.items() if gateway),
     )
+
+
+def _destination(family: int, length: int, route: dict[int, bytes]) -> str:
+    """Empty for a default route, or a part of one."""
+    if not length:
+        return ""
+    address = ipaddress.ip_address(route[_RTA_DST])
+    return f"{address}/{length}" if length >= _NETWORK_BITS[family] or address.is_multicast else ""
+
+
+def _carried_by(index: int) -> set[int]:
+    """The interface, and those that stand on it, such as VLANs."""
+    rows, carried = interfaces(), {index}
+    for _ in rows:
+        carried |= {
+            row.ifindex for row in rows if row.link in carried and not row.namespace and row.kind != "veth"
+        }
+    return carried
+
+
+def _ways(route: dict[int, bytes], carried: set[int]) -> Iterator[bool]:
+    """Of each next hop of a route that is on one of these interfaces: whether it is a gateway."""
+    if int.from_bytes(route.get(_RTA_OIF, b""), sys.byteorder) in carried:
+        yield not _RTA_GATEWAYS.isdisjoint(route)
+    hops = route.get(_RTA_MULTIPATH, b"")
+    while len(hops) >= _NEXT_HOP.size:
+        size, index = _NEXT_HOP.unpack_from(hops)
+        if index in carried:
+            yield not _RTA_GATEWAYS.isdisjoint(_attributes(hops[_NEXT_HOP.size : size]))
+        hops = hops[max(_NEXT_HOP.size, size + 3 & ~3) :]
 
 
 def network_trouble(ifname: str, routes: Routes) -> str | None:
     """Why `ifname` must not carry EtherCAT frames, and what to do; None if it may."""
-    other = "name the one that the sensor is connected to ('ethercat-sensor adapters' lists them)"
+    other = "name the sensor's interface ('ethercat-sensor adapters' lists them)"
     anyway = f"{ALLOW_IP} overrides this"
-    if routes.default:
-        return f"{ifname} has the machine's default route, so it is not for a sensor: {other}; {anyway}"
+    if elsewhere := routes.elsewhere:
+        return f"{ifname} has {elsewhere}, so it is not for a sensor: {other}; {anyway}"
     if routes.leased:
         return (
             f"{ifname} has the IP address {routes.leased[0]} by DHCP, so it is part of a network: {other}, "
@@ -532,12 +581,25 @@ def _owner(lock: int) -> int:
     return 0
 
 
-def _in_use(ifname: str, process: int = 0) -> InterfaceError:
+def _in_use(ifname: str, process: int = 0, who: str = "another EtherCAT master") -> InterfaceError:
     """The error to be raised; `process` has the interface, 0 if that is not known."""
-    who = "another EtherCAT master"
     if process > 0 and (name := _name_of(Path(f"/proc/{process}"))):
         who += f", process {process} ({name})"
     return InterfaceError(f"{ifname} is in use by {who}: stop that one first")
+
+
+def check_unused(ifname: str) -> None:
+    """InterfaceError if an EtherCAT master or a virtual sensor has the interface, which may not be there."""
+    if not (inodes := master_sockets(ifname)):
+        return
+    index = look_up(ifname).ifindex
+    of_slaves = {
+        row.inode for row in packet_sockets() if (row.protocol, row.ifindex) == (_ALL_PROTOCOLS, index)
+    }
+    for process in users_of(inodes):
+        what = "a virtual sensor" if process.sockets & of_slaves else "another EtherCAT master"
+        raise _in_use(ifname, process.pid, what)
+    raise _in_use(ifname, 0, "another EtherCAT master, or a virtual sensor")
 
 
 _MAX_NAME_LENGTH: Final = 15  # of a name that is no alternative one
@@ -555,8 +617,7 @@ def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
     index = _check_allowed(ifname, allow_ip=allow_ip)
     # Of two that start at once neither has the bus open yet, so looking for that is not enough.
     with locked(ifname, index):
-        if inodes := master_sockets(ifname):
-            raise _in_use(ifname, next((process.pid for process in users_of(inodes)), 0))
+        check_unused(ifname)
         _wait_usable(ifname)
         yield
 
@@ -564,25 +625,30 @@ def claimed(ifname: str, *, allow_ip: bool = False) -> Iterator[None]:
 def _check_allowed(ifname: str, *, allow_ip: bool) -> int:
     if problem := name_trouble(ifname):
         raise InterfaceError(problem)
-    found = look_up(ifname)
-    if found.loopback:
-        raise InterfaceError(f"{ifname} is the loopback interface: name the one the sensor is connected to")
-    if not allow_ip:
-        try:
-            routes = find_routes(found.ifindex)
-        except OSError as error:
-            raise InterfaceError(
-                f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "
-                "overrides this check"
-            ) from None
-        if problem := network_trouble(ifname, routes):
-            raise InterfaceError(problem)
+    check_network(found := look_up(ifname), ifname, allow_ip=allow_ip)
     if missing := missing_capabilities():
         raise InterfaceError(
             f"not allowed to open {ifname}: {' and '.join(missing)} missing; run with sudo, or "
             "give the service CAP_NET_RAW and CAP_NET_ADMIN"
         )
     return found.ifindex
+
+
+def check_network(found: Interface, ifname: str, *, allow_ip: bool) -> None:
+    """InterfaceError for one of the machine's network, which `allow_ip` permits, and for loopback."""
+    if found.loopback:
+        raise InterfaceError(f"{ifname} is the loopback interface: name the sensor's")
+    if allow_ip:
+        return
+    try:
+        routes = find_routes(found.ifindex)
+    except OSError as error:
+        raise InterfaceError(
+            f"the kernel does not say whether {ifname} has an IP address ({error}): {ALLOW_IP} "
+            "overrides this check"
+        ) from None
+    if problem := network_trouble(ifname, routes):
+        raise InterfaceError(problem)
 
 
 def _wait_usable(ifname: str) -> None:

@@ -118,7 +118,8 @@ class Sensor:
 
     def enter(self, state: SensorState) -> None:
         """Go to another state; AssertionError for an impossible transition."""
-        assert state in _TRANSITIONS[self.state], f"{self.state.name} -> {state.name}"
+        if state not in _TRANSITIONS[self.state]:
+            raise AssertionError(f"{self.state.name} -> {state.name}")
         self.state = state
 
     @property

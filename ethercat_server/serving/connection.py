@@ -287,7 +287,8 @@ class Connection:
         return f"client {self.peer} (uid {'unknown' if self.uid is None else self.uid})"
 
     def _become(self, state: ConnectionState) -> None:
-        assert state in TRANSITIONS[self.state], f"{self}: {self.state.name} -> {state.name}"
+        if state not in TRANSITIONS[self.state]:
+            raise AssertionError(f"{self}: {self.state.name} -> {state.name}")
         self.state = state
         if self._client_ended or state in (_S.READY, _S.ANSWERING, _S.CLOSED):
             self._watched.readers.discard(self.fd)

@@ -19,10 +19,12 @@ import select
 import socket
 import struct
 from collections.abc import Callable, Collection, Sequence
+from itertools import islice
 from typing import Final, Protocol
 
 from bota_ethercat.address import Address
 from ethercat_server.errors import ServerError, UsageError
+from ethercat_server.ethercat.nic import table, users_of
 
 
 class Stream(Protocol):
@@ -154,6 +156,7 @@ def _owner(answer: bytes, connections: Collection[bytes]) -> int | None:
 
 
 _BACKLOG: Final = 128
+_LISTEN: Final = "0A"  # in /proc/net/tcp
 # Small, so that a client that reads on after a pause gets recent samples, not seconds of old ones.
 _SEND_BUFFER: Final = 65536
 
@@ -232,31 +235,50 @@ class SocketTransport:
 def listen(hosts: Sequence[str], port: int) -> list[socket.socket]:
     """A non-blocking listener for each address of `hosts`; ServerError says why it cannot be had.
 
-    ::1 is left out on a machine without it if there is another address. Duplicates count once.
+    A loopback address, or a family, is left out on a machine without it if there is another address.
+    Duplicates count once.
     """
     listeners: list[socket.socket] = []
+    missing = ""
     for host in _distinct(hosts):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             listener = socket.create_server((host, port), family=family, backlog=_BACKLOG)
         except OSError as error:
-            if error.errno == errno.EAFNOSUPPORT or (error.errno == errno.EADDRNOTAVAIL and listeners):
-                continue  # no IPv6, or no address ::1, on this machine
+            problem = f"port {port} on {host} {_reason(error, port)}"
+            loopback = error.errno == errno.EADDRNOTAVAIL and ipaddress.ip_address(host).is_loopback
+            if loopback or error.errno == errno.EAFNOSUPPORT:
+                missing = missing or problem
+                continue
             for other in listeners:
                 other.close()
-            raise ServerError(f"port {port} on {host} {_reason(error, port)}") from None
+            raise ServerError(problem) from None
         listener.setblocking(False)
         listeners.append(listener)
+    if missing and not listeners:
+        raise ServerError(missing)
     return listeners
 
 
 def _reason(error: OSError, port: int) -> str:
     """Why an address cannot be used, and what to do."""
     if error.errno == errno.EADDRINUSE:
-        return f"is in use by another program ('ss -ltnp'): stop that one, or choose port {port % 65535 + 1}"
+        who = _listening(port) or " ('ss -ltnp')"
+        return f"is in use by another program{who}: stop that one, or choose port {port % 65535 + 1}"
     if error.errno == errno.EADDRNOTAVAIL:
         return "cannot be used: no interface of this machine has this address; 'ip address' lists them"
     return f"cannot be used: {os.strerror(error.errno or 0)}; choose another"
+
+
+def _listening(port: int) -> str:
+    """The process that listens on a port, as part of a sentence; empty if it is not visible."""
+    inodes: set[int] = set()
+    for name in ("tcp", "tcp6"):
+        with contextlib.suppress(OSError):
+            for row in table(f"/proc/self/net/{name}"):
+                if row[3] == _LISTEN and int(row[1].rpartition(":")[2], 16) == port:
+                    inodes.add(int(row[9]))
+    return "".join(f", process {its.pid} ({its.name})" for its in islice(users_of(inodes), 1))
 
 
 def _distinct(hosts: Sequence[str]) -> list[str]:

@@ -16,6 +16,7 @@ from bota_ethercat.program.real_time import make_real_time
 from bota_ethercat.program.signals import signals_call
 from bota_ethercat.settings import SETTINGS
 from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.options import ALLOW_IP, ALLOW_IP_HELP
 from ethercat_server.sensor.models import MODELS
 from ethercat_server.virtual_sensor.distributed_clock import CLOCK_WORDS, parse_clock
 from ethercat_server.virtual_sensor.fault import PPM_LIMIT
@@ -116,6 +117,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="COMMAND",
         help="send a command to the virtual sensor that runs, print its answer and exit",
     )
+    parser.add_argument(ALLOW_IP, action="store_true", help=ALLOW_IP_HELP)
     parser.add_argument("--exit-on-eof", action="store_true", help="exit when stdin ends")
     return parser
 
@@ -207,10 +209,15 @@ def main(
         + (f", beside {', '.join(foreign)}" if foreign else "")
     )
 
+    def on_ready(note: str) -> None:
+        if note:
+            _say(note)
+        print(ready, flush=True)
+
     try:
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)  # reading from the terminal must not suspend it
         with signals_call(stopped.set):
-            link.run(args, slaves, on_open, lambda: print(ready, flush=True), stopped)
+            link.run(args, slaves, on_open, on_ready, stopped)
     except link.LinkError as error:
         _say(error)
         return 1

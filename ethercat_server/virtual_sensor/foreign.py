@@ -188,4 +188,3 @@ def leave_in(life: Application, state: AlState, station: int, outputs_at: int, i
     for step in (AlState.PREOP, AlState.SAFEOP, AlState.OP):
         if step <= state:
             write(reg.AL_CONTROL, step.request())
-    assert life.state is state

@@ -24,7 +24,7 @@ from typing import Final
 
 from bota_ethercat.world import DATAGRAM, decode
 from ethercat_server.errors import InterfaceError
-from ethercat_server.ethercat.nic import arrived_ns, look_up, master_sockets
+from ethercat_server.ethercat.nic import arrived_ns, check_network, look_up, master_sockets
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import SlaveChain
 from ethercat_server.virtual_sensor.faults import LONGEST_LINE, obey
@@ -87,16 +87,20 @@ def run(
     args: argparse.Namespace,
     slaves: Iterable[SlaveOptions],
     on_open: Callable[[], None],
-    on_ready: Callable[[], None],
+    on_ready: Callable[[str], None],
     stop: threading.Event,
 ) -> None:
     """Answer EtherCAT frames on `args.iface` until stopped.
 
     Stops when `stop` is set (checked every 10 ms), on the command `quit`, and at the end of standard input if
     `exit_on_eof`. LinkError if the interface cannot be used, or disappears (one that is only down is waited
-    for), or a path cannot; without `control` `own_socket` is used, if it is free.
+    for), or a path cannot; without `control` `own_socket` is used, and `on_ready` told if that cannot be.
     """
     ifname, control_path = args.iface, args.control
+    try:
+        check_network(look_up(ifname), ifname, allow_ip=args.allow_ip)
+    except InterfaceError as error:
+        raise LinkError(str(error)) from None
     if master_sockets(ifname):  # two that answer each other's answers would take all of the processors
         raise LinkError(f"{ifname} is in use by another virtual sensor or master: stop that one first")
     with contextlib.ExitStack() as stack:
@@ -109,9 +113,14 @@ def run(
         poller = select.poll()
         poller.register(raw, select.POLLIN)
         heard: dict[int, Callable[[], object]] = {}  # besides the frames: what to do, by descriptor
-        with contextlib.suppress(LinkError) if control_path is None else contextlib.nullcontext():
+        note = ""
+        try:
             control = stack.enter_context(bound(control_path or own_socket()))
             heard[control.fileno()] = lambda: _obey(control, bus)
+        except LinkError as error:
+            if control_path is not None:
+                raise
+            note = f"--send does not reach this virtual sensor, {error}: give it --control PATH"
         if args.world:
             world = stack.enter_context(bound(args.world))
             heard[world.fileno()] = lambda: _hear(world, bus)
@@ -124,7 +133,7 @@ def run(
         # All that is loaded need never be looked through again, which takes some 20 ms.
         gc.collect()
         gc.freeze()
-        on_ready()
+        on_ready(note)
         answers, index, up = _Answers(raw, bus, ifname), look_up(ifname).ifindex, True
         while not stop.is_set() and not bus.quit:
             ready = [descriptor for descriptor, _ in poller.poll(_IDLE_MS)]

@@ -16,7 +16,7 @@ Quaternion = tuple[float, float, float, float]  # x, y, z, w
 ZERO: Final[Vector3] = (0.0, 0.0, 0.0)
 # Gravity in the base frame (z up), m/s². The sensor's g is 9.80665 m/s², not 9.81.
 DEFAULT_GRAVITY: Final[Vector3] = (0.0, 0.0, -STANDARD_GRAVITY)
-_NORM_TOLERANCE: Final = 0.01
+NORM_TOLERANCE: Final = 0.01
 
 
 class CompensationError(Exception):
@@ -166,7 +166,7 @@ def unit_quaternion(q: Quaternion) -> Quaternion:
     """`q` made exactly one long; ValueError, a sentence, if it is not nearly so."""
     x, y, z, w = q
     norm = math.sqrt(x * x + y * y + z * z + w * w)
-    if not abs(norm - 1.0) <= _NORM_TOLERANCE:  # a NaN is not either
+    if not abs(norm - 1.0) <= NORM_TOLERANCE:  # a NaN is not either
         raise ValueError(f"a rotation is a quaternion of length 1, this one's is {norm:g}")
     return x / norm, y / norm, z / norm, w / norm
 

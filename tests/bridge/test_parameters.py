@@ -83,6 +83,13 @@ def test_what_is_taken_and_what_else_is_said() -> None:
             ROWS[name].check(wrong)
 
 
+@pytest.mark.parametrize("rounded", [1.0000000000000002, 1.0, 0.9999999999999998, -1.0000000000000002])
+def test_a_rotation_may_be_rounded(rounded: float) -> None:
+    row, mounting = ROWS["orientation.mounting"], (0.0, 0.0, 0.0, rounded)
+    values = {row.name: row.default for row in PARAMETERS} | {row.name: row.check(mounting)}
+    assert gather(values).mounting == (0.0, 0.0, 0.0, math.copysign(1.0, rounded))
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -116,6 +116,12 @@ def test_what_is_said(found: CheckResult, level: Level, said: str) -> None:
     assert said in f"{found.found} {found.why}"
 
 
+def test_error_counters_are_where_the_standard_has_them() -> None:
+    """0x0300 + 2 * port: invalid frames, + 1: of the physical layer; 0x0308, 0x030C, 0x030D, 0x0310."""
+    found = bus_checks.ErrorCounters.parse(bytes(range(20)))
+    assert found == ((0, 2, 4, 6), (1, 3, 5, 7), (8, 9, 10, 11), 12, 13, (16, 17, 18, 19))
+
+
 def test_a_bus_without_a_sensor_is_bad_unless_one_of_its_slaves_may_be_one() -> None:
     coupler = slave(vendor=2, name="EK1100")
     [found] = bus_checks.any_sensor([coupler])

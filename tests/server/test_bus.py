@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 from collections.abc import Callable, Sequence
 from typing import cast
 
@@ -12,10 +13,11 @@ from bota_ethercat.framing import DataFlag
 from ethercat_server.acquisition.start_up import bring_up
 from ethercat_server.ethercat.backend import Backend
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.exchange import DUPLICATE, FIRST_INDEX, MOST_IN_FLIGHT
+from ethercat_server.ethercat.exchange import DUPLICATE, FIRST_INDEX, MOST_IN_FLIGHT, read_clock
 from ethercat_server.ethercat.exchange import Exchange as Taken
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build, parse
+from ethercat_server.sampling.observation import DistributedClock
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -91,6 +93,34 @@ def test_a_slave_that_did_not_do_it_and_a_lost_frame_are_no_answer() -> None:
         assert not bus.finish(bus.write_register(0, 0x1000, b"\1"))
         assert bus.finish(bus.read_register(0, 0x0130, 2)) == nothing
     assert bus.count_slaves() == 0
+
+
+def test_the_clock_of_a_slave_is_what_its_master_set_and_the_way_through_all_its_links() -> None:
+    """A delay is part of the offset; a port without a link, or a time that cannot be, is no way."""
+    registers = {
+        reg.DC_OFFSET: struct.pack("<QI", 5_000_000_000, 300),
+        reg.DC_RECEIVE_TIMES: struct.pack("<4I", 0xFFFFFF00, 0x300, 0x500, 0x700),
+    }
+
+    def read(links: int) -> DistributedClock | None:
+        def answer(frame: bytearray) -> list[bytes]:
+            ado = parse(frame, len(frame))[0].ado
+            return [done(frame, {**registers, reg.DL_STATUS: links.to_bytes(2, "little")}[ado])]
+
+        bus, _ = scripted(answer)
+        return bus.finish(read_clock(bus, 0, 100))
+
+    found = read(0b0111 << 4)
+    assert found is not None
+    assert found[:2] == ((5_000_000_000 - 300) % 2**32, 0x600)
+    for links, loop_ns in ((0b0011, 0x400), (0b1111, 0x800), (0b0001, 0)):
+        found = read(links << 4)
+        assert found is not None
+        assert found.loop_delay_ns == loop_ns
+    registers[reg.DC_RECEIVE_TIMES] = struct.pack("<4I", 0, 0x300, 1_000_000, 0)
+    found = read(0b0111 << 4)
+    assert found is not None
+    assert found.loop_delay_ns == 0x300
 
 
 def foreign_frames() -> list[bytes]:

@@ -487,6 +487,21 @@ def test_who_waits_for_an_answer_is_not_idle(served: Served) -> None:
     assert served.is_closed(client)
 
 
+def test_a_request_in_two_parts_is_complete_once_both_are_there(served: Served) -> None:
+    """The time that a message may take ends with it: a subscriber stays for as long as it likes."""
+    request = encode_json({"action": "describe"})
+    client = served.connect(sent=request[:7])
+    served.serve(1.0)
+    client.send(request[7:])
+    served.serve(1.0)
+    (answer,) = served.read(client)
+    assert answer["reply"] == "describe"
+    served.only.subscribe([True], 1, fresh_only=True)
+    served.serve(60.0)
+    assert served.read(client) == []
+    assert not served.only.state.ending
+
+
 def test_a_client_that_asks_and_never_reads_is_closed(served: Served) -> None:
     client = served.connect()
     request = encode_json({"action": "describe", "id": "x" * 4_000})

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import itertools
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -193,38 +195,109 @@ def test_a_link_that_is_too_fast_for_a_slave_ends_in_a_switch(
 
 # -- an interface of the machine's network
 
-IN_A_NETWORK = """
+ROUTED = """
 set -e
-ip link add near0 type veth peer name far0
-ip link set far0 up
-ip link set near0 up
+for end in near other; do
+    ip link add ${end}0 type veth peer name ${end}1
+    ip link set ${end}1 up
+    ip link set ${end}0 up
+done
 ip address add 192.0.2.7/24 dev near0
-ip route add default via 192.0.2.1
+ip address add 198.51.100.7/24 dev other0
+ip address add 2001:db8::7/64 dev near0 nodad
+ip address add 2001:db8:1::7/64 dev other0 nodad
+eval "$1"
+shift
 exec "$@"
 """
-"""In a network namespace, where a default route hurts nobody."""
-REFUSE = """
+"""In a network namespace, where a route to elsewhere hurts nobody."""
+LOOK = """
+import contextlib
+import os
 import sys
+from ethercat_server.access.adapters import adapters
+from ethercat_server.doctor.machine import Host
+from ethercat_server.doctor.machine_checks import CHECKS
 from ethercat_server.errors import InterfaceError
 from ethercat_server.ethercat.nic import claimed
+from ethercat_server.virtual_sensor.cli import main
 try:
     with claimed("near0"):
-        pass
+        print("allowed")
 except InterfaceError as error:
     print(error)
 with claimed("near0", allow_ip=True):
-    print("allowed")
+    print(*(row.unfit for row in adapters() if row.name == "near0"))
+look = CHECKS["other software", "addresses"]
+refused, allowed = (look(Host("near0", allow_ip=yes)) for yes in (False, True))
+print(refused.level.name, refused.found, *refused.commands, *allowed.commands)
+with contextlib.redirect_stderr(sys.stdout):
+    print(main(["near0", "--exit-on-eof", "--control", f"/tmp/control-{os.getpid()}"]))
 """
 
 
-def test_the_default_route_is_refused_unless_it_is_allowed() -> None:
-    """Only in a network namespace of its own may a test have one, so this is a process."""
-    done = completed("unshare", "--net", "bash", "-c", IN_A_NETWORK, "bash", sys.executable, "-c", REFUSE)
-    refused, allowed = done.stdout.splitlines()
-    assert "near0 has the machine's default route" in refused, done.stderr
-    assert "'ethercat-sensor adapters' lists them" in refused
-    assert "--allow-ip" in refused
-    assert allowed == "allowed"
+@pytest.mark.parametrize(
+    ("routes", "elsewhere"),
+    [
+        (routes, "the machine's default route")
+        for routes in (
+            "ip route add default via 192.0.2.1",
+            "ip route add default dev near0",
+            "ip route add default via inet6 fe80::1 dev near0",
+            *(
+                f"ip route add default nexthop via {one} nexthop via {other}"
+                for one, other in itertools.permutations(
+                    ("192.0.2.1 dev near0 weight 9", "198.51.100.1 dev other0")
+                )
+            ),
+            "ip nexthop add id 5 via 192.0.2.1 dev near0; ip route add default nhid 5",
+            "ip rule add from 192.0.2.7 table 77; ip route add default via 192.0.2.1 table 77",
+            "ip rule add fwmark 1 table 7777; ip route add default dev near0 table 7777",
+            "ip route add 0.0.0.0/1 via 192.0.2.1; ip route add 128.0.0.0/1 via 192.0.2.1",
+            "ip route add 128.0.0.0/2 dev near0",
+            "ip -6 route add default via 2001:db8::1",
+            "ip -6 route add default nexthop via 2001:db8::1 nexthop via 2001:db8:1::1",
+            "ip -6 route add 2000::/3 dev near0",
+            "ip link add link near0 name up0 type macvlan; ip link set up0 up; ip route add default dev up0",
+        )
+    ]
+    + [
+        ("ip route add 10.0.0.0/8 via 192.0.2.1", "the route to 10.0.0.0/8, through a gateway"),
+        ("ip -6 route add fd00::/8 via 2001:db8::1 table 9", "the route to fd00::/8, through a gateway"),
+        ("true", ""),
+        ("ip route add 10.1.0.0/16 dev near0", ""),
+        ("ip route add 224.0.0.0/4 dev near0", ""),
+        ("ip route add default via 198.51.100.1; ip -6 route add default via 2001:db8:1::1", ""),
+        ("ip route add default nexthop via 198.51.100.1 nexthop via 198.51.100.2", ""),
+        ("ip route add unreachable default; ip -6 route add blackhole default", ""),
+    ],
+)
+def test_the_interface_with_a_route_to_elsewhere_is_refused_by_all(routes: str, elsewhere: str) -> None:
+    """By server, `find`, doctor and virtual sensor, unless it is allowed."""
+    looked = completed("unshare", "--net", "bash", "-c", ROUTED, "bash", routes, sys.executable, "-c", LOOK)
+    server, find, doctor, *virtual = looked.stdout.splitlines()
+    if not elsewhere:
+        assert server == "allowed"
+        assert doctor.startswith("LOOK ")
+        assert "sudo ip address flush dev near0" in doctor
+        assert virtual[0].startswith("ready"), looked.stderr
+        return
+    assert server.startswith(f"near0 has {elsewhere}, so it is not for a sensor"), looked.stderr
+    assert "'ethercat-sensor adapters' lists them" in server
+    assert "--allow-ip" in server
+    way = re.sub("the (machine's )?|,.*", "", elsewhere)
+    assert find.startswith("part of" if "type macvlan" in routes else way)
+    assert doctor.startswith(f"TROUBLE {elsewhere} (")
+    assert "flush" not in doctor, "it would cut the machine off"
+    assert virtual == [f"ethercat-virtual-sensor: {server}", "1"]
+
+
+def test_no_service_is_installed_for_one() -> None:
+    routes = "ip route add default nexthop via 192.0.2.1 nexthop via 192.0.2.2"
+    install = Path(__file__).parents[2] / "scripts/install-service"
+    done = completed("unshare", "--net", "bash", "-c", ROUTED, "bash", routes, install, "--dry-run", "near0")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("install-service: near0 has the machine's default route")
 
 
 @contextlib.contextmanager
@@ -274,6 +347,7 @@ def test_an_address_that_somebody_gave_it_is_allowed(veth: Veth) -> None:
         (Routes(leased=("2001:db8::2/64",)), "address 2001:db8::2/64 by DHCP"),
         (Routes(("10.0.0.2/24",)), None),
         (Routes((), ("fe80::1/64",), others=("10.1.0.0/16",)), None),
+        (Routes(others=("10.1.0.0/16",), beyond=("10.1.0.0/16",)), "the route to 10.1.0.0/16, through"),
         (Routes(), None),
     ],
 )
@@ -355,15 +429,15 @@ def test_the_lock_that_root_made_is_the_services_too(veth: Veth, monkeypatch: py
         nic.locked(*which).__enter__()
 
 
-@pytest.mark.parametrize("trap", ["link", "fifo", "writable"])
-def test_a_lock_that_may_be_anothers_is_not_used(veth: Veth, directory: Path, trap: str) -> None:
+@pytest.mark.parametrize("trap", ["link", "fifo", 0o777, 0o720, 0o702])
+def test_a_lock_that_may_be_anothers_is_not_used(veth: Veth, directory: Path, trap: str | int) -> None:
     directory.mkdir(mode=0o700)
     if trap == "link":
         (directory / "lock").symlink_to(directory.parent)
     elif trap == "fifo":
         os.mkfifo(directory / "lock")
-    else:
-        directory.chmod(0o777)
+    elif isinstance(trap, int):
+        directory.chmod(trap)
     with claimed(veth.near), pytest.raises(OSError):  # noqa: PT011 - any
         nic._open_lock("lock")
 

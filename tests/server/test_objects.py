@@ -41,6 +41,7 @@ from ethercat_server.sensor.objects.dictionary import (
 from ethercat_server.sensor.sensor import Identity, Sensor, SensorState
 from ethercat_server.sensor.set_up import read_offset, read_settings, write_offset
 from ethercat_server.sensor.tare import tare
+from tests.simulation import ManualClock
 
 # Names of objects in Bota's manual, and in the script that read them all.
 IN_THE_MANUAL = (
@@ -107,6 +108,7 @@ def test_what_no_object_is_called() -> None:
 
 MAILBOXES = ((0x1000, 128), (0x1080, 128))
 READ, WRITTEN, ABORTED = 0x43, 0x60, 0x80
+PROBED = 0x1000  # the device type, which is read to find out which counter the slave takes
 
 
 class GivenBus:
@@ -117,7 +119,6 @@ class GivenBus:
     def __init__(self, *answers: tuple[int, int, bytes]) -> None:
         self.answers = list(answers)
         self.asked = 0
-        self.counters: list[int] = []
 
     def read_register(self, slave: int, address: int, size: int) -> Steps[bytes]:
         yield from ()
@@ -125,19 +126,20 @@ class GivenBus:
             return b""
         command, index, data = self.answers.pop(0)
         service = 2 if command == ABORTED else 3
-        body = struct.pack("<HBHB", service << 12, command, index, 1) + data
+        body = struct.pack("<HBHB", service << 12, command, index, index != PROBED) + data
         return (struct.pack("<HHBB", len(body), 0, 0, 3) + body).ljust(size, b"\0")
 
     def write_register(self, slave: int, address: int, data: bytes) -> Steps[bool]:
         yield from ()
+        if data[9:11] == PROBED.to_bytes(2, "little"):
+            self.answers.insert(0, (READ, PROBED, bytes(4)))
         self.asked += 1
-        self.counters.append(data[5] >> 4)
         return True
 
 
 def run(bus: GivenBus, steps: Steps[T]) -> T:
     done = finish(steps)
-    assert bus.asked == 1
+    assert bus.asked == 2, "once, after the probe"
     assert not bus.answers
     return done
 
@@ -154,14 +156,71 @@ def test_the_late_answer_to_a_repeated_transfer_is_left_alone() -> None:
     run(bus, mailbox(bus).write(0x8001, 1, b"efgh"))
 
 
-def test_no_message_has_the_counter_of_the_one_before_or_that_soems_mapping_begins_with() -> None:
-    bus = GivenBus(*[(READ, 0x8001, b"abcd")] * 20)
-    sdo = mailbox(bus)
-    for _ in range(20):
-        bus.asked = 0
-        finish(sdo.read(0x8001, 1))
-    assert all(one != other for one, other in itertools.pairwise([1, *bus.counters, 1]))
-    assert set(bus.counters) == set(range(2, 8))
+class CountingSlave:
+    """Does one request after the other, in so many seconds, and drops one with the counter of the last.
+
+    An object's value is the number of requests that were done.
+    """
+
+    def __init__(self, reading_s: float, writing_s: float) -> None:
+        self.clock = ManualClock()
+        self.takes_s = {0x40: reading_s, 0x23: writing_s}
+        self.counter = self.done = self._ready_ns = 0
+        self.counters, self.written = list[int](), list[bytes]()
+        self._request = self._answer = b""
+        self._answers: list[bytes] = []
+
+    def _work(self) -> None:
+        if self._answer and self.clock.now_ns >= self._ready_ns:
+            self._answers.append(self._answer)
+            self._answer = b""
+        if not self._request or self._answer:
+            return
+        request, self._request = self._request, b""
+        if (counter := request[5] >> 4) == self.counter:
+            return
+        self.counter, self.done = counter, self.done + 1
+        command, index, subindex = struct.unpack_from("<BHB", request, 8)
+        if command == 0x23:
+            self.written.append(request[12:16])
+        answer, value = (READ, self.done) if command == 0x40 else (WRITTEN, 0)
+        self._answer = struct.pack("<HHBBHBHBI", 10, 0, 0, 3, 0x3000, answer, index, subindex, value)
+        self._ready_ns = self.clock.now_ns + round(self.takes_s[command] * 1e9)
+
+    def read_register(self, _slave: int, _address: int, size: int) -> Steps[bytes]:
+        yield from ()
+        self._work()
+        return self._answers.pop(0).ljust(size, b"\0") if self._answers else b""
+
+    def write_register(self, _slave: int, _address: int, data: bytes) -> Steps[bool]:
+        yield from ()
+        self._work()
+        if self._request:
+            return False
+        self._request = data
+        self.counters.append(data[5] >> 4)
+        return True
+
+
+@pytest.mark.parametrize("seconds", [(0, 0), (0.03, 0.03), (0.4, 0.4), (0, 0.9)])
+@pytest.mark.parametrize("before", range(1, 8))
+def test_each_request_is_done_once_whatever_counter_another_master_left(
+    before: int, seconds: tuple[float, float]
+) -> None:
+    """By a slow slave, too, which looks as if it dropped them; no read gets the answer to an earlier one."""
+    slave = CountingSlave(*seconds)
+    sdo = MailboxSdo(cast(Bus, slave), 0, MAILBOXES)
+    for count in range(1, 4):
+        slave.counter, began_ns = before, slave.clock.now_ns
+        finish(sdo.write(0x8001, 1, b"efgh"), slave.clock)
+        for _ in range(3):
+            done = slave.done
+            assert int.from_bytes(finish(sdo.read(0x8001, 1), slave.clock), "little") > done
+        assert slave.written == [b"efgh"] * count
+        assert any(seconds) or slave.clock.now_ns - began_ns < 100_000_000
+        slave.clock.sleep(1)
+        finish(sdo.drain(10), slave.clock)  # what another master does
+    assert set(slave.counters) == set(range(2, 8)), "SOEM's mapping begins with 1, where the bus comes up"
 
 
 def test_an_answer_about_another_object_is_left_alone_and_a_refusal_is_not() -> None:
@@ -335,6 +394,19 @@ def test_a_load_that_creeps_is_not_rest_and_noise_is() -> None:
     for seed in range(100):
         tared = run_tare(ScriptedSdo(), 20, [0.0] * 6, noise(seed, 0.6))
         assert abs(tared["residual"][0]) < 1
+
+
+def test_a_load_that_moves_by_more_than_the_limit_during_a_tare_is_noticed() -> None:
+    """By 0.3 N, between the samples before the offset and those after it; the offset is taken back."""
+    for change, refused in ((0.28, False), (0.32, True), (-0.28, False), (-0.32, True)):
+        sdo = ScriptedSdo()
+        force = itertools.chain(itertools.repeat(5.0, 22), itertools.repeat(5.0 + change))
+        if not refused:
+            assert run_tare(sdo, 20, [0.0] * 6, force)["residual"][0] == pytest.approx(change)
+            continue
+        with pytest.raises(RequestError, match="Fx"):
+            run_tare(sdo, 20, [0.0] * 6, force)
+        assert sdo.held[0x8000, 1] == bytes(4)
 
 
 def test_a_sensor_that_turns_fast_is_not_at_rest_however_steadily() -> None:

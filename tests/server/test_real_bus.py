@@ -24,6 +24,7 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.nic import claimed
 from ethercat_server.ethercat.slave.sii import decode
 from ethercat_server.ethercat.soem import SoemBackend, packet_sockets
+from ethercat_server.ethercat.wire import Command, parse
 from ethercat_server.sensor.sensor import Sensor
 from tests.server.running import (
     ATTEMPTS,
@@ -208,6 +209,40 @@ def test_without_soems_master_the_sensors_come_to_op_as_well() -> None:
         assert sizes == [61, 61]
         assert [sensor.stats(number)["al_state"] for number in range(2)] == ["OP", "OP"]
         assert bus.process_data.most_wkc == [6]
+
+
+@pytest.mark.parametrize("arguments", ["--pdo 61", "--pdo 77", "--serial 1,2"])
+def test_no_request_beside_soems_has_the_counter_of_the_one_before(arguments: str) -> None:
+    """The slave would drop it."""
+    with (
+        virtual_sensor(*arguments.split()) as (veth, _),
+        claimed(veth.near),
+        contextlib.closing(Bus(backend := SoemBackend(veth.near))) as bus,
+        socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3)) as capture,
+    ):
+        capture.bind((veth.near, 3))
+        capture.setsockopt(socket.SOL_SOCKET, 33, 1 << 24)  # SO_RCVBUFFORCE
+        backend.open()
+        bring_up(bus, Asked(), lambda: None)
+        for slave in bus.slaves:
+            bus.finish(slave.sdo.read(0x8011, 0))
+        capture.setblocking(False)
+        counters: dict[int, list[int]] = {}
+        dropped = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                frame, address = capture.recvfrom(1514)
+                for row in parse(frame, len(frame)) if address[2] == socket.PACKET_OUTGOING else ():
+                    message = frame[row.data : row.data + row.length]
+                    if (row.command, row.ado, row.length) != (Command.FPWR, 0x1000, 128):
+                        continue
+                    before = counters.setdefault(row.adp, [0])
+                    before.append(message[5] >> 4)
+                    if before[-1] == before[-2] and message[9:11] != b"\x00\x10":
+                        dropped.append((row.adp, len(before)))
+    assert len(counters) == len(arguments.split(","))
+    assert all({1, 2, 3, 4, 5, 6, 7} <= {*found} for found in counters.values()), "SOEM's and the others"
+    assert dropped == []
 
 
 # -- a service on a chain of two sensors, with a configuration file; the last of these ends it

@@ -512,6 +512,13 @@ def test_a_change_of_the_offset_is_told_at_once(bench: Bench) -> None:
     assert told() == bench.described()["offset"] == changed
 
 
+def test_a_tare_has_the_time_that_its_samples_take() -> None:
+    """At the lowest rate, too."""
+    bench = Bench(settings={"sinc_length": 2048})
+    assert bench.described()["rate_hz"] == 25
+    assert bench.ask("tare", samples=100)["ok"]
+
+
 def test_noise_does_not_make_a_tare_worse(bench: Bench) -> None:
     """It is on target already, so that each of these may be somewhat worse by chance."""
     for channel, deviation in (("force.x", 0.5), ("force.z", 0.1), ("torque.y", 0.02)):

@@ -5,6 +5,7 @@ After that nothing is left behind, and the devices of others are as they were.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import random
@@ -27,10 +28,13 @@ from ethercat_server.errors import BusError, ServerError, SetUpError, StopReques
 from ethercat_server.ethercat import nic
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
+from ethercat_server.ethercat.datagrams import Steps
+from ethercat_server.ethercat.nic import claimed
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.ethercat.slave.controller import SlaveController
 from ethercat_server.ethercat.slave.registers import FMMU, FMMU_SIZE, SYNC_MANAGER, pack_sync_manager
+from ethercat_server.ethercat.soem import SoemBackend
 from ethercat_server.ethercat.wire import DATAGRAM_INDEX, Command, build
 from ethercat_server.process import realtime
 from ethercat_server.sensor import scan
@@ -41,6 +45,7 @@ from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor import virtual_bus
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.foreign import ForeignSlave
+from ethercat_server.virtual_sensor.mailbox import Mailbox
 from ethercat_server.virtual_sensor.options import SensorOptions, parse_chain, slaves_in
 from tests.ended import completed, run_here
 from tests.rights import NET_ADMIN, NET_RAW, without
@@ -51,6 +56,7 @@ from tests.server.running import (
     Server,
     Veth,
     free_port,
+    needs_bus,
     on_a_bus,
     starved,
     virtual_sensor,
@@ -139,7 +145,21 @@ def test_a_port_that_is_taken(caplog: pytest.LogCaptureFixture) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         said = fails(caplog, "virtual", str(port))
-    assert f"port {port} on 127.0.0.1 is in use by another program" in said
+    assert f"port {port} on 127.0.0.1 is in use by another program, process {os.getpid()} (" in said
+    assert said.endswith(f"): stop that one, or choose port {port % 65535 + 1}")
+
+
+@needs_bus
+def test_an_interface_that_is_taken_is_said_before_a_port_that_is(caplog: pytest.LogCaptureFixture) -> None:
+    """Another port would lead to the next error only."""
+    with virtual_sensor() as (veth, sensor), socket.create_server(("127.0.0.1", 0)) as other:
+        port = str(other.getsockname()[1])
+        said = fails(caplog, veth.far, port, "--user", "root")
+        assert said.startswith(f"{veth.far} is in use by a virtual sensor, process {sensor.process.pid} (")
+        with claimed(veth.near), contextlib.closing(backend := SoemBackend(veth.near)):
+            backend.open()
+            said = fails(caplog, veth.near, port, "--user", "root")
+        assert said.startswith(f"{veth.near} is in use by another EtherCAT master, process {os.getpid()} (")
 
 
 # -- sensors that are not what they must be, in memory
@@ -293,6 +313,73 @@ def test_a_master_that_lost_frames_has_misled_is_replaced(step: str) -> None:
     backend.master = misled = Misled(bus, step)  # type: ignore[assignment]
     assert bring_up(bus, Asked(), lambda: None).sensors[0].streams
     assert misled.failed == (step in ("scan", "map_process_data"))
+
+
+class CountsOn(Misled):
+    """Maps with mailbox counters of its own, as SOEM does."""
+
+    def __init__(self, last: int) -> None:
+        self.step, self.last = "", last
+
+    def map_process_data(self, check_interrupt: CheckInterrupt) -> None:
+        bus = self.bus
+        bus._soem = None
+        bus.map_process_data(check_interrupt)
+        bus._soem = self
+        for slave in bus.slaves:
+            bus.finish(leave_counter(bus, slave.number, self.last))
+
+
+def leave_counter(bus: Bus, number: int, counter: int) -> Steps[None]:
+    """Read an object as another master does."""
+    request = struct.pack("<HHBBHBHB4x", 10, 0, 0, 3 | counter << 4, 0x2000, 0x40, 0x1008, 0)
+    assert (yield from bus.write_register(number, 0x1000, request.ljust(128, b"\0")))
+    yield from bus.read_register(number, 0x1080, 128)
+
+
+@pytest.mark.parametrize("last", more_if_long([2, 3, 6, 7], range(1, 8)))
+def test_no_request_is_slow_whatever_counter_a_master_left(
+    last: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the start, and when one comes back, in firmware that keeps it in INIT; on a request at any time."""
+    init, scan_bus, master = Mailbox.__init__, Bus.scan, CountsOn(last)
+
+    def new(mailbox: Mailbox, *arguments: Any) -> None:
+        init(mailbox, *arguments)
+        mailbox._last_counter = last
+
+    def scanned(bus: Bus, *arguments: Any, **options: Any) -> None:
+        master.bus = bus
+        scan_bus(bus, *arguments, **options)
+
+    monkeypatch.setattr(Mailbox, "__init__", new)
+    monkeypatch.setattr(Mailbox, "reset", lambda mailbox: mailbox._replies.clear())
+    monkeypatch.setattr(Bus, "scan", scanned)
+    backend = MemoryBackend(*(SensorOptions(signal="rest", serial=n, pdo_size=n) for n in (61, 77)))
+    backend.master = master  # type: ignore[assignment]
+    simulation = Simulation(backend=backend)
+    client = simulation.connect()
+    assert simulation.clock.now_ns - simulation.started_ns < 900_000_000
+    asked = (
+        ("sdo_read", {"index": 0x8011}),
+        ("sdo_write", {"index": 0x8000, "subindex": 1, "hex": "00000000"}),
+        ("configure", {"settings": {"imu_active": 3}}),
+    )
+    for action, keys in asked:
+        for number in range(2):
+            began_ns = simulation.clock.now_ns
+            client.ask(action, sensor=number, **keys)
+            assert simulation.clock.now_ns - began_ns < 100_000_000, (action, number)
+        simulation.run(0.2)
+        for number in range(2):
+            task = simulation.recovery.acyclic.start(leave_counter(simulation.bus, number, last))
+            simulation.run(0.05)
+            assert task.finished
+    client.ask("subscribe")
+    for number in range(2):
+        simulation.command(f"power cycle 0.2 @{number}")
+        assert client.wait_event("sensor_back")["lost_s"] < 0.25
+        client.events.clear()
 
 
 def test_a_start_is_given_up_between_two_transfers() -> None:

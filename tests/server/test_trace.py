@@ -14,7 +14,7 @@ import pytest
 from ethercat_server.daemon.traces import Traces
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.doctor.trace import find_losses
-from ethercat_server.sampling.replay import Trace, TraceError
+from ethercat_server.sampling.replay import Decision, Record, Trace, TraceError
 from ethercat_server.sampling.trace import RecordKind
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -157,6 +157,31 @@ def test_what_a_held_up_exchange_cost_is_not_blamed_on_the_sensor() -> None:
     found = [loss for loss in find_losses(0, steps) if not loss.text.startswith("maybe")]
     assert len(found) > 10
     assert "sensor" not in {loss.cause for loss in found}
+
+
+@pytest.mark.parametrize(
+    ("asleep_ms", "took_ms", "expected"),
+    [
+        (1.0, 2.5, ("card or slave", "2 lost: an exchange took 2.50 ms")),
+        (1.3, 0.1, ("sensor", "2 lost: it was polled and gave none")),
+        (1.4, 2.5, ("card or slave", "2 lost: an exchange took 2.50 ms")),
+        (2.5, 0.1, ("machine", "2 lost: this computer sent nothing for 2.50 ms")),
+        (2.5, 2.5, ("machine", "2 lost: this computer sent nothing for 2.50 ms")),
+    ],
+)
+def test_the_cause_of_a_loss_is_what_took_the_time(
+    asleep_ms: float, took_ms: float, expected: tuple[str, str]
+) -> None:
+    """Between two exchanges, or in one: the pause after a long one, too, counts from when it was back."""
+    steps, sent_ns = list[Decision](), 1_000_000_000
+    for number in range(30):
+        lost, long_one = number == 20, number in (19, 20)
+        sent_ns += round((asleep_ms if lost else 0.9) * 1e6)
+        took_ns = round((took_ms if long_one else 0.1) * 1e6)
+        record = Record(sent_ns, took_ns, 0, 0, 0, RecordKind.FRESH, False, 3)
+        steps.append(Decision(record, sent_ns, 3 if lost else 1, False, True, False))
+        sent_ns += took_ns
+    assert [loss[2:] for loss in find_losses(0, steps)] == [expected]
 
 
 def test_who_may_not_control_the_server_gets_no_trace() -> None:

@@ -14,12 +14,13 @@ import random
 import select
 import socket
 import struct
+import sys
 import termios
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Final
 
 import pytest
 
@@ -31,8 +32,9 @@ from ethercat_server.serving.hub import Hub
 from ethercat_server.serving.permissions import MAX_CLIENTS_PER_USER
 from ethercat_server.serving.transport import SocketStream, SocketTransport, Stream, Transport
 from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
+from tests.ended import completed
 from tests.rights import NO_OTHER_USER, socket_of
-from tests.server.running import free_port, wait_until
+from tests.server.running import free_port, needs_bus, wait_until
 from tests.simulation import ManualClock, more_if_long
 
 PATIENCE_S = 20.0
@@ -397,3 +399,42 @@ def test_overlapping_addresses_are_not_reported_as_a_port_in_use(wildcard: str, 
     for hosts in ((wildcard, one), (one, wildcard)):
         with pytest.raises(UsageError, match=f"overlap: {wildcard} includes {one}; remove one"):
             SocketTransport(hosts, free_port())
+
+
+LOOPBACK: Final = """
+import asyncio
+from unittest.mock import Mock
+from bota_clients.monitor.web.server import serving
+from ethercat_server.errors import ServerError
+from ethercat_server.serving.transport import listen
+async def show_page():
+    async with serving(Mock(), "localhost", 0):
+        print("page")
+for hosts in ("127.0.0.1", "::1"), ("::1", "127.0.0.1"), ("127.0.0.1",):
+    try:
+        print(*(listener.getsockname()[0] for listener in listen(hosts, 0)))
+    except ServerError as error:
+        print(error)
+try:
+    asyncio.run(show_page())
+except OSError:
+    print("no page")
+"""
+NOT_HERE: Final = "port 0 on 127.0.0.1 cannot be used: no interface of this machine has this address"
+
+
+@needs_bus
+@pytest.mark.parametrize(
+    ("lacks", "said"),
+    [
+        ("::1", ["127.0.0.1", "127.0.0.1", "127.0.0.1", "page"]),
+        ("127.0.0.1", ["::1", "::1", NOT_HERE, "page"]),
+        ("::1 127.0.0.1", [NOT_HERE, "port 0 on ::1 cannot", NOT_HERE, "no page"]),
+    ],
+)
+def test_a_machine_lacks_a_loopback_address(lacks: str, said: list[str]) -> None:
+    away = "; ".join(f"ip address del {one}/{128 if ':' in one else 8} dev lo" for one in lacks.split())
+    script = f"set -e; ip link set lo up; {away}; exec {sys.executable} -W ignore -c '{LOOPBACK}'"
+    found = completed("unshare", "--net", "bash", "-c", script)
+    assert all(map(str.startswith, found.stdout.splitlines(), said)), found
+    assert found.stdout.count("\n") == len(said)

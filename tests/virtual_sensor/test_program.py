@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import select
 import signal
 import socket
@@ -126,6 +127,11 @@ def test_it_says_when_it_is_ready_and_how_it_ends_and_each_interface_has_serial_
     assert ending.wait() == 0
 
 
+def test_loopback_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["lo"]) == 1
+    assert "lo is the loopback interface" in capsys.readouterr().err
+
+
 @pytest.mark.bus
 def test_the_control_socket(
     veth: tuple[str, str], start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -155,15 +161,17 @@ def test_the_control_socket(
     assert f"no virtual sensor of yours answers at {path} (No such file" in capsys.readouterr().err
 
 
-@pytest.mark.long
 @pytest.mark.bus
-def test_without_a_place_it_listens_where_commands_are_sent_to(
+def test_without_a_place_it_listens_where_commands_are_sent_to_or_says_that_it_does_not(
     veth: tuple[str, str], start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
     sensor = start(veth[0])
-    start(veth[1])  # the place is taken
+    second = start(veth[1])
+    assert re.search(
+        "--send does not reach this virtual sensor, .*already in use: .*--control", second.said()
+    )
     assert main(["--send", "quit"]) == 0
     assert sensor.wait() == 0
 

@@ -8,6 +8,7 @@ Sources: ETG.1000.6 (abort codes: table "SDO Abort Codes"), CiA 301.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import struct
 from collections import defaultdict
@@ -36,8 +37,10 @@ _EXPEDITED: Final = 0x03
 _SIZE_GIVEN: Final = 0x01
 _ABORT: Final = 0x80
 _LONGEST_EXPEDITED: Final = 4
-_MOST_DRAINED: Final = 4
 _SIZE_BYTES: Final = 4  # the size goes before what is longer
+_PROBED: Final = 0x1000, 0  # the device type, which every CoE slave has
+_DROPPED_S: Final = 0.02  # without an answer at first, then twice as long, until the probe is sent again
+_IN_STEP_S: Final = 0.1  # after an answer: another master may use the mailbox meanwhile
 _ANSWER_S: Final = 0.7  # until the request is sent again
 _TRANSFER_S: Final = 2.1  # in all: a short loss of frames is not an error
 
@@ -248,7 +251,8 @@ class MailboxSdo:
             )
         self._counter = 0
         self._in_use = False
-        self._stale = True  # whether an answer may come that was not asked for last
+        # Until when it is certain that the slave takes the next counter, and that no late answer comes.
+        self._in_step: Deadline | None = None
 
     def read(self, index: int, subindex: int) -> Steps[bytes]:
         command, rest = yield from self._transfer(index, subindex, _UPLOAD, b"")
@@ -280,7 +284,7 @@ class MailboxSdo:
         if not self._in_use:
             yield from self._alone(self._receive())
 
-    def drain(self, most: int = _MOST_DRAINED) -> Steps[None]:
+    def drain(self, most: int) -> Steps[None]:
         """Discard the messages that are there, at most `most`."""
         for _ in range(most):
             if (yield from self._receive()) == b"":
@@ -298,41 +302,77 @@ class MailboxSdo:
         finally:
             self._in_use = False
 
+    def synchronize(self) -> Steps[None]:
+        """To be called when another user of the mailbox has counted on."""
+        self._in_step = None
+        with contextlib.suppress(SdoAbortError):
+            yield from self.read(*_PROBED)
+
     def _ask(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
+        """The answer to a request, which is sent once the mailbox is in step.
+
+        A slave that drops a request because of its counter looks like a slow one, where a write must not be
+        repeated. So an object that never changes is read first. Of two such requests with different counters
+        one is answered; answers come in order, so none from before comes after that.
+        """
         doing, expected = ("reading", _UPLOAD) if command == _UPLOAD else ("writing", _DOWNLOADED)
-        give_up, again = Deadline(self.clock, _TRANSFER_S), False
-        body = _SDO_HEADER.pack(_COE_SDO_REQUEST << 12, command, index, subindex) + data.ljust(4, b"\0")
+        give_up, patience_s = Deadline(self.clock, _TRANSFER_S), _DROPPED_S
+        probe, wanted, sent = (*_PROBED, _UPLOAD), (index, subindex, expected), False
         while not give_up.passed:
-            if self._stale:
-                yield from self.drain()
-            self._stale = True
-            if (yield from self._put(body)):
-                deadline = Deadline(self.clock, _ANSWER_S)
-                while not deadline.passed:
-                    yield None
-                    if (message := (yield from self._receive())) is None:
-                        break  # ask again: reading and writing twice does no harm
-                    if (answer := _answer(message, index, subindex, expected)) is None:
-                        continue
-                    self._stale = again
-                    if answer[0] == _ABORT:
-                        code = int.from_bytes(answer[1][:4], "little")
-                        raise SdoAbortError(
-                            f"{self._name} refused {doing} object 0x{index:04X}:{subindex}: "
-                            f"{abort_meaning(code)} (abort 0x{code:08X})",
-                            code,
-                        )
-                    return answer
-            again = True
-            yield None
+            if self._in_step is not None and not self._in_step.passed:
+                sent = True
+                found = yield from self._exchange(_request(command, index, subindex, data), _ANSWER_S, wanted)
+            else:
+                self._in_step, awaited = None, (probe, wanted) if sent else (probe,)
+                found = yield from self._exchange(_request(_UPLOAD, *_PROBED), patience_s, *awaited)
+                patience_s = min(2 * patience_s, _ANSWER_S)
+            if found is None:
+                self._in_step = None
+                continue
+            which, answer = found
+            if which == probe or self._in_step is not None:
+                self._in_step = Deadline(self.clock, _IN_STEP_S)
+            if which != wanted:
+                continue
+            if answer[0] == _ABORT:
+                code = int.from_bytes(answer[1][:4], "little")
+                raise SdoAbortError(
+                    f"{self._name} refused {doing} object 0x{index:04X}:{subindex}: "
+                    f"{abort_meaning(code)} (abort 0x{code:08X})",
+                    code,
+                )
+            return answer
         raise SetUpError(self._unanswered(doing, index, subindex, "no answer"))
 
+    def _exchange(
+        self, body: bytes, seconds: float, *awaited: tuple[int, int, int]
+    ) -> Steps[tuple[tuple[int, int, int], tuple[int, bytes]] | None]:
+        """Send a request; which of the awaited answers (see `_answer`) comes first, and that.
+
+        None if none comes, or a datagram was lost.
+        """
+        was_sent = yield from self._put(body)
+        deadline = Deadline(self.clock, seconds)
+        while True:
+            yield None
+            if (message := (yield from self._receive())) is None:
+                return None
+            for which in awaited:
+                if (answer := _answer(message, *which)) is not None:
+                    return which, answer
+            if not was_sent or deadline.passed:
+                return None
+
     def _put(self, body: bytes) -> Steps[bool]:
-        """Send a CoE message; False if that failed. It has another counter than the one before."""
-        self._counter = max(2, self._counter + 1 & 7)  # SOEM's mapping begins with 1
-        header = _HEADER.pack(len(body), 0, 0, _TYPE_COE | self._counter << 4)
+        """Send a CoE message; False if that failed, and the next one has its counter: if the slave has got it
+        after all, it drops that one.
+        """
+        counter = max(2, self._counter + 1 & 7)  # SOEM's mapping begins with 1
+        header = _HEADER.pack(len(body), 0, 0, _TYPE_COE | counter << 4)
         message = (header + body).ljust(self._out_size, b"\0")
-        return (yield from self._bus.write_register(self._number, self._out, message))
+        if done := (yield from self._bus.write_register(self._number, self._out, message)):
+            self._counter = counter
+        return done
 
     def _receive(self) -> Steps[bytes | None]:
         """The CoE message that is there, or the header of one of another protocol; empty if none is.
@@ -353,6 +393,10 @@ class MailboxSdo:
 
     def _unanswered(self, doing: str, index: int, subindex: int, what: str) -> str:
         return f"{self._name} did not answer {doing} object 0x{index:04X}:{subindex}: {what}"
+
+
+def _request(command: int, index: int, subindex: int, data: bytes = b"") -> bytes:
+    return _SDO_HEADER.pack(_COE_SDO_REQUEST << 12, command, index, subindex) + data.ljust(4, b"\0")
 
 
 def _answer(body: bytes, index: int, subindex: int, expected: int) -> tuple[int, bytes] | None:

@@ -23,6 +23,7 @@ from bota_ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
     NO_PAYLOAD,
+    NORM_TOLERANCE,
     ZERO,
     Accelerometer,
     CompensationError,
@@ -201,7 +202,7 @@ class Parameters:
     orientation_topic: str = _row("orientation", f"Topic of the sources {', '.join(TOPIC_SOURCES)}")
     orientation_base_frame: str = _row("base_link", "Frame that gravity is given in, for the source tf")
     orientation_mounting: Quaternion = _row((0.0, 0.0, 0.0, 1.0),
-        "Quaternion x y z w: frame_id in the frame of the topic", 0, 1)
+        "Quaternion x y z w: frame_id in the frame of the topic", 0, 1 + NORM_TOLERANCE)
     orientation_stale_after: float = _row(0.1,
         "Largest difference of the stamps of orientation and sample, s", 0.001, 10)
     accelerometer_offset: Vector3 = _row(ZERO, "Its offset, m/s²; ~/identify finds it", 0, 5)
@@ -294,7 +295,7 @@ def gather(given: Mapping[str, Any]) -> Parameters:
             "long; for no compensation of gravity set tool_mass to 0"
         )
     try:
-        assert parameters.mounting
+        unit_quaternion(parameters.orientation_mounting)
     except ValueError as error:
         mounting = list(parameters.orientation_mounting)
         raise ParameterError(f"parameter orientation.mounting is {mounting}: {error}") from None

@@ -54,7 +54,7 @@ _FOREIGN_HOST: Final = (
     "The page is for this machine only: open http://localhost:PORT/, from elsewhere over ssh -L."
 )
 _FOREIGN_ORIGIN: Final = "The stream is for the page that is served here, and not for others."
-_NO_ADDRESS: Final = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT, None)  # no IPv6; asyncio may lose the number
+_NO_ADDRESS: Final = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT, None)  # asyncio may lose the number
 _POLICY_VIOLATION: Final = 1008
 _TRY_AGAIN_LATER: Final = 1013
 _WHY: Final = {
@@ -154,13 +154,15 @@ async def serving(
             await asyncio.sleep(POINTS_S)
 
     async with contextlib.AsyncExitStack() as stack:
-        for address in ("127.0.0.1", "::1") if host == "localhost" else (host,):
+        missing = 0
+        for address in (addresses := ("127.0.0.1", "::1") if host == "localhost" else (host,)):
             try:
                 server = await stack.enter_async_context(serve(converse, address, port, **options))
+                port = next(iter(server.sockets)).getsockname()[1]
             except OSError as error:
-                if (host, address) != ("localhost", "::1") or error.errno not in _NO_ADDRESS:
+                missing += 1
+                if missing == len(addresses) or error.errno not in _NO_ADDRESS:
                     raise
-            port = next(iter(server.sockets)).getsockname()[1]
         collecting = asyncio.create_task(collect())
         try:
             yield port
