@@ -82,7 +82,7 @@ def test_the_live_figure_of_what_is_lost_is_the_summarys(
     for each in (frame(805, DataFlag.GAP), frame(806)):
         measurement.add_frame(each)
     message(measurement, 806)
-    program.show(measurement, 802)
+    program.show(measurement)
     assert re.match(r" *\d+\.\d Hz  age 0\.40 ms  lost 5  repeated 0  N \+0", capsys.readouterr().out)
     program.print_summary(measurement.summary(), {"rate_hz": 800})
     shown = capsys.readouterr().out

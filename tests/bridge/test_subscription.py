@@ -7,6 +7,7 @@ import random
 import subprocess
 import threading
 import time
+from array import array
 from bisect import bisect_right
 from collections import deque
 from pathlib import Path
@@ -18,6 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 
+from bota_ethercat.distribution import Distribution
 from bota_ethercat.pdo import encode
 from bota_ethercat_bridge import check_subscription
 from bota_ethercat_bridge.subscription import Subscription
@@ -227,7 +229,9 @@ def test_cpp_counts_the_same(tmp_path: Path) -> None:
 def test_what_to_change(lost: int, depth: int, age_ms: float, best_effort: bool, words: str) -> None:
     counted = Subscription("/wrench")
     counted.received, counted.lost, counted.missing, counted.rate_hz = 800, lost, lost, 800.0
-    said = [*check_subscription.report(counted, [round(age_ms * 1e6)] * 800, depth, best_effort=best_effort)]
+    ages = Distribution()
+    ages.count(array("f", [age_ms * 1e6] * 800))
+    said = [*check_subscription.report(counted, ages, depth, best_effort=best_effort)]
     assert f"received 800, lost {lost}, missing {lost}" == said[0]
     assert words in " ".join(said[2:])
     assert bool(said[2:]) == bool(words)
@@ -261,7 +265,7 @@ def test_ctrl_c_before_the_first_message_blames_nobody(
     monkeypatch.setattr(rclpy, "try_shutdown", lambda: None)
     monkeypatch.setattr(check_subscription, "_find", interrupt)
     assert check_subscription.main(["wrench"]) == 1
-    assert capsys.readouterr() == ("", "check_subscription: stopped\n")
+    assert capsys.readouterr() == ("", "bridge-check-subscription: stopped\n")
 
 
 def test_without_ros_it_is_one_sentence(
