@@ -46,12 +46,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # RCLError, which has no public name
         parser.error(f"ROS cannot start: {str(error).partition(', at /')[0]}")
-    node, ages = rclpy.create_node("check_subscription", start_parameter_services=False), Distribution()
+    node = rclpy.create_node("check_subscription", start_parameter_services=False)
     try:
         topic = node.resolve_topic_name(given.topic)
     except RuntimeError as error:  # rclpy has no public name for it
         parser.error(f"{given.topic!r} is no topic: {str(error).partition(', at /')[0]}")
-    counted, publishers, is_stopped = Subscription(topic), 0, True
+    counted, publishers, is_stopped = Counted(topic), 0, True
     with contextlib.suppress(KeyboardInterrupt):  # what came until then is told
         if (publisher := _find(node, topic)) is not None:
             package, _, name = publisher.topic_type.split("/")
@@ -63,7 +63,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             def receive(message: Any) -> None:
                 counted.receive(message.header.stamp, time.time_ns())
-                ages.count(array("f", [counted.age_ns]))
 
             of_node = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}/published"
             policy = ReliabilityPolicy.BEST_EFFORT if given.best_effort else ReliabilityPolicy.RELIABLE
@@ -85,9 +84,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     if publishers > 1:
         sys.stdout.write(f"{topic} has {publishers} publishers, which falsifies the rest: stop all but one\n")
-    for line in report(counted, ages, given.depth, best_effort=given.best_effort):
+    for line in report(counted, given.depth, best_effort=given.best_effort):
         sys.stdout.write(f"{line}\n")
     return int(counted.lost > 0)
+
+
+class Counted(Subscription):
+    """With the ages of all messages."""
+
+    def __init__(self, topic: str) -> None:
+        super().__init__(topic)
+        self.ages = Distribution()
+
+    def receive(self, stamp: Any, now_ns: int) -> None:
+        super().receive(stamp, now_ns)
+        self.ages.count(array("f", [self.age_ns]))
 
 
 def _find(node: Node, topic: str) -> Any:
@@ -101,9 +112,9 @@ def _find(node: Node, topic: str) -> Any:
     return None
 
 
-def report(counted: Subscription, ages: Distribution, depth: int, *, best_effort: bool) -> Iterator[str]:
+def report(counted: Counted, depth: int, *, best_effort: bool) -> Iterator[str]:
     """What was measured, and what to change: a sentence each."""
-    p50, p99, longest = (ages.summary_us()[point] / 1e3 for point in ("p50", "p99", "max"))
+    p50, p99, longest = (counted.ages.summary_us()[point] / 1e3 for point in ("p50", "p99", "max"))
     yield f"received {counted.received}, lost {counted.lost}, missing {counted.missing}"
     yield f"age p50 {p50:.1f} ms, p99 {p99:.1f} ms, longest {longest:.1f} ms"
     if not counted.rate_hz:

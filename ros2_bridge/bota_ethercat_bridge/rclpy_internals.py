@@ -133,7 +133,8 @@ def taking(node: Node, *subscriptions: Any) -> Callable[[float], None]:
     if not is_known():
         executor = SingleThreadedExecutor(context=node.context)
         executor.add_node(node)
-        return executor.spin_once
+        spin: Callable[[float], None] = executor.spin_once
+        return spin
     from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: PLC0415 - of those known
 
     with node.context.handle:
