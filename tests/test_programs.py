@@ -21,7 +21,9 @@ import pytest
 from bota_clients.identify.cli import main as identify
 from bota_ethercat.program.arguments import Parser
 from ethercat_server import programs
+from tests.clients.recordings import frame, write
 from tests.ended import completed, run_here
+from tests.served_simulation import served
 from tests.simulation import more_if_long
 
 ROOT: Final = Path(__file__).parent.parent
@@ -99,6 +101,48 @@ def test_nobody_reads_what_the_virtual_sensor_answers(tmp_path: Path) -> None:
         thread.start()
         assert unread("ethercat-virtual-sensor", "--control", path, "--send", "stats") == (1, "")
         thread.join()
+
+
+# Of each program, what it does where a server streams on `port`; what it writes is in `out`.
+CLOSED: Final = {
+    "ethercat-server": ["--help", "virtual abc"],
+    "ethercat-virtual-sensor": ["--help", "--control {out}/none --send stats"],
+    "ethercat-sensor": [
+        "adapters", "filters --loop 500", "read :{port} rate", "tare :{port}", "save :{port}",
+        "apply :{port} --set chop=on", "apply :{port} --set chop=off --json", "snapshot {out}/s.json :{port}",
+    ],
+    "ethercat-doctor": ["--help", "no-such --json"],
+    "ethercat-export": ["{given}/run.mcap {out}/run.csv"],
+    "ethercat-identify": ["{given}/tool.yaml --bota {out}/tool.json"],
+    "ethercat-record": ["{out}/run.mcap --server :{port} --for 0.2s"],
+    "ethercat-replay": ["--help", "{out}/none.mcap"],
+    "ethercat-report": ["{given}/run.mcap -o {out}/run.html"],
+    "ethercat-monitor": ["--json --seconds 1 --server :{port}"],
+    "bridge-client": ["--help", "--ros-args -p sensor:=-1"],
+    "bridge-check-subscription": ["--help", "a --for 0"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("closing", more_if_long(["<&- >&- 2>&-"], ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"]))
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_closed_standard_streams_change_nothing_of_what_is_done(
+    name: str, closing: str, tmp_path: Path
+) -> None:
+    """Real processes, whose descriptors 0 to 2 are free for whatever is opened first."""
+    (given := tmp_path / "given").mkdir()
+    (given / "tool.yaml").write_text("tool_mass: 1.0\ntool_center_of_mass: [0.0, 0.0, 0.1]\n")
+    write(given / "run.mcap", [frame(number) for number in range(400)])
+    with served() as server:
+        for row in CLOSED[name]:
+            ends = []
+            for how in ("", closing):
+                (out := tmp_path / f"{CLOSED[name].index(row)}{bool(how)}").mkdir()
+                arguments = row.format(port=server.port, given=given, out=out).split()
+                program = Path(sys.executable).with_name(name)
+                done = completed("sh", "-c", f'exec "$@" {how}', "sh", program, *arguments)
+                assert "Traceback" not in done.stdout + done.stderr, (row, how, done.stderr)
+                ends.append((done.returncode, sorted(path.name for path in out.iterdir())))
+            assert ends[1:] == ends[:1], row
 
 
 @pytest.mark.parametrize("number", more_if_long([signal.SIGINT], [signal.SIGINT, signal.SIGTERM]))

@@ -274,8 +274,9 @@ def test_it_records_on_when_nobody_reads_what_it_says(out: Path) -> None:
 
 
 def test_without_a_standard_error_it_records_too(endless: Replay, out: Path) -> None:
-    command = f'exec "$0" -m bota_clients.record.cli {out} --server :{endless.port} --for 0.2s 2>&-'
-    subprocess.run(["sh", "-c", command, sys.executable], check=True, timeout=PATIENCE_S)
+    command = f'exec "$0" {out} --server :{endless.port} --for 0.2s 2>&-'
+    program = Path(sys.executable).with_name("ethercat-record")
+    subprocess.run(["sh", "-c", command, program], check=True, timeout=PATIENCE_S)
     assert end(out)["reason"] == "time is up"
 
 
