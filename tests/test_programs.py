@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import re
@@ -19,8 +20,10 @@ from typing import Any, Final
 import pytest
 
 from bota_clients.identify.cli import main as identify
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.health.advice import IT_TELLS
+from bota_ethercat.program.arguments import EXAMPLES, Parser, command
 from ethercat_server import programs
+from ethercat_server.tool import settings
 from tests.clients.recordings import frame, write
 from tests.ended import completed, run_here
 from tests.served_simulation import served
@@ -250,6 +253,56 @@ def test_help_begins_with_three_examples_that_are_understood(
     for row in rows:
         _, *arguments = shlex.split(row.removeprefix("sudo "), comments=True)
         assert run_here(main, *arguments).code == 42, row
+
+
+def test_a_command_in_a_message_works_as_it_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From pip's folder, which nobody has on PATH, and by links, which sudo finds too."""
+    bin_, on_path = tmp_path / "a b" / "bin", tmp_path / "on_path"
+    for folder in (bin_, on_path):
+        folder.mkdir(parents=True)
+    for name in ("ethercat-doctor", "ethercat-monitor"):
+        (bin_ / name).touch(0o755)
+    monkeypatch.setattr(sys, "argv", [str(bin_ / "ethercat-monitor")])
+    monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
+    monkeypatch.setenv("PATH", str(on_path))
+    monkeypatch.setattr("bota_ethercat.program.arguments._SUDO_PATH", "/none")
+    assert command("sudo ethercat-doctor ens5") == f"sudo '{bin_}/ethercat-doctor' ens5"
+    assert command("ethercat-doctor a.trace") == f"'{bin_}/ethercat-doctor' a.trace"
+    assert command("ethercat-none") == "ethercat-none"
+    (on_path / "ethercat-doctor").symlink_to(bin_ / "ethercat-doctor")
+    assert command("ethercat-doctor a.trace") == "ethercat-doctor a.trace"
+    assert command("sudo ethercat-doctor ens5") == f"sudo '{bin_}/ethercat-doctor' ens5"
+    monkeypatch.setattr("bota_ethercat.program.arguments._SUDO_PATH", str(on_path))
+    assert command("sudo ethercat-doctor ens5") == "sudo ethercat-doctor ens5"
+    assert f"'{bin_}/ethercat-monitor' --once" in Parser("ethercat-monitor", "", "").format_help()
+
+
+def test_no_message_has_a_command_that_only_works_on_path() -> None:
+    """Beside docstrings, and what a program's own --help says of itself."""
+    names = "|".join(SCRIPTS)
+    bare = re.compile(rf"(sudo |')({names})\b(?!@)|^({names}) [a-z-]")
+    found, known = list[str](), {EXAMPLES, settings._FORMAT, IT_TELLS}
+    of_help = ("command", "Parser", "_Parser", "add")
+    for folder in ("protocol", "ethercat_server", "ros2_bridge", "clients/bota_clients"):
+        for path in (ROOT / folder).rglob("*.py"):
+            nodes = [*ast.walk(ast.parse(path.read_text()))]
+            told = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+            for call in nodes:
+                if isinstance(call, ast.Call) and ast.unparse(call.func) in (
+                    "command",
+                    "Parser",
+                    "_Parser",
+                    "add",
+                ):
+                    told |= {id(part) for part in ast.walk(call)}
+            found += [
+                f"{path}:{node.lineno}: {node.value}" for node in nodes
+                if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in told
+                and node.value not in known and bare.search(node.value)
+            ]  # fmt: skip
+    assert found == []
 
 
 def test_help_needs_nothing_of_the_extra() -> None:
