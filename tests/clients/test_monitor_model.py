@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from functools import partial
 from types import SimpleNamespace
 from typing import cast
@@ -198,6 +199,18 @@ def test_a_monitor_that_was_not_run_blames_neither_server_nor_sensor(model: Mode
     (alert,) = only(model, now(10) + 8.4).alerts
     assert alert.text == "No new sample for 8.4 s, this computer did not run this program for 8.3 s"
     assert alert.remedy == "Give it a priority, or the computer less to do"
+
+
+def test_what_is_past_is_told_at_its_worst_and_at_its_last_time(model: Model) -> None:
+    at = 0
+    for lost in (0, 40, 7):  # then more than a second in which none is
+        at += lost
+        for _ in range(20):
+            take(model, *run(at, 50))
+            at += 50
+    (alert,) = only(model, now(at)).alerts
+    assert re.match(r"40 of \d+ samples .* were lost", alert.text)
+    assert alert.ago_s == pytest.approx(0.25, abs=0.1)
 
 
 def test_a_lost_sensor_is_told_until_it_is_back_and_later_too(model: Model) -> None:
