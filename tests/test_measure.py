@@ -115,6 +115,7 @@ def test_a_connection_that_ends_is_told_and_what_comes_meanwhile_is_not_compared
 
         turns: Iterator[list[object]] = iter(
             [
+                [Connected({}, False, ())],
                 [Disconnected("the server closed it", True, True)],
                 [Disconnected("refused", True, False)],
                 [Connected({}, True, ()), *map(frame, range(900, 950))],
@@ -134,6 +135,15 @@ def test_a_connection_that_ends_is_told_and_what_comes_meanwhile_is_not_compared
     ]  # fmt: skip
     found = measurement.summary()
     assert (found.messages, found.lost, found.lost_before, found.unknown, found.repeated) == (949, 0, 0, 0, 0)
+
+
+def test_what_came_before_the_first_of_the_other_is_not_lost() -> None:
+    measurement = Measurement(800.0)
+    for number in range(100):
+        measurement.add_frame(frame(number))
+    for number in range(50, 100):
+        message(measurement, number)
+    assert measurement.summary().lost == 0
 
 
 def test_a_clock_that_is_set_back_and_a_pause_are_no_fault() -> None:

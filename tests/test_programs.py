@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import importlib
 import os
@@ -21,7 +22,7 @@ import pytest
 
 from bota_clients.identify.cli import main as identify
 from bota_ethercat.health.advice import IT_TELLS
-from bota_ethercat.program.arguments import EXAMPLES, Parser, command
+from bota_ethercat.program.arguments import EXAMPLES, Parser, command, number, whole
 from ethercat_server import programs
 from ethercat_server.tool import settings
 from tests.clients.recordings import frame, write
@@ -146,6 +147,23 @@ def test_closed_standard_streams_change_nothing_of_what_is_done(
                 assert "Traceback" not in done.stdout + done.stderr, (row, how, done.stderr)
                 ends.append((done.returncode, sorted(path.name for path in out.iterdir())))
             assert ends[1:] == ends[:1], row
+
+
+def test_what_is_opened_for_closed_streams_is_for_children_too() -> None:
+    child = "subprocess.run(['sh', '-c', 'echo; echo >&2; cat'], check=True)"
+    script = (
+        f"import subprocess; from bota_ethercat.program.start import open_streams; open_streams(); {child}"
+    )
+    assert completed("sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, "-c", script).returncode == 0
+
+
+def test_limits_of_numbers_are_allowed() -> None:
+    assert [number(1, 32)(text) for text in ("1", "32")] == [1, 32]
+    assert [whole(1, 32)(text) for text in ("1", "0x20")] == [1, 32]
+    for text in ("0", "33"):
+        for parse in (number(1, 32), whole(1, 32)):
+            with pytest.raises(argparse.ArgumentTypeError, match="from 1 to 32"):
+                parse(text)
 
 
 @pytest.mark.parametrize("number", more_if_long([signal.SIGINT], [signal.SIGINT, signal.SIGTERM]))
