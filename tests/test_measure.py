@@ -160,6 +160,10 @@ def test_a_clock_that_is_set_back_and_a_pause_are_no_fault() -> None:
 
 
 def test_a_topic_that_falls_silent_or_is_another_streams_is_found_in_fixed_memory() -> None:
+    measurement = Measurement(800.0)
+    for number in range(40_000):
+        measurement.add_frame(frame(number))
+    assert measurement.summary().lost == 0
     measurement = measured()
     for number in range(801, 40_000):
         measurement.add_frame(frame(number))

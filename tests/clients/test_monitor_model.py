@@ -22,7 +22,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.health.limits import Level
+from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.clients import monitor_states as made
 from tests.clients.monitor_states import START_S, description, frame, now, status
@@ -215,7 +215,7 @@ def test_what_is_past_is_told_at_its_worst_and_at_its_last_time(model: Model) ->
 
 def test_the_latest_of_what_is_past_and_the_worst_of_what_is_present_come_first(model: Model) -> None:
     model.connected(description(("BFT-SENS-ECAT-M8",) * 2), made.OWN_PEER, START_S)
-    hot: dict[str, float] = {"temperature": 90.0}
+    hot: dict[str, float] = {"temperature": LIMITS.temperature_warn + 1}
     seconds: list[dict[str, float]] = [hot, {"warnings": 0b1000}, {}, hot]
     overload = {**REST, "warnings": 0b10001, "force_torque_saturated": 4}
     for at, values in enumerate(seconds):
