@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
 import signal
@@ -115,7 +116,7 @@ class Chain(contextlib.ExitStack):
 
     def sleep(self, seconds: float) -> None:
         end = time.monotonic() + seconds
-        self.wait(lambda: time.monotonic() > end, seconds=seconds + 5)
+        self.wait(lambda: time.monotonic() > end, seconds=math.inf)  # it may have been stopped meanwhile
 
     def stop(self) -> list[str]:
         """End everything, the last first; what was wrong about how they ended."""

@@ -9,7 +9,6 @@ import argparse
 import importlib
 import os
 import re
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any, Final
@@ -107,4 +106,6 @@ def write(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    write(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(prog="scripts.completions", description=__doc__)
+    parser.add_argument("folder", type=Path)
+    write(parser.parse_args().folder)

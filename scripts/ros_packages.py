@@ -6,6 +6,7 @@ CHANGELOG.md, and to package.xml the URLs of the repository and of its bug track
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 from pathlib import Path
@@ -55,7 +56,9 @@ def with_urls(manifest: str, repository: str) -> str:
 def main(arguments: list[str], root: Path = _ROOT) -> int:
     manifests = {folder: (folder / "package.xml").read_text() for folder in folders(root)}
     known = [re.findall('type="repository">(.+)<', text) for text in manifests.values()]
-    repository = (arguments or min(known) or [""])[0].rstrip("/")
+    parser = argparse.ArgumentParser(prog="scripts.ros_packages", description=__doc__)
+    parser.add_argument("repository", nargs="?", help="URL of this project's, to be given once")
+    repository = (parser.parse_args(arguments).repository or (min(known) or [""])[0]).rstrip("/")
     if not _REPOSITORY.fullmatch(repository) or _PLACEHOLDER.search(repository):
         what = (
             f"{repository!r} is no repository's URL"

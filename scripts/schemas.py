@@ -8,6 +8,7 @@ object; and from the rows that all programs share (`bota_ethercat.replies`) `Row
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 from pathlib import Path
@@ -221,5 +222,6 @@ def text_of(schema: Schema) -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(prog="scripts.schemas", description=__doc__).parse_args()
     for name, schema in generate().items():
         (FOLDER / f"{name}.json").write_text(text_of(schema), encoding="utf-8")

@@ -5,6 +5,7 @@ python -m tests.public_names    writes them into public_names.txt
 
 from __future__ import annotations
 
+import argparse
 import inspect
 import re
 import tomllib
@@ -95,4 +96,5 @@ def listed(*, ros: bool) -> list[str]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(prog="tests.public_names", description=__doc__).parse_args()
     LIST.write_text("".join(f"{line}\n" for line in sorted([*public_names(), *listed(ros=True)])))

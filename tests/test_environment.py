@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -48,11 +49,62 @@ def test_an_activated_environment_does_not_make_the_next_one(tmp_path: Path) -> 
     assert (code, said) == (0, f"{Path(sys.executable).resolve()}\n")
 
 
+# With a wrong argument, which nothing of it is done for either; what scripts/test gets is pytest's.
+SCRIPTS: Final = {
+    "scripts/benchmark": "--colour", "scripts/demo": "--colour", "scripts/install-service": "--colour",
+    "scripts/lock": "x", "scripts/release": "--colour", "scripts/test": "",
+    "scripts/try-ros2-control": "--colour",
+    "-m scripts.completions": "--colour", "-m scripts.ros_packages": "--colour", "-m scripts.schemas": "x",
+    "-m tests.public_names": "x",
+}  # fmt: skip
+
+
+def test_every_script_is_known() -> None:
+    made = completed("git", "ls-files", "scripts", cwd=ROOT).stdout.split()
+    programs = {
+        path if "." not in path else f"-m {path[:-3].replace('/', '.')}"
+        for path in made
+        if path.count("/") == 1 and (
+            (ROOT / path).read_bytes().startswith(b"#!")
+            or ('if __name__ == "__main__"' in (ROOT / path).read_text() and "test_" not in path)
+        )
+    }  # fmt: skip
+    assert programs | {"-m tests.public_names"} == set(SCRIPTS)
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One without an environment."""
+    folder = tmp_path_factory.mktemp("checkout")
+    for path in completed("git", "ls-files", cwd=ROOT).stdout.splitlines():
+        if (ROOT / path).is_file():
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / path, folder / path)
+    return folder
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_help_and_wrong_arguments_do_nothing(name: str, checkout: Path) -> None:
+    def state() -> list[tuple[Path, int]]:
+        return sorted((path, path.stat().st_mtime_ns) for path in checkout.rglob("*"))
+
+    before = state()
+    command = [sys.executable, "-B", *name.split()] if name.startswith("-") else [checkout / name]
+    environment = {**os.environ, "PYTHONPATH": f"{checkout}:{checkout}/protocol:{checkout}/ros2_bridge"}
+    for arguments in (["--help"], ["-h"], *([word] for word in SCRIPTS[name].split())):
+        done = completed(*command, *arguments, cwd=checkout, env=environment, timeout=20)
+        is_help = arguments[0] in ("--help", "-h")
+        assert done.returncode == (0 if is_help else 2), done.stderr
+        assert ("usage: " in done.stdout) == is_help, done.stdout
+        assert bool(done.stderr) != is_help
+    assert state() == before
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("--seconds abc", "--seconds: 'abc': it must be a number of seconds"),
-        ("--no-ros --seconds=", "--seconds: '': it must be a number of seconds"),
+        ("--seconds abc", "--seconds: 'abc': it must be a number of seconds: see --help"),
+        ("--no-ros --seconds=", "--seconds: '': it must be a number of seconds: see --help"),
         ("--seconds 2 --colour", "unknown argument '--colour': see --help"),
     ],
 )

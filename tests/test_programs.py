@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import ast
 import importlib
 import os
 import re
@@ -19,9 +21,13 @@ from typing import Any, Final
 import pytest
 
 from bota_clients.identify.cli import main as identify
-from bota_ethercat.program.arguments import Parser
+from bota_ethercat.health.advice import IT_TELLS
+from bota_ethercat.program.arguments import EXAMPLES, Parser, command, number, whole
 from ethercat_server import programs
+from ethercat_server.tool import settings
+from tests.clients.recordings import frame, write
 from tests.ended import completed, run_here
+from tests.served_simulation import served
 from tests.simulation import more_if_long
 
 ROOT: Final = Path(__file__).parent.parent
@@ -99,6 +105,65 @@ def test_nobody_reads_what_the_virtual_sensor_answers(tmp_path: Path) -> None:
         thread.start()
         assert unread("ethercat-virtual-sensor", "--control", path, "--send", "stats") == (1, "")
         thread.join()
+
+
+# Of each program, what it does where a server streams on `port`; what it writes is in `out`.
+CLOSED: Final = {
+    "ethercat-server": ["--help", "virtual abc"],
+    "ethercat-virtual-sensor": ["--help", "--control {out}/none --send stats"],
+    "ethercat-sensor": [
+        "adapters", "filters --loop 500", "read :{port} rate", "tare :{port}", "save :{port}",
+        "apply :{port} --set chop=on", "apply :{port} --set chop=off --json", "snapshot {out}/s.json :{port}",
+    ],
+    "ethercat-doctor": ["--help", "no-such --json"],
+    "ethercat-export": ["{given}/run.mcap {out}/run.csv"],
+    "ethercat-identify": ["{given}/tool.yaml --bota {out}/tool.json"],
+    "ethercat-record": ["{out}/run.mcap --server :{port} --for 0.2s"],
+    "ethercat-replay": ["--help", "{out}/none.mcap"],
+    "ethercat-report": ["{given}/run.mcap -o {out}/run.html"],
+    "ethercat-monitor": ["--json --seconds 1 --server :{port}"],
+    "bridge-client": ["--help", "--ros-args -p sensor:=-1"],
+    "bridge-check-subscription": ["--help", "a --for 0"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("closing", more_if_long(["<&- >&- 2>&-"], ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"]))
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_closed_standard_streams_change_nothing_of_what_is_done(
+    name: str, closing: str, tmp_path: Path
+) -> None:
+    """Real processes, whose descriptors 0 to 2 are free for whatever is opened first."""
+    (given := tmp_path / "given").mkdir()
+    (given / "tool.yaml").write_text("tool_mass: 1.0\ntool_center_of_mass: [0.0, 0.0, 0.1]\n")
+    write(given / "run.mcap", [frame(number) for number in range(400)])
+    with served() as server:
+        for row in CLOSED[name]:
+            ends = []
+            for how in ("", closing):
+                (out := tmp_path / f"{CLOSED[name].index(row)}{bool(how)}").mkdir()
+                arguments = row.format(port=server.port, given=given, out=out).split()
+                program = Path(sys.executable).with_name(name)
+                done = completed("sh", "-c", f'exec "$@" {how}', "sh", program, *arguments)
+                assert "Traceback" not in done.stdout + done.stderr, (row, how, done.stderr)
+                ends.append((done.returncode, sorted(path.name for path in out.iterdir())))
+            assert ends[1:] == ends[:1], row
+
+
+def test_what_is_opened_for_closed_streams_is_for_children_too() -> None:
+    child = "subprocess.run(['sh', '-c', 'echo; echo >&2; cat'], check=True)"
+    script = (
+        f"import subprocess; from bota_ethercat.program.start import open_streams; open_streams(); {child}"
+    )
+    assert completed("sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, "-c", script).returncode == 0
+
+
+def test_limits_of_numbers_are_allowed() -> None:
+    assert [number(1, 32)(text) for text in ("1", "32")] == [1, 32]
+    assert [whole(1, 32)(text) for text in ("1", "0x20")] == [1, 32]
+    for text in ("0", "33"):
+        for parse in (number(1, 32), whole(1, 32)):
+            with pytest.raises(argparse.ArgumentTypeError, match="from 1 to 32"):
+                parse(text)
 
 
 @pytest.mark.parametrize("number", more_if_long([signal.SIGINT], [signal.SIGINT, signal.SIGTERM]))
@@ -206,6 +271,51 @@ def test_help_begins_with_three_examples_that_are_understood(
     for row in rows:
         _, *arguments = shlex.split(row.removeprefix("sudo "), comments=True)
         assert run_here(main, *arguments).code == 42, row
+
+
+def test_a_command_in_a_message_works_as_it_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From pip's folder, which nobody has on PATH, and by links, which sudo finds too."""
+    bin_, on_path = tmp_path / "a b" / "bin", tmp_path / "on_path"
+    for folder in (bin_, on_path):
+        folder.mkdir(parents=True)
+    for name in ("ethercat-doctor", "ethercat-monitor"):
+        (bin_ / name).touch(0o755)
+    monkeypatch.setattr(sys, "argv", [str(bin_ / "ethercat-monitor")])
+    monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
+    monkeypatch.setenv("PATH", str(on_path))
+    monkeypatch.setattr("bota_ethercat.program.arguments._SUDO_PATH", "/none")
+    assert command("sudo ethercat-doctor ens5") == f"sudo '{bin_}/ethercat-doctor' ens5"
+    assert command("ethercat-doctor a.trace") == f"'{bin_}/ethercat-doctor' a.trace"
+    assert command("ethercat-none") == "ethercat-none"
+    (on_path / "ethercat-doctor").symlink_to(bin_ / "ethercat-doctor")
+    assert command("ethercat-doctor a.trace") == "ethercat-doctor a.trace"
+    assert command("sudo ethercat-doctor ens5") == f"sudo '{bin_}/ethercat-doctor' ens5"
+    monkeypatch.setattr("bota_ethercat.program.arguments._SUDO_PATH", str(on_path))
+    assert command("sudo ethercat-doctor ens5") == "sudo ethercat-doctor ens5"
+    assert f"'{bin_}/ethercat-monitor' --once" in Parser("ethercat-monitor", "", "").format_help()
+
+
+def test_no_message_has_a_command_that_only_works_on_path() -> None:
+    """Beside docstrings, and what a program's own --help says of itself."""
+    names = "|".join(SCRIPTS)
+    bare = re.compile(rf"(sudo |')({names})\b(?!@)|^({names}) [a-z-]")
+    found, known = list[str](), {EXAMPLES, settings._FORMAT, IT_TELLS}
+    of_help = ("command", "Parser", "_Parser", "add")
+    for folder in ("protocol", "ethercat_server", "ros2_bridge", "clients/bota_clients"):
+        for path in (ROOT / folder).rglob("*.py"):
+            nodes = [*ast.walk(ast.parse(path.read_text()))]
+            told = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+            for call in nodes:
+                if isinstance(call, ast.Call) and ast.unparse(call.func) in of_help:
+                    told |= {id(part) for part in ast.walk(call)}
+            found += [
+                f"{path}:{node.lineno}: {node.value}" for node in nodes
+                if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in told
+                and node.value not in known and bare.search(node.value)
+            ]  # fmt: skip
+    assert found == []
 
 
 def test_help_needs_nothing_of_the_extra() -> None:

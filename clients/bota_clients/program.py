@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import shlex
 import signal
 import sys
@@ -34,7 +33,7 @@ def start(program: str, module: str, *arguments: object) -> int:
 
     Errors of this project become one sentence and exit code 1. That nobody reads standard error is none.
     """
-    if sys.stderr is None or sys.stderr is sys.__stderr__:  # not in a test
+    if sys.stderr is sys.__stderr__:  # not in a test, nor closed
         sys.stderr = _standard_error()
     try:
         code: int = import_module(f"bota_clients.{module}").run(*arguments)
@@ -64,10 +63,8 @@ class _Unheard(io.FileIO):
 
 
 def _standard_error() -> io.TextIOWrapper:
-    """Without one, whose descriptor may be another file's by now, there is no reader either."""
-    file = _Unheard(2, "w", closefd=False) if sys.stderr else io.FileIO(os.devnull, "w")
-    encoding = getattr(sys.stderr, "encoding", None)
-    return io.TextIOWrapper(io.BufferedWriter(file), encoding, "backslashreplace", line_buffering=True)
+    file = io.BufferedWriter(_Unheard(2, "w", closefd=False))
+    return io.TextIOWrapper(file, sys.stderr.encoding, "backslashreplace", line_buffering=True)
 
 
 def call_on(loop: AbstractEventLoop, stop: Callable[[], object], *names: str) -> None:

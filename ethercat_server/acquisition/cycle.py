@@ -13,8 +13,8 @@ from itertools import cycle
 from math import inf
 from typing import Any, Final, Protocol
 
+from bota_ethercat.distribution import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.acyclic import Acyclic
-from ethercat_server.acquisition.distribution import SLOT_NS, RecentDistribution
 from ethercat_server.acquisition.health import RoundTripHealth
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.recovery import Recovery

@@ -154,7 +154,7 @@ def _find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> 
         terminal.start(bus, number)
     if wanted.sensor_name is not None and sensors[0].identity.name != wanted.sensor_name:
         raise BusError(
-            f"the sensor on {bus.ifname} is a {sensors[0].identity.name}, not a {wanted.sensor_name}: "
+            f"the sensor on {bus.ifname} is a {sensors[0].identity.name}, not {wanted.sensor_name!r}: "
             "correct the name on the command line or leave it out"
         )
     try:

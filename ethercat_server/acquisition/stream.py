@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
+from bota_ethercat.distribution import RecentDistribution
 from bota_ethercat.framing import DataFlag, data_encoder
 from bota_ethercat.pdo import LAYOUTS
-from ethercat_server.acquisition.distribution import RecentDistribution
 from ethercat_server.acquisition.drift import Drift
 from ethercat_server.acquisition.health import SampleHealth
 from ethercat_server.ethercat.bus import Bus

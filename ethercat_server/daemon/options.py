@@ -7,6 +7,7 @@ import argparse
 import functools
 import ipaddress
 import shlex
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -315,8 +316,11 @@ def parse_options(argv: Sequence[str] | None = None) -> ServerOptions:
 
     argparse itself exits with code 2 for the errors it finds.
     """
-    parser = build_parser()
-    parsed = parser.parse_intermixed_args(argv)
+    parser, words = build_parser(), list(sys.argv[1:] if argv is None else argv)
+    if "--virtual" in words[:-1]:  # its value begins with dashes, too
+        at = words.index("--virtual")
+        words[at : at + 2] = [f"--virtual={words[at + 1]}"]
+    parsed = parser.parse_intermixed_args(words)
     if parsed.port is None and (parsed.sensor_name or "")[:1].isdigit():  # no model's name
         try:
             parsed.sensor_name, parsed.port = None, _PORT(parsed.sensor_name)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from bota_ethercat.program import state
+from bota_ethercat.program.arguments import command
 from ethercat_server.process import realtime
 from ethercat_server.sampling.trace import FrozenTrace
 from ethercat_server.server import Server
@@ -54,4 +55,4 @@ def _write(trace: FrozenTrace, path: Path) -> None:
     except OSError as error:
         log.warning("the trace of the loss is not kept: %s", error)
     else:
-        log.info("the minute of the loss is in %s: 'ethercat-doctor %s' shows it", path, path)
+        log.info("the minute of the loss is in %s: '%s' shows it", path, command(f"ethercat-doctor {path}"))

@@ -20,6 +20,7 @@ from bota_ethercat.health import sentences
 from bota_ethercat.health.judge import judge
 from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.health.observer import StreamObserver, by_sensor
+from bota_ethercat.program.arguments import command
 from bota_ethercat.replies import DistributionStatus, Status
 from ethercat_server.access.adapters import Holder, find_holder, links
 from ethercat_server.access.private_server import open_interface
@@ -103,7 +104,7 @@ def answers(ifname: str, count: int, silent: str = CHECK_CABLE) -> CheckResult:
         )
     return graded(
         text + "s" * (count == 1),
-        (not count, bad, why, f"ethercat-sensor eeprom {ifname}"),
+        (not count, bad, why, command(f"ethercat-sensor eeprom {ifname}")),
         slaves=count,
     )  # fmt: skip
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
+from bota_ethercat.program.arguments import command
 from ethercat_server.access.adapters import Adapter, is_wireless
 from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.report import (
@@ -101,7 +102,7 @@ def _capabilities(machine: Host) -> CheckResult:
         f"missing: {', '.join(missing)}" if missing else f"all four: {', '.join(held)}",
         (missing, note,
          f"a server started by this user {without}, and the doctor can check less; the service has all "
-         "four", f"sudo ethercat-doctor {shlex.quote(machine.asked or machine.ifname)}"),
+         "four", command(f"sudo ethercat-doctor {shlex.quote(machine.asked or machine.ifname)}")),
         missing=missing, held=held,
     )  # fmt: skip
 
@@ -176,7 +177,7 @@ _ERRORS: Final = (
 _DROPS: Final = (
     "rx_dropped", "tx_dropped", "rx_fifo_errors", "rx_missed_errors", "rx_over_errors", "tx_fifo_errors",
 )  # fmt: skip
-_LIST: Final = "ethercat-sensor adapters"
+_LIST: Final = command("ethercat-sensor adapters")
 _CORRUPTED: Final = "corrupted: check cable, connectors, shield and sources of interference"
 
 

@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.client import Client
 from bota_ethercat.errors import ConnectionFailedError, ProtocolError
+from bota_ethercat.program.arguments import command
 from bota_ethercat.program.server_choice import default_server
 from bota_ethercat.text.untrusted import printable
 from ethercat_server.errors import ServerError
@@ -65,7 +66,8 @@ def save(path: Path) -> str:
         raise ServerError(f"the program at {address} is not a compatible ethercat-server") from None
     except OSError as error:
         raise ServerError(f"{path} cannot be written: {error.strerror}") from None
-    return f"{path}: {len(data) // 1024} KiB; 'ethercat-doctor {path}' shows it"
+    show = command(f"ethercat-doctor {path}")
+    return f"{path}: {len(data) // 1024} KiB; '{show}' shows it"
 
 
 def show(path: Path) -> Iterator[str]:

@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
 from bota_ethercat.errors import SettingError
 from bota_ethercat.pdo import AXES
+from bota_ethercat.program.arguments import command
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.signals import signals_held_back
 from bota_ethercat.program.tare_memory import former, remember
@@ -235,9 +236,8 @@ def read_snapshot(path: Path) -> Snapshot:
         raise UsageError(f"{path} is not a snapshot: it is not valid JSON") from None
     kind = (content.get("format"), content.get("version")) if isinstance(content, dict) else None
     if kind != (_FORMAT, _VERSION):
-        raise UsageError(
-            f"{path} is not a snapshot of version {_VERSION}: make one with ethercat-sensor snapshot"
-        )
+        make = command("ethercat-sensor snapshot")
+        raise UsageError(f"{path} is not a snapshot of version {_VERSION}: make one with '{make}'")
     try:
         identity = Identity(
             str(content["model"]), int(content["serial"]), str(content["hardware"]), str(content["firmware"])

@@ -239,7 +239,7 @@ def _send(path: str | None, command: str) -> int:
         why = error.strerror or error
         _say(f"no virtual sensor of yours answers at {path} ({why}): start one, or give --control")
         return 1
-    print(answer)
+    print(answer.replace(" | ", "\n") if command.split() == ["help"] else answer)
     return int(not answer.startswith("ok"))
 
 

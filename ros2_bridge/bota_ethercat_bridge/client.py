@@ -12,6 +12,7 @@ import signal
 
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C is never a traceback, whatever is being imported
 
+import contextlib  # noqa: E402
 import sys  # noqa: E402
 from collections.abc import Sequence  # noqa: E402
 from importlib import import_module  # noqa: E402
@@ -34,6 +35,7 @@ defaults: share/bota_ethercat_bridge/config/client.yaml.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
+    _open_streams()
     signals = StopSignals()
     own = list(sys.argv[1:] if arguments is None else arguments)
     if own and own[0] in {"-h", "--help"}:
@@ -50,10 +52,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def check_subscription() -> int:
     """The program `bridge-check-subscription`, in the module of that name."""
+    _open_streams()
     if problem := environment_problem():
         return refuse(problem, 1)
     measure = _load("check_subscription", "main")
     return 1 if measure is None else int(measure())
+
+
+def _open_streams() -> None:
+    with contextlib.suppress(ImportError):  # which `_load` tells
+        import_module("bota_ethercat.program.start").open_streams()
 
 
 def _load(module: str, function: str) -> Any:

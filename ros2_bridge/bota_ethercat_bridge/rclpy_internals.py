@@ -23,6 +23,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from bota_ethercat.cdr import StampedNumbers
 
 RIGHT_FOR: Final = ("7.1.", "9.1.")  # Jazzy, Kilted
+_MOST_TAKEN: Final = 100  # messages of a subscription at once
 _THREADS: Final = 4  # of the documented executor: a service, the supervisor, an orientation, TF
 
 
@@ -122,6 +123,35 @@ class Spinner:
             self._stopping = True
             if not self._ended:
                 self._executor.create_task(lambda: None)  # something to do, so that `spin_once` returns
+
+
+def taking(node: Node, *subscriptions: Any) -> Callable[[float], None]:
+    """What waits, at most for so many seconds, and calls these subscriptions' callbacks with what is there.
+
+    At the rate of a sensor an executor, which has a turn for each message, takes most of a core.
+    """
+    if not is_known():
+        executor = SingleThreadedExecutor(context=node.context)
+        executor.add_node(node)
+        spin: Callable[[float], None] = executor.spin_once
+        return spin
+    from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: PLC0415 - of those known
+
+    with node.context.handle:
+        wait_set = rclpy_implementation.WaitSet(len(subscriptions), 0, 0, 0, 0, 0, node.context.handle)
+
+    def take(timeout_s: float) -> None:
+        wait_set.clear_entities()
+        for each in subscriptions:
+            wait_set.add_subscription(each.handle)
+        wait_set.wait(round(timeout_s * 1e9))
+        for each in subscriptions:
+            for _ in range(_MOST_TAKEN):
+                if (taken := each.handle.take_message(each.msg_type, each.raw)) is None:
+                    break
+                each.callback(taken[0])
+
+    return take
 
 
 def make_executors(node: Node, parameters: Any) -> tuple[Executor, dict[str, Executor]]:

@@ -10,16 +10,20 @@ import contextlib
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from bota_ethercat.client import Client
+from bota_ethercat.client import Client, Connected, Disconnected
+from bota_ethercat.errors import ConnectionFailedError
+from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import SampleDecoder
 from bota_ethercat.program.arguments import number
 from scripts.benchmarks.records import PORT, REAL_TIME
 from scripts.chain import Chain, ScriptError, Stopped, ignore_signals, loopback_up, stoppable
-from scripts.demonstration.measure import FULL_RATE, Measurement, Summary, verdict
+from scripts.demonstration.measure import FULL_RATE, Figures, Measurement, verdict
 
 TOPIC: Final = "/wrench"
 _SHOW_S: Final = 1.0
@@ -29,64 +33,77 @@ _VECTORS: Final = (
 
 
 @contextlib.contextmanager
-def listening(client: Client, measurement: Measurement, lock: threading.Lock) -> Iterator[None]:
-    """Two threads take what comes from the server and on the ROS topic."""
+def listening(measurement: Measurement) -> Iterator[deque[str]]:
+    """Two threads take what comes from the server and on the ROS topic; yields what is to be told."""
     import rclpy  # noqa: PLC0415 - only now are signals handled
     from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415
-    from rclpy.executors import SingleThreadedExecutor  # noqa: PLC0415
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
 
-    from bota_ethercat_bridge.rclpy_internals import Spinner  # noqa: PLC0415
+    from bota_ethercat_bridge.rclpy_internals import taking  # noqa: PLC0415
 
-    def receive() -> None:
-        for frame in client.frames():
-            with lock:
-                measurement.add_frame(frame)
+    told, is_over = deque[str](maxlen=9), threading.Event()
+    client = Client(PORT, raw=True)
 
     def on_message(message: Any) -> None:
         now_ns, stamp, wrench = time.time_ns(), message.header.stamp, message.wrench
         values = [getattr(part, axis) for part in (wrench.force, wrench.torque) for axis in "xyz"]
-        with lock:
-            measurement.add_message(stamp.sec * 10**9 + stamp.nanosec, values, now_ns)
+        measurement.add_message(stamp.sec * 10**9 + stamp.nanosec, values, now_ns)
+
+    def subscribe() -> None:
+        while not is_over.is_set():
+            take(0.1)
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node("demo")
-    node.create_subscription(WrenchStamped, TOPIC, on_message, 50)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    spinner = Spinner(executor)
-    client.ask("subscribe")
-    threads = [threading.Thread(target=each, daemon=True) for each in (receive, spinner.run)]
+    node = rclpy.create_node("demo", start_parameter_services=False)
+    take = taking(node, node.create_subscription(WrenchStamped, TOPIC, on_message, 50))
+    threads = [
+        threading.Thread(target=each, daemon=True)
+        for each in (partial(receive, client, measurement, told), subscribe)
+    ]
     for thread in threads:
         thread.start()
     try:
-        yield
+        yield told
     finally:
+        is_over.set()
         client.close()
-        spinner.stop()
         for thread in threads:
             thread.join(3)
-        executor.shutdown()
         node.destroy_node()
         rclpy.try_shutdown()
 
 
-def show(measurement: Measurement, messages: int) -> None:
-    """A line: the rate and age of this number of newest messages, all losses, and the latest sample."""
-    newest, so_far = measurement.summary(messages), measurement.summary()
+def receive(client: Client, measurement: Measurement, told: deque[str]) -> None:
+    """Take what comes from the server until the client is closed; a connection that ends is told."""
+    with contextlib.suppress(ConnectionFailedError):
+        while True:
+            for item in client.poll_all(_SHOW_S):
+                if isinstance(item, DataMessage):
+                    measurement.add_frame(item)
+                elif isinstance(item, Disconnected) and item.was_connected:
+                    measurement.interrupted()
+                    told.append(f"the connection to the server ended ({item.reason}): connecting again")
+                elif isinstance(item, Connected) and item.again:
+                    told.append("connected again; what the server sent meanwhile is not compared")
+
+
+def show(measurement: Measurement) -> None:
+    """A line: the rate and age of the messages since the last one, all losses, and the latest sample."""
+    newest, frame = measurement.take_newest(), measurement.latest
     figures = (
-        f"{newest.rate_hz:7.1f} Hz  age {newest.age_ms[0]:.2f} ms  lost {so_far.lost + so_far.lost_before}  "
-        f"repeated {so_far.repeated}"
+        f"{newest.rate_hz:7.1f} Hz  age {newest.age_ms[0]:.2f} ms  lost {newest.lost + newest.lost_before}  "
+        f"repeated {newest.repeated}"
     )
-    if (frame := measurement.latest) is not None:
+    measurement.latest = None
+    if frame is not None:
         sample = SampleDecoder(len(frame.process_data)).decode(frame.process_data)
         for name, unit, digits in _VECTORS:
             values = " ".join(f"{value:+.{digits}f}" for value in getattr(sample, name))
             figures += f"  {unit} {values}"
-    print(figures, flush=True)
+    print(f"{figures}{'' if frame else '  no samples from the server'}", flush=True)
 
 
-def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
+def print_summary(summary: Figures, sensor: Mapping[str, Any]) -> None:
     """The figures of the whole run."""
     print("What arrived on the ROS topic:")
     for name, value in (
@@ -103,6 +120,8 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
         ("All are samples of the sensor", "NO" if summary.unknown else "yes"),
     ):
         print(f"  {name:<34}{value:>10}")
+    if summary.paused_s:
+        print(f"For {summary.paused_s:.0f} s no message came; the rate is that of the rest.")
     if summary.lost + summary.lost_before:
         print("Samples are missing: other programs had the processors for some time. docs/tuning.md helps.")
 
@@ -110,31 +129,26 @@ def print_summary(summary: Summary, sensor: Mapping[str, Any]) -> None:
 def run(seconds: float | None) -> int:
     """The demo itself; returns the exit code. ScriptError or Stopped end it early."""
     loopback_up()
-    lock = threading.Lock()
     binaries = Path(sys.executable).parent
     with Chain() as chain:
         chain.start("ethercat-server", binaries / "ethercat-server", "virtual", PORT)
         chain.start("bridge-client", binaries / "bridge-client", "--ros-args", "-p", f"server_port:={PORT}",
                     "-p", f"rt_priority:={REAL_TIME}")  # fmt: skip
-        client = chain.connect(1)
-        sensor = client.description["sensors"][0]
+        sensor = chain.connect(1).description["sensors"][0]
         measurement = Measurement(float(sensor["rate_hz"]))
-        with listening(client, measurement, lock):
+        with listening(measurement) as told:
             chain.wait(lambda: measurement.messages > 0, f"nothing arrived on {TOPIC}")
-            with lock:
-                measurement.begin()
+            measurement.begin()
             print(f"{sensor['name']}, serial {sensor['serial']}, {sensor['rate_hz']} Hz, virtual", flush=True)
-            shown = 0
             with contextlib.suppress(Stopped):
                 end = time.monotonic() + (seconds or float("inf"))
                 while (left := end - time.monotonic()) > 0:
                     chain.sleep(min(_SHOW_S, left))
-                    with lock:
-                        show(measurement, measurement.messages - shown)
-                        shown = measurement.messages
+                    while told:
+                        print(told.popleft(), flush=True)
+                    show(measurement)
             ignore_signals()
-            with lock:  # what comes while they end is none of the figures
-                summary = measurement.summary()
+            summary = measurement.summary()  # what comes while they end is none of the figures
         troubles = chain.stop()
     print_summary(summary, sensor)
     if trouble := verdict(summary, float(sensor["rate_hz"])) or next(iter(troubles), None):

@@ -7,6 +7,7 @@ import random
 import subprocess
 import threading
 import time
+from array import array
 from bisect import bisect_right
 from collections import deque
 from pathlib import Path
@@ -17,9 +18,10 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import Temperature
 
 from bota_ethercat.pdo import encode
-from bota_ethercat_bridge import check_subscription
+from bota_ethercat_bridge import check_subscription, rclpy_internals
 from bota_ethercat_bridge.subscription import Subscription
 from tests.bridge.real_node import retire
 from tests.bridge.scripted_server import ScriptedServer
@@ -225,9 +227,10 @@ def test_cpp_counts_the_same(tmp_path: Path) -> None:
     ],
 )
 def test_what_to_change(lost: int, depth: int, age_ms: float, best_effort: bool, words: str) -> None:
-    counted = Subscription("/wrench")
+    counted = check_subscription.Counted("/wrench")
     counted.received, counted.lost, counted.missing, counted.rate_hz = 800, lost, lost, 800.0
-    said = [*check_subscription.report(counted, [round(age_ms * 1e6)] * 800, depth, best_effort=best_effort)]
+    counted.ages.count(array("f", [age_ms * 1e6] * 800))
+    said = [*check_subscription.report(counted, depth, best_effort=best_effort)]
     assert f"received 800, lost {lost}, missing {lost}" == said[0]
     assert words in " ".join(said[2:])
     assert bool(said[2:]) == bool(words)
@@ -261,7 +264,7 @@ def test_ctrl_c_before_the_first_message_blames_nobody(
     monkeypatch.setattr(rclpy, "try_shutdown", lambda: None)
     monkeypatch.setattr(check_subscription, "_find", interrupt)
     assert check_subscription.main(["wrench"]) == 1
-    assert capsys.readouterr() == ("", "check_subscription: stopped\n")
+    assert capsys.readouterr() == ("", "bridge-check-subscription: stopped\n")
 
 
 def test_without_ros_it_is_one_sentence(
@@ -275,6 +278,30 @@ def test_without_ros_it_is_one_sentence(
         check_subscription.main(["wrench"])
     assert ended.value.code == 2
     assert capsys.readouterr().err.endswith("rcl: ROS_DOMAIN_ID is not an integral number\n")
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_what_waits_takes_every_message_once_in_order(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of real DDS, with what is right for this version of rclpy and for any."""
+    monkeypatch.setattr(rclpy_internals, "is_known", lambda: known)
+    sending, own = (rclpy.create_node(f"taking_{name}_{known}") for name in "ab")
+    publisher = sending.create_publisher(Temperature, f"taking_{known}", 1000)
+    heard, sent = list[float](), [float(number) for number in range(250)]
+
+    def hear(message: Any) -> None:
+        heard.append(message.temperature)
+
+    take = rclpy_internals.taking(own, own.create_subscription(Temperature, f"taking_{known}", hear, 1000))
+    deadline = time.monotonic() + PATIENCE_S
+    while not publisher.get_subscription_count() and time.monotonic() < deadline:
+        take(0.01)
+    for number in sent:
+        publisher.publish(Temperature(temperature=number))
+    while len(heard) < len(sent) and time.monotonic() < deadline:
+        take(0.1)
+    retire(sending)
+    retire(own)
+    assert heard == sent
 
 
 @pytest.mark.long

@@ -92,6 +92,14 @@ def test_time_is_the_monotonic_clocks(tmp_path: Path) -> None:
     assert [row["time_s"] for row in rows(path.with_suffix(".csv"))] == [f"{ns / 1e9:.9f}" for ns in times]
 
 
+def test_time_begins_with_the_earliest_of_several_sensors(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    record(path, [frame(8001), frame(8000, 1), frame(8002), frame(8001, 1)], sensors=(0, 1))
+    export(path)
+    times = [float(row["time_s"]) for row in rows(path.with_suffix(".csv"))]
+    assert times == [PERIOD_NS * 1e-9 * n for n in (1, 0, 2, 1)]
+
+
 def test_what_cannot_be_done_is_said_and_leaves_nothing(tmp_path: Path) -> None:
     path, out = tmp_path / "run.mcap", tmp_path / "run.csv"
     record(path, [frame(0)])

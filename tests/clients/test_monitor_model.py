@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from functools import partial
 from types import SimpleNamespace
 from typing import cast
@@ -16,12 +17,12 @@ from bota_clients.monitor.compensated import NewestCompensated
 from bota_clients.monitor.model import Model, SensorView
 from bota_clients.monitor.reader import MonitorReader
 from bota_clients.monitor.screen import ViewOptions, render, table
-from bota_clients.monitor.words import json_line, json_object
+from bota_clients.monitor.words import json_line, json_object, verdict
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.health.limits import Level
+from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from bota_ethercat.stream.timeline import Timeline
 from tests.clients import monitor_states as made
@@ -199,6 +200,36 @@ def test_a_monitor_that_was_not_run_blames_neither_server_nor_sensor(model: Mode
     (alert,) = only(model, now(10) + 8.4).alerts
     assert alert.text == "No new sample for 8.4 s, this computer did not run this program for 8.3 s"
     assert alert.remedy == "Give it a priority, or the computer less to do"
+
+
+def test_what_is_past_is_told_at_its_worst_and_at_its_last_time(model: Model) -> None:
+    at = 0
+    for lost in (0, 40, 7):  # then more than a second in which none is
+        at += lost
+        for _ in range(20):
+            take(model, *run(at, 50))
+            at += 50
+    (alert,) = only(model, now(at)).alerts
+    assert re.match(r"40 of \d+ samples .* were lost", alert.text)
+    assert alert.ago_s == pytest.approx(0.25, abs=0.1)
+
+
+def test_the_latest_of_what_is_past_and_the_worst_of_what_is_present_come_first(model: Model) -> None:
+    model.connected(description(("BFT-SENS-ECAT-M8",) * 2), made.OWN_PEER, START_S)
+    hot: dict[str, float] = {"temperature": LIMITS.temperature_warn + 1}
+    seconds: list[dict[str, float]] = [hot, {"warnings": 0b1000}, {}, hot]
+    overload = {**REST, "warnings": 0b10001, "force_torque_saturated": 4}
+    for at, values in enumerate(seconds):
+        for first in range(at * 1000, at * 1000 + 1000, 100):
+            others = [frame(k, overload if at == 3 else REST, sensor=1) for k in range(first, first + 100)]
+            model.add_frames([*run(first, 100, **values), *others], now(first + 99))
+        if at == 2:
+            past = [alert.ago_s for alert in model.state(now(2999)).sensors[0].alerts]
+            assert past == sorted(past, key=lambda ago_s: ago_s or 0)
+            assert len(set(past)) > 1
+    level, text = verdict(model.state(now(3999)))
+    assert level > Level.LOOK
+    assert re.match("sensor 1: .*saturated.*; sensor 0: .*°C", text)
 
 
 def test_a_lost_sensor_is_told_until_it_is_back_and_later_too(model: Model) -> None:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from bota_ethercat.health.limits import Level
+from bota_ethercat.program.arguments import command
 from ethercat_server.doctor.machine import FACTS, Host, processor_list
 from ethercat_server.doctor.machine_checks import CHECKS, examine_machine, rising
 from ethercat_server.doctor.report import CannotLookError, CheckResult, bad, examine, ok
@@ -81,9 +82,10 @@ DEEP: Files = {
 }  # fmt: skip
 TOO_DEEP = [f"echo 1 | sudo tee {CPUS}/cpu*/cpuidle/state[23]/disable"]
 DMA = "/dev/cpu_dma_latency"
+DOCTOR = command("sudo ethercat-doctor ens5")
 PROCESSORS = [
     Case("capabilities", FINE),
-    Case("capabilities", NOTE, NO_RIGHTS, values={"missing": NAMES}, commands=["sudo ethercat-doctor ens5"]),
+    Case("capabilities", NOTE, NO_RIGHTS, values={"missing": NAMES}, commands=[DOCTOR]),
     Case("capabilities", NOTE, {"/proc/self/status": f"CapEff:\t{3 << 12:016x}\n"}, said="less steady cycle"),
     Case("governor", FINE),
     Case("governor", LOOK, {GOVERNOR.replace("*", "2"): "powersave"}, said="performance on 3, powersave on 1",

@@ -13,6 +13,7 @@ import math
 import os
 import re
 import resource
+import signal
 import socket
 import subprocess
 import sys
@@ -35,6 +36,7 @@ from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from tests.bridge.scripted_server import MemoryServer, ScriptedChannel, ScriptedServer, process_data
 from tests.descriptions import description, sensor_row
 from tests.golden_vectors import odd_messages
+from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port, full_listener
 from tests.simulation import MemoryChannel, Simulation
 
@@ -651,9 +653,9 @@ PULLS: dict[str, tuple[Pull, str]] = {
 
 def guard(channel: TcpChannel) -> Callable[[Callable[[str], object]], object]:
     source = examples()[1]
-    assert len(source.splitlines()) <= 15
+    assert len(source.splitlines()) <= 16
     names: dict[str, Any] = {}
-    exec(source, names)
+    exec(source.replace("signal.signal(number", "print(number"), names)  # the signals are not this process's
     names["Client"] = lambda _, **options: Client(1, channel=channel, **options)
     found: Callable[[Callable[[str], object]], object] = names["guard"]
     return found
@@ -731,3 +733,20 @@ def test_the_guard_of_the_docs_waits_for_a_server_and_stops_when_it_is_ended(
     with pytest.raises(KeyboardInterrupt):
         guard(channel)(said.append)
     assert said == ["60.0 N", "the guard has ended"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_the_guard_of_the_docs_stops_at_every_signal_that_ends_it(number: int) -> None:
+    """A process, which systemd, docker and the end of an ssh session end so."""
+    with served() as server:
+        script = examples()[1].replace("12001", str(server.port)).replace("latest(", "latest(max_age_s=60, ")
+        command = [sys.executable, "-c", f"{script}\nguard(lambda why: print(why, flush=True))"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            try:
+                deadline = time.monotonic() + PATIENCE_S
+                while not server.hub.connections and time.monotonic() < deadline:
+                    time.sleep(0.01)
+                process.send_signal(number)
+                assert process.communicate(timeout=PATIENCE_S)[0] == "the guard has ended\n"
+            finally:
+                process.kill()

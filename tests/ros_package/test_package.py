@@ -117,7 +117,8 @@ def test_the_urls_are_asked_for_once_and_a_placeholder_is_refused(
 
 
 def test_everything_that_is_imported_is_a_dependency_once() -> None:
-    ours = {"bota_ethercat_bridge", "bota_ft_compensation", "bota_ethercat", "__future__", *sys.stdlib_module_names}
+    ours = {"bota_ethercat_bridge", "bota_ft_compensation", "bota_ethercat", "__future__"}
+    ours |= sys.stdlib_module_names
     ours.add("bota_ethercat_msgs")  # used where it is there
     # Packages that are not named as their modules; the package tf2_ros is C++.
     packages = {"tf2_ros": "tf2_ros_py", "numpy": "python3-numpy"}

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import pytest
 
+from bota_ethercat.distribution import RecentDistribution
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.acquisition import health
-from ethercat_server.acquisition.distribution import RecentDistribution
 from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.sampling.trust import TrustState
 from ethercat_server.simulation.machine import REALTIME_START_NS, START_NS, Machine, SimulatedClock

@@ -21,9 +21,9 @@ from types import SimpleNamespace
 import pytest
 
 from bota_ethercat.control import ACTIONS, request
+from bota_ethercat.distribution import WINDOW_SLOTS
 from bota_ethercat.framing import DataFlag, encode_json
 from bota_ethercat.text.json_text import JsonObject
-from ethercat_server.acquisition.distribution import WINDOW_SLOTS
 from ethercat_server.process import logs
 from ethercat_server.serving.bare_json import encode_bare_json
 from ethercat_server.serving.connection import MAX_REQUEST_LENGTH, Connection

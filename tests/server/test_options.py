@@ -59,6 +59,7 @@ def test_what_nobody_sets_has_the_notes_defaults() -> None:
         (["ens5", "1", "--set", "fir=maybe"], "true or false"),
         (["ens5", "1", "--set", "sinc_length=0"], "from 32 to 2048"),
         (["ens5", "1", "--set", "fast=true"], "fast is true but fir is false"),
+        (["ens5", "1", "--virtual", "--bogus"], "requires the interface 'virtual'"),
         (["ens5", "1", "--virtual", "--pdo 77"], "requires the interface 'virtual'"),
         (["ens5", "1", "--config", "/no/such/file.toml"], "No such file"),
     ],

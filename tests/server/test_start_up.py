@@ -405,7 +405,7 @@ def test_models_and_their_names() -> None:
     assert "'BFT-GENA-THING', a model this server does not know" in refused(strange)
     rokubi, wanted = MemoryBackend(SensorOptions(model="BFT-ROKS-ECAT-M8")), Asked()
     wanted.sensor_name = "BFT-SENS-ECAT-M8"
-    assert "is a BFT-ROKS-ECAT-M8, not a BFT-SENS-ECAT-M8" in refused(rokubi, wanted)
+    assert "is a BFT-ROKS-ECAT-M8, not 'BFT-SENS-ECAT-M8'" in refused(rokubi, wanted)
     wanted.sensor_name = "BFT-ROKS-ECAT-M8"
     assert [sensor.streams for sensor in start(rokubi, wanted).sensors] == [True]
 

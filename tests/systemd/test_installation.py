@@ -184,7 +184,7 @@ INSTALLED_AND_PURGED = """
 set -e
 cd "$1"
 config=/etc/ethercat-server
-everything() { find /etc /opt /usr/lib /var/lib /run ! -path '*/var/lib/dpkg/*' ! -name '*-' | sort; }
+everything() { find /etc /opt /usr/bin /usr/lib /var/lib /run ! -path '*/lib/dpkg/*' ! -name '*-' | sort; }
 # systemd-sysusers writes a password in its own way.
 accounts() { cut -d: -f 1,3,4 /etc/passwd; cut -d: -f 1,3 /etc/group; }
 before=$(everything; accounts)
@@ -195,7 +195,7 @@ cd /usr/share
 folders=$(echo {bash-completion/completions,zsh/vendor-completions,fish/vendor_completions.d,man/man1})
 for each in $folders; do ls $each/*ethercat-server*; done | wc -l
 cd "$1"
-setpriv --reuid=ethercat --regid=ethercat --clear-groups /opt/ethercat-server/bin/ethercat-server --version
+setpriv --reuid=ethercat --regid=ethercat --clear-groups ethercat-server --version
 mkdir /var/lib/ethercat-sensors  # as the service does
 echo "# mine" >>$config/ens5.env
 scripts/install-service --keep-environment ens5 14000
@@ -206,7 +206,7 @@ systemctl enable --quiet ethercat-server@ens5 ethercat-server@ens6
 echo "enabled $(ls /etc/systemd/system/multi-user.target.wants | grep -c ethercat)"
 scripts/install-service --uninstall
 echo "enabled $(ls /etc/systemd/system/multi-user.target.wants | grep -c ethercat)"
-[ ! -e /opt/ethercat-server ]
+[ ! -e /opt/ethercat-server ] && [ ! -e /usr/bin/ethercat-server ]
 tail -n 1 $config/ens5.env
 dpkg --purge ethercat-server ethercat-server-ens5 ethercat-server-ens6 >/dev/null
 scripts/install-service --uninstall

@@ -186,6 +186,7 @@ def test_the_notes_scripts_are_these_commands(
             "did you mean 'acceleration_filter' or 'angular_rate_filter'?",
         ),
         (["apply", "ens5", "--set", "IMU=1"], "did you mean 'imu_active'?"),
+        (["read", "ens5", "rate"], "did you mean Sampling rate or "),
         (
             ["read", "ens5", "sinc"],
             "did you mean SINC length or Force/torque filter SINC length?",

@@ -16,7 +16,7 @@ import pytest
 
 from ethercat_server.ethercat.wire import ETHERTYPE
 from ethercat_server.virtual_sensor.cli import build_parser, main, options_from
-from ethercat_server.virtual_sensor.faults import LONGEST_LINE
+from ethercat_server.virtual_sensor.faults import COMMANDS, LONGEST_LINE
 from ethercat_server.virtual_sensor.link import obey_lines, open_interface
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests import rights
@@ -152,6 +152,8 @@ def test_the_control_socket(
         ):
             assert main(["--control", str(path), "--send", command]) == (answer != "ok\n")
             assert capsys.readouterr().out == answer
+    assert main(["--control", str(path), "--send", "help"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == len(COMMANDS)
     assert main(["--control", str(path), "--send", "stats"]) == 0
     assert json.loads(capsys.readouterr().out.removeprefix("ok "))["frames"] == 0
     assert main(["--control", str(path), "--send", "quit"]) == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Iterator
 from functools import cache
+from itertools import chain, islice
 from typing import Final
 
 import numpy as np
@@ -18,6 +19,7 @@ from bota_ethercat.pdo import Sample, SampleDecoder
 from bota_ethercat.program.new_file import NewFile
 
 _SECOND: Final = 1_000_000_000
+_BEGIN: Final = 100  # frames
 VECTORS: Final = (("force", "N"), ("torque", "Nm"), ("acceleration", "m_s2"), ("angular_rate", "rad_s"))
 _FLAGS: Final = (DataFlag.GAP, DataFlag.REPEATED, DataFlag.INVALID)
 REGISTERS: Final = (
@@ -51,15 +53,17 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         raise RecordingError(f"{recording.path} has no samples{which}")
     decoder = cache(lambda size: SampleDecoder(size, options.imu_units))
     written = last_ns = stamp_ns = 0
-    first_ns: int | None = None
-    frames = recording.frames(options.sensor)
+    frames = iter(recording.frames(options.sensor))
     if not options.all:
         frames = new_samples(frames, {})
+    # Of several sensors another's may be the earliest.
+    begin = [*islice(frames, _BEGIN)]
+    moments = [frame.monotonic_ns for frame in begin]
+    first_ns = min((each for each in moments if each > moments[0] - _SECOND), default=0)
     with NewFile(options.output, force=options.force) as file:
         file.write(",".join(COLUMNS) + "\n")
-        for frame in frames:
+        for frame in chain(begin, frames):
             written += 1
-            first_ns = frame.monotonic_ns if first_ns is None else first_ns
             if frame.monotonic_ns < last_ns - _SECOND:  # its machine was restarted: only the stamps go on
                 first_ns += frame.monotonic_ns - last_ns - max(0, frame.stamp_ns - stamp_ns)
             last_ns, stamp_ns = frame.monotonic_ns, frame.stamp_ns

@@ -38,12 +38,14 @@ from bota_clients.recording.columns import Ints
 from bota_clients.recording.reader import Recording, Since
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError, FileError
+from bota_ethercat.program.arguments import command
 from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.text.json_text import parse_json_object
 from bota_ft_compensation.identification.parameter_file import offset_of
 
+_ALIGN: Final = command("ethercat-export align")
 _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
 _CHUNK: Final = 1024  # frames, in a file
 _GROUP: Final = 131_072  # samples, in a file
@@ -69,7 +71,7 @@ class ForeignClock(NamedTuple):
             found = parse_json_object(path.read_bytes())
             return cls(int(found["stamp_ns"]), int(found["monotonic_ns"]), float(found["drift_ppm"]))
         except (OSError, BadMessageError, LookupError, TypeError, ValueError):
-            raise RecordingError(f"{path} is not what 'ethercat-export align' prints") from None
+            raise RecordingError(f"{path} is not what '{_ALIGN}' prints") from None
 
     def instants(self, stamps_ns: Ints) -> Ints:
         """Of the server's CLOCK_MONOTONIC."""
@@ -169,7 +171,7 @@ class Stamped:
             )
         which, bound = ("first", begin_ns) if stamps[row] < begin_ns else ("last", end_ns)
         taken, limit = np.array([stamps[row], bound]).astype("datetime64[ns]")
-        what = "leave the row out, or find the offset of its clock with 'ethercat-export align'"
+        what = f"leave the row out, or find the offset of its clock with '{_ALIGN}'"
         if not stamps[row]:
             what = "its time was not set (0): leave the row out"
         for unit, per_unit in _PER_SECOND.items():

@@ -171,6 +171,8 @@ def run(options: argparse.Namespace) -> int:
             result, poses = _in_motion(data, sensor), ()
         except CompensationError as refusal:
             error = f"{error}; or, by motion alone: {refusal}"
+    if result is not None:
+        _write_files(options, result, sensor, offset)
     if options.json:
         sys.stdout.write(json.dumps(as_json(poses, rejected, result, error), indent=1) + "\n")
     else:
@@ -185,6 +187,12 @@ def run(options: argparse.Namespace) -> int:
     if result is None:
         _say(error or "no result")
         return 1
+    return 0
+
+
+def _write_files(
+    options: argparse.Namespace, result: Identified, sensor: RecordedSensor, offset: Sequence[float] | None
+) -> None:
     if options.bota is not None:
         write_bota(options.bota, result.payload)
         _say(f"written to {options.bota}")
@@ -204,7 +212,6 @@ def run(options: argparse.Namespace) -> int:
                 f"{options.path} has no offset of the sensor's own, so the bias is right only until that is "
                 "changed: record with a newer server"
             )
-    return 0
 
 
 def _with_inertia(result: Identified, data: Columns, sensor: RecordedSensor) -> Identified:

@@ -104,10 +104,10 @@ def losses(sensor: SensorView) -> list[tuple[str, bool]]:
     """Each kind of loss in words, and whether there was any."""
     lost = sensor.status.lost_samples
     return [
-        (f"{count(lost)} on the bus", bool(lost)),
         (f"{sensor.missed} on the way here", bool(sensor.missed)),
         (f"repeated {sensor.repeated}", bool(sensor.repeated)),
         (f"invalid {sensor.invalid}", bool(sensor.invalid)),
+        (f"{count(lost)} on the bus since start", False),  # what is lost now is in the verdict
     ]
 
 

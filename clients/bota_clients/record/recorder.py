@@ -155,7 +155,9 @@ class Recorder:
             ):
                 if number:
                     found.append(f"{count(number, thing)} of sensor {position} {what}")
-        gone = f", but for {count(self.disconnections, 'disconnection')}" if self.disconnections else ""
+        gone = ""
+        if self.disconnections:
+            gone = f"; not counted: what came during {count(self.disconnections, 'disconnection')}"
         return f"{frames}, {decimal(self._disk.tell())}; {', '.join(found) or 'nothing was lost'}{gone}"
 
     def _counts(self) -> dict[int, StreamCounts]:

@@ -370,7 +370,7 @@ _CHECKS: Final = (
           "If it is unloaded, it may have been damaged by overload: tare it and compare.",
           "No channel was saturated."),
     _Kind("Warnings", {f"warning {1 << bit}" for bit in range(32)} - _SATURATED, 1, None,
-          "The sensor reports it.", good="The sensor reported none, but those of saturation."),
+          "The sensor reports it.", good="The sensor reported no other."),
     _Kind("Numbers", ["not_finite"], 1, None, "A single one of them corrupts every sum and filter.",
           good="Every value is a finite number."),
     _Kind("Stamps", ["clock"], _FEWEST, _stamps, "Sensor fusion and derivatives suffer."),

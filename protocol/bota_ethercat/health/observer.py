@@ -105,6 +105,8 @@ class SensorObserver:
 
     def note_unread(self, unread: tuple[float, bool], now_ns: int) -> None:
         """What `Client.take_unread` has returned just now."""
+        while self._unread and self._unread[-1][1] <= unread:  # never the worst again
+            self._unread.pop()
         self._unread.append((now_ns, unread))
 
     def restart(self) -> None:

@@ -4,12 +4,18 @@
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
+import shutil
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from bota_ethercat.program.version import VERSION
 
 _Value = TypeVar("_Value")
+_SUDO_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"  # as Debian sets it
 
 EXAMPLES: Final = """\
 ethercat-server virtual 12001                              # a simulated sensor
@@ -50,6 +56,20 @@ def examples_of(program: str) -> list[str]:
     return [row for row in EXAMPLES.splitlines() if program in row.removeprefix("sudo ").split()[:1]]
 
 
+def command(row: str) -> str:
+    """A row with a command line of one of the programs, as it works where this one runs.
+
+    With the path of the program unless it is on PATH, or for sudo on that of sudo.
+    """
+    rest = row.removeprefix("sudo ")
+    before, name = row[: -len(rest)], rest.split(" ")[0]
+    for beside in (sys.argv[0], sys.executable):
+        path = Path(beside).absolute().with_name(name)
+        if not shutil.which(name, path=_SUDO_PATH if before else None) and os.access(path, os.X_OK):
+            return before + shlex.quote(str(path)) + rest[len(name) :]
+    return row
+
+
 class Parser(argparse.ArgumentParser):
     """The parser of a program, or of a subcommand."""
 
@@ -60,7 +80,7 @@ class Parser(argparse.ArgumentParser):
     def format_help(self) -> str:
         """The examples, then what argparse has."""
         rows = examples_of(self.prog)
-        return "\n".join([*(["examples:", *rows, ""] if rows else []), super().format_help()])
+        return "\n".join([*(["examples:", *map(command, rows), ""] if rows else []), super().format_help()])
 
 
 def typed(convert: Callable[[str], _Value], what: str = "") -> Callable[[str], _Value]:

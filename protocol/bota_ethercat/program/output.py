@@ -25,8 +25,7 @@ def ends_with_its_reader(main: Callable[_P, int]) -> Callable[_P, int]:
             try:
                 return main(*args, **kwargs)
             finally:  # argparse exits when it has printed its help
-                if sys.stdout is not None:
-                    sys.stdout.flush()
+                sys.stdout.flush()
         except OSError as error:
             if not is_of_output(error):
                 raise

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts a program: Ctrl-C is never a traceback, whatever is being imported, and output never fails.
+"""Starts a program: Ctrl-C is never a traceback, whatever is being imported, and output never fails, also
+where a standard stream is closed (`>&-`).
 
 Few imports, for Python's own handler raises KeyboardInterrupt in the middle of them. While a program loads,
 SIGINT and SIGTERM have their default action; `signals` is for when all is loaded.
@@ -10,6 +11,7 @@ import signal
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # as early as can be: this is imported by entry points only
 
 import io  # noqa: E402
+import os  # noqa: E402
 import sys  # noqa: E402
 from importlib import import_module  # noqa: E402
 
@@ -18,6 +20,7 @@ INTERRUPTED = 130  # Exit code after Ctrl-C, as shells have it
 
 def run(module: str) -> int:
     """The exit code of `main` of this module, which handles Ctrl-C itself once it can."""
+    open_streams()
     for stream in (sys.stdout, sys.stderr):  # its encoding may lack characters
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -28,3 +31,16 @@ def run(module: str) -> int:
     finally:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     return code
+
+
+def open_streams() -> None:
+    """Have nothing on closed standard streams; else files and sockets would get their descriptors."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            opened = os.open(os.devnull, os.O_RDWR)  # the lowest that is free
+            if opened != number:
+                os.dup2(opened, number)
+                os.close(opened)
+            os.set_inheritable(number, True)
+            stream = open(number, "w" if number else "r", encoding="utf-8", closefd=False)  # noqa: SIM115
+            setattr(sys, name, stream)

@@ -22,8 +22,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def names_with(word: str, known: Iterable[str]) -> list[str]:
-    """The first few names of which `word` is a part, as `sinc` is of `sinc_length` and `SINC length`."""
+    """The shortest few names of which `word` is a part, as `sinc` is of `sinc_length` and `SINC length`."""
     if len(word) < _MIN_PART:
         return []
     part = re.compile(rf"(?<![^\W_]){re.escape(word)}(?![^\W_])", re.IGNORECASE)
-    return list(filter(part.search, known))[:_MAX_NAMES]
+    return sorted(filter(part.search, known), key=len)[:_MAX_NAMES]

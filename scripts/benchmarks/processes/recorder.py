@@ -12,8 +12,9 @@ import socket
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from bota_ethercat.client import make_real_time
 from bota_ethercat.control import request
@@ -43,33 +44,29 @@ def tcp(recording: ArrivalRecorder, port: int = PORT) -> None:
 def ros(recording: ArrivalRecorder, sensors: str) -> None:
     """A subscriber of the `wrench` of each sensor.
 
-    It waits for and takes messages itself, because rclpy's executor takes longer for that than everything
-    else on the way: what is measured is to be the way to the subscriber, not the subscriber.
+    What is measured is to be the way to the subscriber, not the subscriber.
     """
     import rclpy  # noqa: PLC0415 - the arguments come first
     from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415
-    from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: PLC0415
+
+    from bota_ethercat_bridge.rclpy_internals import taking  # noqa: PLC0415
+
+    is_recording = True
+
+    def add(position: int, message: Any) -> None:
+        nonlocal is_recording
+        now, force, torque = time.monotonic_ns(), message.wrench.force, message.wrench.torque
+        clock = decode_clock((force.x, force.y, force.z, torque.x))
+        is_recording = is_recording and recording.add(position, *clock, 0, now)
 
     rclpy.init(args=[])
     node = rclpy.create_node("benchmark")
-    topics = [f"/benchmark_{position}" for position in range(int(sensors))]
-    handles = [
-        node.create_subscription(WrenchStamped, topic, lambda _: None, _DEPTH).handle for topic in topics
-    ]
-    with node.context.handle:
-        wait_set = rclpy_implementation.WaitSet(len(handles), 0, 0, 0, 0, 0, node.context.handle)
-    is_recording = True
+    take = taking(node, *(
+        node.create_subscription(WrenchStamped, f"/benchmark_{position}", partial(add, position), _DEPTH)
+        for position in range(int(sensors))
+    ))  # fmt: skip
     while is_recording:
-        wait_set.clear_entities()
-        for handle in handles:
-            wait_set.add_subscription(handle)
-        wait_set.wait(1_000_000_000)
-        for position, handle in enumerate(handles):
-            while is_recording and (taken := handle.take_message(WrenchStamped, False)) is not None:
-                now = time.monotonic_ns()
-                force, torque = taken[0].wrench.force, taken[0].wrench.torque
-                clock = decode_clock((force.x, force.y, force.z, torque.x))
-                is_recording = recording.add(position, *clock, 0, now)
+        take(1.0)
     node.destroy_node()
     rclpy.try_shutdown()
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Distributions of durations, since the start and of the last ten seconds, in fixed memory."""
 
 from __future__ import annotations
