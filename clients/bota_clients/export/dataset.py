@@ -406,7 +406,9 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     }  # fmt: skip
     if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
         raise FileError(f"{path} {EXISTS}")
-    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
+    with tempfile.TemporaryDirectory(
+        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
         made, valid = Path(folder, path.name), list[Array]()
         if frames:
             blocks = _in_chunks(windows_of(recording, frames, windows, sensor.sensor), _CHUNK)
