@@ -7,7 +7,6 @@ must pass the same test as a pose that is taken live.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator
 from typing import Final, NamedTuple
@@ -15,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_clients.recording.columns import Bools, Columns, Floats
+from bota_ethercat_bridge.ft_compensation.identification.resampling import stretches
 from bota_ethercat_bridge.ft_compensation.quantities import StationaryLimits
 from bota_ethercat_bridge.ft_compensation.stationary import (
     BAD_WRENCH,
@@ -50,7 +50,9 @@ def find_stationary_periods(
     rows, good = usable_rows(fresh)
     times = (fresh.monotonic_ns - fresh.monotonic_ns[0]) * 1e-9
     rows = np.where(good[:, np.newaxis], rows, 0.0)
-    for part in _parts(times):
+    for part in stretches(times, _LONGEST_GAP_S):
+        if part.stop - part.start < 3 * _BLOCK_SAMPLES:
+            continue
         for begin, end in _stretches(times[part], rows[part], good[part]):
             first, last = part.start + begin, part.start + end
             seconds = float(times[last - 1] - times[first])
@@ -75,16 +77,6 @@ def usable_rows(columns: Columns) -> tuple[Floats, Bools]:
     saturated = saturated | columns.angular_rate_saturated | (columns.warnings & int(BAD_WRENCH))
     good: Bools = np.isfinite(rows).all(axis=1) & (saturated == 0)
     return rows, good
-
-
-def _parts(times: Floats) -> Iterator[slice]:
-    """The parts without a gap; a server on a restarted machine has another monotonic clock."""
-    steps = np.diff(times)
-    breaks = np.flatnonzero((steps < -_BLOCK_S) | (steps > _LONGEST_GAP_S)) + 1
-    bounds = [0, *breaks.tolist(), len(times)]
-    for begin, end in itertools.pairwise(bounds):
-        if end - begin >= 3 * _BLOCK_SAMPLES:
-            yield slice(begin, end)
 
 
 def _stretches(times: Floats, rows: Floats, good: Bools) -> Iterator[tuple[int, int]]:

@@ -25,6 +25,7 @@ def refuse_existing(path: Path, *, force: bool) -> None:
     if exists and not force:
         raise FileError(f"{path} {EXISTS}")
 
+
 # Of what a file system lacks: folders of VirtualBox, CIFS, WSL and 9P, NFS without its lock service, FUSE.
 _LACKING: Final = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.ENOLCK}
 
