@@ -184,7 +184,7 @@ class Stamped:
             self.count -= self.left_out
 
     def _places(self, stamps: Ints, instants: Ints) -> Iterator[list[int]]:
-        """Of each row, by the samples' clocks: the stretches that it may be of, and it; a step back ends one."""
+        """Of each row the stretches without a step back that it may be of, by the samples' clocks; and it."""
         last = np.flatnonzero(np.diff(stamps) < 0)  # before each step back
         apart = instants[last + 1] - instants[last]
         first = [-math.inf, *(stamps[last + 1] - apart).tolist()]
