@@ -142,7 +142,7 @@ def stepped(share: Array) -> Array:
 @pytest.mark.parametrize("seed", more_if_long([0, 1], range(20)))
 @pytest.mark.parametrize("bend", [straight, slewed, warmed, stepped])
 def test_a_clock_that_is_not_straight_is_told_and_the_interval_holds(bend: Motion, seed: int) -> None:
-    """A robot's clock that bends by 1 ms against a line; its stamps jitter by 0.5 ms, as the page has it."""
+    """A robot's clock that bends by 1 ms against a line; its stamps jitter by 0.5 ms."""
     noise = np.random.default_rng(seed)
     times, begin_s = np.arange(0, 40, 0.00125), noise.uniform(0, 20)
     instants = np.arange(1, 39, 0.008)
