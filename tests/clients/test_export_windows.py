@@ -168,6 +168,23 @@ def test_a_bias_goes_with_the_sensors_own_offset(tmp_path: Path) -> None:
     assert parts == [pytest.approx(720, abs=4), pytest.approx(797, abs=3), 0, pytest.approx(797, abs=3)]
 
 
+@pytest.mark.parametrize("fir", [False, True])
+def test_a_changed_offset_puts_the_samples_before_in_doubt_whatever_the_filters_delay(fir: bool) -> None:
+    """At 100 Hz: 24 samples, where force is late by 1.5 or 12, and two after the change was told."""
+    tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0], "bias": [1.0, 0, 0, 0, 0, 0]}
+    live = Windows(200, tool=tool | {"sensor_offset": [1.0, 0, 0, 0, 0, 0]})
+    settings = {"sinc_length": 512, **SETTINGS, "fir": fir}
+    for begin, offset in ((0, 1.0), (100, 2.0)):
+        live.configure(settings, 100.0, offset=[offset, 0, 0, 0, 0, 0])
+        live.add(
+            [frame(number)._replace(monotonic_ns=number * 10_000_000) for number in range(begin, begin + 100)]
+        )
+    valid = live.at(np.array([live.until_ns]))["force_torque_compensated_valid"][0]
+    samples = np.arange(len(valid)) + 200 - len(valid)
+    doubted = samples[(~valid) & (samples < 190)]
+    assert [doubted.min(), doubted.max()] == [75, 101]
+
+
 def test_a_bias_is_not_guessed(tmp_path: Path) -> None:
     run, path, frames = tmp_path / "run.mcap", tmp_path / "tool.yaml", tmp_path / "frames.csv"
     frames.write_text(f"timestamp\n{START_NS + 10**8}\n")
