@@ -189,7 +189,7 @@ def test_a_file_that_is_there_and_complete_is_not_called_unwritten(tmp_path: Pat
         (folder / "tool.json").write_text(TOOL)
         lacks = f"folder {folder_sync} fsync {sync} flock {lock} truncate {sync} links 1 "
         lacks += f"rename {errno.ETXTBSY} rmdir {errno.EBUSY}"
-        given = {"LD_PRELOAD": library, "LACKS": lacks, "STATE_DIRECTORY": "."}
+        given = {"LD_PRELOAD": str(library), "LACKS": lacks, "STATE_DIRECTORY": "."}
         done = subprocess.run(
             [sys.executable, "-c", WRITERS], capture_output=True, text=True, check=False, timeout=60,
             env=os.environ | given, cwd=folder,

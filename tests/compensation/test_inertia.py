@@ -12,7 +12,12 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat_bridge.ft_compensation.alignment import align
-from bota_ethercat_bridge.ft_compensation.bounds import torque_bound_95, torque_noise_95
+from bota_ethercat_bridge.ft_compensation.bounds import (
+    IMU_BELOW,
+    inertia_noise,
+    torque_bound_95,
+    torque_noise_95,
+)
 from bota_ethercat_bridge.ft_compensation.identification.inertia import identify_inertia, turn
 from bota_ethercat_bridge.ft_compensation.identification.payload import Identified, identify
 from bota_ethercat_bridge.ft_compensation.quantities import (
@@ -136,6 +141,31 @@ def test_the_bound_covers_95_percent_of_the_torque_that_is_left(name: str, seed:
         at_rest = torque_bound_95(each, known, None, noise=noise)
         assert np.median(bounds) < (1.2 * at_rest if each is found.payload else 0.9)
     assert rms(torque) < (0.03 if name == "turned" else max(0.015, RMS_OF_95 * noise))
+
+
+@pytest.mark.parametrize("what", ["rate", "spin"])
+def test_the_bound_of_an_unknown_inertia_alone_is_neither_narrow_nor_wide(what: str) -> None:
+    draw, half = np.random.default_rng([SEED, 12]), np.array((1e-3, 2e-3, 1.5e-3, 8e-4, 5e-4, 6e-4))
+    tool, known = (
+        Payload(1.0, (0.0, 0.0, 0.0), (0.01,) * 6, inertia_interval=tuple(half)),
+        EXACT._replace(offset_interval=(0.0,) * 3, scale_interval=(0.0,) * 3, cross_axis_interval=(0.0,) * 6),
+    )
+    shares = []
+    for _ in range(1000):
+        wrong, turned = tensor(tuple(draw.normal(size=6) * half / 1.96)), draw.normal(size=3)
+        torque = wrong @ turned if what == "spin" else np.cross(turned, wrong @ turned)
+        still, (x, y, z) = (0.0, 0.0, 0.0), turned.tolist()
+        turning = (still, (x, y, z)) if what == "spin" else ((x, y, z), still)
+        shares.append(np.linalg.norm(torque) / torque_bound_95(tool, known, None, still, turning))
+    assert 0.85 < np.mean(np.array(shares) <= 1.0) < 0.99
+    assert np.mean(shares) > 0.4
+
+
+def test_the_noise_of_the_gyroscope_acts_on_lever_and_tensor_together() -> None:
+    alignment, tool = align(settings(), RATE_HZ), Payload(2.0, (0.0, 0.0, 0.1), (0.02, 0.01, 0.005, 0, 0, 0))
+    spin, lever = alignment.noise()[1], 2.0 * 0.1 * (0.1 + IMU_BELOW)
+    both = math.hypot(spin * lever, inertia_noise(tool, alignment))
+    assert both == pytest.approx(spin * (lever + 0.02))
 
 
 def test_where_it_hardly_turns_only_what_mass_and_center_make_likely_is_known() -> None:

@@ -49,7 +49,6 @@ _AROUND_S: Final = 0.4  # of a part: what a drift of 200 ppm in an hour takes
 _PARTS: Final = 8
 _T_95: Final = 2.447  # Student's t for as many parts, less two
 _SHORTEST_S: Final = 10.0
-_GAP_S, _GAP_PERIODS = 0.5, 5.0  # samples further apart do not belong together
 _LONGEST: Final = 8  # stretches without a gap, of which the first offset is found
 _LEAST_RATE: Final = 0.05  # rad/s, root mean square
 _EXPLAINED: Final = 0.5
@@ -196,8 +195,7 @@ def _smooth(which: str, stamps_ns: Ints, rates: Array) -> Stretches:
     RecordingError if they are too few or too small.
     """
     times = (stamps_ns - stamps_ns[0]) * 1e-9
-    period = float(np.median(np.diff(times)))
-    parts = resampled(times, rates, period, max(_GAP_S, _GAP_PERIODS * period), 2 * _AROUND_S)
+    period, parts = resampled(times, rates, 2 * _AROUND_S)
     if sum(float(even[-1] - even[0]) for even, _ in parts) < _SHORTEST_S - 2 * period:
         raise RecordingError(f"the {which} was recorded for less than {_SHORTEST_S:g} s: record a minute")
     if np.linalg.norm(rates.std(axis=0)) < _LEAST_RATE:

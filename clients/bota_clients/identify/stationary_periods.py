@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_clients.recording.columns import Bools, Columns, Floats
-from bota_ethercat_bridge.ft_compensation.identification.resampling import stretches
+from bota_ethercat_bridge.ft_compensation.identification.resampling import GAP_S, stretches
 from bota_ethercat_bridge.ft_compensation.quantities import StationaryLimits
 from bota_ethercat_bridge.ft_compensation.stationary import (
     BAD_WRENCH,
@@ -27,7 +27,6 @@ from bota_ethercat_bridge.ft_compensation.stationary import (
 LEAST_S: Final = 1.0  # shorter periods are no poses
 _BLOCK_S: Final = 0.1
 _BLOCK_SAMPLES: Final = 8  # at least, however slow the sensor is
-_LONGEST_GAP_S: Final = 0.5
 _SAME_POSE: Final = math.cos(math.radians(1.5))
 _LIMITS: Final = StationaryLimits()
 
@@ -50,7 +49,7 @@ def find_stationary_periods(
     rows, good = usable_rows(fresh)
     times = (fresh.monotonic_ns - fresh.monotonic_ns[0]) * 1e-9
     rows = np.where(good[:, np.newaxis], rows, 0.0)
-    for part in stretches(times, _LONGEST_GAP_S):
+    for part in stretches(times, GAP_S):
         if part.stop - part.start < 3 * _BLOCK_SAMPLES:
             continue
         for begin, end in _stretches(times[part], rows[part], good[part]):

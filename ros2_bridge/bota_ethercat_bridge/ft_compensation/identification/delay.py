@@ -36,7 +36,6 @@ _EXPLAINED: Final = 0.5
 _WIDEST_S: Final = 0.005
 _LEAST_S: Final = 4.0
 _SHORTEST_S, _LONGEST_S = 0.04, 0.5  # of the window that smooths
-_GAP_S, _GAP_PERIODS = 0.5, 5.0  # samples further apart do not belong together
 _TREND: Final = 3  # coefficients of the polynomial that the bias may follow
 _AS_GOOD: Final = 1.05  # noise alone makes them differ so much, where there is little to align
 _LEFT: Final = 0.7  # of the force's rms: more is no model of it
@@ -127,8 +126,7 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
 
 def _stretches(times: Array, samples: Array, least_s: float) -> tuple[float, Sequence[tuple[Array, Array]]]:
     """The usual period, and what `resampled` makes of it; CompensationError if that is too short."""
-    period = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    parts = resampled(times, samples, period, max(_GAP_S, _GAP_PERIODS * period), least_s)
+    period, parts = resampled(times, samples, least_s)
     if (seconds := sum(float(grid[-1] - grid[0]) for grid, _ in parts)) < _LEAST_S:
         raise CompensationError(f"{seconds:.1f} s without a gap are too few: shake the sensor for 10 s")
     return period, parts

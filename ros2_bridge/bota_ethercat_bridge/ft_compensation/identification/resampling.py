@@ -7,12 +7,14 @@ So memory follows from the samples: the time between two of them is whatever a f
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+GAP_S: Final = 0.5  # samples further apart do not belong together
+_GAP_PERIODS: Final = 5.0  # of slow ones
 
 
 def stretches(times: NDArray[Any], gap: float) -> list[slice]:
@@ -22,15 +24,14 @@ def stretches(times: NDArray[Any], gap: float) -> list[slice]:
     return [slice(*ends) for ends in pairwise([0, *breaks.tolist(), len(times)]) if ends[1] > ends[0]]
 
 
-def resampled(
-    times: Array, columns: Array, period: float, gap_s: float, least_s: float = 0.0
-) -> list[tuple[Array, Array]]:
-    """Even times, and `columns` (n, k) at these, of each stretch that is longer than `least_s`."""
-    parts = [part for part in stretches(times, gap_s) if times[part.stop - 1] - times[part.start] > least_s]
+def resampled(times: Array, columns: Array, least_s: float) -> tuple[float, list[tuple[Array, Array]]]:
+    """The usual period; of each stretch over `least_s` even times so far apart, and `columns` (n, k) there."""
+    period = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    parts = stretches(times, max(GAP_S, _GAP_PERIODS * period))
+    parts = [part for part in parts if times[part.stop - 1] - times[part.start] > least_s]
     grids = [np.arange(times[part.start], times[part.stop - 1], period) for part in parts]
-    return [
-        (grid, at_times(grid, times[part], columns[part])) for grid, part in zip(grids, parts, strict=True)
-    ]
+    rows = zip(grids, parts, strict=True)
+    return period, [(grid, at_times(grid, times[part], columns[part])) for grid, part in rows]
 
 
 def hann_window(seconds: float, period: float) -> Array:
