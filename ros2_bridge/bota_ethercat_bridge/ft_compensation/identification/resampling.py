@@ -25,7 +25,7 @@ def stretches(times: NDArray[Any], gap: float) -> list[slice]:
 
 
 def resampled(times: Array, columns: Array, least_s: float) -> tuple[float, list[tuple[Array, Array]]]:
-    """The usual period; of each stretch over `least_s` even times so far apart, and `columns` (n, k) there."""
+    """The usual period; of each stretch over `least_s`, even times so far apart and `columns` there."""
     period = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     parts = stretches(times, max(GAP_S, _GAP_PERIODS * period))
     parts = [part for part in parts if times[part.stop - 1] - times[part.start] > least_s]
