@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import itertools
+import random
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +15,7 @@ import pytest
 
 from bota_clients.export.cli import main as export
 from bota_clients.identify.cli import main as identify
+from bota_clients.recording.order import longest_order
 from bota_clients.report.cli import main as report
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.settings import start_up_defaults
@@ -163,13 +166,32 @@ def test_rows_and_messages_that_are_in_no_order_are_left_out_and_counted(
     table, bag = tmp_path / "frames.csv", write_bag(tmp_path / "bag", "/t", [imu(stamp) for stamp in given])
     table.write_text("\n".join(["timestamp", *map(str, given)]))
     for name, *at in ("a.npz", table), ("b.npz", bag, "--topic", "/t"):
-        ended, _ = made.run("export", made.recording, tmp_path / name, "--at", *at)
+        ended = run_here(export, made.recording, tmp_path / name, "--at", *at)
         assert ended.code == 0, ended.err
         said = "windows of 32 samples; 3 frames left out, not later than the row before"
         assert ended.err == f"ethercat-export: {tmp_path / name}: {said}\n"
         assert np.load(tmp_path / name)["stamp_ns"].tolist() == rows
+    with table.open("a") as file:
+        file.write(f"\n{made.frames[-1].stamp_ns + SECOND}")
+    ended = run_here(export, made.recording, tmp_path / "c.npz", "--at", table, "--strict")
+    assert f"row {len(given)} of {table} (counted from 0) is of" in ended.err
     bag = write_bag(
         tmp_path / "imu", "/imu", [*made.messages[:9], *made.messages[8:900], *made.messages[890:]]
     )
-    ended, _ = made.run("export", "align", made.recording, bag, "--topic", "/imu")
+    ended = run_here(export, "align", made.recording, bag, "--topic", "/imu")
     assert set_back or (ended.json["left_out"] == 11 and "11 messages left out" in ended.err)
+
+
+def test_the_most_are_kept() -> None:
+    """Compared with all choices, of rows that may be at several places."""
+    draw = random.Random(1)
+    for _ in range(300):
+        rows = [draw.sample(range(9), draw.randint(0, 3)) for _ in range(6)]
+        most = 0
+        for chosen in itertools.product(*([None, *row] for row in rows)):
+            taken = [place for place in chosen if place is not None]
+            if all(after > before for before, after in itertools.pairwise(taken)):
+                most = max(most, len(taken))
+        kept = longest_order(rows)
+        assert kept.sum() == most, rows
+        assert longest_order(row for row, is_kept in zip(rows, kept, strict=True) if is_kept).all()
