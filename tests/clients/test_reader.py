@@ -290,7 +290,7 @@ def test_the_example_reads_a_recording(path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_only_what_is_around_a_change_of_the_sensors_own_offset_is_left_out(tmp_path: Path) -> None:
-    """0.1 s before it was told and two samples after, none where it is told again; else all reads the same."""
+    """0.1 s before it was told and two samples after, none where it is told again."""
     path = tared(tmp_path / "run.mcap", (1.0, 1.0, 2.0, 4.0), (5.0, 5.0, 6.0, 8.0))
     with open_recording(path) as recording:
         found, offset, remarks = at_last_offset(recording, recording.sensors[0], ImuUnits.SI)
