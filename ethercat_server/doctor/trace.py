@@ -173,12 +173,13 @@ def _points(values_ns: Sequence[float]) -> str:
 def _picture(decisions: Sequence[Decision], losses: Sequence[Loss]) -> Iterator[str]:
     """A mark for each tenth of a second: the worst that happened in it."""
     begin_ns, order = decisions[0].record.sent_ns, [*_MARKS]
-    cells = [0] * (1 + int((decisions[-1].record.sent_ns - begin_ns) * 1e-9 / _CELL_S))
+    cells = {int((each.record.sent_ns - begin_ns) * 1e-9 / _CELL_S): 0 for each in decisions}
+    most = max(cells)
     for loss in losses:
-        at = min(len(cells) - 1, max(0, int((loss.at_ns - begin_ns) * 1e-9 / _CELL_S)))
-        cells[at] = max(cells[at], order.index(loss.cause))
-    for begin in range(0, len(cells), _CELLS):
-        marks = "".join(_MARKS[order[cell]] for cell in cells[begin : begin + _CELLS])
-        yield f"  {begin * _CELL_S:5.0f} s {marks}"
-    if any(cells):
+        at = min(most, max(0, int((loss.at_ns - begin_ns) * 1e-9 / _CELL_S)))
+        cells[at] = max(cells.get(at, 0), order.index(loss.cause))
+    for begin in sorted({at // _CELLS * _CELLS for at in cells}):  # none for a pause
+        marks = (_MARKS[order[cells.get(at, 0)]] for at in range(begin, min(begin + _CELLS, most + 1)))
+        yield f"  {begin * _CELL_S:5.0f} s {''.join(marks)}"
+    if any(cells.values()):
         yield "  " + ", ".join(f"{mark} {cause}" for cause, mark in _MARKS.items() if cause)

@@ -15,13 +15,13 @@ from types import BuiltinFunctionType, CodeType, FrameType, FunctionType, Module
 from typing import Any
 
 import pytest
-from bota_clients.replay.timeline import Timeline
 
 from bota_clients.monitor import words
 from bota_clients.monitor.model import Model
 from bota_clients.monitor.screen import table
 from bota_clients.monitor.web.pages import Pages, WebModel
 from bota_clients.record import recorder as recording
+from bota_clients.replay.pacing import Pacing
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import observer
@@ -179,13 +179,13 @@ def recorder_records(folder: Path) -> Soaked:
 
 
 def replay_repeats(_: Path) -> Soaked:
-    timeline = Timeline(1.0, lambda: 10**12, lambda: 10**18)
+    pacing = Pacing(1.0, lambda: 10**12, lambda: 10**18)
 
     def take(frames: list[DataMessage]) -> None:
         for each in frames:
-            timeline.due(each)
+            pacing.due(each)
 
-    return fed(take, timeline, each_second=lambda _: timeline.begin_again())
+    return fed(take, pacing, each_second=lambda _: pacing.begin_again())
 
 
 def node_publishes(_: Path) -> Soaked:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.align import _robot_rates, find_offset
+from bota_clients.export.align import _robot_rates, _shared, find_offset
 from bota_clients.export.cli import main
 from bota_clients.export.dataset import ForeignClock
 from tests.clients.bags import imu, joint_states, write_bag
@@ -123,6 +123,18 @@ def test_a_motion_that_says_nothing_is_refused(sensor: Motion, robot: Motion, sa
         find_offset(stamps[: len(felt)], felt, stamps, turned)
 
 
+def test_instants_are_compared_where_both_are_known_all_around() -> None:
+    def known(*parts: tuple[float, float]) -> list[tuple[Array, Array]]:
+        return [(np.arange(begin, end, 0.005), np.zeros((0, 3))) for begin, end in parts]
+
+    instants = _shared(known((0, 10), (20, 30)), known((-5, 4), (6, 24.0)), -100.0)
+    assert len(instants) == 0
+    instants = _shared(known((100, 110), (120, 130)), known((-5, 4), (6, 24.0)), 100.0)
+    edges = np.flatnonzero(np.diff(instants) > 0.1)
+    ends = [instants[0], *instants[np.sort([*edges, *(edges + 1)])], instants[-1]]
+    assert ends == pytest.approx([0.4, 3.6, 6.4, 9.6, 20.4, 23.6], abs=0.02)
+
+
 def straight(share: Array) -> Array:
     return 0.0 * share
 
@@ -142,7 +154,7 @@ def stepped(share: Array) -> Array:
 @pytest.mark.parametrize("seed", more_if_long([0, 1], range(20)))
 @pytest.mark.parametrize("bend", [straight, slewed, warmed, stepped])
 def test_a_clock_that_is_not_straight_is_told_and_the_interval_holds(bend: Motion, seed: int) -> None:
-    """A robot's clock that bends by 1 ms against a line; its stamps jitter by 0.5 ms, as the page has it."""
+    """A robot's clock that bends by 1 ms against a line; its stamps jitter by 0.5 ms."""
     noise = np.random.default_rng(seed)
     times, begin_s = np.arange(0, 40, 0.00125), noise.uniform(0, 20)
     instants = np.arange(1, 39, 0.008)

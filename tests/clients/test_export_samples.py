@@ -102,6 +102,26 @@ def test_a_lost_sample_has_no_stamp_where_the_wall_clock_was_set(tmp_path: Path,
     assert stamps[6:].tolist() == [step_ns] * 2
 
 
+@pytest.mark.parametrize("before", [*range(4014, 4021), *range(4093, 4098)])
+def test_stamps_of_lost_samples_are_between_their_neighbors_also_from_block_to_block(
+    tmp_path: Path, before: int
+) -> None:
+    """The clocks drift apart by 100 ppm; 3 are lost around where the reader begins another block, or, with a
+    tool, 0.1 s before that.
+    """
+    frames = [frame(number) for number in (*range(before), *range(before + 3, 4200))]
+    frames = [each._replace(stamp_ns=each.stamp_ns + each.monotonic_ns // 10_000) for each in frames]
+    record(path := tmp_path / "run.mcap", frames, **SETTINGS)
+    tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0]}
+    with open_recording(path) as recording:
+        made = joined(samples_of(recording, Windows(1000, tool=tool)))
+    numbers = np.arange(4200)
+    expected = START_NS + numbers * (PERIOD_NS + PERIOD_NS // 10_000)
+    assert made["monotonic_ns"].tolist() == (numbers * PERIOD_NS).tolist()
+    assert made["stamp_utc"].astype(int).tolist() == expected.tolist()
+    assert np.flatnonzero(~made["valid"]).tolist() == [before, before + 1, before + 2]
+
+
 def test_a_long_interruption_has_no_more_rows_than_the_limit(tmp_path: Path) -> None:
     frames = [frame(number) for number in range(5000)]
     frames += [frame(number, flags=GAP) for number in range(10**9, 10**9 + 5000)]

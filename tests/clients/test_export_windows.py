@@ -24,6 +24,9 @@ from bota_clients.export.dataset import Periodic, Stamped, messages, read_stamps
 from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.replies import SensorInfo
+from bota_ethercat.settings import SettingValue
+from bota_ethercat.stream.timeline import InForce
 from tests.clients.bags import imu, write_bag
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
 from tests.clients.simulated import simulate
@@ -166,6 +169,24 @@ def test_a_bias_goes_with_the_sensors_own_offset(tmp_path: Path) -> None:
     parts = [int(part.sum()) for part in np.split(valid, [802, 1602, 2402])]
     # In doubt are 0.1 s before a change is told, in which it is written, and two samples after it.
     assert parts == [pytest.approx(720, abs=4), pytest.approx(797, abs=3), 0, pytest.approx(797, abs=3)]
+
+
+@pytest.mark.parametrize("fir", [False, True])
+def test_a_changed_offset_puts_the_samples_before_in_doubt_whatever_the_filters_delay(fir: bool) -> None:
+    """At 100 Hz: 24 samples, where force is late by 1.5 or 12, and two after the change was told."""
+    tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0], "bias": [1.0, 0, 0, 0, 0, 0]}
+    live = Windows(200, tool=tool | {"sensor_offset": [1.0, 0, 0, 0, 0, 0]})
+    settings: dict[str, SettingValue] = {"sinc_length": 512, **SETTINGS, "fir": fir}
+    for begin, offset in ((0, 1.0), (100, 2.0)):
+        info = SensorInfo(rate_hz=100.0, settings=settings, offset=(offset, 0, 0, 0, 0, 0))
+        live.configure(InForce(info))
+        live.add(
+            [frame(number)._replace(monotonic_ns=number * 10_000_000) for number in range(begin, begin + 100)]
+        )
+    valid = live.at(np.array([live.until_ns]))["force_torque_compensated_valid"][0]
+    samples = np.arange(len(valid)) + 200 - len(valid)
+    doubted = samples[(~valid) & (samples < 190)]
+    assert [doubted.min(), doubted.max()] == [75, 101]
 
 
 def test_a_bias_is_not_guessed(tmp_path: Path) -> None:

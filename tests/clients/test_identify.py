@@ -246,6 +246,10 @@ def shaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def record_felt(path: Path, felt: motion.Felt, settings: dict[str, Any]) -> None:
+    record(path, felt_frames(felt), **settings)
+
+
+def felt_frames(felt: motion.Felt) -> list[DataMessage]:
     made = []
     for number, (time_s, *vectors) in enumerate(zip(*felt, strict=True)):
         names = ("force", "torque", "acceleration", "angular_rate")
@@ -256,7 +260,7 @@ def record_felt(path: Path, felt: motion.Felt, settings: dict[str, Any]) -> None
             for axis, value in zip("xyz", vector, strict=True)
         }
         made.append((time_s + 1.0, number, encode(61, values)))
-    record(path, frames(made), **settings)
+    return frames(made)
 
 
 @pytest.mark.parametrize("turns", [True, False])

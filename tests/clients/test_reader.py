@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 import re
 import struct
@@ -14,12 +15,13 @@ import zstandard
 
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
-from bota_clients.recording.columns import columns
+from bota_clients.recording.columns import at_last_offset, columns
 from bota_clients.recording.mcap_file import MAX_CHUNK, McapFile
 from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.pdo import SampleDecoder
+from bota_ethercat.pdo import ImuUnits, SampleDecoder
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
+from tests.clients.test_export_windows import tared
 
 DOCS = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
 CHUNKS = 10
@@ -157,6 +159,15 @@ def test_an_empty_tail_after_a_power_failure_is_left_out(path: Path) -> None:
     with open_recording(path) as recording:
         assert list(recording.frames()) == FRAMES[: 5 * PER_CHUNK]
         assert recording.cut_off
+    # Nor those of the last three chunks, whose records are there.
+    gone = bytearray(data[: ends[5]])
+    for begin, end in itertools.pairwise(ends[2:6]):
+        gone[begin + 60 : begin + 200] = bytes(140)
+        assert (gone[begin], begin + 200 < end) == (0x06, True)
+    path.write_bytes(gone)
+    with open_recording(path) as recording:
+        assert list(recording.frames()) == FRAMES[: 3 * PER_CHUNK]
+        assert str(recording.cut_off) == "it has no footer, and is read without 3 damaged chunks at its end"
 
 
 # -- damaged and hostile
@@ -278,3 +289,13 @@ def test_the_example_reads_a_recording(path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(path.parent)
     (example,) = re.findall(r"```python\n([^`]*open_recording.*?)```", DOCS, re.DOTALL)
     exec(compile(example, "docs/recording.md", "exec"), {})
+
+
+def test_only_what_is_around_a_change_of_the_sensors_own_offset_is_left_out(tmp_path: Path) -> None:
+    """0.1 s before it was told and two samples after, none where it is told again."""
+    path = tared(tmp_path / "run.mcap", (1.0, 1.0, 2.0, 4.0), (5.0, 5.0, 6.0, 8.0))
+    with open_recording(path) as recording:
+        found, offset, remarks = at_last_offset(recording, recording.sensors[0], ImuUnits.SI)
+    assert (offset, remarks) == ((4.0, 0, 0, 0, 0, 0), [])
+    assert found.force[:, 0] == pytest.approx(8.0)
+    assert sorted({*range(3200)} - {*found.sequence.tolist()}) == [*range(1520, 1603), *range(2320, 2403)]

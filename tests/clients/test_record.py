@@ -164,7 +164,12 @@ def later(sent: DataMessage, ms: float) -> DataMessage:
     [
         ([frame(1), frame(2), frame(1, 1)], "nothing was lost"),
         (
-            [frame(1), RecordedEvent(0, {"event": "disconnected", "source": "recorder"}), frame(1, 1)],
+            [
+                frame(1),
+                RecordedEvent(0, {"event": "disconnected", "source": "recorder"}),
+                frame(9),
+                frame(1, 1),
+            ],
             "nothing was lost; not counted: what came during 1 disconnection",
         ),
         (

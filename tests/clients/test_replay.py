@@ -273,6 +273,10 @@ def test_what_is_said_of_sensors_follows_the_recording(path: Path) -> None:
         ]
     sensors.follow(RecordedEvent(0, {"event": "sensor_lost", "sensor": 1, "reason": "different_sensor"}))
     assert sensors.sensors[1].describe()["state"] == "REFUSED"
+    for code in (1, 2):
+        sensors.follow(RecordedEvent(0, {"event": "emergency", "sensor": 1, "code": code}))
+    status = sensors.sensors[1].status()
+    assert (status["emergencies"], status["emergency"]["code"]) == (2, 2)
     sensors.follow(RecordedEvent(0, {"event": "offset_changed", "sensor": 1, "offset": [2.0] * 6}))
     assert sensors.sensors[1].describe()["offset"] == [2.0] * 6
     reply = describe(0)

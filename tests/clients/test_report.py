@@ -205,6 +205,13 @@ def test_frames_that_the_client_did_not_take_are_told_apart_from_those_the_serve
     assert (series.lost, series.withheld) == (80, 80)
 
 
+def test_where_two_of_three_samples_are_lost_the_usual_interval_is_not_the_period(
+    frames: tuple[DataMessage, ...],
+) -> None:
+    kept = flagged(renumbered(frames[::3]), DataFlag.GAP, range(1, len(frames)))
+    assert Examination(subject_of(kept, ROW)).series.lost == 2 * (len(kept) - 1)
+
+
 def test_invalid_frames_are_a_silence(frames: tuple[DataMessage, ...]) -> None:
     kept = flagged(frames, DataFlag.INVALID, range(2000, 2025))  # 62 ms, and 0.9 %
     assert expect(subject_of(kept, ROW), {SILENT: (TROUBLE, "25 frames were invalid")}).series.lost == 0

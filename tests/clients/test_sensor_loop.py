@@ -227,7 +227,10 @@ TOOL = {
 
 
 def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
-    """Times, acceleration, angular rate: with lost samples, a long gap, a NaN, a clock that stood still."""
+    """Times, acceleration, angular rate: with lost samples, a long gap, a NaN, a clock that stood still.
+
+    Then at rest with three gaps: nothing begins in the first, a push in the second, hardly one in the third.
+    """
     random_ = random.Random(7)
     time_s = 1000.0
     for number in range(60):
@@ -235,6 +238,9 @@ def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
         swing = [math.sin((3 + axis) * time_s + axis) for axis in range(6)]
         values = [*(9 * each for each in swing[:3]), *(2 * each for each in swing[3:])]
         yield time_s, tuple(math.nan if number == 50 and axis == 4 else v for axis, v in enumerate(values))
+    for number in range(60, 100):
+        time_s += (1 if number % 10 else 200) / rate_hz
+        yield time_s, (0.1, 0.2, 9.8 + 0.6 * (number >= 80) + 0.4 * (number >= 90), 0.02, -0.02, 0.0)
 
 
 def loads(running: Loop, model: str, lag_s: float, fir: bool, rate_hz: float, *samples: Any) -> Any:
@@ -277,6 +283,8 @@ def test_the_load_of_the_tool_is_that_of_python(
         else:
             expected = Compensator(tool).compensate(ZERO, ZERO, felt, imu.turning).tool
             assert load == pytest.approx(expected.values, abs=1e-9), number
+    withheld = [found[6 * number] is None for number in (70, 80, 90)]
+    assert withheld == [False, True, False], "after a gap in which the sensor began to move"
 
 
 @pytest.mark.parametrize("seed", range(20))

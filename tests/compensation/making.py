@@ -50,6 +50,14 @@ def pose(
     return Pose(Wrench.of(values), gravity_for(up))
 
 
+def check_coverage(shares: Sequence[float], least: float = 0.2) -> None:
+    """Of errors as shares of their 95 % intervals: within 1, nearly all; 0.41 in the mean if they are normal,
+    and far less if the intervals are too wide.
+    """
+    assert np.mean(np.array(shares) <= 1.0) > 0.9
+    assert least < np.mean(shares) < 0.55
+
+
 def written_parameters(path: Path) -> dict[str, Any]:
     """What a parameter file gives every node, as ROS's own parser would read it."""
     found: dict[str, Any] = yaml.safe_load(path.read_text())["/**"]["ros__parameters"]

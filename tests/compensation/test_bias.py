@@ -51,6 +51,14 @@ def at_rest(up: tuple[float, float, float] = (0, 0, 1), seed: int = 0, **changed
 # Rest.
 
 
+def test_the_latest_of_a_window_is_its_last_quarter_and_its_time_its_middle() -> None:
+    noise = random.Random(1)
+    means = window(lambda n: noisy(noise, Wrench((0.1 * (n > 0.75 * RATE), 0.0, 0.0), ZERO))).means()
+    assert means.time_s == pytest.approx(0.5, abs=0.01)
+    assert means.latest.force[0] == pytest.approx(0.1, abs=0.06)
+    assert means.wrench.force[0] == pytest.approx(0.025, abs=0.03)
+
+
 def test_a_window_at_rest() -> None:
     means = at_rest()
     assert means.samples == RATE + 1

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from bota_ethercat.sensor.response import acceleration_response, force_torque_response
+from bota_ethercat.sensor.response import acceleration_response, force_lag_s, force_torque_response
+from bota_ft_compensation.alignment import gyroscope_later_s
 from bota_ft_compensation.identification.delay import Lag, check_held_out, find_lag
 from bota_ft_compensation.quantities import CompensationError, Payload
 from tests.compensation import motion
@@ -24,9 +25,20 @@ def shaken(seed: int) -> motion.Path:
     return motion.guided(seed, metres=0.06, radians=0.3, hertz=(1.5, 4.0))
 
 
-def lag_of(felt: Felt, noise: float = 0.3) -> Lag:
-    force = felt.force + np.random.default_rng(5).normal(0, noise, felt.force.shape)
-    return find_lag(felt.times, force, felt.acceleration, felt.rate, GYROSCOPE_S)
+def lag_of(felt: Felt, gyroscope_s: float = GYROSCOPE_S) -> Lag:
+    force = felt.force + np.random.default_rng(5).normal(0, 0.3, felt.force.shape)
+    return find_lag(felt.times, force, felt.acceleration, felt.rate, gyroscope_s)
+
+
+@pytest.mark.parametrize("filters", [(1, 6), (4, 9)])
+def test_how_late_the_gyroscope_is_does_not_matter(filters: tuple[int, int]) -> None:
+    """Of a tool that mostly turns."""
+    acceleration, rate = filters
+    chosen = settings(acceleration_filter=acceleration, angular_rate_filter=rate)
+    path, tool = motion.turned(SEED + 1), Payload(1.5, (0.05, 0.0, 0.12))
+    found = lag_of(motion.filtered(path, tool, 10.0, chosen), gyroscope_later_s(chosen))
+    assert found.seconds == pytest.approx(force_lag_s(chosen), abs=3e-4)
+    assert found.explained > 0.99
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,12 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ft_compensation.alignment import align
-from bota_ft_compensation.bounds import torque_bound_95, torque_noise_95
+from bota_ft_compensation.bounds import (
+    IMU_BELOW,
+    inertia_noise,
+    torque_bound_95,
+    torque_noise_95,
+)
 from bota_ft_compensation.identification.inertia import identify_inertia, turn
 from bota_ft_compensation.identification.payload import Identified, identify
 from bota_ft_compensation.quantities import (
@@ -52,10 +57,10 @@ def path_of(name: str, seed: int) -> Path:
 
 
 @functools.cache
-def recorded(name: str, seed: int, tool: Payload, seconds: float = 20.0, *, fir: bool = False) -> Felt:
-    """With the sensor's noise and bias."""
+def recorded(name: str, seed: int, tool: Payload, seconds: float = 20.0, **chosen: Any) -> Felt:
+    """With the sensor's noise and bias, at these settings."""
     felt = motion.filtered(
-        path_of(name, seed), tool, seconds, settings(fir=fir), seed=seed, imu=imperfect(seed)
+        path_of(name, seed), tool, seconds, settings(**chosen), seed=seed, imu=imperfect(seed)
     )
     draw, shape = np.random.default_rng([seed, 4]), felt.force.shape
     return felt._replace(
@@ -64,10 +69,10 @@ def recorded(name: str, seed: int, tool: Payload, seconds: float = 20.0, *, fir:
     )
 
 
-def identified(felt: Felt, tool: Payload, known: Accelerometer = EXACT, *, fir: bool = False) -> Identified:
+def identified(felt: Felt, tool: Payload, known: Accelerometer = EXACT, **chosen: Any) -> Identified:
     noise = random.Random(int(1e6 * tool.mass))
     poses = identify([pose(up, tool, BIAS, noise, 0.01) for up in AXES])
-    alignment = align(settings(fir=fir), RATE_HZ)
+    alignment = align(settings(**chosen), RATE_HZ)
     return identify_inertia(turn(felt.times, np.hstack(felt[1:]), alignment, known, IMU), poses)
 
 
@@ -80,17 +85,25 @@ def rms(torque: Array) -> float:
     return math.sqrt(float((torque**2).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize("fir", [False, True], ids=["FIR off", "FIR on"])
+FILTERS: dict[str, dict[str, Any]] = {
+    "as delivered": {},
+    "FIR on": {"fir": True},
+    "a slow gyroscope": {"angular_rate_filter": 6},
+    "a slow accelerometer": {"acceleration_filter": 4, "angular_rate_filter": 9},
+}
+
+
+@pytest.mark.parametrize("filters", FILTERS)
 @pytest.mark.parametrize("seed", more_if_long([0, 1], range(12)))
-def test_in_20_s_of_motion_every_principal_moment_is_found_to_10_percent(seed: int, fir: bool) -> None:
+def test_in_20_s_of_motion_every_principal_moment_is_found_to_10_percent(seed: int, filters: str) -> None:
     seed += 1000 * SEED
-    tool, known = tool_of(seed), imperfect(seed).known
-    felt = recorded("turned", seed, tool, fir=fir)
-    found = identified(felt, tool, known, fir=fir)
+    tool, known, chosen = tool_of(seed), imperfect(seed).known, FILTERS[filters]
+    felt = recorded("turned", seed, tool, **chosen)
+    found = identified(felt, tool, known, **chosen)
     moments, truth = (np.linalg.eigvalsh(tensor(each.inertia)) for each in (found.payload, tool))
     assert np.abs(moments / truth - 1.0).max() < 0.1
     assert max(found.payload.inertia_interval) < 0.1 * truth[2]
-    if not fir:
+    if not chosen:
         assert rms(left(felt, found.payload, known).torque) < 0.03
 
 
@@ -128,6 +141,31 @@ def test_the_bound_covers_95_percent_of_the_torque_that_is_left(name: str, seed:
         at_rest = torque_bound_95(each, known, None, noise=noise)
         assert np.median(bounds) < (1.2 * at_rest if each is found.payload else 0.9)
     assert rms(torque) < (0.03 if name == "turned" else max(0.015, RMS_OF_95 * noise))
+
+
+@pytest.mark.parametrize("what", ["rate", "spin"])
+def test_the_bound_of_an_unknown_inertia_alone_is_neither_narrow_nor_wide(what: str) -> None:
+    draw, half = np.random.default_rng([SEED, 12]), np.array((1e-3, 2e-3, 1.5e-3, 8e-4, 5e-4, 6e-4))
+    tool, known = (
+        Payload(1.0, (0.0, 0.0, 0.0), (0.01,) * 6, inertia_interval=tuple(half)),
+        EXACT._replace(offset_interval=(0.0,) * 3, scale_interval=(0.0,) * 3, cross_axis_interval=(0.0,) * 6),
+    )
+    shares = []
+    for _ in range(1000):
+        wrong, turned = tensor(tuple(draw.normal(size=6) * half / 1.96)), draw.normal(size=3)
+        torque = wrong @ turned if what == "spin" else np.cross(turned, wrong @ turned)
+        still, (x, y, z) = (0.0, 0.0, 0.0), turned.tolist()
+        turning = (still, (x, y, z)) if what == "spin" else ((x, y, z), still)
+        shares.append(np.linalg.norm(torque) / torque_bound_95(tool, known, None, still, turning))
+    assert 0.85 < np.mean(np.array(shares) <= 1.0) < 0.99
+    assert np.mean(shares) > 0.4
+
+
+def test_the_noise_of_the_gyroscope_acts_on_lever_and_tensor_together() -> None:
+    alignment, tool = align(settings(), RATE_HZ), Payload(2.0, (0.0, 0.0, 0.1), (0.02, 0.01, 0.005, 0, 0, 0))
+    spin, lever = alignment.noise()[1], 2.0 * 0.1 * (0.1 + IMU_BELOW)
+    both = math.hypot(spin * lever, inertia_noise(tool, alignment))
+    assert both == pytest.approx(spin * (lever + 0.02))
 
 
 def test_where_it_hardly_turns_only_what_mass_and_center_make_likely_is_known() -> None:

@@ -329,6 +329,20 @@ def arm(turned: float) -> tuple[float, float, float, float]:
     return quaternion_about((1.0, 0.0, 0.0), turned)
 
 
+@pytest.mark.parametrize("told_s", [1.0, 1.003, 1.0199, 1.024])
+@pytest.mark.parametrize("late", [False, True])
+def test_an_orientation_between_two_samples_is_turned_on_by_what_is_left(told_s: float, late: bool) -> None:
+    source, rate = QuaternionGravity(), 2.0
+    for number in range(4):
+        if number == 2 + late:
+            source.update(arm(rate * told_s), told_s)
+        if number < 3 or told_s < 1.02:
+            source.add_rate((rate, 0.0, 0.0), 1.0 + 0.01 * number)
+    expected = QuaternionGravity()
+    expected.update(arm(rate * (1.03 if told_s < 1.02 else 1.02)), told_s)
+    assert source.gravity(told_s) == pytest.approx(expected.gravity(told_s), abs=1e-4)
+
+
 def test_an_orientation_is_held_where_the_gyroscope_is_of_no_use() -> None:
     source = QuaternionGravity()
     source.add_rate((2.0, 0.0, 0.0), 1.0)

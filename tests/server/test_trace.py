@@ -6,6 +6,7 @@ import base64
 import itertools
 import json
 import random
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from ethercat_server.daemon.traces import Traces
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.doctor.trace import find_losses
 from ethercat_server.sampling.replay import Decision, Record, Trace, TraceError
-from ethercat_server.sampling.trace import RecordKind
+from ethercat_server.sampling.trace import RECORD, RecordKind
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.ended import run_here
@@ -145,6 +146,11 @@ def test_the_doctor_keeps_a_trace_and_shows_what_was_lost_and_why(tmp_path: Path
     shown = run_here(doctor, path).out
     assert "this computer sent nothing for 2" in shown
     assert "lost: it was polled and gave none" in shown
+    data = bytearray(path.read_bytes())
+    for at in range(len(data) - 10 * RECORD.size, len(data), RECORD.size):  # as of a clock that was broken
+        struct.pack_into("<Q", data, at, struct.unpack_from("<Q", data, at)[0] + 10**17)
+    path.write_bytes(data)
+    assert len(run_here(doctor, path).out.splitlines()) < len(shown.splitlines()) + 20
     path.write_bytes(b'{"format": "another"}\n')
     assert "it is no trace of the sampling clocks" in run_here(doctor, path).err
 

@@ -14,6 +14,7 @@ two differ is part of the interval.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -25,14 +26,21 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import PROGRAM
-from bota_clients.export.dataset import ForeignClock, messages
+from bota_clients.export.dataset import MOST_LEFT_OUT, ForeignClock, messages
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.program import interrupt_on_signals, say
 from bota_clients.recording.columns import Ints, columns
+from bota_clients.recording.order import TimeAxis, in_order
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import angular_rate_response
-from bota_ft_compensation.identification.delay import at_times, hann_window, lowest, smoothed
+from bota_ft_compensation.identification.delay import lowest
+from bota_ft_compensation.identification.resampling import (
+    at_times,
+    hann_window,
+    resampled,
+    smoothed,
+)
 
 Array = npt.NDArray[np.float64]
 _SMOOTH_S: Final = 0.1
@@ -41,6 +49,7 @@ _AROUND_S: Final = 0.4  # of a part: what a drift of 200 ppm in an hour takes
 _PARTS: Final = 8
 _T_95: Final = 2.447  # Student's t for as many parts, less two
 _SHORTEST_S: Final = 10.0
+_LONGEST: Final = 8  # stretches without a gap, of which the first offset is found
 _LEAST_RATE: Final = 0.05  # rad/s, root mean square
 _EXPLAINED: Final = 0.5
 _APART_S: Final = 0.5
@@ -61,7 +70,10 @@ def find_offset(
     The robot's clock, half of the 95 % intervals, and `bend_ms`, by how much the clocks are off the line if
     they are not straight against each other, else 0. RecordingError if the motion does not show it.
     """
-    sensor, robot = _smooth("sensor", times_ns, rates), _smooth("robot", robot_ns, robot_rates)
+    stretches = _smooth("sensor", times_ns, rates), _smooth("robot", robot_ns, robot_rates)
+    sensor, robot = (
+        (np.concatenate([x for x, _ in each]), np.concatenate([y for _, y in each])) for each in stretches
+    )
 
     def residual(instants: Array, offset: float | Array) -> float:
         """The squares of the sensor's rates that no rotation of the robot's explains, (rad/s)²."""
@@ -69,18 +81,12 @@ def find_offset(
         felt = at_times(instants + offset, *sensor)
         return float(((felt - basis @ (basis.T @ felt)) ** 2).sum())
 
-    sizes = [at_times(np.arange(0, times[-1], _STEP_S), times, turned) for times, turned in (sensor, robot)]
-    size = sum(map(len, sizes))
-    felt, turned = (np.fft.rfft(each - each.mean(axis=0), size, axis=0) for each in sizes)
-    found = np.fft.irfft(felt[:, :, np.newaxis] * turned[:, np.newaxis].conj(), size, axis=0)
-    agree, lags = (found**2).sum(axis=(1, 2)), np.arange(size)  # whatever the rotation
-    lags[len(sizes[0]) :] -= size
+    lags, agree = _correlated(*stretches)
     best = int(np.argmax(agree))
     coarse = float(lags[best]) * _STEP_S
-    begin, end = max(0.0, -coarse), min(robot[0][-1], sensor[0][-1] - coarse)
-    instants = np.arange(begin + _AROUND_S, end - _AROUND_S, _STEP_S / 2)
+    instants = _shared(*stretches, coarse)
     rest = 1.0
-    if end - begin > _SHORTEST_S / 2:
+    if len(instants) * _STEP_S / 2 > _SHORTEST_S / 2 - 2 * _AROUND_S:
         rest = residual(instants, coarse) / float(
             len(instants) * at_times(instants + coarse, *sensor).var(axis=0).sum()
         )
@@ -146,16 +152,56 @@ def _bend(at: Array, offsets: Array, weights: Array) -> float:
     return bend
 
 
-def _smooth(which: str, stamps_ns: Ints, rates: Array) -> tuple[Array, Array]:
-    """Even times from 0 on, s, and the rates at these; RecordingError if they are too few or too small."""
+Stretches = list[tuple[Array, Array]]
+
+
+def _correlated(sensor: Stretches, robot: Stretches) -> tuple[Ints, Array]:
+    """Lags in steps, ascending, and how well the rates agree at each, whatever the rotation."""
+    lags, products = list[Ints](), list[Array]()
+    both = []
+    for each in (sensor, robot):
+        longest = sorted(each, key=lambda part: -len(part[0]))[:_LONGEST]
+        grids = [np.arange(np.ceil(times[0] / _STEP_S), times[-1] / _STEP_S) for times, _ in longest]
+        turned = [at_times(grid * _STEP_S, *part) for grid, part in zip(grids, longest, strict=True)]
+        mean = np.concatenate(turned).mean(axis=0)
+        both.append([(int(grid[0]), columns - mean) for grid, columns in zip(grids, turned, strict=True)])
+    for (felt_at, felt), (turned_at, turned) in itertools.product(*both):
+        size = len(felt) + len(turned)
+        own, other = (np.fft.rfft(columns, size, axis=0) for columns in (felt, turned))
+        found = np.fft.irfft(own[:, :, np.newaxis] * other[:, np.newaxis].conj(), size, axis=0)
+        lags.append((np.arange(size) + len(turned)) % size - len(turned) + felt_at - turned_at)
+        products.append(found.reshape(size, -1))
+    steps, of = np.unique(np.concatenate(lags), return_inverse=True)
+    total = np.zeros((len(steps), products[0].shape[1]))
+    np.add.at(total, of, np.concatenate(products))
+    return steps, np.asarray((total**2).sum(axis=1))
+
+
+def _shared(sensor: Stretches, robot: Stretches, offset_s: float) -> Array:
+    """Instants of the robot's at which both are known, and around them."""
+    begins, ends = (np.array([times[at] for times, _ in sensor]) - offset_s for at in (0, -1))
+    found = []
+    for times, _ in robot:
+        instants = np.arange(times[0] + _AROUND_S, times[-1] - _AROUND_S, _STEP_S / 2)
+        of = np.maximum(np.searchsorted(begins, instants, "right") - 1, 0)
+        is_inside = (instants > begins[of] + _AROUND_S) & (instants < ends[of] - _AROUND_S)
+        found.append(instants[is_inside])
+    return np.concatenate(found)
+
+
+def _smooth(which: str, stamps_ns: Ints, rates: Array) -> Stretches:
+    """Even times of each stretch, s since the first stamp, and the rates at these.
+
+    RecordingError if they are too few or too small.
+    """
     times = (stamps_ns - stamps_ns[0]) * 1e-9
-    if times[-1] < _SHORTEST_S:
+    period, parts = resampled(times, rates, 2 * _AROUND_S)
+    if sum(float(even[-1] - even[0]) for even, _ in parts) < _SHORTEST_S - 2 * period:
         raise RecordingError(f"the {which} was recorded for less than {_SHORTEST_S:g} s: record a minute")
     if np.linalg.norm(rates.std(axis=0)) < _LEAST_RATE:
         raise RecordingError(f"the {which} hardly turned: turn it about several axes")
-    period = float(np.median(np.diff(times)))
-    even = np.arange(0, times[-1], period)
-    return even, smoothed(at_times(even, times, rates), hann_window(_SMOOTH_S, period))
+    window = hann_window(_SMOOTH_S, period)
+    return [(even, smoothed(columns, window)) for even, columns in parts]
 
 
 def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[Ints, Array, int]:
@@ -183,12 +229,14 @@ def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[
             rows.append(row)
         else:
             left_out += 1
-    if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
+    times = np.array(stamps, np.int64)
+    kept = in_order(times)
+    if len(times) < 2 or (~kept).mean() > MOST_LEFT_OUT:
         which = f", but for {left_out} that do not tell how the link turned," if left_out else ""
         raise RecordingError(
             f"the messages of {topic} in {path}{which} are too few, or not in the order of their stamps"
         )
-    times, values = np.array(stamps, np.int64), np.array(rows)
+    times, values, left_out = times[kept], np.array(rows)[kept], left_out + int((~kept).sum())
     if not joints:
         return times, values, left_out
     angles = dict(zip(turning, values.T, strict=True))
@@ -271,18 +319,20 @@ def _turned(vectors: Array) -> Array:
 def run(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     with open_recording(options.recording) as recording:
-        rows = []
-        for in_force, frames in recording.batches(choose(recording, options.sensor).sensor):
+        rows, axis = [], TimeAxis()
+        for in_force, frames in axis.batches(recording.batches(choose(recording, options.sensor).sensor)):
             table = columns(frames, options.imu_units)
             table = table.where(table.fresh & np.isfinite(table.angular_rate).all(axis=1))
             delay_s = angular_rate_response(in_force.info.settings).delay_s or 0.0
             rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
     instants, rates = map(np.concatenate, zip(*rows, strict=True))
-    if (np.diff(instants) <= 0).any():
-        raise RecordingError("the server's machine was restarted during the recording: record again")
+    for remark in axis.said:
+        say(PROGRAM, f"{options.recording}: {remark}")
     stamps, robot_rates, left_out = _robot_rates(options.bag, options.topic, options.urdf, options.link)
     if left_out:
-        say(PROGRAM, f"{count(left_out, 'message')} left out, without finite angles or rates")
+        say(
+            PROGRAM, f"{count(left_out, 'message')} left out, without finite angles or rates, or out of order"
+        )
     clock, intervals = find_offset(instants, rates, stamps, robot_rates)
     if bend_ms := intervals["bend_ms"]:
         say(

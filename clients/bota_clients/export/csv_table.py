@@ -12,6 +12,7 @@ import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
+from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataFlag, DataMessage
@@ -52,8 +53,8 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         which = "" if options.sensor is None else f" of sensor {options.sensor}"
         raise RecordingError(f"{recording.path} has no samples{which}")
     decoder = cache(lambda size: SampleDecoder(size, options.imu_units))
-    written = last_ns = stamp_ns = 0
-    frames = iter(recording.frames(options.sensor))
+    written, axis, first_ns = 0, TimeAxis(), -1
+    frames = recording.frames(options.sensor)
     if not options.all:
         frames = new_samples(frames, {})
     # Of several sensors another's may be the earliest.
@@ -64,16 +65,15 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         file.write(",".join(COLUMNS) + "\n")
         for frame in chain(begin, frames):
             written += 1
-            if frame.monotonic_ns < last_ns - _SECOND:  # its machine was restarted: only the stamps go on
-                first_ns += frame.monotonic_ns - last_ns - max(0, frame.stamp_ns - stamp_ns)
-            last_ns, stamp_ns = frame.monotonic_ns, frame.stamp_ns
+            place_ns = axis.place(frame)
+            first_ns = place_ns if first_ns < 0 else first_ns
             sample = decoder(len(frame.process_data)).decode(frame.process_data)
-            when = f"{(last_ns - first_ns) / _SECOND:.9f},{np.datetime64(stamp_ns, 'ns')}Z"
+            when = f"{(place_ns - first_ns) / _SECOND:.9f},{np.datetime64(frame.stamp_ns, 'ns')}Z"
             file.write(f"{when},{frame.sensor},{frame.sequence},{_values(sample, frame.flags)}\n")
         file.finish()
     left_out = (sum(there.values()) if options.sensor is None else there[options.sensor]) - written
     left = f"; {count(left_out, 'frame')} without a new sample left out" if left_out else ""
-    return f"{count(written, 'sample')}{left}"
+    return "; ".join([f"{count(written, 'sample')}{left}", *axis.said])
 
 
 def _values(sample: Sample, flags: int) -> str:

@@ -35,6 +35,7 @@ from bota_clients.export.windows import Array, Arrays, Windows, interpolated, re
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
+from bota_clients.recording.order import TimeAxis, in_order, longest_order
 from bota_clients.recording.reader import Recording, Since
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError, FileError
@@ -44,6 +45,7 @@ from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.text.json_text import parse_json_object
 from bota_ft_compensation.identification.parameter_file import offset_of
+from bota_ft_compensation.identification.resampling import stretches
 
 _ALIGN: Final = command("ethercat-export align")
 _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
@@ -55,6 +57,9 @@ _PER_SECOND: Final = {"s": _SECOND, "ms": 1_000_000, "us": 1000, "ns": 1}
 _FIRST: Final = -(1 << 63)
 _COARSEST_S: Final = 0.001
 _NEAR_NS: Final = 366 * 86400 * _SECOND
+MOST_LEFT_OUT: Final = (
+    0.1  # of rows or messages, because of their order: with more it is the stamps that are wrong
+)
 
 
 class ForeignClock(NamedTuple):
@@ -82,18 +87,22 @@ class ForeignClock(NamedTuple):
 
 
 class Periodic:
-    """Frames at a rate, from the first sample on until the last."""
+    """Frames at a rate, from the first sample on until the last; none in pauses of more than a second."""
 
     def __init__(self, fps: float) -> None:
-        self._period_ns, self._made, self._begin_ns = _SECOND / fps, 0, -1
+        self._period_ns, self._begin_ns = _SECOND / fps, -1
 
     def exposed(self, stamps: Ints, instants: Ints) -> Ints:
         """As `Stamped.exposed`; the stamps are by CLOCK_REALTIME."""
         if self._begin_ns < 0:
             self._begin_ns = int(instants[0])
-        begin, self._made = self._made, math.ceil((instants[-1] - self._begin_ns) / self._period_ns)
-        made = self._begin_ns + np.rint(np.arange(begin, self._made) * self._period_ns).astype(np.int64)
-        return np.stack([interpolated(made, instants, stamps), made])
+        made = list[Ints]()
+        for part in stretches(instants, _SECOND):
+            ends = (instants[[part.start, part.stop - 1]] - self._begin_ns) / self._period_ns
+            numbers = np.arange(*np.ceil(ends))
+            made.append(self._begin_ns + np.rint(numbers * self._period_ns).astype(np.int64))
+        exposed = np.concatenate(made)
+        return np.stack([interpolated(exposed, instants, stamps), exposed])
 
 
 class Stamped:
@@ -101,6 +110,7 @@ class Stamped:
 
     Attributes:
         outside: how many so far were before or after the recording, so that their windows are not valid.
+        left_out: rows that are in no order, or there twice.
     """
 
     def __init__(
@@ -116,9 +126,13 @@ class Stamped:
 
         `strict`: RecordingError for a frame outside of the recording.
         """
-        self.outside, self.strict, self._early = 0, strict, 0
+        self.outside, self.left_out, self.strict, self._early = 0, 0, strict, 0
         self.count, self._stamps, self._source, self._clock = len(stamps_ns), stamps_ns, source, clock
-        self._left, self._latency_ns = stamps_ns, round(latency_s * _SECOND)
+        self._rows, self._left, self._latency_ns = (
+            np.arange(len(stamps_ns)),
+            stamps_ns,
+            round(latency_s * _SECOND),
+        )
 
     def exposed(self, stamps: Ints, instants: Ints) -> Ints:
         """(2, f) ns: stamps of the frames up to the last of these samples, and instants of their exposure.
@@ -148,12 +162,39 @@ class Stamped:
         return np.stack([made, found - self._latency_ns])
 
     def begin(self, recording: Recording, sensor: int) -> None:
-        """Find the frames before its lowest stamp, which is not its first if the clock was set."""
+        """Leave out what is in no order, and find the frames before its lowest stamp.
+
+        Which is not its first if the clock was set.
+        """
+        self._leave_out(recording, sensor)
         new = (each.stamp_ns for each in recording.frames(sensor) if not each.flags & NOT_NEW)
         first_ns, stamps = next(new, 0), self._stamps
         if not self.strict and self._clock is None and first_ns - _NEAR_NS < stamps[0] < first_ns:
             ascending = stamps[: int(np.append(np.flatnonzero(np.diff(stamps) < 0), len(stamps))[0]) + 1]
             self._early = int(np.searchsorted(ascending, min(first_ns, min(new, default=first_ns))))
+
+    def _leave_out(self, recording: Recording, sensor: int) -> None:
+        """What is not later than the row before, unless the clock was set back, or it is much."""
+        kept = in_order(self._stamps)
+        if self._clock is None and not kept.all():
+            batches = TimeAxis().batches(recording.batches(sensor))
+            new = [each for _, batch in batches for each in batch if not each.flags & NOT_NEW]
+            both = np.array([(each.stamp_ns, each.monotonic_ns) for each in new], np.int64).reshape(-1, 2)
+            kept = longest_order(self._places(*both.T))
+        if (~kept).mean() <= MOST_LEFT_OUT:
+            self.left_out = int((~kept).sum())
+            self._rows, self._stamps, self._left = self._rows[kept], self._stamps[kept], self._left[kept]
+            self.count -= self.left_out
+
+    def _places(self, stamps: Ints, instants: Ints) -> Iterator[list[int]]:
+        """Of each row the stretches without a step back that it may be of, by the samples' clocks; and it."""
+        last = np.flatnonzero(np.diff(stamps) < 0)  # before each step back
+        apart = instants[last + 1] - instants[last]
+        first = [-math.inf, *(stamps[last + 1] - apart).tolist()]
+        ends = [*(stamps[last] + apart).tolist(), math.inf]
+        for row in self._stamps.tolist():
+            within = enumerate(zip(first, ends, strict=True))
+            yield [(number << 64) + row for number, (begin, end) in within if begin <= row <= end]
 
     def end(self, stamp_ns: int, instant_ns: int) -> Ints:
         """As `exposed`, of the frames after the recording's last sample, if the others are."""
@@ -164,7 +205,7 @@ class Stamped:
 
     def refusal(self, row: int, begin_ns: int, end_ns: int) -> RecordingError:
         """Of this row, which was not exposed between these two stamps, or is not in its place."""
-        source, stamps = f"row {row} of {self._source} (counted from 0)", self._stamps
+        source, stamps = f"row {self._rows[row]} of {self._source} (counted from 0)", self._stamps
         if row and stamps[row] < stamps[row - 1]:
             return RecordingError(
                 f"{source} is before the row above it, and the server's clock was not set then: sort the rows"
@@ -198,7 +239,7 @@ def read_stamps(path: Path, name: str = "timestamp") -> Ints:
             f"the times of {name} in {path} are all 0: what wrote them, a camera's driver or a simulation "
             "without a clock, set none; have it stamp its frames and record again"
         )
-    if (again := np.flatnonzero(np.diff(stamps) == 0)).size:
+    if (again := np.flatnonzero(np.diff(stamps) == 0)).size > MOST_LEFT_OUT * len(stamps):
         raise RecordingError(
             f"row {again[0] + 1} of {path} (counted from 0) has the time of the row above it: its times are "
             "too coarse for the frames, or the row is there twice; give times of at least 1 ms resolution"
@@ -329,16 +370,19 @@ def windows_of(
     frames: Periodic | Stamped,
     windows: Windows,
     sensor: int = 0,
+    axis: TimeAxis | None = None,
 ) -> Iterator[Arrays]:
     """Blocks of f frames: `stamp_ns` as given, `monotonic_ns` of the exposure, and their `Windows.at`.
 
-    RecordingError for a frame that has no place among the samples and is not merely before or after them.
+    On `axis`, by default a new one. RecordingError for a frame that has no place among the samples and is not
+    merely before or after them.
     """
     stamped, outside = frames if isinstance(frames, Stamped) else None, 0
     if stamped is not None:
         stamped.begin(recording, sensor)
     done, first, clocks, waiting = 0, *(np.zeros((2, 0), np.int64) for _ in range(3))
-    for in_force, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
+    batches = (axis or TimeAxis()).batches(recording.batches(sensor))
+    for in_force, batch in itertools.chain(batches, [(None, [])]):
         until_ns = windows.until_ns
         if in_force is not None:
             windows.configure(in_force)
@@ -354,8 +398,9 @@ def windows_of(
             if stamped is None or stamped.strict or done > outside:
                 break
             outside += int(is_early.sum())
-        if ready.size:
-            yield {"stamp_ns": ready[0], "monotonic_ns": ready[1], **windows.at(ready[1])}
+        for begin in range(0, len(ready[0]), _CHUNK):  # in a pause there may be many
+            stamp_ns, instants = ready[:, begin : begin + _CHUNK]
+            yield {"stamp_ns": stamp_ns, "monotonic_ns": instants, **windows.at(instants)}
         done, waiting = done + len(ready[0]), waiting[:, len(ready[0]) :]
         windows.forget(min([until_ns, *waiting[1, :1].tolist()]))
     if not clocks.size:
@@ -388,7 +433,10 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         frames = Stamped(stamps, str(options.at), options.latency, clock, strict=options.strict)
     if tool and any(tool.get("bias", ())):
         _check_offsets(options.tool, tool, recording, sensor.offsets)
-    windows = Windows(length if frames else MOST_LOST, tool=tool, imu_units=options.imu_units)
+    axis, windows = (
+        TimeAxis(),
+        Windows(length if frames else MOST_LOST, tool=tool, imu_units=options.imu_units),
+    )
     if (stream := windows.stream) is not None:  # else what is compensated is marked, stretch by stretch
         whys = {stream.obstacle_of(row.info.settings) for row in sensor.history}
         if whys and "" not in whys:
@@ -413,27 +461,32 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     }  # fmt: skip
     if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
         raise FileError(f"{path} {EXISTS}")
-    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
+    with tempfile.TemporaryDirectory(
+        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
         made, valid = Path(folder, path.name), list[Array]()
         if frames:
-            blocks = _in_chunks(windows_of(recording, frames, windows, sensor.sensor), _CHUNK)
+            blocks = _in_chunks(windows_of(recording, frames, windows, sensor.sensor, axis), _CHUNK)
         else:
-            blocks = _in_chunks(samples_of(recording, windows, sensor.sensor), _GROUP)
+            blocks = _in_chunks(samples_of(recording, windows, sensor.sensor, axis), _GROUP)
             blocks = _tallied(blocks, valid)
         _WRITERS[options.suffix](made, json.dumps(about, default=str), blocks)
         if path.is_dir():
             shutil.rmtree(path)
         made.replace(path)
+    said = axis.said
     if not frames:
         rows = np.concatenate(valid)
-        return f"{count(len(rows), 'sample')}, {len(rows) - rows.sum()} of them not valid"
-    outside = ""
+        said.insert(0, f"{count(len(rows), 'sample')}, {len(rows) - rows.sum()} of them not valid")
+        return "; ".join(said)
     if isinstance(frames, Stamped) and frames.outside:
-        outside = (
-            f"; those of {frames.outside} of {count(frames.count, 'frame')} are not valid: the frames are "
+        said.append(
+            f"those of {frames.outside} of {count(frames.count, 'frame')} are not valid: the frames are "
             "before or after the recording (--strict refuses them)"
         )
-    return f"windows of {count(length, 'sample')}{outside}"
+    if isinstance(frames, Stamped) and frames.left_out:
+        said.append(f"{count(frames.left_out, 'frame')} left out, not later than the row before")
+    return "; ".join([f"windows of {count(length, 'sample')}", *said])
 
 
 def _tallied(blocks: Iterable[Arrays], valid: list[Array]) -> Iterator[Arrays]:

@@ -15,6 +15,7 @@ from bota_clients.errors import RecordingError
 from bota_clients.export.csv_table import REGISTERS, VECTORS, new_samples
 from bota_clients.export.windows import Array, Arrays, Windows, interpolated
 from bota_clients.recording.columns import RECORD, Columns, joined
+from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
 from bota_ethercat.framing import DataFlag
 
@@ -24,14 +25,17 @@ _STEP_NS: Final = 1_000_000
 _SLEW: Final = 0.001
 
 
-def samples_of(recording: Recording, windows: Windows, sensor: int = 0) -> Iterator[Arrays]:
+def samples_of(
+    recording: Recording, windows: Windows, sensor: int = 0, axis: TimeAxis | None = None
+) -> Iterator[Arrays]:
     """Blocks of rows, with the places and the compensated wrench of `windows`, of a length of `MOST_LOST`.
 
-    RecordingError.
+    On `axis`, by default a new one. RecordingError.
     """
+    batches = (axis or TimeAxis()).batches(recording.batches(sensor))
     held, first_ns, gaps = list[Columns](), 0, dict[int, int]()
     begin, taken = 0, 0  # samples: number of the first that is held, and how many were taken
-    for in_force, batch in itertools.chain(recording.batches(sensor), [(None, [])]):
+    for in_force, batch in itertools.chain(batches, [(None, [])]):
         if in_force is not None:
             windows.configure(in_force)
             samples = windows.add([*new_samples(batch, gaps)])

@@ -36,7 +36,9 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     if recording.cut_off is not None:
         notes["repaired"] = recording.cut_off
     refuse_existing(path, force=options.force)
-    with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=path.parent) as folder:
+    with tempfile.TemporaryDirectory(
+        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
         made = Path(folder, path.name)
         with contextlib.closing(DiskFile(made, overwrite=False)) as disk:
             writer = RecordingWriter(disk, f"{PROGRAM} {VERSION}", notes)

@@ -25,7 +25,9 @@ from bota_ft_compensation.quantities import CompensationError
 def run(options: argparse.Namespace) -> int:
     with open_recording(options.path) as recording:
         sensor = choose(recording, options.sensor)
-        data, _ = at_last_offset(recording, sensor, options.imu_units)
+        data, _, remarks = at_last_offset(recording, sensor, options.imu_units)
+    for remark in remarks:
+        say("ethercat-identify", f"{options.path}: {remark}")
     if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise RecordingError(f"{options.path}: settings were changed during it: record without that")
     settings, found, error, left = sensor.info.settings, None, "", (0.0, 0.0)

@@ -158,7 +158,9 @@ def run(options: argparse.Namespace) -> int:
         for row in sensor.history:
             if why := obstacle(row.info.settings, has_tool=True, by_imu=True):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")
-        data, offset = at_last_offset(recording, sensor, options.imu_units)
+        data, offset, remarks = at_last_offset(recording, sensor, options.imu_units)
+    for remark in remarks:
+        _say(f"{options.path}: {remark}")
     periods, rejected = find_stationary_periods(data)
     if len(periods) > MOST_POSES:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])

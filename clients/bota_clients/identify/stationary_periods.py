@@ -7,7 +7,6 @@ must pass the same test as a pose that is taken live.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator
 from typing import Final, NamedTuple
@@ -16,6 +15,7 @@ import numpy as np
 
 from bota_clients.recording.columns import Bools, Columns, Floats
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
+from bota_ft_compensation.identification.resampling import GAP_S, stretches
 from bota_ft_compensation.quantities import StationaryLimits
 from bota_ft_compensation.stationary import (
     CHANCE,
@@ -27,7 +27,6 @@ from bota_ft_compensation.stationary import (
 LEAST_S: Final = 1.0  # shorter periods are no poses
 _BLOCK_S: Final = 0.1
 _BLOCK_SAMPLES: Final = 8  # at least, however slow the sensor is
-_LONGEST_GAP_S: Final = 0.5
 _SAME_POSE: Final = math.cos(math.radians(1.5))
 _LIMITS: Final = StationaryLimits()
 
@@ -50,7 +49,9 @@ def find_stationary_periods(
     rows, good = usable_rows(fresh)
     times = (fresh.monotonic_ns - fresh.monotonic_ns[0]) * 1e-9
     rows = np.where(good[:, np.newaxis], rows, 0.0)
-    for part in _parts(times):
+    for part in stretches(times, GAP_S):
+        if part.stop - part.start < 3 * _BLOCK_SAMPLES:
+            continue
         for begin, end in _stretches(times[part], rows[part], good[part]):
             first, last = part.start + begin, part.start + end
             seconds = float(times[last - 1] - times[first])
@@ -74,16 +75,6 @@ def usable_rows(columns: Columns) -> tuple[Floats, Bools]:
     flagged = sum(channel.flagged(columns) for channel in (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE))
     good: Bools = np.isfinite(rows).all(axis=1) & (flagged == 0)
     return rows, good
-
-
-def _parts(times: Floats) -> Iterator[slice]:
-    """The parts without a gap; a server on a restarted machine has another monotonic clock."""
-    steps = np.diff(times)
-    breaks = np.flatnonzero((steps < -_BLOCK_S) | (steps > _LONGEST_GAP_S)) + 1
-    bounds = [0, *breaks.tolist(), len(times)]
-    for begin, end in itertools.pairwise(bounds):
-        if end - begin >= 3 * _BLOCK_SAMPLES:
-            yield slice(begin, end)
 
 
 def _stretches(times: Floats, rows: Floats, good: Bools) -> Iterator[tuple[int, int]]:

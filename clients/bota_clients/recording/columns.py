@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
+from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import RecordedSensor, Recording
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataMessage
@@ -113,24 +114,23 @@ def joined(parts: Sequence[Columns]) -> Columns:
 
 def at_last_offset(
     recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits
-) -> tuple[Columns, tuple[float, ...] | None]:
-    """A sensor's columns as if its last offset had been in force all the time, and that offset.
+) -> tuple[Columns, tuple[float, ...] | None, list[str]]:
+    """A sensor's columns as if its last offset had been in force all the time, that offset, and remarks.
 
-    Without the samples in which a change was being written. None: the recording does not say the offset.
-    RecordingError if it says so in part only.
+    On one axis of time, without the samples in which a change was being written. None: the recording does not
+    say the offset. RecordingError if it says so in part only.
     """
-    told = [row.info.offset for row in sensor.offsets]
-    if not told or set(told) == {None}:
-        return columns(recording.frames(sensor.sensor), imu_units), None
-    if None in told:
+    told = [row.info.offset for row in sensor.offsets] or [None]
+    if None in told and set(told) != {None}:
         raise RecordingError(
             f"{recording.path}: the own offset of sensor {sensor.sensor} is not known all the time: record "
             "from one server"
         )
-    last = np.array(told[-1])
+    nothing, axis = (0.0,) * 6, TimeAxis()
+    last = np.array(told[-1] or nothing)
     parts, in_doubt, before = list[Columns](), list[tuple[int, int]](), last
-    for in_force, batch in recording.batches(sensor.sensor):
-        part, shift = columns(batch, imu_units), last - in_force.info.offset
+    for in_force, batch in axis.batches(recording.batches(sensor.sensor)):
+        part, shift = columns(batch, imu_units), last - np.array(in_force.info.offset or nothing)
         if parts and (shift != before).any():
             at_ns = batch[0].monotonic_ns
             in_doubt.append((at_ns - in_force.doubt_ns, at_ns + in_force.doubt_after_ns))
@@ -138,8 +138,8 @@ def at_last_offset(
         part.torque[:] += shift[3:]
         parts.append(part)
         before = shift
-    found = joined(parts)
+    found = joined(parts or [columns([])])
     is_sure = np.ones(len(found), bool)
     for begin_ns, end_ns in in_doubt:
         is_sure &= (found.monotonic_ns < begin_ns) | (found.monotonic_ns > end_ns)
-    return found.where(is_sure), told[-1]
+    return found.where(is_sure), told[-1], axis.said

@@ -28,6 +28,7 @@ from mcap.records import Channel, Chunk, Metadata
 from mcap.stream_reader import get_chunk_data_stream
 
 from bota_clients.errors import RecordingError
+from bota_clients.numbers import count
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 # Largest chunk in bytes, compressed or not. Those of ethercat-record have some hundred kilobytes.
@@ -145,13 +146,14 @@ class McapFile:
         if left == self._size - len(MAGIC):
             raise RecordingError(f"{self.path} was cut off before anything was recorded")
         more = f", and the last {left} bytes, an incomplete record, were ignored" if left else ""
+        there = len(self._chunks)
         while self._chunks:
             try:
                 self._unpack(self._chunks[-1])
                 break
             except RecordingError:  # after a power failure the last blocks of the file may be zeros
                 self._chunks.pop()
-                more = ", and its last chunk, which is damaged, was ignored"
+                more = f", and is read without {count(there - len(self._chunks), 'damaged chunk')} at its end"
         self.cut_off = f"it has no footer{more}"
 
     def _index_record(self, opcode: int, body: int, length: int) -> None:

@@ -7,7 +7,6 @@ records, and if the disk takes only a part of them, the file is truncated again.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.program.new_file import EXISTS
+from bota_ethercat.program.new_file import EXISTS, where_supported
 from bota_ethercat.text.json_text import JsonObject
 
 try:
@@ -38,8 +37,10 @@ def _open_locked(path: Path, flags: int) -> int:
     fd = os.open(path, flags, 0o666)
     try:
         if _LOCKS:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.ftruncate(fd, 0)
+            with where_supported():
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(fd).st_size:
+            os.ftruncate(fd, 0)
     except OSError as error:
         os.close(fd)
         if isinstance(error, BlockingIOError):
@@ -68,6 +69,7 @@ class DiskFile:
             raise RecordingError(f"{path} {EXISTS}") from None
         except OSError as error:
             raise self._failed(error) from None
+        self._counts_links = os.fstat(self._fd).st_nlink > 0  # some file systems do not
 
     def write(self, data: bytes) -> int:
         """Buffer `data` until the next flush."""
@@ -93,17 +95,17 @@ class DiskFile:
             self._position = self._written
             raise self._failed(error, "; what was written before is intact") from None
         self._written = self._position
-        self.removed = os.fstat(self._fd).st_nlink == 0
+        self.removed = self._counts_links and os.fstat(self._fd).st_nlink == 0
         if self.removed:
             raise RecordingError(f"{self.path} was removed while it was written: nothing of it is left")
 
     def sync(self) -> None:
         """Synchronize the file to the disk; RecordingError."""
         try:
-            os.fsync(self._fd)
+            with where_supported():  # a pipe or a device has nothing to sync
+                os.fsync(self._fd)
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a pipe or a device has nothing to sync
-                raise self._failed(error) from None
+            raise self._failed(error) from None
 
     def close(self) -> None:
         """Close the file; what is buffered is discarded."""

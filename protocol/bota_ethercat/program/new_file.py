@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,20 @@ def refuse_existing(path: Path, *, force: bool) -> None:
         raise FileError(f"{path} cannot be written: {error.strerror or error}") from None
     if exists and not force:
         raise FileError(f"{path} {EXISTS}")
+
+
+# Of what a file system lacks: folders of VirtualBox, CIFS, WSL and 9P, NFS without its lock service, FUSE.
+_LACKING: Final = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.ENOLCK}
+
+
+@contextlib.contextmanager
+def where_supported() -> Iterator[None]:
+    """Go on without an operation that the file system lacks; its other errors are raised."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _LACKING:
+            raise
 
 
 class NewFile:
@@ -56,11 +71,14 @@ class NewFile:
         with self._errors():
             self._file.flush()
             if not self._in_place:
-                os.fsync(self._file.fileno())
+                with where_supported():
+                    os.fsync(self._file.fileno())
+            self._file.close()  # first: some file systems rename no open file
+            if not self._in_place:
                 refuse_existing(self._path, force=self._force)
                 self._beside.replace(self._target)
-                _sync_directory(self._target.parent)
-            self._file.close()
+                with contextlib.suppress(OSError):  # it is there, complete
+                    _sync_directory(self._target.parent)
 
     def close(self) -> None:
         """Discard what is not finished."""

@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
+from bota_ethercat.program.new_file import where_supported
+
 _MAX_SIZE: Final = 1 << 20  # bytes that a file may have
 
 
@@ -48,7 +50,8 @@ def replace(path: Path, parts: Iterable[bytes]) -> None:
         with unfinished.open("wb") as file:
             file.writelines(parts)
             file.flush()
-            os.fsync(file.fileno())
+            with where_supported():
+                os.fsync(file.fileno())
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)

@@ -12,17 +12,21 @@ worth nothing unless compensation by it leaves less force in parts of the record
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Final, Literal, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bota_ethercat.settings import SettingValue
 from bota_ft_compensation.alignment import Alignment, align
+from bota_ft_compensation.identification.resampling import (
+    Array,
+    at_times,
+    hann_window,
+    resampled,
+    smoothed,
+)
 from bota_ft_compensation.quantities import CompensationError
-
-Array = NDArray[np.float64]
 
 _PARTS: Final = 8
 _T_95: Final = 2.365  # Student's t for as many parts
@@ -51,22 +55,25 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
     """
     if not (np.diff(times) > 0).all():
         raise CompensationError("the samples are not in the order of their times: record from one server")
-    seconds = float(times[-1] - times[0]) if len(times) else 0.0
-    if seconds < _LEAST_S:
-        raise CompensationError(f"{seconds:.1f} s are too few: shake the sensor for 10 s")
-    # On an even grid, so that stamps that jitter do not shake the derivative of the angular rate.
-    period = float(np.median(np.diff(times)))
-    stamps, times = times, np.arange(times[0], times[-1], period)
-    force, acceleration, rate = (at_times(times, stamps, columns) for columns in (force, acceleration, rate))
-    turned = np.concatenate([np.gradient(rate, period, axis=0), _products(rate)], axis=1)
+    # On even grids, so that stamps that jitter do not shake the derivative of the angular rate.
+    samples = np.concatenate([force, acceleration, rate], axis=1)
+    period, parts = _stretches(times, samples, _LATEST_S - _EARLIEST_S + 2 * _SHORTEST_S)
     # All alike, and so long that little noise remains in what the motion is regressed on: that would pull the
     # lag. Noise would be least, and fit best, between two samples, too.
-    slow = smoothed(force, hann_window(_SHORTEST_S, period))
-    pace = float(np.linalg.norm(slow - slow.mean(axis=0)) / np.linalg.norm(np.gradient(slow, period, axis=0)))
+    window = hann_window(_SHORTEST_S, period)
+    slows = [smoothed(columns[:, :3], window) for _, columns in parts]
+    slow, paces = map(np.concatenate, (slows, [np.gradient(each, period, axis=0) for each in slows]))
+    pace = float(np.linalg.norm(slow - slow.mean(axis=0)) / np.linalg.norm(paces))
     seconds = min(max(_SMOOTHED * pace, _SHORTEST_S), _LONGEST_S)
-    window = hann_window(seconds, period)
-    force, acceleration, turned = (smoothed(columns, window) for columns in (force, acceleration, turned))
-    instants = np.arange(times[0] + _LATEST_S + seconds, times[-1] + _EARLIEST_S - seconds, seconds / 4)
+    period, parts = _stretches(times, samples, _LATEST_S - _EARLIEST_S + 2 * seconds)
+    window, smooth, inner = hann_window(seconds, period), list[Array](), list[Array]()
+    for grid, columns in parts:
+        rate = columns[:, 6:]
+        spun = np.concatenate([columns[:, :6], np.gradient(rate, period, axis=0), _products(rate)], axis=1)
+        smooth.append(smoothed(spun, window))
+        inner.append(np.arange(grid[0] + _LATEST_S + seconds, grid[-1] + _EARLIEST_S - seconds, seconds / 4))
+    instants, times = np.concatenate(inner), np.concatenate([grid for grid, _ in parts])
+    force, acceleration, turned = np.split(np.concatenate(smooth), [3, 6], axis=1)
     trend = np.linalg.qr(np.vander(instants - instants.mean(), _TREND))[0]  # a bias that drifts
 
     def detrended(columns: Array) -> Array:
@@ -105,7 +112,7 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
         lags.append(-float(((part - part.mean(axis=0)) * rest).sum()) / max(steepness, 1e-30))
     step = max(period, 0.002)
     curve = max(residual(best - step) - 2 * residual(best) + residual(best + step), 1e-300) / step**2
-    degrees = max(3 * (instants[-1] - instants[0]) / seconds - 3 * rows.shape[1], 1.0)
+    degrees = max(3 * len(instants) / 4 - 3 * rows.shape[1], 1.0)
     interval = _T_95 * max(
         float(np.std(lags, ddof=1)) / math.sqrt(_PARTS), math.sqrt(2 * residual(best) / (curve * degrees))
     )
@@ -117,6 +124,14 @@ def find_lag(times: Array, force: Array, acceleration: Array, rate: Array, gyros
     return Lag(best, interval, explained)
 
 
+def _stretches(times: Array, samples: Array, least_s: float) -> tuple[float, Sequence[tuple[Array, Array]]]:
+    """The usual period, and what `resampled` makes of it; CompensationError if that is too short."""
+    period, parts = resampled(times, samples, least_s)
+    if (seconds := sum(float(grid[-1] - grid[0]) for grid, _ in parts)) < _LEAST_S:
+        raise CompensationError(f"{seconds:.1f} s without a gap are too few: shake the sensor for 10 s")
+    return period, parts
+
+
 def check_held_out(
     stamps: Array, samples: Array, settings: Mapping[str, SettingValue], lag: Lag
 ) -> tuple[float, float]:
@@ -125,12 +140,10 @@ def check_held_out(
     Of `samples` (n, 9): N, m/s² and rad/s, by the samples that compensation has: what it looks ahead costs
     what it costs. CompensationError if the alignment makes it worse.
     """
-    period = float(np.median(np.diff(stamps)))
-    times = np.arange(stamps[0], stamps[-1], period)
-    force, acceleration, rate = np.split(at_times(times, stamps, samples), [3, 6], axis=1)
+    period, parts = _stretches(stamps, samples, _LATEST_S)
     both = align(settings, 1.0 / period, lag.seconds), align({}, 1.0 / period)
-    aligned, not_aligned = (_held_out(force, acceleration, rate, each) for each in both)
-    if not min(aligned, not_aligned) < _LEFT * float(np.linalg.norm(force.std(axis=0))):
+    aligned, not_aligned = (_held_out([columns for _, columns in parts], each) for each in both)
+    if not min(aligned, not_aligned) < _LEFT * float(np.linalg.norm(samples[:, :3].std(axis=0))):
         raise CompensationError(
             "the motion in parts of the recording does not tell the force in the others: shake the sensor "
             "all the time, in all directions, and let nothing touch the tool"
@@ -143,11 +156,14 @@ def check_held_out(
     )
 
 
-def _held_out(force: Array, acceleration: Array, rate: Array, alignment: Alignment) -> float:
-    columns = zip((acceleration, rate, rate), alignment.taps[:, ::-1], strict=True)
-    felt, turned, spun = (smoothed(each, taps, "full")[: len(force)] for each, taps in columns)
-    rows = np.concatenate([felt, spun, _products(turned), np.ones((len(felt), 1))], axis=1)
-    rows, force = (each[alignment.taps.shape[1] :] for each in (rows, force))
+def _held_out(stretches: Iterable[Array], alignment: Alignment) -> float:
+    found, begin = list[tuple[Array, Array]](), alignment.taps.shape[1]
+    for force, *imu in (np.split(samples, [3, 6], axis=1) for samples in stretches):
+        columns = zip((*imu, imu[1]), alignment.taps[:, ::-1], strict=True)
+        felt, turned, spun = (smoothed(each, taps, "full")[: len(force)] for each, taps in columns)
+        part = np.concatenate([felt, spun, _products(turned), np.ones((len(felt), 1))], axis=1)
+        found.append((part[begin:], force[begin:]))
+    rows, force = map(np.concatenate, zip(*found, strict=True))
     squares = 0.0
     for part in np.array_split(np.arange(len(rows)), _PARTS):
         tool = np.linalg.lstsq(np.delete(rows, part, 0), np.delete(force, part, 0), rcond=None)[0]
@@ -157,19 +173,6 @@ def _held_out(force: Array, acceleration: Array, rate: Array, alignment: Alignme
 
 def _products(rate: Array) -> Array:
     return np.asarray((rate[:, :, None] * rate[:, None]).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
-
-
-def hann_window(seconds: float, period: float) -> Array:
-    window = np.hanning(max(3, round(seconds / period) | 1) + 2)[1:-1]
-    return np.asarray(window / window.sum())
-
-
-def smoothed(columns: Array, window: Array, mode: Literal["same", "full"] = "same") -> Array:
-    return np.stack([np.convolve(column, window, mode) for column in columns.T], axis=1)
-
-
-def at_times(instants: Array, times: Array, columns: Array) -> Array:
-    return np.stack([np.interp(instants, times, column) for column in columns.T], axis=1)
 
 
 def lowest(function: Callable[[float], float], start: float, step: float) -> float:

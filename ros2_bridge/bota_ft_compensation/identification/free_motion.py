@@ -81,7 +81,7 @@ def identify_in_motion(turned: Turned, imu: Vector3) -> Identified:
     biases = np.concatenate([still, still * minutes], axis=2)
     wrench = np.concatenate([turned.force, turned.torque], axis=1)
     nothing = np.zeros_like(spun)
-    is_free, answer = turned.is_whole, np.zeros(_UNKNOWNS)
+    is_free, answer = np.ones(len(read), bool), np.zeros(_UNKNOWNS)
     if len(np.unique(pieces[is_free])) < _LEAST_PIECES:
         raise CompensationError(f"at least 10 s of motion are needed: {_MORE}")
     for _ in range(_ROUNDS):
@@ -104,7 +104,7 @@ def identify_in_motion(turned: Turned, imu: Vector3) -> Identified:
         beyond = np.linalg.norm(left[:, :3], axis=1)
         beyond[beyond < _TYPICAL * np.median(beyond[is_free])] = 0.0
         used, is_free = is_free, untouched(turned, beyond, abs(answer[0]) * STANDARD_GRAVITY)
-    share = float(used.sum() / turned.is_whole.sum())
+    share = float(used.mean())
     rows = np.eye(_UNKNOWNS)
     rows[1:4] /= answer[0]  # the center is moment / mass: to first order
     rows[1:4, 0] = -answer[1:4] / answer[0] ** 2

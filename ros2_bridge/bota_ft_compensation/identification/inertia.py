@@ -11,6 +11,7 @@ covers residuals that are correlated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,8 +20,13 @@ from numpy.typing import NDArray
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, fir_taps
 from bota_ft_compensation.alignment import Alignment, Array
-from bota_ft_compensation.identification.delay import at_times, hann_window, smoothed
 from bota_ft_compensation.identification.payload import Identified
+from bota_ft_compensation.identification.resampling import (
+    at_times,
+    hann_window,
+    smoothed,
+    stretches,
+)
 from bota_ft_compensation.identification.weighted import students_t
 from bota_ft_compensation.quantities import (
     ELEMENTS,
@@ -56,8 +62,7 @@ class Turned(NamedTuple):
     felt: Array  # (n, 3): specific force at the wrench origin, m/s²
     arm: Array  # (n, 3, 3): times a place in the sensor's frame, m: by how much it is another there
     spun: Array  # (n, 3, 6): times the tensor: J alpha + omega x J omega
-    times: Array  # (n,) s
-    is_whole: NDArray[np.bool_]  # (n,): whether no sample is missing there
+    times: Array  # (n,) s; none where a sample is missing
 
 
 def turn(
@@ -70,48 +75,57 @@ def turn(
     if alignment.lag_s is None:
         raise CompensationError("by the filters that were set it is not known how late the force is")
     period, settings = alignment.period_s, alignment.settings
-    times = np.arange(stamps[0], stamps[-1], period)
     late = [each(settings).delay_s or 0.0 for each in _RESPONSES]
     taps = np.array(fir_taps()) if settings.get("fir") else np.ones(1)
     lag_s = alignment.lag_s - period * (len(taps) - 1) / 2
-    load, acceleration, rate = np.split(samples, [6, 9], axis=1)
-    load = at_times(times, stamps, load)
-    acceleration, rate = (
-        smoothed(at_times(times - lag_s + delay_s - late[0], stamps, columns), taps, "full")[: len(times)]
-        for columns, delay_s in zip((acceleration, rate), late, strict=True)
-    )
-    felt = np.stack(accelerometer.correct(tuple(acceleration.T)), axis=1)
-    spin = np.gradient(rate, period, axis=0)
-    arm = crossing(spin) + crossing(rate) @ crossing(rate)
-    _check_imu(felt, rate, arm, period)
-    spun = _elements(spin) + crossing(rate) @ _elements(rate)
-    felt = felt - arm @ np.array(imu)
-    window = hann_window(_WINDOW_S, period)
-    every = max(1, round(_WINDOW_S / period / 4))
-    columns = np.concatenate([load, felt, arm.reshape(-1, 9), spun.reshape(-1, 18)], axis=1)
-    found, times = smoothed(columns, window)[::every], times[::every]
+    window, every = hann_window(_WINDOW_S, period), max(1, round(_WINDOW_S / period / 4))
     reach_s = period * len(taps) + abs(lag_s) + _WINDOW_S
-    is_gap = np.diff(stamps) > max(alignment.gap_s, 2.5 * period)
-    last = np.append(stamps[:-1][is_gap], stamps[-1])
-    first = np.append(stamps[0], stamps[1:][is_gap])
-    of = np.searchsorted(first, times, "right") - 1  # the stretch without a gap
-    is_whole = (times > first[of] + reach_s) & (times < last[of] - _WINDOW_S)
-    force, torque, felt, arm, spun = np.split(found, [3, 6, 9, 18], axis=1)
-    return Turned(force, torque, felt, arm.reshape(-1, 3, 3), spun.reshape(-1, 3, 6), times, is_whole)
+    moved, found, instants = list[tuple[Array, ...]](), list[Array](), list[Array]()
+    for stretch in stretches(stamps, max(alignment.gap_s, 2.5 * period)):
+        begin_s, *_, end_s = own = stamps[stretch]
+        if end_s - begin_s < reach_s + 4 * _WINDOW_S:
+            continue
+        times = np.arange(begin_s, end_s, period)
+        load, acceleration, rate = np.split(samples[stretch], [6, 9], axis=1)
+        load = at_times(times, own, load)
+        acceleration, rate = (
+            smoothed(at_times(times - lag_s + delay_s - late[0], own, columns), taps, "full")[: len(times)]
+            for columns, delay_s in zip((acceleration, rate), late, strict=True)
+        )
+        felt = np.stack(accelerometer.correct(tuple(acceleration.T)), axis=1)
+        spin = np.gradient(rate, period, axis=0)
+        arm = crossing(spin) + crossing(rate) @ crossing(rate)
+        moved.append((felt, rate, arm))
+        spun = _elements(spin) + crossing(rate) @ _elements(rate)
+        columns = [load, felt - arm @ np.array(imu), arm.reshape(-1, 9), spun.reshape(-1, 18)]
+        smooth, times = smoothed(np.concatenate(columns, axis=1), window)[::every], times[::every]
+        is_whole = (times > begin_s + reach_s) & (times < end_s - _WINDOW_S)
+        found.append(smooth[is_whole])
+        instants.append(times[is_whole])
+    if not found:
+        raise CompensationError("there is a gap in every half second: 'ethercat-report' tells why")
+    _check_imu(moved, period)
+    force, torque, felt, arm, spun = np.split(np.concatenate(found), [3, 6, 9, 18], axis=1)
+    times = np.concatenate(instants)
+    return Turned(force, torque, felt, arm.reshape(-1, 3, 3), spun.reshape(-1, 3, 6), times)
 
 
-def _check_imu(felt: Array, rate: Array, arm: Array, period: float) -> None:
-    """CompensationError if gravity does not turn as the gyroscope says."""
-    if not _GRAVITY[0] < (size := float(np.median(np.linalg.norm(felt, axis=1)))) < _GRAVITY[1]:
+def _check_imu(moved: Sequence[tuple[Array, ...]], period: float) -> None:
+    """CompensationError if gravity does not turn as the gyroscope says, in what the IMU felt of stretches."""
+    size = float(np.median(np.concatenate([np.linalg.norm(felt, axis=1) for felt, _, _ in moved])))
+    if not _GRAVITY[0] < size < _GRAVITY[1]:
         raise CompensationError(
             f"the accelerometer reads {size:.2f} m/s² mostly, where gravity is 9.81: check imu_raw_units"
         )
-    window = hann_window(2 * _WINDOW_S, period)
-    inner = slice(len(window), -len(window))
-    changes = np.gradient(smoothed(felt, window), period, axis=0)[inner]
-    turns = smoothed(np.cross(felt, rate), window)[inner]
+    window, rows = hann_window(2 * _WINDOW_S, period), list[Array]()
+    for felt, rate, arm in moved:
+        slow = smoothed(np.concatenate([felt, arm.reshape(-1, 9)], axis=1), window)
+        turns = smoothed(np.cross(felt, rate), window)
+        row = np.concatenate([np.gradient(slow, period, axis=0), turns], axis=1)
+        rows.append(row[len(window) : -len(window)])
+    changes, swung, turns = np.split(np.concatenate(rows), [3, 12], axis=1)
     # Less what the IMU feels on the arm about which it turns, which is as regular.
-    swung = np.gradient(smoothed(arm.reshape(-1, 9), window), period, axis=0)[inner].reshape(-1, 3)
+    swung = swung.reshape(-1, 3)
     found = np.linalg.lstsq(swung, np.stack([changes.ravel(), turns.ravel()], axis=1), rcond=None)[0]
     changes, turns = (
         each - (swung @ at).reshape(-1, 3) for each, at in zip((changes, turns), found.T, strict=True)
@@ -162,15 +176,15 @@ def identify_inertia(turned: Turned, poses: Identified) -> Identified:
 
 
 def untouched(turned: Turned, beyond: Array, weight: float) -> NDArray[np.bool_]:
-    """(n,): no sample is missing, and so much force, N, that the tool does not explain is no contact."""
+    """(n,): so much force, N, that the tool does not explain is no contact."""
     spread = max(1, round(_AROUND_S / float(np.diff(turned.times[:2])[0])))
     is_touched = beyond > _CONTACT_N + _CONTACT_SHARE * weight
-    return turned.is_whole & (np.convolve(is_touched, np.ones(2 * spread + 1), "same") < 0.5)
+    return np.asarray(np.convolve(is_touched, np.ones(2 * spread + 1))[spread:-spread] < 0.5)
 
 
 def divided(turned: Turned) -> tuple[Array, NDArray[np.int64], Array]:
     """Minutes (n, 1, 1), numbers of the pieces (n,), and `spun` where it is more than noise."""
-    pieces = (turned.times / _PIECE_S).astype(int) - int(turned.times[0] / _PIECE_S)
+    pieces = np.unique((turned.times / _PIECE_S).astype(int), return_inverse=True)[1]
     squares, lengths = np.zeros((pieces[-1] + 1, 6)), np.maximum(np.bincount(pieces), 1)
     np.add.at(squares, pieces, (turned.spun**2).sum(axis=1) / lengths[pieces, None])
     spun = turned.spun * (squares > _LEAST_SPIN**2)[pieces, None]
