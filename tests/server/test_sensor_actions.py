@@ -506,7 +506,7 @@ def test_a_change_of_the_offset_is_told_at_once(bench: Bench) -> None:
     assert bench.ask("sdo_write", index=OFFSET, subindex=3, type="f32", value=1.5)["ok"]
     changed = [*new[:2], 1.5, *new[3:]]
     assert told() == bench.described()["offset"] == changed
-    bench.command("on-write 0x8000 1 freeze force.z")  # the tare is taken back
+    bench.command("on-write 0x8000 1 signal poses")  # the tare is taken back
     assert not bench.ask("tare", samples=50)["ok"]
     assert told() != changed
     assert told() == bench.described()["offset"] == changed

@@ -395,7 +395,7 @@ private:
         if (before != bias_change_ && sensor.rate_hz > 0.0)
             doubted_until_ns_ = newest_ns_ + static_cast<std::uint64_t>(std::llround(kDoubtAfter * 1e9 / sensor.rate_hz));
         newest_ns_ = monotonic_ns;
-        if (newest_ns_ <= doubted_until_ns_) load_.fill(NAN);
+        if (doubted_until_ns_ > 0 && newest_ns_ <= doubted_until_ns_) load_.fill(NAN);
         else if (!tool_) load_ = {};
     }
 
