@@ -24,8 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from bota_ethercat.program.arguments import command
-from ethercat_server.errors import InterfaceError
+from ethercat_server.errors import LIST_ADAPTERS, InterfaceError
 from ethercat_server.ethercat.options import ALLOW_IP, VIRTUAL_INTERFACE
 from ethercat_server.ethercat.wire import ETHERTYPE
 
@@ -60,7 +59,6 @@ def packet_sockets() -> list[Listener]:
     return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in table("/proc/self/net/packet")]
 
 
-_LIST: Final = command("ethercat-sensor adapters")
 _SIOCGSTAMPNS: Final = 0x80108907
 _TIMESPEC: Final = struct.Struct("=qq")
 
@@ -254,7 +252,7 @@ def name_trouble(ifname: str) -> str | None:
         return None
     return (
         f"{ifname!r} is not an interface name: it must have 1 to {_MAX_NAME_LENGTH} characters; "
-        f"'{_LIST}' lists them"
+        f"'{LIST_ADAPTERS}' lists them"
     )
 
 
@@ -421,7 +419,7 @@ def find_routes(index: int) -> Routes:
 
 def network_trouble(ifname: str, routes: Routes) -> str | None:
     """Why `ifname` must not carry EtherCAT frames, and what to do; None if it may."""
-    other = f"name the one that the sensor is connected to ('{_LIST}' lists them)"
+    other = f"name the one that the sensor is connected to ('{LIST_ADAPTERS}' lists them)"
     anyway = f"{ALLOW_IP} overrides this"
     if routes.default:
         return f"{ifname} has the machine's default route, so it is not for a sensor: {other}; {anyway}"
