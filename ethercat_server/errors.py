@@ -13,6 +13,12 @@ ServerError
 
 from __future__ import annotations
 
+from typing import Final
+
+from bota_ethercat.program.command import command
+
+LIST_ADAPTERS: Final = command("ethercat-sensor adapters")  # in some of them
+
 
 class ServerError(Exception):
     """Base of all errors here."""

@@ -76,7 +76,7 @@ def test_every_script_is_known() -> None:
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One without an environment."""
     folder = tmp_path_factory.mktemp("checkout")
-    for path in completed("git", "ls-files", cwd=ROOT).stdout.splitlines():
+    for path in completed("git", "ls-files", "-co", "--exclude-standard", cwd=ROOT).stdout.splitlines():
         if (ROOT / path).is_file():
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / path, folder / path)

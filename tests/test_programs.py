@@ -22,7 +22,8 @@ import pytest
 
 from bota_clients.identify.cli import main as identify
 from bota_ethercat.health.advice import IT_TELLS
-from bota_ethercat.program.arguments import EXAMPLES, Parser, command, number, whole
+from bota_ethercat.program.arguments import EXAMPLES, Parser, number, whole
+from bota_ethercat.program.command import command
 from ethercat_server import programs
 from ethercat_server.tool import settings
 from tests.clients.recordings import frame, write
@@ -285,14 +286,14 @@ def test_a_command_in_a_message_works_as_it_is_printed(
     monkeypatch.setattr(sys, "argv", [str(bin_ / "ethercat-monitor")])
     monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
     monkeypatch.setenv("PATH", str(on_path))
-    monkeypatch.setattr("bota_ethercat.program.arguments._SUDO_PATH", "/none")
+    monkeypatch.setattr("bota_ethercat.program.command._SUDO_PATH", "/none")
     assert command("sudo ethercat-doctor ens5") == f"sudo '{bin_}/ethercat-doctor' ens5"
     assert command("ethercat-doctor a.trace") == f"'{bin_}/ethercat-doctor' a.trace"
     assert command("ethercat-none") == "ethercat-none"
     (on_path / "ethercat-doctor").symlink_to(bin_ / "ethercat-doctor")
     assert command("ethercat-doctor a.trace") == "ethercat-doctor a.trace"
     assert command("sudo ethercat-doctor ens5") == f"sudo '{bin_}/ethercat-doctor' ens5"
-    monkeypatch.setattr("bota_ethercat.program.arguments._SUDO_PATH", str(on_path))
+    monkeypatch.setattr("bota_ethercat.program.command._SUDO_PATH", str(on_path))
     assert command("sudo ethercat-doctor ens5") == "sudo ethercat-doctor ens5"
     assert f"'{bin_}/ethercat-monitor' --once" in Parser("ethercat-monitor", "", "").format_help()
 

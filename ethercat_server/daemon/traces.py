@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from bota_ethercat.program import state
-from bota_ethercat.program.arguments import command
+from bota_ethercat.program.command import command
 from ethercat_server.process import realtime
 from ethercat_server.sampling.trace import FrozenTrace
 from ethercat_server.server import Server

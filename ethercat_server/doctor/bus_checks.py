@@ -20,7 +20,7 @@ from bota_ethercat.health import sentences
 from bota_ethercat.health.judge import judge
 from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.health.observer import StreamObserver, by_sensor
-from bota_ethercat.program.arguments import command
+from bota_ethercat.program.command import command
 from bota_ethercat.replies import DistributionStatus, Status
 from ethercat_server.access.adapters import Holder, find_holder, links
 from ethercat_server.access.private_server import open_interface

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from bota_ethercat.program.arguments import command
+from bota_ethercat.program.command import command
 from ethercat_server.access.adapters import Adapter, is_wireless
 from ethercat_server.doctor.machine import Host
 from ethercat_server.doctor.report import (

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_ethercat.client import Client
 from bota_ethercat.errors import ConnectionFailedError, ProtocolError
-from bota_ethercat.program.arguments import command
+from bota_ethercat.program.command import command
 from bota_ethercat.program.server_choice import default_server
 from bota_ethercat.text.untrusted import printable
 from ethercat_server.errors import ServerError

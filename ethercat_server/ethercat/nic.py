@@ -24,8 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from bota_ethercat.program.arguments import command
-from ethercat_server.errors import InterfaceError
+from ethercat_server.errors import LIST_ADAPTERS, InterfaceError
 from ethercat_server.ethercat.options import ALLOW_IP, VIRTUAL_INTERFACE
 from ethercat_server.ethercat.wire import ETHERTYPE
 
@@ -60,7 +59,6 @@ def packet_sockets() -> list[Listener]:
     return [Listener(int(row[3], 16), int(row[4]), int(row[-1])) for row in table("/proc/self/net/packet")]
 
 
-_LIST: Final = command("ethercat-sensor adapters")
 _SIOCGSTAMPNS: Final = 0x80108907
 _TIMESPEC: Final = struct.Struct("=qq")
 
@@ -258,7 +256,7 @@ def name_trouble(ifname: str) -> str | None:
         return None
     return (
         f"{ifname!r} is not an interface name: it must have 1 to {_MAX_NAME_LENGTH} characters; "
-        f"'{_LIST}' lists them"
+        f"'{LIST_ADAPTERS}' lists them"
     )
 
 
@@ -470,7 +468,7 @@ def _ways(route: dict[int, bytes], carried: set[int]) -> Iterator[bool]:
 
 def network_trouble(ifname: str, routes: Routes) -> str | None:
     """Why `ifname` must not carry EtherCAT frames, and what to do; None if it may."""
-    other = f"name the sensor's interface ('{_LIST}' lists them)"
+    other = f"name the sensor's interface ('{LIST_ADAPTERS}' lists them)"
     anyway = f"{ALLOW_IP} overrides this"
     if elsewhere := routes.elsewhere:
         return f"{ifname} has {elsewhere}, so it is not for a sensor: {other}; {anyway}"

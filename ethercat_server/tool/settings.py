@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
 from bota_ethercat.errors import SettingError
 from bota_ethercat.pdo import AXES
-from bota_ethercat.program.arguments import command
+from bota_ethercat.program.command import command
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.signals import signals_held_back
 from bota_ethercat.program.tare_memory import former, remember

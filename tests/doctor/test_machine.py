@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from bota_ethercat.health.limits import Level
-from bota_ethercat.program.arguments import command
+from bota_ethercat.program.command import command
 from ethercat_server.doctor.machine import FACTS, Host, processor_list
 from ethercat_server.doctor.machine_checks import CHECKS, examine_machine, rising
 from ethercat_server.doctor.report import CannotLookError, CheckResult, bad, examine, ok

@@ -39,7 +39,7 @@ from bota_clients.recording.order import TimeAxis, in_order, longest_order
 from bota_clients.recording.reader import Recording, Since
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError, FileError
-from bota_ethercat.program.arguments import command
+from bota_ethercat.program.command import command
 from bota_ethercat.program.new_file import EXISTS
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.sensor.response import delays_ms

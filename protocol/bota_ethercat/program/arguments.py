@@ -4,18 +4,13 @@
 from __future__ import annotations
 
 import argparse
-import os
-import shlex
-import shutil
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from bota_ethercat.program.command import command
 from bota_ethercat.program.version import VERSION
 
 _Value = TypeVar("_Value")
-_SUDO_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"  # as Debian sets it
 
 EXAMPLES: Final = """\
 ethercat-server virtual 12001                              # a simulated sensor
@@ -54,20 +49,6 @@ ethercat-identify delay shaken.mcap                        # how late force is, 
 def examples_of(program: str) -> list[str]:
     """The rows of `EXAMPLES` that start it."""
     return [row for row in EXAMPLES.splitlines() if program in row.removeprefix("sudo ").split()[:1]]
-
-
-def command(row: str) -> str:
-    """A row with a command line of one of the programs, as it works where this one runs.
-
-    With the path of the program unless it is on PATH, or for sudo on that of sudo.
-    """
-    rest = row.removeprefix("sudo ")
-    before, name = row[: -len(rest)], rest.split(" ")[0]
-    for beside in (sys.argv[0], sys.executable):
-        path = Path(beside).absolute().with_name(name)
-        if not shutil.which(name, path=_SUDO_PATH if before else None) and os.access(path, os.X_OK):
-            return before + shlex.quote(str(path)) + rest[len(name) :]
-    return row
 
 
 class Parser(argparse.ArgumentParser):
