@@ -108,6 +108,37 @@ def test_stamps_rise_while_the_clock_is_only_slewed() -> None:
     assert running.clock.time_ns() - stamps[-1] < 3e6
 
 
+# chrony's largest by default, phc2sys' and adjtimex' (a tick 10 % longer), ntpd's.
+SLEWS = (1 / 12, -1 / 13, 0.1, -0.1, 0.04, -0.02, 0.0005)
+
+
+@pytest.mark.parametrize("dc", ["", "none"])
+@pytest.mark.parametrize(
+    ("slew", "sinc_length"), more_if_long([(0.1, 64), (-0.1, 512)], itertools.product(SLEWS, (32, 64, 512)))
+)
+def test_a_slew_costs_no_sample_and_stamps_follow_it(slew: float, sinc_length: int, dc: str) -> None:
+    sensor = SensorOptions(signal="clock", ppm=150.0, dc=dc)
+    running = Simulation(sensor, machine=Machine(), settings={"sinc_length": sinc_length})
+    running.run(2.0)
+    start = len(running.frames)
+    for now in (slew, 0.0, -slew, 0.0):
+        running.backend.become(Machine(slew=now))
+        running.run(1.0)
+    got = running.frames[start:]
+    check_frames(got)
+    assert lost(got) == running.status()["sensors"][0]["lost_samples"] == 0
+    errors_ns = sorted(abs(frame.monotonic_ns - reading(frame).instant_ns) for frame in got)
+    assert errors_ns[-5] < 10_000, "all but those of the samples in which it changed"
+    assert errors_ns[-1] < 40_000
+    (offset_ns,) = {frame.stamp_ns - frame.monotonic_ns for frame in got}
+    assert abs(offset_ns - (REALTIME_START_NS - START_NS)) < 1000
+    running.clock.stall(100 * PERIOD_NS)
+    running.backend.become(Machine(slew=slew))
+    running.run(0.5)
+    running.clock.stall(100 * PERIOD_NS)
+    check_lost(running, 10)
+
+
 def test_a_stall_is_counted_and_followed_by_no_burst() -> None:
     running, periods = simulation(), 30
     running.at(1.0, lambda: running.clock.stall(periods * PERIOD_NS))
