@@ -154,8 +154,9 @@ class Cycle:
     def _due_ns(self) -> int:
         """When the next exchange is due.
 
-        Polls that lie close together are merged: the earlier one waits for the later, by no more than the
-        time that four exchanges cost this machine, as measured. So three quarters of its time are left.
+        Polls that lie close together are merged: the earlier one, unless it probes the phase, waits for the
+        later, by no more than the time that four exchanges cost this machine, as measured. So three quarters
+        of its time are left.
         """
         streams, sent_ns, unanswered = self._recovery.polled, self._sent_ns, self._unanswered
         if len(streams) == 1:
@@ -165,7 +166,8 @@ class Cycle:
                 stream.clock.next_poll_ns(sent_ns, unanswered, in_flight=self._in_flight)
                 for stream in streams
             ]
-            latest_ns = min(wanted) + self._spacing_ns
+            early = (poll for poll, each in zip(wanted, streams, strict=True) if each.clock.is_probing)
+            latest_ns = min(min(wanted) + self._spacing_ns, *early, inf)
             poll_ns = max([each for each in wanted if each <= latest_ns])
         else:
             return sent_ns + _RECOVERY_STEP_NS
