@@ -76,8 +76,10 @@ class ManualClock:
     def __init__(self, now_ns: int = 1_000_000_000) -> None:
         self.now_ns = now_ns
 
-    def monotonic_ns(self) -> int:
+    def raw_ns(self) -> int:
         return self.now_ns
+
+    monotonic_ns = raw_ns
 
     def time_ns(self) -> int:
         return self.now_ns
@@ -114,7 +116,7 @@ class RecordingHub(Hub):
     """Keeps what it hands to its clients; simulated time passes while it serves them."""
 
     def __init__(self, simulation: Simulation) -> None:
-        super().__init__(simulation.listen(), simulation.clock.monotonic_ns)
+        super().__init__(simulation.listen(), simulation.clock.raw_ns)
         self._simulation = simulation
 
     def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
@@ -185,14 +187,14 @@ class Exchange:
     def __call__(self, timeout_s: float = 0.01) -> int:
         """The working counter of all frames; -1 if one did not come back in time."""
         process_data, clock = self.bus.process_data, self.bus.clock
-        until_ns = clock.monotonic_ns() + round(timeout_s * 1e9)
-        began_ns, awaited, total = clock.monotonic_ns(), len(process_data.inputs), 0
+        until_ns = clock.raw_ns() + round(timeout_s * 1e9)
+        began_ns, awaited, total = clock.raw_ns(), len(process_data.inputs), 0
         process_data.send()
         while awaited:
-            left_ns = until_ns - clock.monotonic_ns()
+            left_ns = until_ns - clock.raw_ns()
             if left_ns <= 0 or (frame := self.bus.backend.receive(left_ns * 1e-9)) is None:
                 return -1
-            answer = process_data.match(frame, clock.monotonic_ns())
+            answer = process_data.match(frame, clock.raw_ns())
             if answer is not None and answer.sent_ns > began_ns:
                 awaited -= 1
                 total += answer.wkc

@@ -249,6 +249,16 @@ def test_sampling_is_pure() -> None:
             assert {each for each in imports(path) if each not in MODULES} <= allowed, name
 
 
+def test_sampling_is_timed_by_a_clock_that_is_not_slewed() -> None:
+    """Only stamps are of CLOCK_MONOTONIC; a start-up and its time-outs may be slewed."""
+    may_have = {f"{S}.acquisition.stream": 2, f"{S}.acquisition.terminals": 1}
+    for name, path in MODULES.items():
+        if room(name) in {f"{S}.acquisition", f"{S}.sampling", f"{S}.serving"} or "exchange" in name:
+            nodes = [node for node in ast.walk(tree(path)) if isinstance(node, ast.Attribute)]
+            found = [node for node in nodes if node.attr in {"monotonic", "monotonic_ns", "perf_counter_ns"}]
+            assert len(found) == may_have.get(name, 0), name
+
+
 @functools.cache
 def imports_on_top(module: str) -> set[str]:
     """What a module imports, but for what a function imports."""

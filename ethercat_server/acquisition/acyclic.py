@@ -118,6 +118,6 @@ class Acyclic:
         if isinstance(wanted, RegisterAccess):
             task.access = wanted
         elif wanted:
-            task.resume_at_ns = self._bus.clock.monotonic_ns() + int(wanted * 1e9)
+            task.resume_at_ns = self._bus.clock.raw_ns() + int(wanted * 1e9)
         else:
             task.turn = self.turn

@@ -51,7 +51,7 @@ class Outlet(Protocol):
         """Take the DATA frames that an exchange made, one for a sensor; `now_ns` is when it was back."""
 
     def serve(self, until_ns: int) -> int:
-        """Serve the clients, or wait, until CLOCK_MONOTONIC is `until_ns`; returns the time."""
+        """Serve the clients, or wait, until CLOCK_MONOTONIC_RAW is `until_ns`; returns the time."""
 
 
 class Watchdog(Protocol):
@@ -85,10 +85,10 @@ class Cycle:
         self._acyclic, self._jobs = acyclic, jobs
         self._watchdog = watchdog
         self._bus, self._process_data = bus, bus.process_data
-        self._backend, self._monotonic_ns = bus.backend, bus.clock.monotonic_ns
+        self._backend, self._raw_ns = bus.backend, bus.clock.raw_ns
         self._sensors = sensors
         self._streams = streams
-        self._hub = hub
+        self._hub, self._stamps = hub, streams[0].stamps
         self._recovery = recovery
         self._missed_deadlines = self._missed_until_ns = 0
         self._round_trip = round_trip
@@ -106,7 +106,7 @@ class Cycle:
         ]
         # When the last exchange was sent; whether it is in flight; how many were sent since the last answer,
         # and when the first of those was, if there are several.
-        self._sent_ns = self._unanswered_since_ns = bus.clock.monotonic_ns()
+        self._sent_ns = self._unanswered_since_ns = bus.clock.raw_ns()
         self._in_flight, self._unanswered = False, 0
         # Wake-up lateness of the first sleep since the clocks learned; None before it.
         self._woke_late_ns: float | None = None
@@ -115,7 +115,7 @@ class Cycle:
         self._exchange = RecentDistribution()
         self._everyone = [self._wake, self._exchange, *(stream.age for stream in streams)]
         self._in_turn = cycle(self._everyone)
-        self._started_ns = bus.clock.monotonic_ns()
+        self._started_ns = bus.clock.raw_ns()
         self._summarize_at_ns = 0
         self._chores_at_ns = self._roll_at_ns = 0
         self._slept = False  # whether the loop had slept until the due exchange when `stop` ended it
@@ -129,15 +129,15 @@ class Cycle:
     def run(self) -> None:
         """Run the loop until `stop`."""
         hub, acyclic, recovery = self._hub, self._acyclic, self._recovery
-        monotonic_ns, serve_by, slept = self._monotonic_ns, 0, self._slept
+        raw_ns, serve_by, slept = self._raw_ns, 0, self._slept
         self._feed_at_ns = 0
         while True:
-            due, now = self._due_ns(), monotonic_ns()
+            due, now = self._due_ns(), raw_ns()
             if now >= acyclic.due_ns:
                 self._jobs.check()
                 # While working counters are too low, or all sensors are lost, no poll must be in time.
                 acyclic.run(due if recovery.polled and not recovery.incomplete else inf, now)
-                due, now = self._due_ns(), monotonic_ns()
+                due, now = self._due_ns(), raw_ns()
             in_flight = self._in_flight or acyclic.awaiting is not None
             slept = slept or (due > now and not in_flight)
             if slept or now > serve_by:
@@ -146,7 +146,7 @@ class Cycle:
             if self.stopping:
                 break
             self._step(now, due, (now if in_flight else due) + _SERVE_EVERY_NS, slept=slept)
-            now, slept = monotonic_ns(), False
+            now, slept = raw_ns(), False
             if now >= self._chores_at_ns:
                 self._do_chores(now)
         self._slept = slept
@@ -154,8 +154,9 @@ class Cycle:
     def _due_ns(self) -> int:
         """When the next exchange is due.
 
-        Polls that lie close together are merged: the earlier one waits for the later, by no more than the
-        time that four exchanges cost this machine, as measured. So three quarters of its time are left.
+        Polls that lie close together are merged: the earlier one, unless it probes the phase, waits for the
+        later, by no more than the time that four exchanges cost this machine, as measured. So three quarters
+        of its time are left.
         """
         streams, sent_ns, unanswered = self._recovery.polled, self._sent_ns, self._unanswered
         if len(streams) == 1:
@@ -165,7 +166,8 @@ class Cycle:
                 stream.clock.next_poll_ns(sent_ns, unanswered, in_flight=self._in_flight)
                 for stream in streams
             ]
-            latest_ns = min(wanted) + self._spacing_ns
+            early = (poll for poll, each in zip(wanted, streams, strict=True) if each.clock.is_probing)
+            latest_ns = min(min(wanted) + self._spacing_ns, *early, inf)
             poll_ns = max([each for each in wanted if each <= latest_ns])
         else:
             return sent_ns + _RECOVERY_STEP_NS
@@ -192,7 +194,7 @@ class Cycle:
                 self._recovery.check_silence(now - self._unanswered_since_ns, now)
             wait = min(due, until_ns) - now
             is_answered = self._receive(wait, now)
-            if is_answered or (now := self._monotonic_ns()) < due:
+            if is_answered or (now := self._raw_ns()) < due:
                 return
             slept = slept or wait > 0
         if self._unanswered or now - due > self._shortest_ns:
@@ -203,7 +205,7 @@ class Cycle:
             self._wake.record(sent - due)
             if self._woke_late_ns is None:
                 self._woke_late_ns = sent - due
-        most = self._round_trip.patience_ns if self._one_by_one else self._due_ns() - self._monotonic_ns()
+        most = self._round_trip.patience_ns if self._one_by_one else self._due_ns() - self._raw_ns()
         if (wait := min(int(most), until_ns - now)) > 0:
             self._receive(wait, sent)
 
@@ -223,12 +225,12 @@ class Cycle:
 
         That is handed out.
         """
-        frame, back = self._backend.receive(wait * 1e-9 if wait > 0 else 0.0), self._monotonic_ns()
+        frame, back = self._backend.receive(wait * 1e-9 if wait > 0 else 0.0), self._raw_ns()
         while frame is not None and (exchange := self._process_data.match(frame, back)) is DUPLICATE:
             # Drain duplicates of earlier answers, which would delay this one.
             if back > self._sent_ns + _SERVE_EVERY_NS:
                 return False
-            frame, back = self._backend.receive(0.0), self._monotonic_ns()
+            frame, back = self._backend.receive(0.0), self._raw_ns()
         if frame is None or exchange is None:
             if frame is not None:
                 self._recovery.causes.see_foreign(frame, back)
@@ -282,6 +284,7 @@ class Cycle:
         arrived = self._bus.backend.arrived_ns()
         if not sent < arrived < back:  # the kernel does not say, or CLOCK_REALTIME was set
             arrived = back
+        arrived = back - int((back - arrived) / self._stamps.rate)  # by CLOCK_REALTIME
         if back - sent - round_trip.usual_ns > self._shortest_ns:  # it was held up
             self._count_missed(sent + round_trip.usual_ns, back)
             # By this computer, if the answer had arrived, and the loop was waiting for it.
@@ -291,7 +294,7 @@ class Cycle:
             self.tracing.notes.append(learn_note(exchange, arrived, RecordKind.LEARNED, self._woke_late_ns))
             learn(round_trip, learners, sent, arrived, back, self._woke_late_ns)
             self._woke_late_ns = None
-            self._cost_ns += _COST_GAIN * (self._bus.clock.monotonic_ns() - back - self._cost_ns)
+            self._cost_ns += _COST_GAIN * (self._bus.clock.raw_ns() - back - self._cost_ns)
         else:
             self.tracing.notes.append(learn_note(exchange, arrived))
             clocks = [row[-1].clock for row in self._carried[which] if row[-1].exchange is exchange]
@@ -302,7 +305,7 @@ class Cycle:
     def _do_chores(self, now: int) -> None:
         """Housekeeping that is not done for every exchange, a little at a time."""
         self._chores_at_ns = now + _CHORES_EVERY_NS
-        self._streams[0].realtime_offset.follow()
+        self._stamps.follow_realtime()
         self.tracing.pack()
         next(self._in_turn).count()
         for stream in self._streams:
@@ -333,7 +336,7 @@ class Cycle:
 
     def status(self) -> dict[str, Any]:
         """The cycle's part of the `status` reply."""
-        now_ns = self._bus.clock.monotonic_ns()
+        now_ns = self._bus.clock.raw_ns()
         if now_ns >= self._summarize_at_ns:
             self._summarize_at_ns = now_ns + _SUMMARY_NS
             for stream in self._streams:

@@ -65,7 +65,7 @@ class Drift:
         self._unusable = True  # until the next second, so that nothing is from before
 
     def _now_s(self) -> float:
-        return self._clock.monotonic_ns() * 1e-9
+        return self._clock.raw_ns() * 1e-9
 
     def add(self, columns: Sequence[Sequence[float]]) -> None:
         """Some samples, by field of the process data."""

@@ -158,7 +158,7 @@ class SensorRecovery:
     def check_events(self) -> Steps[None]:
         """Try refused event times again when it is time: another master may have changed what they need."""
         events = self._stream.clock.events
-        if events and self._sensor.streams and events.trust.is_due(self._bus.clock.monotonic_ns()):
+        if events and self._sensor.streams and events.trust.is_due(self._bus.clock.raw_ns()):
             with contextlib.suppress(GoneError):
                 yield from self._slave.latch_events()
                 if (clock := (yield from self._bus.read_clock(self._number))) is not None:
@@ -203,7 +203,7 @@ class SensorRecovery:
         change.done(extended(error, LATER))
 
     def _report_lost(self, reason: str) -> None:
-        now_ns = self._lost_at_ns = self._bus.clock.monotonic_ns()
+        now_ns = self._lost_at_ns = self._bus.clock.raw_ns()
         if not self._recovery.causes.known_cause(now_ns):
             self._recovery.on_unexplained_loss()
         log.warning("sensor %d (%s) is lost: %s", self._number, self._sensor.identity, reason)
@@ -236,14 +236,14 @@ class SensorRecovery:
                 self._announce(event(Event.RECONFIGURED, sensor=self._number, **sensor.in_force()))
             change.done(change.failed and extended(change.failed, IN_FORCE))
         if lost_at_ns is not None:
-            lost_s = round((self._bus.clock.monotonic_ns() - lost_at_ns) * 1e-9, 3)
+            lost_s = round((self._bus.clock.raw_ns() - lost_at_ns) * 1e-9, 3)
             log.info("sensor %d (%s) is back after %.3f s", self._number, sensor.identity, lost_s)
             self._announce(event(Event.SENSOR_BACK, sensor=self._number, lost_s=lost_s, **sensor.in_force()))
 
     def _refuse(self, found: Identity) -> None:
         number, sensor = self._number, self._sensor
         sensor.enter(SensorState.REFUSED)
-        self._lost_at_ns = self._lost_at_ns or self._bus.clock.monotonic_ns()
+        self._lost_at_ns = self._lost_at_ns or self._bus.clock.raw_ns()
         if (change := self._change) is not None:
             self._change = None
             change.done(BusError(f"sensor {number} was replaced by a {found} meanwhile"))
@@ -440,7 +440,7 @@ class Recovery:
 
     def _until_next_check_s(self) -> float:
         """Time until the next check: they are evenly spaced, however long each of them takes."""
-        now_ns = self.bus.clock.monotonic_ns()
+        now_ns = self.bus.clock.raw_ns()
         self._next_check_ns = max(self._next_check_ns + _WATCH_EVERY_NS // (2 * len(self.sensors)), now_ns)
         return (self._next_check_ns - now_ns) * 1e-9
 
@@ -450,7 +450,7 @@ class Recovery:
 
     def explain(self, reason: str, otherwise: str = "") -> str:
         """Why a sensor is lost, with what explains it."""
-        return self.causes.explain(reason, self.bus.clock.monotonic_ns(), otherwise)
+        return self.causes.explain(reason, self.bus.clock.raw_ns(), otherwise)
 
     def count_alive(self) -> None:
         """A sensor has begun or ceased to stream."""

@@ -17,7 +17,7 @@ from bota_ethercat.pdo import LAYOUTS
 from ethercat_server.acquisition.drift import Drift
 from ethercat_server.acquisition.health import SampleHealth
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.clock import SYSTEM_CLOCK, Clock, RealtimeOffset
+from ethercat_server.ethercat.clock import SLACK_NS, SYSTEM_CLOCK, Clock, StampClocks
 from ethercat_server.ethercat.exchange import DUPLICATE, Exchange
 from ethercat_server.ethercat.wire import BYTE_NS
 from ethercat_server.sampling.association import SILENT_PERIODS
@@ -47,7 +47,7 @@ class SensorStream:
         round_trip: RoundTrip,
         clock: Clock = SYSTEM_CLOCK,
         latching: DistributedClock | None = None,
-        realtime_offset: RealtimeOffset | None = None,
+        stamps: StampClocks | None = None,
         data_offset_ns: int = 0,
         data_size: int = min(LAYOUTS),
     ) -> None:
@@ -57,8 +57,8 @@ class SensorStream:
         there.
         """
         self.number = sensor.number
-        self._monotonic_ns = clock.monotonic_ns
-        self.realtime_offset = realtime_offset or RealtimeOffset(clock)
+        self._raw_ns, self._monotonic_ns = clock.raw_ns, clock.monotonic_ns
+        self.stamps = stamps or StampClocks(clock)
         self._round_trip = round_trip
         self._data_offset_ns = data_offset_ns
         self.clock = self._new_clock(sensor.period_ns, latching)
@@ -83,7 +83,7 @@ class SensorStream:
         self._newest_ns = 0  # when the exchange was back that brought the newest sample
         # The working counter of an exchange since then that was not valid; 0 for none.
         self._invalid_wkc = 0
-        self._instant_ns = 0  # of the newest sample
+        self._instant_ns = 0  # of the newest sample, CLOCK_MONOTONIC
         self.notes: list[Note] = []  # see `Tracing`
         self.on_change: Callable[[], None] = lambda: None  # the clock is another one, or begins anew
         self.model, self.nominal_hz = sensor.identity.name, 1e9 / sensor.period_ns
@@ -106,7 +106,7 @@ class SensorStream:
         `latched` is what the slave controller has latched. If `clock.learns` then, `clock.learn` must follow.
         """
         sent_ns, back_ns, _, wkc, _ = exchange
-        clock, self.exchange = self.clock, exchange
+        clock, stamps, self.exchange = self.clock, self.stamps, exchange
         fresh = data != self.process_data
         is_next = clock.observe(sent_ns, back_ns, latched, fresh=fresh)
         self.notes.append((exchange, latched or NOTHING, self.number, fresh))
@@ -117,12 +117,13 @@ class SensorStream:
             self._discard -= 1
             return None
         flags = 0 if is_next and not (self._silent or self._gap) else self._count_lost()
-        if (instant_ns := int(clock.instant_ns)) <= self._instant_ns:  # the one before was dated too late
-            instant_ns = self._instant_ns + 1
-        self._instant_ns, self._newest_ns, self._handed_out = instant_ns, back_ns, data
+        if not -SLACK_NS < self._monotonic_ns() - self._raw_ns() * stamps.rate - stamps.base_ns < SLACK_NS:
+            stamps.follow()
+        if (at_ns := int(clock.instant_ns * stamps.rate + stamps.base_ns)) <= self._instant_ns:
+            at_ns = self._instant_ns + 1  # the one before was dated too late
+        self._instant_ns, self._newest_ns, self._handed_out = at_ns, back_ns, data
         self._counted.append((data, back_ns - clock.instant_ns if clock.locked else None))
-        stamp_ns = instant_ns + self.realtime_offset.ns
-        frame = self._encode(self.sequence, stamp_ns, instant_ns, self.number, flags, wkc, data)
+        frame = self._encode(self.sequence, at_ns + stamps.realtime_ns, at_ns, self.number, flags, wkc, data)
         self.sequence += 1
         return frame, self.number, flags, back_ns
 
@@ -150,9 +151,10 @@ class SensorStream:
             self.invalid_frames += 1
             flags, wkc = INVALID, self._invalid_wkc
             self._invalid_wkc = 0
-        stamp_ns, sequence = now_ns + self.realtime_offset.ns, self.sequence
+        stamp_ns, sequence = self.stamps.monotonic_ns(now_ns), self.sequence
         self.sequence += 1
-        made = self._encode(sequence, stamp_ns, now_ns, self.number, flags, wkc, self._handed_out)
+        realtime_ns = stamp_ns + self.stamps.realtime_ns
+        made = self._encode(sequence, realtime_ns, stamp_ns, self.number, flags, wkc, self._handed_out)
         return made, self.number, flags, self._newest_ns
 
     def _count_lost(self) -> int:
@@ -205,7 +207,7 @@ class SensorStream:
             self.drift.begin("return")
             self._discard = DISCARDED_AT_START
             self._gap = 1
-            self.silent_at_ns = self._monotonic_ns() + SILENT_PERIODS * period_ns
+            self.silent_at_ns = self._raw_ns() + SILENT_PERIODS * period_ns
             self.on_change()
 
     def status(self) -> dict[str, Any]:
@@ -232,12 +234,12 @@ class SensorStream:
 
 def make_streams(bus: Bus, sensors: Sequence[Sensor], round_trip: RoundTrip) -> list[SensorStream]:
     """Those of the sensors on a bus in OP."""
-    offset = RealtimeOffset(bus.clock)
+    stamps = StampClocks(bus.clock)
     data = {at.number: at for inputs in bus.process_data.inputs for at in inputs}
     streams = []
     for number, sensor in enumerate(sensors):
         latching, start, end = bus.finish(bus.read_clock(number)), data[number].start, data[number].end
         streams.append(
-            SensorStream(sensor, round_trip, bus.clock, latching, offset, start * BYTE_NS, end - start)
+            SensorStream(sensor, round_trip, bus.clock, latching, stamps, start * BYTE_NS, end - start)
         )
     return streams

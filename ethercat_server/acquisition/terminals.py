@@ -86,11 +86,12 @@ class Terminal:
         self.steps = self._keep_in_op()
 
     def make_frame(
-        self, exchange: Exchange, start: int, end: int, stamp_ns: int
+        self, exchange: Exchange, start: int, end: int, stamps: tuple[int, int]
     ) -> tuple[bytes, int, int] | None:
         """The frame for an exchange, its flags and when its data was new; None before it had valid data.
 
-        REPEATED: the same data as before. INVALID: it did not take part, or is not in OP.
+        `stamps` by CLOCK_REALTIME and CLOCK_MONOTONIC. REPEATED: the same data as before. INVALID: it did not
+        take part, or is not in OP.
         """
         wkc, before, flags = int.from_bytes(exchange.frame[end : end + 2], "little"), self._newest, 0
         if wkc == 1 and self._streams:
@@ -102,7 +103,7 @@ class Terminal:
         else:
             return None
         self._was_valid = not flags & INVALID
-        head = self._sequence, stamp_ns, exchange.back_ns, self._number, flags, wkc
+        head = self._sequence, *stamps, self._number, flags, wkc
         self._sequence += 1
         if not flags:
             self._newest_ns = exchange.back_ns
@@ -183,9 +184,10 @@ class CycleWithTerminals(Cycle):
         if exchange.sent_ns < self._newest_ns:  # overtaken
             return
         self._newest_ns = exchange.sent_ns
-        stamp_ns, made = exchange.back_ns + self._streams[0].realtime_offset.ns, list[OutgoingFrame]()
+        back_ns, made = self._stamps.monotonic_ns(exchange.back_ns), list[OutgoingFrame]()
+        stamps = back_ns + self._stamps.realtime_ns, back_ns
         for number, start, end in self._bus.process_data.terminals[exchange.which]:
-            if frame := self.terminals[number].make_frame(exchange, start, end, stamp_ns):
+            if frame := self.terminals[number].make_frame(exchange, start, end, stamps):
                 made.append((frame[0], len(self._streams) + number, *frame[1:]))
         if made:
             self._hub.publish(made, exchange.back_ns)

@@ -63,4 +63,4 @@ class Backend(Protocol):
         """The next EtherCAT frame from any sender; None if none arrives within `timeout_s`."""
 
     def arrived_ns(self) -> int:
-        """CLOCK_MONOTONIC when the frame that was received last had arrived; 0 or wrong if unknown."""
+        """CLOCK_MONOTONIC_RAW when the frame received last had arrived; 0 or wrong if unknown."""

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Final, Protocol
 
 _READS: Final = 5
+_FOLLOW_EVERY_NS: Final = 300_000  # in less time, reading a clock distorts its rate
+SLACK_NS: Final = 1000
 
 
 class Clock(Protocol):
-    """CLOCK_MONOTONIC for intervals, CLOCK_REALTIME for stamps, and waiting."""
+    """CLOCK_MONOTONIC_RAW for intervals, the other two for stamps and short waits, and waiting."""
+
+    def raw_ns(self) -> int:
+        """CLOCK_MONOTONIC_RAW, ns: whoever sets this computer's time does not slew it."""
 
     def monotonic_ns(self) -> int:
         """CLOCK_MONOTONIC, ns."""
@@ -21,33 +28,68 @@ class Clock(Protocol):
         """Return after `seconds` at the earliest."""
 
 
-SYSTEM_CLOCK: Final[Clock] = time  # the kernel's clocks
+class _SystemClock:
+    """The kernel's clocks."""
+
+    raw_ns = staticmethod(partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW))
+    monotonic_ns = staticmethod(time.monotonic_ns)
+    time_ns = staticmethod(time.time_ns)
+    sleep = staticmethod(time.sleep)
 
 
-class RealtimeOffset:
-    """CLOCK_REALTIME less CLOCK_MONOTONIC, in ns.
+SYSTEM_CLOCK: Final[Clock] = _SystemClock()
 
-    It is constant until CLOCK_REALTIME is set: the kernel slews both alike. So that it does not depend on
-    what comes between two clock reads, CLOCK_REALTIME is read between two reads of CLOCK_MONOTONIC.
+
+class StampClocks:
+    """CLOCK_MONOTONIC and CLOCK_REALTIME at an instant of CLOCK_MONOTONIC_RAW, against which they are slewed.
+
+    So that nothing depends on what comes between two reads, a clock is read between two reads of another.
+
+    Attributes:
+        rate, base_ns: CLOCK_MONOTONIC is CLOCK_MONOTONIC_RAW times `rate`, and `base_ns`, since `follow`.
+        realtime_ns: CLOCK_REALTIME less CLOCK_MONOTONIC. It is constant until CLOCK_REALTIME is set: the
+            kernel slews both alike.
     """
 
     def __init__(self, clock: Clock) -> None:
-        self._monotonic_ns, self._time_ns = clock.monotonic_ns, clock.time_ns
-        self.ns = self._middle()
+        self._raw_ns, self._monotonic_ns, self._time_ns = clock.raw_ns, clock.monotonic_ns, clock.time_ns
+        self.rate = 1.0
+        self._at_ns = clock.raw_ns()
+        self.base_ns: float = _difference(self._monotonic_ns, self._raw_ns)
+        self.realtime_ns = _difference(self._time_ns, self._monotonic_ns)
+
+    def follow_realtime(self) -> None:
+        """To be called regularly: notices that CLOCK_REALTIME was set."""
+        least, most = _bounds(self._time_ns, self._monotonic_ns)
+        if not least <= self.realtime_ns <= most:
+            self.realtime_ns = _difference(self._time_ns, self._monotonic_ns)
 
     def follow(self) -> None:
-        """To be called regularly: notices that CLOCK_REALTIME was set."""
-        least, most = self._bounds()
-        if not least <= self.ns <= most:
-            self.ns = self._middle()
+        """To be called before an instant is converted, at least where `SLACK_NS` are exceeded."""
+        before_ns, monotonic_ns, after_ns = self._raw_ns(), self._monotonic_ns(), self._raw_ns()
+        if (passed_ns := before_ns - self._at_ns) > _FOLLOW_EVERY_NS:
+            expected_ns = before_ns * self.rate + self.base_ns
+            now_ns = min(max(expected_ns, monotonic_ns - (after_ns - before_ns)), monotonic_ns)
+            self.rate += (now_ns - expected_ns) / passed_ns
+            self.base_ns, self._at_ns = now_ns - before_ns * self.rate, before_ns
 
-    def _bounds(self) -> tuple[int, int]:
-        before_ns, time_ns, after_ns = self._monotonic_ns(), self._time_ns(), self._monotonic_ns()
-        return time_ns - after_ns, time_ns - before_ns
+    def monotonic_ns(self, raw_ns: float) -> int:
+        """CLOCK_MONOTONIC at an instant near now."""
+        self.follow()
+        return int(raw_ns * self.rate + self.base_ns)
 
-    def _middle(self) -> int:
-        least, most = min((self._bounds() for _ in range(_READS)), key=lambda bounds: bounds[1] - bounds[0])
-        return (least + most) // 2
+
+def _bounds(clock_ns: Callable[[], int], other_ns: Callable[[], int]) -> tuple[int, int]:
+    """How far a clock is ahead of another, at least and at most."""
+    before_ns, time_ns, after_ns = other_ns(), clock_ns(), other_ns()
+    return time_ns - after_ns, time_ns - before_ns
+
+
+def _difference(clock_ns: Callable[[], int], other_ns: Callable[[], int]) -> int:
+    """How far a clock is ahead of another."""
+    bounds = (_bounds(clock_ns, other_ns) for _ in range(_READS))
+    least, most = min(bounds, key=lambda each: each[1] - each[0])
+    return (least + most) // 2
 
 
 class Deadline:

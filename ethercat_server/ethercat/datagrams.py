@@ -115,7 +115,7 @@ class Datagrams:
         self.backend = backend
         self.clock = backend.clock
         self._send, self._receive = backend.send, backend.receive
-        self._monotonic_ns = backend.clock.monotonic_ns
+        self._raw_ns = backend.clock.raw_ns
         self._index = 0
         self._timeout_s = 0.0  # the timeout at least; 0 on a bus that is in time
         # By index less the first: when a frame was sent that is not back; else 0.
@@ -134,7 +134,7 @@ class Datagrams:
         self._index = (self._index + 1) % len(self._pending_ns)
         frame = build((command, adp, ado, data), first_index=self._index + FIRST_INDEX)
         self._awaited = frame, len(data)
-        self._pending_ns[self._index] = now_ns = self._monotonic_ns()
+        self._pending_ns[self._index] = now_ns = self._raw_ns()
         self._send(frame.ljust(SHORTEST_FRAME, b"\0"))
         return now_ns + int(max(_TIMEOUT_S, self._timeout_s) * 1e9)
 
@@ -156,7 +156,7 @@ class Datagrams:
 
     def _set_timeout(self, least_s: float, index: int) -> None:
         """What the answer to the frame with this index, which has just come, suggests."""
-        round_trip_s = (self._monotonic_ns() - self._pending_ns[index]) * 1e-9
+        round_trip_s = (self._raw_ns() - self._pending_ns[index]) * 1e-9
         self._timeout_s = min(max(least_s, _LATE_FACTOR * round_trip_s), _LONGEST_TIMEOUT_S)
 
     def give_up(self) -> None:
@@ -190,8 +190,8 @@ class Datagrams:
 
     def listen(self, seconds: float) -> int:
         """The number of frames that arrive from others in this time; nothing is sent."""
-        until_ns, count = self._monotonic_ns() + int(seconds * 1e9), 0
-        while (left_ns := until_ns - self._monotonic_ns()) > 0:
+        until_ns, count = self._raw_ns() + int(seconds * 1e9), 0
+        while (left_ns := until_ns - self._raw_ns()) > 0:
             count += self._receive(left_ns * 1e-9) is not None
         return count
 
@@ -212,7 +212,7 @@ class Datagrams:
     def _ask(self, access: RegisterAccess) -> Answer | None:
         """Send a datagram and wait for its answer."""
         until_ns = self.send(access)
-        while (left_ns := until_ns - self._monotonic_ns()) > 0:
+        while (left_ns := until_ns - self._raw_ns()) > 0:
             if (frame := self._receive(left_ns * 1e-9)) is None:
                 break
             if (answer := self.match(frame)) is not None:

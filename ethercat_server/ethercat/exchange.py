@@ -234,7 +234,7 @@ _IMPOSSIBLE: Final = 0xFFFF
 
 
 class Exchange(NamedTuple):
-    """An exchange whose answer has arrived. Times are CLOCK_MONOTONIC ns."""
+    """An exchange whose answer has arrived. Times are CLOCK_MONOTONIC_RAW ns."""
 
     sent_ns: int
     back_ns: int
@@ -271,7 +271,7 @@ class ProcessData:
         terminals: Sequence[Area] = (),
     ) -> None:
         """See `make_frames`."""
-        self._send, self._monotonic_ns = backend.send, backend.clock.monotonic_ns
+        self._send, self._raw_ns = backend.send, backend.clock.raw_ns
         stations = stations or [None] * len(areas)
         self._frames = frames = make_frames(areas, stations, lrw=lrw, terminals=terminals)
         self._command = int(Command.LRW if lrw else Command.LRD) if frames else -1  # no frame has that
@@ -315,7 +315,7 @@ class ProcessData:
             self._tag = tag = self._tag + 1 & 0xFFFFFFFF
             content[DATAGRAM_INDEX] = index = FIRST_INDEX + tag % _OWN_INDICES
             if self.in_flight >= MOST_IN_FLIGHT or sent[index][0]:
-                now_ns = self._monotonic_ns()
+                now_ns = self._raw_ns()
                 self._expire(now_ns)
                 if self.in_flight >= MOST_IN_FLIGHT:
                     self._tag -= 1
@@ -327,7 +327,7 @@ class ProcessData:
                     content[DATAGRAM_INDEX] = index = FIRST_INDEX + tag % _OWN_INDICES
             _pack_tag_into(content, tag_at, tag)
             self.in_flight += 1
-            now_ns = self._monotonic_ns()
+            now_ns = self._raw_ns()
             self._send(content)
             sent[index] = now_ns, tag, which, tag_at, end, written
         return now_ns
@@ -363,7 +363,7 @@ class ProcessData:
 
     @property
     def lost(self) -> int:
-        self._expire(self._monotonic_ns())
+        self._expire(self._raw_ns())
         return self._lost
 
     def _expire(self, now_ns: int) -> None:

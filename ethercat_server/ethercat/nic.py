@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from ethercat_server.errors import LIST_ADAPTERS, InterfaceError
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.options import ALLOW_IP, VIRTUAL_INTERFACE
 from ethercat_server.ethercat.wire import ETHERTYPE
 
@@ -64,17 +65,17 @@ _TIMESPEC: Final = struct.Struct("=qq")
 
 
 def arrived_ns(fd: int) -> int:
-    """CLOCK_MONOTONIC when the packet that was received last from the socket `fd` had arrived.
+    """CLOCK_MONOTONIC_RAW when the packet that was received last from the socket `fd` had arrived.
 
     0 if the kernel does not say, as at the first call, which has it stamp packets. The stamp is in
-    CLOCK_REALTIME: it is wrong if that was set in between.
+    CLOCK_REALTIME: it is wrong if that was set in between, and off by a slew of what it has waited.
     """
     try:
         seconds, ns = _TIMESPEC.unpack(fcntl.ioctl(fd, _SIOCGSTAMPNS, bytes(_TIMESPEC.size)))
     except OSError:
         return 0
     waited_ns = time.time_ns() - int(seconds * 1_000_000_000 + ns)
-    return time.monotonic_ns() - waited_ns  # if anything comes between the two clocks, it is too late
+    return SYSTEM_CLOCK.raw_ns() - waited_ns  # if anything comes between the two clocks, it is too late
 
 
 def users_of(inodes: set[int]) -> Iterator[Process]:

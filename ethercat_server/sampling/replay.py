@@ -77,7 +77,7 @@ class Decision(NamedTuple):
     """What a sampling clock decided about a record."""
 
     record: Record
-    instant_ns: float  # of a new sample, by CLOCK_MONOTONIC
+    instant_ns: float  # of a new sample, by CLOCK_MONOTONIC_RAW
     steps: int  # samples since the one before
     uncertain: bool
     locked: bool

@@ -137,6 +137,11 @@ class SampleClock:
         return self.by_events and not self._schedule.single
 
     @property
+    def is_probing(self) -> bool:
+        """Whether the next poll is to be early, and must not wait for another sensor's."""
+        return self.locked and self._schedule.probing
+
+    @property
     def one_by_one(self) -> bool:
         """Whether the clock is locked, and an exchange is back before the next one is due."""
         return self.locked and not self._schedule.single

@@ -28,13 +28,13 @@ class Schedule:
         single: whether there is no time for a second poll of a sample.
         margin_ns: how long after a sample is expected the process data should be read.
         aim_after_ns: how long after the phase the next poll should be sent.
+        probing: whether that is to be early: the phase is uncertain, or was not measured for long.
     """
 
     def __init__(self, phase: SensorPhase, round_trip: RoundTrip) -> None:
         self._phase, self._round_trip = phase, round_trip
         self.single = True
-        # Whether the next poll is to be early: the phase is uncertain, or was not measured for long.
-        self._probing = False
+        self.probing = False
         self._hits = 0  # samples since a poll was early
         # κ, the fraction of the margin that is needed: reads are distributed less evenly than it assumes.
         self._scale = 1.0
@@ -70,9 +70,9 @@ class Schedule:
         margin_ns = scale * best_margin_ns(cost_ns, math.sqrt(variance + round_trip.variance))
         self.margin_ns = min(margin_ns, phase.period_ns / 2)
         probed_above = (round_trip.read_variance + RESOLUTION_NS**2) / 4
-        self._probing = self._hits > UNPROBED or (variance > probed_above and not follows_events)
+        self.probing = self._hits > UNPROBED or (variance > probed_above and not follows_events)
         self.aim_after_ns = self.margin_ns - round_trip.read_ns
-        if self._probing and follows_events:
+        if self.probing and follows_events:
             self.aim_after_ns -= 2 * self.margin_ns
 
     def next_poll_ns(
@@ -92,7 +92,7 @@ class Schedule:
             guard_ns = self.margin_ns / 2
             ahead_ns = max(0, int((sent_ns - aim_ns + guard_ns) // period_ns) + 1) * period_ns
             probe_ns = phase.phase_ns - round_trip.read_ns + ahead_ns
-            if self._probing and probe_ns > sent_ns + guard_ns:
+            if self.probing and probe_ns > sent_ns + guard_ns:
                 return probe_ns
             return aim_ns + ahead_ns
         if in_flight:

@@ -2,7 +2,7 @@
 
 A controller with distributed clocks keeps its local time of the moment when the sensor's processor had
 written a sample (PDI buffer change event). The frame that reads the sample reads that, too. `LocalClock`
-follows the local time on CLOCK_MONOTONIC, `EventTimes` dates samples by it, once `Trust` says so.
+follows the local time on CLOCK_MONOTONIC_RAW, `EventTimes` dates samples by it, once `Trust` says so.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ _ASYMMETRY: Final = 1 / 24  # standard deviation of the outward part of a round 
 
 
 class LocalClock:
-    """Local clock of a slave controller. Local times are whole ns that never wrap, others CLOCK_MONOTONIC.
+    """Local clock of a slave controller. Local times are whole ns that never wrap, others this computer's.
 
     Attributes:
         local: local time of the newest exchange, which was back at `back_ns`.
         moved_ns: sum of the corrections that moved all events.
-        phase: CLOCK_MONOTONIC at the local time `local_at`, in steps of a local ns.
+        phase: CLOCK_MONOTONIC_RAW at the local time `local_at`, in steps of a local ns.
         doubt_ns: uncertainty of the phase, once the clock `is_known`.
         excess_ns: what the exchanges that count usually take beyond the shortest.
         short_ns: an exchange that is back sooner is a short one, from which this clock learns.

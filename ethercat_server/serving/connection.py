@@ -126,10 +126,10 @@ class Outbox:
     never part of a frame and never a reply.
     """
 
-    def __init__(self, stream: Stream, monotonic_ns: Callable[[], int], writers: set[int]) -> None:
+    def __init__(self, stream: Stream, clock_ns: Callable[[], int], writers: set[int]) -> None:
         """`writers` has the descriptor of the stream while something waits."""
         self._send, self._fd, self._writers = stream.send, stream.fileno(), writers
-        self._monotonic_ns = monotonic_ns
+        self._clock_ns = clock_ns
         self.sent = 0  # DATA frames sent
         self.withheld = 0  # DATA frames dropped because the client did not read
         self.broken = False  # sending has failed for good; everything is discarded from then on
@@ -209,7 +209,7 @@ class Outbox:
 
     def _wait(self) -> None:
         self._writers.add(self._fd)
-        self.progress_ns = self._monotonic_ns()
+        self.progress_ns = self._clock_ns()
 
     def flush(self) -> None:
         """Send what is queued, as far as the socket accepts it."""
@@ -221,7 +221,7 @@ class Outbox:
                 self._refused(error)
                 return
             self._head_sent += sent
-            self.progress_ns = self._monotonic_ns()
+            self.progress_ns = self._clock_ns()
             if self._head_sent < len(message):
                 return
             self._queue.popleft()
@@ -262,7 +262,7 @@ class Connection:
     """A client's stream and everything that belongs to it."""
 
     def __init__(
-        self, stream: Stream, uid: int | None, monotonic_ns: Callable[[], int], watched: Watched
+        self, stream: Stream, uid: int | None, clock_ns: Callable[[], int], watched: Watched
     ) -> None:
         """`uid` is the user who owns the other end, None if that is not known."""
         self.fd = stream.fileno()
@@ -274,10 +274,10 @@ class Connection:
         self.subscription: DataSubscription | None = None
         self._watched = watched
         self._watched.readers.add(self.fd)
-        self.outbox = Outbox(stream, monotonic_ns, self._watched.writers)
+        self.outbox = Outbox(stream, clock_ns, self._watched.writers)
         self._stream = stream
-        self._monotonic_ns = monotonic_ns
-        self._heard_ns = monotonic_ns()
+        self._clock_ns = clock_ns
+        self._heard_ns = clock_ns()
         self._client_ended = False  # it has closed its side, and may still receive
         self._begun_ns = 0  # since when the rest of an unfinished message is awaited; 0 if there is none
         self._ending_ns = 0  # since when the connection is being closed
@@ -362,16 +362,16 @@ class Connection:
             self.finish()
             return Unreadable(str(error))
         if isinstance(message, dict):  # this decoder accepts no DATA
-            self._heard_ns, self._begun_ns = self._monotonic_ns(), 0
+            self._heard_ns, self._begun_ns = self._clock_ns(), 0
             return message
         self._become(ConnectionState.READING)
         if decoder.pending and not self._begun_ns:
-            self._begun_ns = self._monotonic_ns()
+            self._begun_ns = self._clock_ns()
         return None
 
     def subscribe(self, wanted: Sequence[bool], every: int, fresh_only: bool) -> None:
         """Begin to take DATA, or change which."""
-        self.subscription = DataSubscription(wanted, every, fresh_only, self._monotonic_ns())
+        self.subscription = DataSubscription(wanted, every, fresh_only, self._clock_ns())
 
     def answer_later(self) -> None:
         """The request that was taken is answered later: `answered` then. It may have ended the connection."""
@@ -380,7 +380,7 @@ class Connection:
 
     def answered(self) -> None:
         """Go on with what the client sent after the request; it is idle from now on."""
-        self._heard_ns = self._monotonic_ns()
+        self._heard_ns = self._clock_ns()
         self._become(ConnectionState.READY)
 
     # -- ending
@@ -432,7 +432,7 @@ class Connection:
     def _end(self) -> None:
         self._become(ConnectionState.CLOSING)
         self.subscription = None
-        self._ending_ns = self._monotonic_ns()
+        self._ending_ns = self._clock_ns()
 
     # -- sending
 

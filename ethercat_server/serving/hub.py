@@ -10,7 +10,6 @@ It runs in the acquisition loop's thread. No client can delay the bus, because
 from __future__ import annotations
 
 import logging
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -21,6 +20,7 @@ from bota_ethercat.control import ErrorCode, error_reply
 from bota_ethercat.errors import RequestError
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import OutgoingFrame
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.serving.connection import Connection, ConnectionState, Timeouts, Unreadable, Watched
 from ethercat_server.serving.permissions import Permissions
 from ethercat_server.serving.transport import Transport
@@ -43,12 +43,12 @@ Handler = Callable[[Connection, JsonObject], JsonObject | None]
 class Hub:
     """All client connections. Not thread-safe: one thread does everything."""
 
-    def __init__(self, transport: Transport, monotonic_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, transport: Transport, clock_ns: Callable[[], int] = SYSTEM_CLOCK.raw_ns) -> None:
         self.connections: dict[int, Connection] = {}  # by file descriptor
         self.timeouts = Timeouts()
         self.permissions = Permissions()
         self._transport = transport
-        self._monotonic_ns = monotonic_ns
+        self._clock_ns = clock_ns
         self._handler: Handler | None = None
         self._subscribers: list[Connection] = []
         self._watched = Watched(set(), set())
@@ -91,7 +91,7 @@ class Hub:
 
         Returns the time.
         """
-        watched, now_ns, last_start_ns = self._watched, self._monotonic_ns(), until_ns - _REQUEST_NS
+        watched, now_ns, last_start_ns = self._watched, self._clock_ns(), until_ns - _REQUEST_NS
         # One pass is always made, also where there is never time for a request before a deadline.
         hurried = last_start_ns <= now_ns
         while hurried or now_ns < until_ns:
@@ -105,7 +105,7 @@ class Hub:
             ready = self._transport.wait(watched.readers if reads else (), watched.writers, wait_s)
             if ready[0] or ready[1] or (reads and self._ready):
                 self._serve_ready(*ready, last_start_ns, reads=reads, hurried=hurried)
-            hurried, now_ns = False, self._monotonic_ns()
+            hurried, now_ns = False, self._clock_ns()
         if now_ns >= self._sweep_at_ns:
             self._sweep(now_ns)
         return now_ns
@@ -122,12 +122,12 @@ class Hub:
         """Send what waits; then read and answer if `reads`, unless it is too late to begin."""
         for fd in writable:
             self.connections[fd].outbox.flush()
-        began_ns = self._monotonic_ns()
+        began_ns = self._clock_ns()
         # What came too late to be begun has its turn after the exchange.
         if reads and (hurried or began_ns < last_start_ns):
             self._read(readable)
             self._answer_some(last_start_ns)
-            ended_ns = self._monotonic_ns()
+            ended_ns = self._clock_ns()
             self._pause_ends_ns = ended_ns + min(_PAUSE_RATIO * (ended_ns - began_ns), _LONGEST_PAUSE_NS)
 
     def _read(self, readable: Sequence[int]) -> None:
@@ -149,7 +149,7 @@ class Hub:
         for _ in range(_MAX_ACCEPTS):
             if (stream := self._transport.accept(fd)) is None:
                 return
-            connection = Connection(stream, stream.peer_uid(), self._monotonic_ns, self._watched)
+            connection = Connection(stream, stream.peer_uid(), self._clock_ns, self._watched)
             if self._make_room(connection.uid):
                 self.connections[connection.fd] = connection
             else:
@@ -176,7 +176,7 @@ class Hub:
             connection = self._ready.popleft()
             if connection.state is ConnectionState.READY:
                 self._answer_one(connection)
-            if self._monotonic_ns() >= until_ns:
+            if self._clock_ns() >= until_ns:
                 return
 
     def _answer_one(self, connection: Connection) -> None:
@@ -231,8 +231,8 @@ class Hub:
         for connection in self.connections.values():
             connection.finish()
         self.subscriptions_changed()
-        deadline_ns = self._monotonic_ns() + _CLOSE_NS
-        while self.connections and (now_ns := self._monotonic_ns()) < deadline_ns:
+        deadline_ns = self._clock_ns() + _CLOSE_NS
+        while self.connections and (now_ns := self._clock_ns()) < deadline_ns:
             self.serve(now_ns + _CLOSE_TURN_NS)
         for connection in self.connections.values():
             connection.close()

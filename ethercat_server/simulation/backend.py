@@ -27,7 +27,9 @@ class MemoryBackend:
         self._chance = random.Random(machine.seed + 1)
         self.ifname = "memory"
         self.clock = SimulatedClock(machine)
-        self.sensors = virtual.SlaveChain(slaves or (SensorOptions(),), self.clock.now_ns)
+        self.sensors = virtual.SlaveChain(
+            slaves or (SensorOptions(),), self.clock.now_ns, self.clock.monotonic_at
+        )
         self._on_the_wire: list[tuple[int, int, bytes]] = []
         self._sent = 0
         self._free_at_ns = 0
@@ -87,7 +89,7 @@ class MemoryBackend:
         heapq.heappush(self._on_the_wire, (self.clock.now_ns, self._sent, frame))
 
     def receive(self, timeout_s: float) -> bytes | None:
-        clock, until_ns = self.clock, self.clock.now_ns + round(max(timeout_s, 0) * 1e9)
+        clock, until_ns = self.clock, self.clock.after(max(timeout_s, 0))
         if self._on_the_wire and self._on_the_wire[0][0] <= until_ns:
             arrives_ns, _, frame = heapq.heappop(self._on_the_wire)
             clock.advance(arrives_ns)
@@ -98,4 +100,5 @@ class MemoryBackend:
         return None
 
     def arrived_ns(self) -> int:
-        return self._arrived_ns
+        waited_ns = self.clock.monotonic_at(self.clock.now_ns) - self.clock.monotonic_at(self._arrived_ns)
+        return self.clock.now_ns - waited_ns

@@ -33,10 +33,11 @@ class Machine:
     lost: float = 0.0  # chance that a frame does not come back
     late: float = 0.0  # chance that a frame comes back `late_ns` later; the next may overtake it
     late_ns: float = 2_000_000.0
+    slew: float = 0.0  # CLOCK_MONOTONIC runs by so much of its rate faster than CLOCK_MONOTONIC_RAW
 
 
 class SimulatedClock:
-    """Time that passes only when somebody waits; see `ethercat.clock.Clock`."""
+    """Time that passes only when somebody waits; see `ethercat.clock.Clock`. `now_ns` is the raw one."""
 
     def __init__(self, machine: Machine, start_ns: int = START_NS) -> None:
         self.now_ns = start_ns
@@ -46,16 +47,29 @@ class SimulatedClock:
         self._agenda: list[tuple[int, int, Callable[[], object]]] = []
         self._order = count()
         self._stall_at_ns = self._next_stall()
+        # Since when CLOCK_MONOTONIC has been slewed by how much, and how far it was ahead then.
+        self._slews = [(0, machine.slew, -machine.slew * start_ns)]
 
-    def monotonic_ns(self) -> int:
+    def raw_ns(self) -> int:
         self.now_ns += _CALL_NS
         return self.now_ns
 
+    def monotonic_ns(self) -> int:
+        return self.monotonic_at(self.raw_ns())
+
+    def monotonic_at(self, raw_ns: int) -> int:
+        since_ns, slew, ahead_ns = next(row for row in reversed(self._slews) if row[0] <= raw_ns)
+        return raw_ns + round(ahead_ns + slew * (raw_ns - since_ns))
+
     def time_ns(self) -> int:
-        return self.now_ns + self._ahead_ns
+        return self.monotonic_at(self.now_ns) + self._ahead_ns
 
     def sleep(self, seconds: float) -> None:
-        self.wake_at(self.now_ns + round(seconds * 1e9))
+        self.wake_at(self.after(seconds))
+
+    def after(self, seconds: float) -> int:
+        """When this time has passed, as the kernel waits: by CLOCK_MONOTONIC."""
+        return self.now_ns + round(seconds * 1e9 / (1 + self._machine.slew))
 
     def wake_at(self, due_ns: int) -> None:
         """Wait until `due_ns`, as late as this machine wakes."""
@@ -70,6 +84,8 @@ class SimulatedClock:
     def become(self, machine: Machine) -> None:
         self._machine = machine
         self._stall_at_ns = self._next_stall()
+        ahead_ns = self.monotonic_at(self.now_ns) - self.now_ns
+        self._slews.append((self.now_ns, machine.slew, ahead_ns))
 
     def set_realtime_back(self, seconds: float) -> None:
         self._ahead_ns -= round(seconds * 1e9)

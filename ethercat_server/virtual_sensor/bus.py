@@ -36,11 +36,11 @@ _FIRST_STATION: Final = 0x1001  # where another master begins
 class SlaveChain:
     """Slaves in the order in which frames reach them. All times are in ns, on the caller's clock."""
 
-    def __init__(self, slaves: Iterable[SlaveOptions], now: int) -> None:
-        """All slaves are switched on at `now`."""
+    def __init__(self, slaves: Iterable[SlaveOptions], now: int, stamp: Callable[[int], int] = int) -> None:
+        """All slaves are switched on at `now`. What a sensor says or asks of time is `stamp` of it."""
         self.now = now  # time of the latest call, or at which the latest datagram passed
         self.slaves: list[VirtualSlave] = [
-            VirtualSensor(options, lambda: self.now)
+            VirtualSensor(options, lambda: self.now, stamp)
             if isinstance(options, SensorOptions)
             else ForeignSlave(options, lambda: self.now)
             for options in slaves

@@ -24,6 +24,7 @@ from typing import Final
 
 from bota_ethercat.world import DATAGRAM, decode
 from ethercat_server.errors import InterfaceError
+from ethercat_server.ethercat.clock import SYSTEM_CLOCK, StampClocks
 from ethercat_server.ethercat.nic import arrived_ns, check_network, look_up, master_sockets
 from ethercat_server.ethercat.wire import BYTE_NS, ETHERTYPE
 from ethercat_server.virtual_sensor.bus import SlaveChain
@@ -109,7 +110,7 @@ def run(
         shown = stack.enter_context(open_interface(ifname, ETHERTYPE))
         shown.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
         on_open()
-        bus = SlaveChain(slaves, time.monotonic_ns())
+        bus = SlaveChain(slaves, SYSTEM_CLOCK.raw_ns(), StampClocks(SYSTEM_CLOCK).monotonic_ns)
         poller = select.poll()
         poller.register(raw, select.POLLIN)
         heard: dict[int, Callable[[], object]] = {}  # besides the frames: what to do, by descriptor
@@ -143,7 +144,7 @@ def run(
             if raw.fileno() in ready:
                 up = answers.waiting()
                 continue
-            bus.idle(time.monotonic_ns())
+            bus.idle(SYSTEM_CLOCK.raw_ns())
             # Down is like an unplugged cable: it may come back, unless the interface was deleted.
             if not up and index not in dict(socket.if_nameindex()):
                 raise LinkError(f"interface {ifname} has disappeared: create it again, and restart")
@@ -151,7 +152,7 @@ def run(
 
 def _obey(control: socket.socket, bus: SlaveChain) -> None:
     """Execute the command in the next datagram; who sent it gets the answer, if it has an address."""
-    bus.set_time(time.monotonic_ns())
+    bus.set_time(SYSTEM_CLOCK.raw_ns())
     with contextlib.suppress(OSError):
         line, sender = control.recvfrom(LONGEST_LINE)
         answer = obey(bus, line.decode(errors="replace"))
@@ -163,7 +164,7 @@ def obey_lines(
     descriptor: int, begun: bytearray, bus: SlaveChain, poller: select.poll, exit_on_eof: bool
 ) -> None:
     """Execute the commands that were typed; `begun` is the line that has not ended yet."""
-    bus.set_time(time.monotonic_ns())
+    bus.set_time(SYSTEM_CLOCK.raw_ns())
     try:
         data = os.read(descriptor, _CHUNK)
     except OSError:  # of a terminal, to a job in the background
@@ -253,12 +254,12 @@ class _Answers:
         for _ in range(_FRAMES_PER_TURN):
             try:
                 size, messages, _, _ = raw.recvmsg_into((buffer,), space)
-                arrived, now = arrived_ns(descriptor), time.monotonic_ns()
+                arrived, now = arrived_ns(descriptor), SYSTEM_CLOCK.raw_ns()
                 if not now - _LONGEST_WAIT_NS < arrived < now:
                     arrived = now
                 middle = (arrived + now) // 2 + int(self._half_ns)
                 if bus.process(buffer, size, middle - size * BYTE_NS // 2):
-                    half_ns = (time.monotonic_ns() - now) / 2
+                    half_ns = (SYSTEM_CLOCK.raw_ns() - now) / 2
                     status, control, kind = _AUXDATA.unpack(messages[0][2])
                     if status & _VLAN_VALID:
                         tag = struct.pack("!HH", kind, control)

@@ -103,12 +103,16 @@ def _scattered(number: int, seed: int) -> int:
 class Sampler:
     """Computes samples from power-on to power-off, with the settings in the dictionary.
 
-    `now` gives the time in ns. Faults of channels act on the measured values, before the offsets are added.
+    `now` gives the time in ns; signals and a world outside have `stamp` of it. Faults of channels act on the
+    measured values, before the offsets are added.
     """
 
-    def __init__(self, options: SensorOptions, dictionary: Dictionary, now: Callable[[], int]) -> None:
+    def __init__(
+        self, options: SensorOptions, dictionary: Dictionary, now: Callable[[], int],
+        stamp: Callable[[int], int] = int,
+    ) -> None:  # fmt: skip
         self._dictionary = dictionary
-        self._now = now
+        self._now, self._stamp = now, stamp
         self._layout = layout_for(options.pdo_size)
         self.clock = SamplingClock(now(), dictionary.sinc_in_effect, options.ppm)
         self.made = 0  # number of samples computed
@@ -130,7 +134,8 @@ class Sampler:
         """Measure the signal in `options`, which begins with the next sample."""
         world = options.world or SCENES.get(options.signal)
         self._external = world if isinstance(world, ExternalWorld) else None
-        self._signal_start = self.clock.instant(self._number + 1) if self._external is None else 0
+        begin = self.clock.instant(self._number + 1)
+        self._signal_start = self._stamp(begin) if self._external is None else 0
         self._signal: Measured | Formula = (
             FORMULAS[options.signal] if world is None else Measured(world, options.seed, options.noise)
         )
@@ -152,7 +157,8 @@ class Sampler:
         now = self._now() + later
         number = self.number_at(now)
         if number != self._number:
-            if self._data and self._external is not None and self._external.is_faulty(now * 1e-9):
+            world = self._external
+            if self._data and world is not None and world.is_faulty(self._stamp(now) * 1e-9):
                 return self._data
             self._data = self._prepared if number == self._prepared_number else self._make(number)
             self._number = number
@@ -168,7 +174,7 @@ class Sampler:
 
     def _make(self, number: int) -> bytes:
         self.made += 1
-        instant = self.clock.instant(number)
+        instant = self._stamp(self.clock.instant(number))
         reading = self._signal.reading(number, instant, (instant - self._signal_start) * 1e-9)
         values = [*reading.values]
         if self._has_last_bit:

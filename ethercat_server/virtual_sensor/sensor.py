@@ -28,9 +28,10 @@ class Firmware(Application):
         flash: Flash,
         clock: Callable[[], int],
         on_write: OnWrite,
+        stamp: Callable[[int], int] = int,
     ) -> None:
         self.dictionary = Dictionary(options, flash, self.inputs, clock, on_write)
-        self.sampler = Sampler(options, self.dictionary, clock)
+        self.sampler = Sampler(options, self.dictionary, clock, stamp)
         self.dictionary.changed = self.sampler.settings_changed
         device = sensor_device(options.model, options.serial, options.pdo_size)
         super().__init__(device, clock, self.dictionary, options.eeprom_ms)
@@ -52,8 +53,9 @@ class VirtualSensor(VirtualSlave):
     options: SensorOptions  # its current ones
     life: Firmware | None
 
-    def __init__(self, options: SensorOptions, clock: Callable[[], int]) -> None:
+    def __init__(self, options: SensorOptions, clock: Callable[[], int], stamp: Callable[[int], int]) -> None:
         super().__init__(clock)
+        self._stamp = stamp
         self.options = options
         # The latest, oldest first, across power cycles, as `stats` reports them.
         self.sdo_writes: deque[dict[str, Any]] = deque(maxlen=_WRITES_REMEMBERED)
@@ -85,7 +87,7 @@ class VirtualSensor(VirtualSlave):
             action()
 
     def _switched_on(self) -> Firmware:
-        return Firmware(self.options, self.flash, self._clock, self._remember)
+        return Firmware(self.options, self.flash, self._clock, self._remember, self._stamp)
 
     def power(self, on: bool) -> None:
         super().power(on)

@@ -99,7 +99,7 @@ def count(dc: str, clients: int, seconds: float = SECONDS) -> dict[str, float]:
     """
     backend = MemoryBackend(SensorOptions(ppm=150.0, dc=dc))
     transport = InMemoryTransport(backend.clock)
-    server = Server(Bus(backend), Hub(transport, backend.clock.monotonic_ns), AsFound())
+    server = Server(Bus(backend), Hub(transport, backend.clock.raw_ns), AsFound())
     streams = [transport.connect(buffer_size=1 << 24) for _ in range(clients)]
     for stream in streams:
         stream.send(encode_json(request("subscribe", 1)))

@@ -18,7 +18,7 @@ from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.sampling.trust import TrustState
 from ethercat_server.simulation.machine import REALTIME_START_NS, START_NS, Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
-from tests.simulation import Simulation, check_frames, fresh, more_if_long, reading
+from tests.simulation import Simulation, check_frames, fresh, life_of, more_if_long, reading
 
 PERIOD_NS = 1_250_000
 
@@ -106,6 +106,37 @@ def test_stamps_rise_while_the_clock_is_only_slewed() -> None:
     stamps = [frame.stamp_ns for frame in running.frames]
     assert stamps == sorted(set(stamps))
     assert running.clock.time_ns() - stamps[-1] < 3e6
+
+
+# chrony's largest by default, phc2sys' and adjtimex' (a tick 10 % longer), ntpd's.
+SLEWS = (1 / 12, -1 / 13, 0.1, -0.1, 0.04, -0.02, 0.0005)
+
+
+@pytest.mark.parametrize("dc", ["", "none"])
+@pytest.mark.parametrize(
+    ("slew", "sinc_length"), more_if_long([(0.1, 64), (-0.1, 512)], itertools.product(SLEWS, (32, 64, 512)))
+)
+def test_a_slew_costs_no_sample_and_stamps_follow_it(slew: float, sinc_length: int, dc: str) -> None:
+    sensor = SensorOptions(signal="clock", ppm=150.0, dc=dc)
+    running = Simulation(sensor, machine=Machine(), settings={"sinc_length": sinc_length})
+    running.run(2.0)
+    start = len(running.frames)
+    for now in (slew, 0.0, -slew, 0.0):
+        running.backend.become(Machine(slew=now))
+        running.run(1.0)
+    got = running.frames[start:]
+    check_frames(got)
+    assert lost(got) == running.status()["sensors"][0]["lost_samples"] == 0
+    errors_ns = sorted(abs(frame.monotonic_ns - reading(frame).instant_ns) for frame in got)
+    assert errors_ns[-5] < 10_000, "all but those of the samples in which it changed"
+    assert errors_ns[-1] < 40_000
+    (offset_ns,) = {frame.stamp_ns - frame.monotonic_ns for frame in got}
+    assert abs(offset_ns - (REALTIME_START_NS - START_NS)) < 1000
+    running.clock.stall(100 * PERIOD_NS)
+    running.backend.become(Machine(slew=slew))
+    running.run(0.5)
+    running.clock.stall(100 * PERIOD_NS)
+    check_lost(running, 10)
 
 
 def test_a_stall_is_counted_and_followed_by_no_burst() -> None:
@@ -262,6 +293,27 @@ def test_polls_of_several_sensors_are_merged_if_exchanges_cost_time(monkeypatch:
     ages = ages_ns(running)
     assert ages[len(ages) * 99 // 100] < 300_000
     assert sum(stream.lost_samples for stream in running.streams) == 0
+
+
+@pytest.mark.parametrize("dc", ["", "none"])
+@pytest.mark.parametrize("seed", more_if_long([6, 8], range(40)))
+def test_a_sensor_that_samples_just_after_another_is_followed_as_well(seed: int, dc: str) -> None:
+    """Polls that wait for the other's come late: none would bound the phase on the other side."""
+    sensors = [SensorOptions(serial=n, signal="clock", ppm=150.0, dc=dc) for n in (1, 2)]
+    running, chance = Simulation(*sensors, machine=Machine(seed=seed)), random.Random(seed)
+    running.run(0.3)
+    running.frames.clear()
+    for _ in range(12):
+        # It stops until a sample comes to be while the next frame passes.
+        made = life_of(running.backend, 1).sampler.clock
+        next_ns = made.instant(made.number_at(running.clock.now_ns + chance.randrange(2_000_000, 5_000_000)))
+        running.clock.stall(next_ns - running.clock.now_ns - chance.uniform(5_000, 35_000))
+        running.run(chance.uniform(0.02, 0.06))
+    for number in range(2):
+        frames = [frame for frame in running.frames if frame.sensor == number]
+        check_frames(frames)
+        plain = [frame for frame in frames if not frame.flags & DataFlag.GAP]
+        assert max(abs(frame.monotonic_ns - reading(frame).instant_ns) for frame in plain) < 80_000
 
 
 def test_the_sockets_have_their_turn_even_if_every_deadline_has_passed() -> None:

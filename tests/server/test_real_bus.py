@@ -9,6 +9,7 @@ import contextlib
 import json
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -141,6 +142,37 @@ def test_an_interface_that_disappears_ends_the_server_with_a_sentence(bench: Ben
     assert running.wait() == 1
     assert f"the interface {veth.near} has disappeared" in running.said()
     assert "Traceback" not in running.said()
+
+
+# -- the computer's time is slewed: for this server only, others need theirs
+
+SLEWED = """
+import runpy, sys, time
+now_ns, begun = time.monotonic_ns, time.monotonic_ns()
+
+def slewed_ns():
+    passed = now_ns() - begun
+    rounds, into = divmod(passed, 2_000_000_000)
+    return begun + passed + min(into, 2_000_000_000 - into) // 12
+
+time.monotonic_ns = slewed_ns
+sys.argv = sys.argv[3:]
+runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+"""
+
+
+@pytest.mark.parametrize("dc", ["none", "ppm=20"])
+def test_a_slew_of_the_computers_time_costs_no_sample_untold(dc: str) -> None:
+    with (
+        virtual_sensor("--signal", "clock", "--dc", dc) as (veth, _),
+        server(veth.near, under=[sys.executable, "-c", SLEWED]) as running,
+        running.connect() as client,
+    ):
+        client.ask("subscribe")
+        frames = client.fresh(4000)
+    ahead = [frame.monotonic_ns - reading(frame).instant_ns for frame in frames]
+    assert max(ahead) - min(ahead) > 70_000_000, "stamps follow it"
+    check_frames(frames, complete=False)
 
 
 # -- an interface has several names, and may get others

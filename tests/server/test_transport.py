@@ -341,7 +341,7 @@ def test_who_is_closed_to_make_room_may_be_ready_too(kind: str | int) -> None:
     network = NETWORKS[kind]() if isinstance(kind, str) else InMemory()
     if isinstance(kind, int):
         network.transport = Shuffled(kind)
-    hub, asked = Hub(network.transport), list[Connection]()
+    hub, asked = Hub(network.transport, time.monotonic_ns), list[Connection]()
 
     def grant(connection: Connection, message: JsonObject) -> JsonObject:
         asked.append(connection)

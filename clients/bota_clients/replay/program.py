@@ -56,7 +56,7 @@ class Player:
         self.sensors = ReplayedSensors(recording)
         if not self.sensors.sensors:
             raise RecordingError(f"{recording.path} has neither frames nor sensors: there is nothing to play")
-        self.hub = Hub(SocketTransport(options.hosts, options.port))
+        self.hub = Hub(SocketTransport(options.hosts, options.port), time.monotonic_ns)
         self._recording = recording
         self._options = options
         self._signals = signals

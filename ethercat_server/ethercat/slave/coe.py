@@ -189,14 +189,14 @@ class Emergencies:
     """The emergencies of all sensors."""
 
     def __init__(self, clock: Clock) -> None:
-        self._monotonic_ns = clock.monotonic_ns
+        self._raw_ns = clock.raw_ns
         self._sensors: defaultdict[int, _OfSensor] = defaultdict(_OfSensor)
         # Called at a bounded rate: number of the sensor, emergency, how many the sensor has sent.
         self.tell: Callable[[int, Emergency, int], None] = lambda _number, _emergency, _count: None
 
     def note(self, number: int, emergency: Emergency) -> None:
         """Record an emergency of the sensor `number`."""
-        sensor, now_ns = self._sensors[number], self._monotonic_ns()
+        sensor, now_ns = self._sensors[number], self._raw_ns()
         sensor.count += 1
         sensor.last, sensor.at_ns = emergency, now_ns
         if self._is_to_be_told(sensor, emergency.code, now_ns):
@@ -219,7 +219,7 @@ class Emergencies:
         sensor = self._sensors[number]
         last: dict[str, Any] | None = None
         if sensor.last is not None:
-            ago_s = round((self._monotonic_ns() - sensor.at_ns) * 1e-9, 3)
+            ago_s = round((self._raw_ns() - sensor.at_ns) * 1e-9, 3)
             last = {**sensor.last.as_json(), "ago_s": ago_s}
         return {"emergencies": sensor.count, "emergency": last}
 

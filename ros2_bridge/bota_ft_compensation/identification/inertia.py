@@ -103,7 +103,7 @@ def turn(
         found.append(smooth[is_whole])
         instants.append(times[is_whole])
     if not found:
-        raise CompensationError("there is a gap in every half second: 'ethercat-report' tells why")
+        raise CompensationError("there is a gap in every half second: ethercat-report tells why")
     _check_imu(moved, period)
     force, torque, felt, arm, spun = np.split(np.concatenate(found), [3, 6, 9, 18], axis=1)
     times = np.concatenate(instants)
