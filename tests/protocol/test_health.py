@@ -62,7 +62,7 @@ def of_simulation(*commands: str) -> list[DataMessage]:
 STREAMS: dict[str, tuple[Callable[[], Stream], Level, str]] = {
     "clean": (lambda: Stream(second()), Level.GOOD, "Nothing is wrong with the stream"),
     "clean, of the virtual sensor": (lambda: Stream(of_simulation()), Level.GOOD, "Nothing is wrong"),
-    "skip 50": (lambda: Stream(of_simulation("skip 50")), Level.TROUBLE, "samples (50 %) were lost"),
+    "skip 50": (lambda: Stream(of_simulation("skip 50")), Level.TROUBLE, " %) were lost: the machine"),
     "a few lost": (
         lambda: Stream([f if k != 400 else f._replace(flags=DataFlag.GAP)
                         for k, f in enumerate([*second()[:400], *(f._replace(sequence=f.sequence - 3) for f in
