@@ -56,7 +56,7 @@ class Holder(NamedTuple):
     def __str__(self) -> str:
         if self.pid is not None:
             return f"process {self.pid} ({self.name})"
-        return "another EtherCAT master, or a virtual sensor" if self.address is None else self.name
+        return "another EtherCAT master" if self.address is None else self.name
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from typing import Final, Protocol
 
 from bota_ethercat.address import Address
 from ethercat_server.errors import ServerError, UsageError
-from ethercat_server.ethercat.nic import table, users_of
 
 
 class Stream(Protocol):
@@ -272,6 +271,10 @@ def _reason(error: OSError, port: int) -> str:
 
 def _listening(port: int) -> str:
     """The process that listens on a port, as part of a sentence; empty if it is not visible."""
+    try:
+        from ethercat_server.ethercat.nic import table, users_of  # noqa: PLC0415
+    except ImportError:  # Windows, where recordings are replayed
+        return ""
     inodes: set[int] = set()
     for name in ("tcp", "tcp6"):
         with contextlib.suppress(OSError):

@@ -101,7 +101,9 @@ def test_the_exit_code_is_the_verdict(report: Report, command: str, code: int, w
     found, said, _ = report.again("--json")
     [sensor] = json.loads(said)
     assert (found, sensor["verdict"]) == (code, word)
-    assert [check["check"] for check in sensor["checks"] if check["outcome"] != "good"] == ["Warnings"]
+    bad = [check["check"] for check in sensor["checks"] if check["outcome"] != "good"]
+    noise = ["Noise of force and torque", "Noise of the IMU"]  # which is not to be had of a faulty sensor
+    assert bad == ([] if word == "look" else noise) + ["Warnings"]
 
 
 def test_too_short_a_recording_is_not_conclusive(report: Report) -> None:

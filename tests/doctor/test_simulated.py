@@ -14,6 +14,7 @@ import pytest
 from bota_ethercat.address import Address
 from bota_ethercat.health.limits import Level
 from bota_ethercat.replies import Description, Status
+from bota_ethercat.stream.timeline import Timeline
 from ethercat_server.access.adapters import Holder
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.doctor import bus_checks
@@ -255,6 +256,7 @@ def test_a_computer_that_stood_still_is_blamed_in_place_of_the_cable() -> None:
     sensor = {"sensor": 0, "name": "", "serial": 1, "rate_hz": 800.0, "state": "OP"}
     link = SimpleNamespace(
         clock=SimpleNamespace(monotonic_ns=lambda: 0), private=None, close=lambda: None,
+        client=SimpleNamespace(session=SimpleNamespace(timeline=Timeline())),
         describe=lambda: Description.parse({"sensors": [sensor]}),
         status=lambda: Status.parse(next(statuses)),
     )  # fmt: skip

@@ -151,7 +151,7 @@ def test_a_server_of_another_user_is_asked_for_its_interface(monkeypatch: pytest
         monkeypatch.setenv("BOTA_SERVER", f"127.0.0.1:{server.port}")
         assert str(find_holder("ens5")) == "ethercat-server"
         assert find_holder("ens5") == (None, "ethercat-server", ("127.0.0.1", server.port))
-        assert str(find_holder("ens6")) == "another EtherCAT master, or a virtual sensor"
+        assert str(find_holder("ens6")) == "another EtherCAT master"
         monkeypatch.setattr(holder, "master_sockets", lambda _: set())
         assert find_holder("ens5") == (None, "ethercat-server", ("127.0.0.1", server.port)), "elsewhere"
         assert find_holder("nosuch0") is None
