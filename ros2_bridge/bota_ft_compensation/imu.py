@@ -85,7 +85,10 @@ class ImuSource(Source):
         return self._imu.alignment
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
-        return self.follow(sample.acceleration, sample.angular_rate, time_s)
+        acceleration = sample.acceleration
+        found = self._imu.follow(acceleration, sample.angular_rate, time_s)
+        self.turning = self._imu.turning
+        return found if any(acceleration) else None
 
     def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
         """As `specific_force`, of a sample's m/s² and rad/s."""

@@ -184,10 +184,10 @@ class CompensatedStream:
         Zero without a tool, unless `always`. Every new sample is to come here, in order; `time_s` is by the
         server's monotonic clock, `stamp_s` since 1970.
         """
-        plan, in_force, self._newest_s = self.plan, self.in_force, time_s
-        if not plan.has_tool and not always:
+        source, payload, _, _ = self.plan
+        in_force, self._newest_s = self.in_force, time_s
+        if payload.mass <= 0.0 and not always:
             return ZERO
-        source = plan.source
         if source.in_force is not in_force:
             source.configure(in_force)
         return source.specific_force(sample, time_s, stamp_s)
@@ -217,10 +217,10 @@ class CompensatedStream:
 
     def stages(self, sample: Any, time_s: float, felt: Vector3, turning: Turning | None = None) -> Stages:
         """Every stage of a sample in which `felt` was felt. Components may be arrays of samples."""
-        plan, compensator = self.plan, self._compensator
-        compensator.payload, compensator.bias = plan.payload, plan.ramp.at(time_s)
+        (source, payload, ramp, _), compensator = self.plan, self._compensator
+        compensator.payload, compensator.bias = payload, ramp.at(time_s)
         if turning is None:
-            turning = plan.source.turning
+            turning = source.turning
         return compensator.compensate(sample.force, sample.torque, felt, turning)
 
     def compensate(self, samples: Any) -> tuple[Array, Array]:
