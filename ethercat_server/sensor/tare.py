@@ -8,8 +8,8 @@ errors of the difference of the two means. The standard error of a mean is the l
 single samples, and from the means of eight parts of its window, which covers noise that the sensor's filters
 have correlated.
 
-Rest is judged here (`why_moving`), not as in `bota_ft_compensation`: in raw units, and by sums, which delay
-no exchange.
+Rest is judged here (`why_moving`) by the limits of `bota_ethercat.sensor.rest`, but in raw units, and by
+sums, which delay no exchange.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from bota_ethercat.control import ErrorCode
 from bota_ethercat.errors import RequestError
 from bota_ethercat.pdo import SampleDecoder
+from bota_ethercat.sensor.rest import StationaryLimits
 from bota_ethercat.stream.usable import ANGULAR_RATE, FORCE_TORQUE, judge
 from ethercat_server.errors import BusError
 from ethercat_server.ethercat.clock import Clock, Deadline
@@ -40,22 +41,26 @@ RATE: Final = slice(13, 16)
 LEAST_SAMPLES: Final = 20  # fewer would not show whether the sensor is stationary
 
 
+_REST: Final = StationaryLimits()
+_TURNS_DPS: Final = math.degrees(_REST.angular_rate_deviation)
+
+
 class _Channel(NamedTuple):
     """A quantity of the process data, in its unit."""
 
     name: str
     unit: str
-    most: float  # standard deviation of a stationary sensor, above Bota's own limit for a healthy one
+    most: float  # standard deviation of a stationary sensor
     steady: float  # what a mean may move within a window, and be off target after a tare, beyond noise
 
 
 CHANNELS: Final = (
-    *(_Channel(name, "N", 1.0, 0.3) for name in ("Fx", "Fy", "Fz")),
-    *(_Channel(name, "Nm", 0.05, 0.01) for name in ("Mx", "My", "Mz")),
-    *(_Channel(name, "deg/s", 3.0, math.inf) for name in ("Rx", "Ry", "Rz")),
+    *(_Channel(name, "N", _REST.force_deviation, _REST.force_drift) for name in ("Fx", "Fy", "Fz")),
+    *(_Channel(name, "Nm", _REST.torque_deviation, _REST.torque_drift) for name in ("Mx", "My", "Mz")),
+    *(_Channel(name, "deg/s", _TURNS_DPS, math.inf) for name in ("Rx", "Ry", "Rz")),
 )
 # Limit of the mean angular rate: above it the robot is moving. The residual shows slower motion.
-_REST_TURN_DPS: Final = math.degrees(0.5)
+_REST_TURN_DPS: Final = math.degrees(_REST.uncalibrated_angular_rate)
 _BY_CHANCE: Final = 5.0  # standard errors by which two means must differ to differ significantly
 PARTS: Final = 8  # parts of a window whose means give the standard error of the whole window's
 _ROUNDING: Final = 1e-6  # share of a reading by which REAL32 arithmetic in the sensor may be off

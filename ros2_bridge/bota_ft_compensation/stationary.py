@@ -4,7 +4,7 @@
 The one criterion of tare and identification, live and in recordings (docs/compensation.md). Standard
 deviations see what shakes or is touched, drift a cable that settles or a robot that creeps, the mean angular
 rate a turn about the vertical. One bad sample spoils the window. The server's own tare has another
-criterion: it knows no IMU's calibration.
+criterion, by the same limits: it knows no IMU's calibration.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.pdo import Sample, Vector3
+from bota_ethercat.sensor.rest import StationaryLimits
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE, judge
 from bota_ft_compensation.quantities import (
     NO_WRENCH,
     ZERO,
     CompensationError,
-    StationaryLimits,
     Wrench,
 )
 

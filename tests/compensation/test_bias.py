@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
+from bota_ethercat.sensor.rest import StationaryLimits
 from bota_ethercat.sensor.warnings_register import WarningFlag
 from bota_ft_compensation.bias import BiasRamp, TareBasis, check_at_rest, estimate_bias
 from bota_ft_compensation.quantities import (
@@ -19,7 +20,6 @@ from bota_ft_compensation.quantities import (
     ZERO,
     CompensationError,
     Payload,
-    StationaryLimits,
     Wrench,
 )
 from bota_ft_compensation.stationary import (

@@ -14,9 +14,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from bota_clients.recording.columns import Bools, Columns, Floats
+from bota_ethercat.sensor.rest import StationaryLimits
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
 from bota_ft_compensation.identification.resampling import GAP_S, stretches
-from bota_ft_compensation.quantities import StationaryLimits
 from bota_ft_compensation.stationary import (
     CHANCE,
     NotStationaryError,

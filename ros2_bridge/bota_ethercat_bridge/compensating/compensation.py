@@ -17,13 +17,14 @@ from rclpy.node import Node
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import WRENCH, Sample, Values, Vector3
 from bota_ethercat.replies import SensorInfo
+from bota_ethercat.sensor.rest import StationaryLimits
 from bota_ethercat_bridge.parameters.table import Parameters
 from bota_ethercat_bridge.publishing.contact import ContactTopic
 from bota_ethercat_bridge.publishing.messages import Stamps, decoder
 from bota_ethercat_bridge.publishing.wrenches import FilteredTopic, TfFrames, WrenchTopic, make_frames
 from bota_ethercat_bridge.stream.link import NodeClock
 from bota_ft_compensation.imu import Source
-from bota_ft_compensation.quantities import ZERO, CompensationError, StationaryLimits
+from bota_ft_compensation.quantities import ZERO, CompensationError
 from bota_ft_compensation.stationary import StationaryWindow, triple
 from bota_ft_compensation.stream import CompensatedStream
 

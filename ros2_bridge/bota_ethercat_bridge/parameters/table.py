@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.health.limits import LIMITS, StreamLimits
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.program.real_time import HIGHEST_PRIORITY
+from bota_ethercat.sensor.rest import StationaryLimits
 from bota_ft_compensation.contact import FARTHEST_M, Surface, surface_of
 from bota_ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
 from bota_ft_compensation.quantities import (
@@ -29,7 +30,6 @@ from bota_ft_compensation.quantities import (
     CompensationError,
     Payload,
     Quaternion,
-    StationaryLimits,
     length,
     unit_quaternion,
 )
