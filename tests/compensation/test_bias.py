@@ -27,6 +27,7 @@ from bota_ft_compensation.stationary import (
     StationaryMeans,
     StationaryWindow,
 )
+from bota_ft_compensation.stream import obstacle
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, noisy, sample
 
 RATE = 800
@@ -210,3 +211,25 @@ def test_a_shift_and_another_tool_change_both_biases() -> None:
     assert weighed.taken == TareBasis(TOOL, felt((1, 0, 0)))
     assert weighed.undone(10.0).taken == TareBasis(TOOL, felt((0, 0, 1)))
     assert BiasRamp().go(NEW, 0.0).shifted(NEW).undone(1.0).target == NO_WRENCH, "none stays none"
+
+
+@pytest.mark.parametrize(
+    ("settings", "without_tool", "by_robot", "by_imu"),
+    [
+        ({}, "", "", ""),
+        ({"calibration_matrix": False}, *["calibration_matrix is off"] * 3),
+        ({"inertia_compensation": True}, "", *["inertia_compensation is on"] * 2),
+        ({"coordinate_system": True}, "", "", "coordinate_system is on"),
+        ({"imu_active": 0}, "", "", "imu_active"),
+    ],
+)
+def test_the_settings_with_which_nothing_can_be_compensated(
+    settings: dict[str, Any], without_tool: str, by_robot: str, by_imu: str
+) -> None:
+    for expected, has_tool, is_imu in (
+        (without_tool, False, False), (without_tool, False, True), (by_robot, True, False),
+        (by_imu, True, True),
+    ):  # fmt: skip
+        told = obstacle(settings, has_tool=has_tool, by_imu=is_imu)
+        assert expected in told
+        assert bool(told) == bool(expected)

@@ -11,6 +11,7 @@ import pytest
 from bota_ethercat.sensor.response import acceleration_response, force_lag_s, force_torque_response
 from bota_ft_compensation.alignment import gyroscope_later_s
 from bota_ft_compensation.identification.delay import Lag, check_held_out, find_lag
+from bota_ft_compensation.identification.resampling import resampled
 from bota_ft_compensation.quantities import CompensationError, Payload
 from tests.compensation import motion
 from tests.compensation.making import SEED
@@ -136,3 +137,10 @@ def test_samples_of_two_servers_are_refused() -> None:
     felt = motion.filtered(shaken(1), TOOL, 5.0, settings())
     with pytest.raises(CompensationError, match="order of their times"):
         lag_of(felt._replace(times=np.where(felt.times < 2.5, felt.times, felt.times - 1.0)))
+
+
+def test_a_stretch_that_is_long_enough_is_used() -> None:
+    times = np.concatenate([np.arange(0.0, 0.9, 0.01), np.arange(2.0, 3.5, 0.01)])
+    period, parts = resampled(times, times[:, None], 1.0)
+    assert period == pytest.approx(0.01)
+    assert [(round(grid[0], 2), round(grid[-1], 1)) for grid, _ in parts] == [(2.0, 3.5)]

@@ -63,8 +63,8 @@ def pushed(felt: Felt, force: motion.Array) -> Felt:
     return felt._replace(force=felt.force + force, torque=felt.torque + np.cross([0.02, 0.1, 0.1], force))
 
 
-def held(felt: Felt) -> Felt:
-    grip = np.random.default_rng(SEED).normal(0.0, 2.0, size=(42, 3))
+def held(felt: Felt, newtons: float = 2.0) -> Felt:
+    grip = np.random.default_rng(SEED).normal(0.0, newtons, size=(42, 3))
     return pushed(felt, np.stack([np.interp(felt.times * 2.0, range(42), axis) for axis in grip.T], axis=1))
 
 
@@ -75,6 +75,7 @@ def part_of_the_time(felt: Felt, share: float) -> Felt:
 FREE = "not those of a tool that moves freely"
 REFUSED: dict[str, tuple[Callable[[Felt], Felt], str]] = {
     "held": (held, FREE),
+    "hardly held": (lambda felt: held(felt, 0.4), FREE),
     "pulled up": (lambda felt: upward(felt, 4.0), FREE),
     "pushed": (lambda felt: part_of_the_time(felt, 0.5), FREE),
     "sign of the force": (lambda felt: felt._replace(force=-felt.force), "mass would be negative"),
@@ -114,3 +115,31 @@ def test_a_touch_is_left_out_and_hardly_any_motion_is_refused() -> None:
     found = identified(recorded("about x", SEED + 6, tool))
     assert found.payload.mass == pytest.approx(tool.mass, abs=found.mass_interval)
     assert "hardly turned about y and z" in found.notes[0]
+
+
+def test_the_center_of_a_heavy_tool_is_known_better() -> None:
+    """Its interval is that of the moment by the mass."""
+    light, heavy = (
+        identified(recorded("turned", SEED + 6, tool_of(SEED + 6, mass=mass))).payload.center_interval
+        for mass in (0.5, 4.0)
+    )
+    assert np.all(np.array(heavy) < np.array(light))
+
+
+def test_what_is_made_of_a_sample_does_not_depend_on_where_the_recording_begins() -> None:
+    felt = recorded("turned", SEED + 6, tool_of(SEED + 6))
+    whole, part = (
+        turn(
+            felt.times[rows],
+            np.hstack([each[rows] for each in felt[1:]]),
+            align(settings(), RATE_HZ),
+            EXACT,
+            IMU,
+        )
+        for rows in (slice(None), slice(800, None))
+    )
+    rows = np.searchsorted(whole.times, part.times - 1e-6)
+    same = np.abs(whole.times[rows] - part.times) < 1e-6
+    assert same.sum() > 100
+    assert part.felt[same] == pytest.approx(whole.felt[rows][same], abs=1e-6)
+    assert part.spun[same] == pytest.approx(whole.spun[rows][same], abs=1e-6)

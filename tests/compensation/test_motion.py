@@ -343,6 +343,16 @@ def test_an_orientation_between_two_samples_is_turned_on_by_what_is_left(told_s:
     assert source.gravity(told_s) == pytest.approx(expected.gravity(told_s), abs=1e-4)
 
 
+def test_an_orientation_is_turned_on_from_the_first_two_rates_on() -> None:
+    source = QuaternionGravity()
+    assert source.update((0.0, 0.0, 0.0, 1.0), 0.0)
+    source.add_rate((2.0, 0.0, 0.0), 0.0)
+    source.add_rate((2.0, 0.0, 0.0), 0.01)
+    assert source.gravity(0.01) == pytest.approx(
+        (0.0, STANDARD_GRAVITY * -math.sin(0.02), -STANDARD_GRAVITY * math.cos(0.02)), abs=1e-4
+    )
+
+
 def test_an_orientation_is_held_where_the_gyroscope_is_of_no_use() -> None:
     source = QuaternionGravity()
     source.add_rate((2.0, 0.0, 0.0), 1.0)

@@ -190,6 +190,19 @@ def test_the_cause_of_a_loss_is_what_took_the_time(
     assert [loss[2:] for loss in find_losses(0, steps)] == [expected]
 
 
+def test_a_sensor_that_takes_no_part_is_told_once() -> None:
+    kinds = [RecordKind.FRESH] * 5 + [RecordKind.INVALID] * 4 + [RecordKind.FRESH] * 5
+    steps = [
+        Decision(Record(at, 10**5, 0, 0, 0, kind, False, 3), at, 5 if number == 9 else 1, False, True, False)
+        for number, kind in enumerate(kinds)
+        for at in [10**9 + number * 10**6]
+    ]
+    assert [loss[2:] for loss in find_losses(0, steps)] == [
+        ("not in the exchange", "it took no part in an exchange (working counter 3)"),
+        ("not in the exchange", "4 lost: while it took no part"),
+    ]
+
+
 def test_who_may_not_control_the_server_gets_no_trace() -> None:
     simulation = Simulation()
     simulation.run(0.2)
