@@ -16,6 +16,7 @@ import pytest
 
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.errors import SetUpError
+from ethercat_server.ethercat.clock import StampClocks
 from ethercat_server.ethercat.exchange import LATCHED, Area, fit_a_frame, latched_datagrams, make_frames
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import Command, Datagram, parse
@@ -263,3 +264,42 @@ def test_neither_the_length_of_a_frame_nor_the_slaves_behind_are_in_a_stamp(coun
     running.run(1.0)
     for number in range(count):
         assert abs(median(errors_ns([frame for frame in running.frames if frame.sensor == number]))) < 500
+
+
+class HeldUp:
+    """Clocks of a machine with CLOCK_MONOTONIC slewed, which may hold a program up at each read."""
+
+    def __init__(self) -> None:
+        self.now_ns = 5 * 10**9
+        self.holds_ns: Callable[[], int] = lambda: 100
+
+    def raw_ns(self) -> int:
+        now_ns = self.now_ns
+        self.now_ns += self.holds_ns()
+        return now_ns
+
+    def monotonic_ns(self) -> int:
+        return self.slewed_ns(self.raw_ns())
+
+    def time_ns(self) -> int:
+        return self.monotonic_ns() + 10**18
+
+    @staticmethod
+    def slewed_ns(raw_ns: int) -> int:
+        return raw_ns + raw_ns // 2000 + 10**9
+
+    def sleep(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
+
+
+def test_stamps_follow_a_slewed_clock_also_where_reading_it_is_held_up() -> None:
+    clock, chance = HeldUp(), random.Random(58)
+    clocks = StampClocks(clock)
+    clock.sleep(1.0)
+    clocks.follow()
+    assert clocks.rate == pytest.approx(1.0005, abs=1e-6), "at the first look"
+    clock.holds_ns = lambda: chance.randrange(1_000_000) if chance.random() < 0.1 else 100
+    for _ in range(1000):
+        clock.sleep(0.001)
+        now_ns = clock.now_ns
+        assert abs(clocks.monotonic_ns(now_ns) - clock.slewed_ns(now_ns)) < 10_000
