@@ -102,6 +102,12 @@ def test_a_lost_sample_has_no_stamp_where_the_wall_clock_was_set(tmp_path: Path,
     assert stamps[6:].tolist() == [step_ns] * 2
 
 
+def test_clocks_that_drift_apart_in_a_long_gap_were_not_set(tmp_path: Path) -> None:
+    frames = [frame(number) for number in (0, 1, 80_001, 80_002)]
+    frames = [each._replace(stamp_ns=each.stamp_ns + each.monotonic_ns // 10_000) for each in frames]
+    assert not np.isnat(samples(tmp_path / "run.mcap", frames)["stamp_utc"]).any()
+
+
 @pytest.mark.parametrize("before", [*range(4014, 4021), *range(4093, 4098)])
 def test_stamps_of_lost_samples_are_between_their_neighbors_also_from_block_to_block(
     tmp_path: Path, before: int
