@@ -99,6 +99,16 @@ def test_samples_that_did_not_come_make_no_jitter(model: Model, silent: bool) ->
     assert (sensor.jitter_us, sensor.jitter_worst_us) == pytest.approx((50, 50), abs=0.1)
 
 
+def test_another_rate_is_no_jitter(model: Model) -> None:
+    take(model, *(frame(k)._replace(monotonic_ns=10**12 + k * made.PERIOD_NS) for k in range(100)))
+    other = description()
+    other["sensors"][0]["rate_hz"] /= 2
+    made.describe(model, other, now(100))
+    slow = [frame(k)._replace(monotonic_ns=10**12 + (2 * k - 99) * made.PERIOD_NS) for k in range(100, 200)]
+    sensor = take(model, *slow)
+    assert (sensor.missed, sensor.jitter_us, sensor.jitter_worst_us) == (0, 0, 0)
+
+
 def test_the_rate_is_that_of_the_samples_and_falls_when_they_stop(model: Model) -> None:
     for first in range(0, 1600, 40):
         take(model, *run(first, 40))
