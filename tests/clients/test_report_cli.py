@@ -139,6 +139,21 @@ def test_a_change_of_settings_is_no_fault_of_the_sensor(report: Report) -> None:
     assert report.lacks("The settings were changed 1 time while", number(frames()[:changing])) == []
 
 
+def test_what_took_a_sensor_off_the_bus_is_what_the_server_said(report: Report) -> None:
+    sent = [*frames()]
+    sent[1000:1100] = [frame._replace(flags=DataFlag.INVALID) for frame in sent[1000:1100]]
+    report.of(SENSOR, sent)
+    assert report.lacks("Check its cable and power.") == []
+    lost: dict[str, object] = {
+        "event": "sensor_lost", "sensor": 0, "reason": "it left OP",
+        "message": "sensor 0 is lost: it left OP: this computer stood still for 300 ms",
+    }  # fmt: skip
+    report.record(SENSOR, sent[:1000], {**lost, "sensor": 1, "message": "another"}, lost, sent[1000:])
+    report.again()
+    words = "Check its cable", "another", f"The server said: {lost['message']}."
+    assert report.lacks(*words) == [*words[:2]]
+
+
 def test_a_sensor_that_was_exchanged_is_not_taken_for_the_other(report: Report) -> None:
     new = description({**sensor_row(sinc_length=SINC), "serial": 99, "firmware": "2.0.0"})
     code, out = report.of(SENSOR, frames()[:SPLIT], new, frames()[SPLIT:])

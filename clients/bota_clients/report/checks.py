@@ -403,5 +403,6 @@ def _observe(series: Series) -> Observation:
         angular_rate_saturated=bits(samples.angular_rate_saturated),
         temperature=coldest if coldest < LIMITS.coldest else hottest,
         locked=False if judged and series.is_irregular else None,
+        lost_because=series.subject.lost_because,
         settings=series.subject.settings,
     )

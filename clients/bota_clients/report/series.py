@@ -20,6 +20,7 @@ from bota_clients.numbers import count, listing, moment
 from bota_clients.recording.columns import Bools, Columns, Floats, Ints, columns, joined
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.accounting import StreamAccounting
+from bota_ethercat.control import Event
 from bota_ethercat.health.limits import LIMITS
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import SensorInfo
@@ -40,6 +41,7 @@ class Subject:
     columns: Columns
     source: str  # a file name
     remarks: tuple[str, ...] = ()  # sentences about the recording for the reader of the report
+    lost_because: str = ""  # what the server said when it lost the sensor last
 
     @property
     def who(self) -> str:
@@ -111,7 +113,10 @@ def _subject(recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) 
             f"The sensor's own offset was changed {count(tared, 'time')} (by a tare, say): forces before and "
             "after differ by that."
         )
-    return Subject(kept, found, recording.path.name).with_remarks(remarks)
+    told = [e for each in recording.events if (e := each.event).get("event") == Event.SENSOR_LOST]
+    because = [printable(e.get("message", ""), 300) for e in told if e.get("sensor") == sensor.sensor]
+    subject = Subject(kept, found, recording.path.name, lost_because="".join(because[-1:]))
+    return subject.with_remarks(remarks)
 
 
 def _remarks(history: Sequence[SensorInfo], kept: SensorInfo, frames: Columns) -> list[str]:

@@ -45,6 +45,7 @@ class Observation(NamedTuple):
     missed_deadlines: int = 0  # by the server's loop, in sampling periods
     reconnects: int = 0
     is_lost: bool = False  # the server says that it has lost the sensor
+    lost_because: str = ""  # what it said when it lost it
     state: str = "OP"  # the sensor's AL state
     server_silent: bool = False  # the server itself owes an answer
     emergency: str = ""  # what the sensor's newest emergency says, if it is new and not over
@@ -108,6 +109,8 @@ def _look(key: str, found: str, remedy: str, about: About = About.STREAM, size: 
 
 def _advice(seen: Observation) -> str:
     """Where to look for the reason why a sensor did not answer."""
+    if seen.lost_because:
+        return f"The server said: {seen.lost_because}"
     return _STOOD_STILL if _stood_still(seen) else _CABLE
 
 
@@ -196,7 +199,8 @@ def _losses(seen: Observation, limits: StreamLimits) -> Iterator[Finding]:
         total = seen.samples + seen.lost
         found = f"{seen.lost} of {total} samples ({_percent(seen.lost, total)}) were lost"
         remedy = f"The machine is too busy or the cable is bad; {IT_TELLS}"
-        if seen.recoveries or seen.is_lost:  # whatever took it off the bus has taken its samples, too
+        # Whatever took it off the bus has taken its samples, too.
+        if seen.recoveries or seen.is_lost or seen.lost_because:
             remedy = _advice(seen)
         if seen.unread_s > _BUFFERED_S:
             why, advice = did_not_read(seen.unread_s, busy=seen.busy)
