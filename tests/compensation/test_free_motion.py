@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -59,13 +59,15 @@ def upward(felt: Felt, newtons: float) -> Felt:
     return pushed(felt, newtons * rotation[:, 2])
 
 
-def pushed(felt: Felt, force: motion.Array) -> Felt:
-    return felt._replace(force=felt.force + force, torque=felt.torque + np.cross([0.02, 0.1, 0.1], force))
+def pushed(felt: Felt, force: motion.Array, at: Sequence[float] = (0.02, 0.1, 0.1)) -> Felt:
+    return felt._replace(force=felt.force + force, torque=felt.torque + np.cross(at, force))
 
 
-def held(felt: Felt, newtons: float = 2.0) -> Felt:
+def held(felt: Felt, newtons: float = 2.0, at: Sequence[float] = (0.02, 0.1, 0.1)) -> Felt:
     grip = np.random.default_rng(SEED).normal(0.0, newtons, size=(42, 3))
-    return pushed(felt, np.stack([np.interp(felt.times * 2.0, range(42), axis) for axis in grip.T], axis=1))
+    return pushed(
+        felt, np.stack([np.interp(felt.times * 2.0, range(42), axis) for axis in grip.T], axis=1), at
+    )
 
 
 def part_of_the_time(felt: Felt, share: float) -> Felt:
@@ -76,6 +78,7 @@ FREE = "not those of a tool that moves freely"
 REFUSED: dict[str, tuple[Callable[[Felt], Felt], str]] = {
     "held": (held, FREE),
     "hardly held": (lambda felt: held(felt, 0.4), FREE),
+    "hardly held where it makes no torque": (lambda felt: held(felt, 0.4, (0.0, 0.0, 0.0)), FREE),
     "pulled up": (lambda felt: upward(felt, 4.0), FREE),
     "pushed": (lambda felt: part_of_the_time(felt, 0.5), FREE),
     "sign of the force": (lambda felt: felt._replace(force=-felt.force), "mass would be negative"),
