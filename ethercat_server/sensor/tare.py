@@ -62,6 +62,7 @@ CHANNELS: Final = (
 # Limit of the mean angular rate: above it the robot is moving. The residual shows slower motion.
 _REST_TURN_DPS: Final = math.degrees(_REST.uncalibrated_angular_rate)
 _BY_CHANCE: Final = 5.0  # standard errors by which two means must differ to differ significantly
+_VAGUE: Final = 2.0  # standard errors by which a standard deviation of few samples may be above its limit
 PARTS: Final = 8  # parts of a window whose means give the standard error of the whole window's
 _ROUNDING: Final = 1e-6  # share of a reading by which REAL32 arithmetic in the sensor may be off
 _PATIENCE: Final = 4.0  # timeout for samples, in multiples of their nominal duration
@@ -143,6 +144,7 @@ class ChannelStatistics(NamedTuple):
     change: float  # from the mean of the first half to that of the second
     by_chance: float  # what noise explains of that
     error: float  # standard error of the mean
+    samples: int
 
 
 class Part:
@@ -177,7 +179,7 @@ def channel_statistics(parts: Sequence[Part], channel: int, start: float = 0.0) 
     means = [part.sums[channel] / part.taken for part in parts]
     of_parts = math.dist(means, [sum(means) / PARTS] * PARTS) / math.sqrt(PARTS * (PARTS - 1))
     error = max(math.sqrt(variance / samples), of_parts)
-    return ChannelStatistics(start + mean, math.sqrt(variance), abs(other - one), by_chance, error)
+    return ChannelStatistics(start + mean, math.sqrt(variance), abs(other - one), by_chance, error, samples)
 
 
 def _average(clock: Clock, sensor: Sensor, stream: Samples, samples: int) -> Steps[list[ChannelStatistics]]:
@@ -226,9 +228,10 @@ def why_moving(window: Sequence[ChannelStatistics]) -> str:
     turn = math.hypot(*(found.mean for found in window[6:]))
     if turn > _REST_TURN_DPS:
         return f"it turns by {turn:.3g} deg/s (mean; at most {_REST_TURN_DPS:.3g})"
-    for (name, unit, most, steady), found in zip(CHANNELS, window, strict=True):
+    for (name, unit, limit, steady), found in zip(CHANNELS, window, strict=True):
+        most = limit * (1.0 + _VAGUE / math.sqrt(2.0 * found.samples))
         if found.deviation > most:
-            return f"{name} varies by {found.deviation:.3g} {unit} (standard deviation; at most {most:g})"
+            return f"{name} varies by {found.deviation:.3g} {unit} (standard deviation; at most {most:.2g})"
         if found.change > (most_change := steady + found.by_chance):
             return f"{name} changes by {found.change:.3g} {unit} (mean; at most {most_change:.3g})"
     return ""

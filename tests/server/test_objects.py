@@ -390,7 +390,7 @@ def test_a_load_that_creeps_is_not_rest_and_noise_is() -> None:
     with pytest.raises(RequestError, match=r"Fx changes by 1\.2 N"):
         run_tare(ScriptedSdo(), 400, [0.0] * 6, (n * 0.006 for n in itertools.count()))
     with pytest.raises(RequestError, match="Fx changes by"):
-        run_tare(ScriptedSdo(), 400, [0.0] * 6, (n * 0.007 + x for n, x in enumerate(noise(1, 0.3))))
+        run_tare(ScriptedSdo(), 400, [0.0] * 6, (n * 0.006 + x for n, x in enumerate(noise(1, 0.3))))
     for seed in range(100):
         tared = run_tare(ScriptedSdo(), 20, [0.0] * 6, noise(seed, 0.6))
         assert abs(tared["residual"][0]) < 1
