@@ -241,6 +241,7 @@ def test_every_code_has_words() -> None:
         0xFF07: "device-specific", 0xB000: "of no class that CiA 301 defines",
     }  # fmt: skip
     assert {code: Emergency(code, 0, b"").text for code in words} == words
+    assert [Emergency(code, 0, b"").is_reset for code in (0x0000, 0x0012, 0x0100)] == [True, True, False]
 
 
 def test_messages_of_every_length_and_service_are_parsed_or_not() -> None:
