@@ -253,7 +253,10 @@ def test_no_request_beside_soems_has_the_counter_of_the_one_before(arguments: st
         socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3)) as capture,
     ):
         capture.bind((veth.near, 3))
-        capture.setsockopt(socket.SOL_SOCKET, 33, 1 << 24)  # SO_RCVBUFFORCE
+        try:
+            capture.setsockopt(socket.SOL_SOCKET, 33, 1 << 24)  # SO_RCVBUFFORCE
+        except PermissionError:
+            pytest.skip("it takes root outside of a user namespace: less would not hold all frames")
         backend.open()
         bring_up(bus, Asked(), lambda: None)
         for slave in bus.slaves:
