@@ -20,7 +20,6 @@ from bota_clients.numbers import count, listing, moment
 from bota_clients.recording.columns import Bools, Columns, Floats, Ints, columns, joined
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.accounting import StreamAccounting
-from bota_ethercat.control import Event
 from bota_ethercat.health.limits import LIMITS
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import SensorInfo
@@ -94,11 +93,14 @@ def _subject(recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) 
     """Its longest stretch without a change of settings or sensor."""
     # The order in the file decides what came first, because clocks differ.
     stretches: list[tuple[SensorInfo, list[Columns]]] = [(sensor.info, [columns([])])]
+    lost = dict[int, str]()  # by stretch: what the server said when it lost the sensor in it
     for in_force, frames in recording.batches(sensor.sensor):
         was, info = stretches[-1][0], in_force.info
         if (was.identity, was.settings) != (info.identity, info.settings):
             stretches.append((info, []))
         stretches[-1][1].append(columns(frames, imu_units))
+        if in_force.lost:
+            lost[len(stretches) - 1] = in_force.lost
     longest = max(range(len(stretches)), key=lambda number: sum(map(len, stretches[number][1])))
     kept, found = stretches[longest][0], joined(stretches[longest][1])
     if longest + 1 < len(stretches):
@@ -113,9 +115,7 @@ def _subject(recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) 
             f"The sensor's own offset was changed {count(tared, 'time')} (by a tare, say): forces before and "
             "after differ by that."
         )
-    told = [e for each in recording.events if (e := each.event).get("event") == Event.SENSOR_LOST]
-    because = [printable(e.get("message", ""), 300) for e in told if e.get("sensor") == sensor.sensor]
-    subject = Subject(kept, found, recording.path.name, lost_because="".join(because[-1:]))
+    subject = Subject(kept, found, recording.path.name, lost_because=printable(lost.get(longest, ""), 300))
     return subject.with_remarks(remarks)
 
 
