@@ -95,18 +95,30 @@ class Stream:
         self.settings |= settings
         self.event("reconfigured", **self.in_force)
 
-    def set_offset(self, *offset: float) -> None:
+    def set_offset(self, *offset: float, is_sudden: bool = True, is_change: bool = True) -> None:
         """The server tells it once it is written; what came shortly before may have part of it."""
-        self.change_offset(*offset)
+        if is_sudden:
+            self.change_offset(*offset)
         self.event("offset_changed", offset=offset)
-        self._hidden_until_ns = max(self.truth) - EPOCH_NS + 2 * self.period_ns
+        self.is_told = True
+        if is_change:
+            self._hidden_until_ns = max(self.truth) - EPOCH_NS + 2 * self.period_ns
+
+    def write_offset(self, *offset: float) -> None:
+        """As the server does it, which says before that it will; a sample between any two of the numbers."""
+        self.event("offset_changed", offset=None)
+        self.is_told, before = False, self.offset
+        for written in range(len(offset) + 1):
+            self.offset = offset[:written] + before[written:]
+            self.send(known=False)
+        self.set_offset(*offset, is_sudden=False, is_change=offset != before)
 
     def change_offset(self, *offset: float) -> None:
         self.offset = offset
         since_ns = max(self.truth) - 26 * self.period_ns
         self.truth |= {at: now._replace(is_certain=False) for at, now in self.truth.items() if at > since_ns}
 
-    _hidden_until_ns = 0
+    _hidden_until_ns, is_told = 0, True
 
     @property
     def period_ns(self) -> int:
@@ -141,8 +153,8 @@ class Stream:
                 is_known = known and self.now_ns > self._hidden_until_ns
                 self.truth[frame.stamp_ns] = Truth(
                     usability, usability if force_torque is None else force_torque,
-                    self.contact if is_known else None, self.offset, self.settings["sinc_length"],
-                    self.rate_hz,
+                    self.contact if is_known else None, self.offset if self.is_told else (),
+                    self.settings["sinc_length"], self.rate_hz,
                 )  # fmt: skip
             flags &= ~DataFlag.GAP
 
@@ -190,6 +202,28 @@ def offset_in_a_gap(s: Stream) -> None:
     s.send(40)
     s.set_offset(9.0, 8.0, -7.0, 0.3, 0.2, 0.1)
     s.send(40, DataFlag.GAP, lost=5)
+
+
+def offset_written(s: Stream) -> None:
+    """Twice, and once where the same is written again."""
+    s.send(40)
+    s.write_offset(9.0, 8.0, -7.0, 0.3, 0.2, 0.1)
+    s.contact = (0.0, 4.0, 0.0, 0.0, 0.0, 0.1)
+    s.send(1)
+    s.write_offset(*(0.0,) * 6)
+    s.send(20)
+    s.write_offset(*(0.0,) * 6)
+    s.send(20)
+
+
+def offset_no_longer_known(s: Stream) -> None:
+    s.send(40)
+    s.event("sensor_back", **(s.in_force | {"offset": None}))
+    s.is_told = False
+    s.send(20, known=False)
+    s.event("sensor_back", **s.in_force)
+    s.is_told = True
+    s.send(20)
 
 
 def description_crosses(s: Stream) -> None:
@@ -362,7 +396,8 @@ def events_of_no_consequence(s: Stream) -> None:
 
 
 STORIES: Final[Sequence[Callable[[Stream], None]]] = (
-    plain, other_filter, other_rate, offset, offset_in_a_gap, description_crosses, description_follows,
+    plain, other_filter, other_rate, offset, offset_in_a_gap, offset_written, offset_no_longer_known,
+    description_crosses, description_follows,
     warning_bits, saturation_fields, not_finite, stuck, silent_bus, gaps, lost_and_back,
     lost_without_a_word_of_its_return, back_with_another_offset, another_connection,
     another_connection_with_another_offset, another_connection_with_other_settings, server_restarted,

@@ -96,6 +96,8 @@ class Sensor:
     delay_ms: dict[str, float | None] = field(default_factory=dict)
     # The force/torque offset in force; written again when the sensor has lost it. None: it has none.
     offset: tuple[float, ...] | None = None
+    # Whether it is in force for certain: not while another one is being written.
+    offset_is_certain: bool = True
     # The SINC length is a guess from a rate that CHOP may have divided: not to be written for no reason.
     sinc_guessed: bool = False
     settled_at: Deadline | None = None  # when its data will have settled; see `settle`
@@ -140,8 +142,8 @@ class Sensor:
 
     @property
     def reported_offset(self) -> list[float] | None:
-        """The force/torque offset as messages carry it; None if it is not known, or no numbers."""
-        offset = self.offset
+        """The force/torque offset as messages carry it; None if it is not certain, or no numbers."""
+        offset = self.offset if self.offset_is_certain else None
         return list(offset) if offset is not None and all(map(math.isfinite, offset)) else None
 
     def in_force(self) -> dict[str, Any]:

@@ -108,7 +108,7 @@ def _finish_set_up(sdo: Sdo, sensor: Sensor) -> Steps[None]:
     yield from read_settings(sdo, sensor)
     if sensor.offset is not None and (yield from read_offset(sdo)) != sensor.offset:
         yield from write_offset(sdo, sensor.offset)
-    sensor.change_interrupted = False
+    sensor.change_interrupted, sensor.offset_is_certain = False, True
 
 
 def write_setting(sdo: Sdo, sensor: Sensor, name: str, value: SettingValue | None = None) -> Steps[None]:

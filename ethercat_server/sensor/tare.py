@@ -91,7 +91,8 @@ def tare(
     """Steps of the action `tare`; returns what its reply carries. RequestError if the sensor is not at rest,
     or cannot hold the offset, or if an axis is off target afterwards or worse than before.
 
-    If it fails after that, the old offset is written again. `on_offset` is called after each write.
+    If it fails after that, the old offset is written again. `on_offset` is called before and after each
+    write.
     """
     _check_fits(target, "the key 'target'")
     samples = max(samples, LEAST_SAMPLES)
@@ -107,19 +108,26 @@ def tare(
     new = tuple(t - found.mean + o for t, found, o in zip(target, before[:6], old, strict=True))
     _check_fits(new, "the offset that the key 'target' asks for")
 
-    def write() -> Steps[tuple[tuple[float, ...], list[ChannelStatistics]]]:
-        written = sensor.offset = yield from write_offset(sdo, new)
+    def put(offset: Sequence[float]) -> Steps[tuple[float, ...]]:
+        # Said before the first number is written: of the samples meanwhile nobody knows the offset.
+        sensor.offset_is_certain = False
         on_offset(sensor)
+        written = sensor.offset = yield from write_offset(sdo, offset)
+        sensor.offset_is_certain = True
+        on_offset(sensor)
+        return written
+
+    def write() -> Steps[tuple[tuple[float, ...], list[ChannelStatistics]]]:
+        written = yield from put(new)
         yield from _wait(sdo.clock, sensor, stream, SETTLING_SAMPLES)
         after = yield from _average(sdo.clock, sensor, stream, samples)
         _check_better(sensor, before, after, samples, target)
         return written, after
 
     try:
-        new, after = yield from or_undone(write(), lambda: write_offset(sdo, old), OLD, sensor)
+        new, after = yield from or_undone(write(), lambda: put(old), OLD, sensor)
     except (BusError, RequestError):
         sensor.offset = old
-        on_offset(sensor)
         raise
     return {
         "old_offset": list(old),

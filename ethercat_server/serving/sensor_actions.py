@@ -127,12 +127,10 @@ class SensorActions:
         data = bytes_to_write(values)
 
         def steps() -> Steps[Mapping[str, Any]]:
-            before, offset = sensor.settings, sensor.offset
-            written = yield from write(sdo, sensor, values["index"], values["subindex"], data)
+            before, index, subindex = sensor.settings, values["index"], values["subindex"]
+            written = yield from write(sdo, sensor, index, subindex, data, self._announce_offset)
             if sensor.settings != before:
                 self._announce_change(sensor)
-            if sensor.offset != offset:
-                self._announce_offset(sensor)
             return written
 
         self._jobs.start(sensor.number, steps(), self._answering(connection, request))
@@ -179,7 +177,8 @@ class SensorActions:
         self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, **sensor.in_force()))
 
     def _announce_offset(self, sensor: Sensor) -> None:
-        self._streams[sensor.number].drift.begin("tare")
+        if sensor.offset_is_certain:
+            self._streams[sensor.number].drift.begin("tare")
         self._hub.broadcast(event(Event.OFFSET_CHANGED, sensor=sensor.number, offset=sensor.reported_offset))
 
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:

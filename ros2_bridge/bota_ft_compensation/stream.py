@@ -55,10 +55,13 @@ _BY_IMU: Final = (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE)  # what weight and i
 
 
 class OwnOffset:
-    """How changes of the sensor's own offset affect a bias; offsets in N and Nm, None: unknown."""
+    """How changes of the sensor's own offset affect a bias; offsets in N and Nm.
+
+    None: unknown. So is one that is being changed: the server says so before it writes the first number.
+    """
 
     def __init__(self) -> None:
-        self.of_bias: Wrench | None = None  # the offset that the bias goes with
+        self.of_bias: Wrench | None = None  # the offset that the bias goes with, or the last without a bias
         self._appeared = False  # whether the offset became known only after the bias was taken
         # Whether there is a bias. Zero may be one: what a tare finds where the sensor reads nothing.
         self.has_bias = False
@@ -69,24 +72,22 @@ class OwnOffset:
         self.of_bias, self._appeared = offset, False
 
     def follow(self, now: Wrench | None) -> Wrench | None:
-        """The shift of the bias that the current offset requires, once; None: no shift."""
+        """The shift of the bias that the current offset requires, once; None: the offset is as it was."""
         before = self.of_bias
         if now is None or now == before:
             return None
         self.of_bias = now
-        if not self.has_bias:
+        if before is None:
+            self._appeared = self.has_bias
             return None
-        self._appeared = self._appeared or before is None
-        return None if before is None else now.plus(before, -1.0)
+        return now.plus(before, -1.0) if self.has_bias else NO_WRENCH
 
     def doubt(self, now: Wrench | None) -> str:
-        """Why the bias may not fit the sensor with its current offset, a sentence; empty if it does."""
-        if not self.has_bias:
-            return ""
+        """Why samples with this offset cannot be compensated, a sentence; empty if they can."""
         if self._appeared:
             return "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare"
         if self.of_bias is not None and now is None:
-            return "the sensor's own offset is no longer known: the bias may be wrong, tare"
+            return "the sensor's own offset is being changed, or is no longer known: if this lasts, tare"
         return ""
 
 
@@ -135,12 +136,14 @@ class CompensatedStream:
         plan: what is done with what comes next.
         in_force: for what comes next (`configure`).
         own_offset: how the sensor's own offset changes the bias.
-        hold: why nothing is compensated for now, whatever else is known; empty: nothing holds it up.
+        forbidden: why nothing may be compensated, whatever is in force; empty: it may.
+        hold: why nothing is compensated for now, a sentence; empty: nothing holds it up (`check`).
         use_saturated: whether samples that are saturated or out of range are compensated all the same.
     """
 
     def __init__(self, plan: Plan = Plan(), *, use_saturated: bool = True) -> None:  # noqa: B008
-        self.plan, self.hold, self.use_saturated = plan, "", use_saturated
+        self.plan, self.use_saturated = plan, use_saturated
+        self.forbidden = self.hold = ""
         self.in_force, self.own_offset = InForce(SensorInfo()), OwnOffset()
         self._compensator = Compensator()
         self._newest_s = self._doubted_until_s = -math.inf
@@ -156,27 +159,21 @@ class CompensatedStream:
         return None if offset is None else Wrench.of(offset)
 
     def follow_offset(self) -> Wrench | None:
-        """Shift the bias by what the sensor's own offset has changed by; None: not at all.
+        """Shift the bias by what the sensor's own offset has changed by; None: it is as it was.
 
         The next samples may have been measured before the change was complete.
         """
         if (change := self.own_offset.follow(self.offset)) is not None:
             self.plan = self.plan._replace(ramp=self.plan.ramp.shifted(change))
             self._doubted_until_s = self._newest_s + self.in_force.doubt_after_ns * 1e-9 + _ROUNDING_S
+        self.check()
         return change
 
-    @property
-    def doubt(self) -> str:
-        """Why the bias may not fit, a sentence; empty if it does."""
-        return self.own_offset.doubt(self.offset)
-
-    @property
-    def obstacle(self) -> str:
-        """Of the settings that are in force, as the function."""
-        return self.obstacle_of(self.in_force.info.settings)
-
-    def obstacle_of(self, settings: Settings) -> str:
-        return obstacle(settings, has_tool=self.plan.has_tool, by_imu=self.plan.source.is_imu)
+    def check(self) -> None:
+        """Find out what holds up the samples that follow; after a change of the plan, or of what forbids."""
+        has_tool, by_imu = self.plan.has_tool, self.plan.source.is_imu
+        why = self.forbidden or obstacle(self.in_force.info.settings, has_tool=has_tool, by_imu=by_imu)
+        self.hold = why or self.own_offset.doubt(self.offset)
 
     def feel(self, sample: Sample, time_s: float, stamp_s: float, *, always: bool = False) -> Vector3 | None:
         """The specific force at the tool in this sample, m/s²; None if it is not known.
@@ -244,7 +241,7 @@ class CompensatedStream:
         found = np.vstack(self.stages(columns, math.inf, cast(Any, felt.T), turning).final).T
         flagged = sum(channel.flagged(samples) for channel in self._needed)
         found[(times <= self._doubted_until_s) | (flagged != 0)] = math.nan
-        if self.doubt or self.obstacle:
+        if self.hold:
             found[:] = math.nan
         self._newest_s = times[-1] if len(times) else self._newest_s
         return found, np.column_stack(np.broadcast_arrays(*self.bounds(felt.T, turning), times)[:2])

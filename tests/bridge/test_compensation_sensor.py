@@ -99,7 +99,11 @@ def test_a_change_of_the_sensors_own_offset_shifts_the_bias(
     stages.settle(ZERO6)
     # What a client that does not ask the server has done is not known.
     sensor.send_json({"event": "sensor_back", "sensor": 0, "offset": None})
-    node.until("the sensor's own offset is no longer known", compensation="warn")
+    node.until(
+        "wrench_compensated has stopped: the sensor's own offset is being changed, or is no longer known: "
+        "if this lasts, tare",
+        compensation="error",
+    )
     sensor.send_json({"event": "sensor_back", "sensor": 0, "offset": [1.0] * 6})
     node.until(compensation="ok")
 
@@ -167,7 +171,7 @@ def test_a_bias_of_a_file_is_of_the_offset_that_the_file_names(sensor: Sensor) -
         assert [list(value) for value in node.parameters("bias", "sensor_offset")] == [[2.0] * 6, ZERO6]
 
 
-def test_an_offset_that_was_not_known_puts_the_bias_in_doubt(sensor: Sensor, node: Node) -> None:
+def test_with_an_offset_that_was_not_known_nothing_is_compensated(sensor: Sensor, node: Node) -> None:
     """As of a server that was too old to tell it."""
     sensor.set_offset(None, tell=True)
     node.run(0.1)
@@ -175,7 +179,10 @@ def test_an_offset_that_was_not_known_puts_the_bias_in_doubt(sensor: Sensor, nod
     node.until(compensation="ok")
     sensor.set_offset([0.0] * 6)
     sensor.drop()
-    node.until("was unknown when the bias was taken", compensation="warn")
+    node.until(
+        "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare",
+        compensation="error",
+    )
     node.do("tare")
     node.until(compensation="ok")
 

@@ -392,7 +392,10 @@ def test_with_a_tool_the_newest_sample_is_without_it_and_contact_is_told() -> No
     )
     made.connect(model, description(), made.OWN_PEER, START_S)  # a server that does not tell the offset
     sensor = take(model, *(frame(k, still) for k in range(240, 280)))
-    assert sensor.not_compensated.endswith("is no longer known: the bias may be wrong, tare")
+    assert sensor.not_compensated == (
+        "the wrench cannot be compensated: the sensor's own offset is being changed, or is no longer known: "
+        "if this lasts, tare"
+    )
 
 
 def test_what_cannot_be_compensated_is_told() -> None:

@@ -496,10 +496,13 @@ def test_a_tare_that_made_it_worse_is_taken_back(bench: Bench) -> None:
 
 def test_a_change_of_the_offset_is_told_at_once(bench: Bench) -> None:
     def told() -> Any:
+        assert bench.listener.wait_event("offset_changed")["offset"] is None, "before the first is written"
         return bench.listener.wait_event("offset_changed")["offset"]
 
     assert bench.described()["offset"] == [0.0] * 6
     new = tare_at_rest(bench)["new_offset"]
+    event = bench.listener.wait_event("offset_changed")
+    assert event == {"event": "offset_changed", "sensor": 0, "offset": None}
     event = bench.listener.wait_event("offset_changed")
     assert event == {"event": "offset_changed", "sensor": 0, "offset": new}
     assert bench.described()["offset"] == new

@@ -46,6 +46,7 @@ from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.text.json_text import parse_json_object
 from bota_ft_compensation.identification.parameter_file import offset_of
 from bota_ft_compensation.identification.resampling import stretches
+from bota_ft_compensation.stream import obstacle
 
 _ALIGN: Final = command("ethercat-export align")
 _ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
@@ -438,7 +439,8 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         Windows(length if frames else MOST_LOST, tool=tool, imu_units=options.imu_units),
     )
     if (stream := windows.stream) is not None:  # else what is compensated is marked, stretch by stretch
-        whys = {stream.obstacle_of(row.info.settings) for row in sensor.history}
+        has_tool = stream.plan.has_tool
+        whys = {obstacle(row.info.settings, has_tool=has_tool, by_imu=True) for row in sensor.history}
         if whys and "" not in whys:
             raise RecordingError(f"the wrench cannot be compensated: {min(whys)}; or omit --tool")
     about = {

@@ -110,12 +110,13 @@ class Windows:
 
     def _follow(self, in_force: InForce, stream: CompensatedStream) -> None:
         """What is in force for what follows, the sensor's own offset too."""
+        was_announced = stream.offset is None  # of what came since then nothing is compensated
         stream.configure(in_force)
         self._doubt_ns = in_force.doubt_ns
         if stream.follow_offset() is None:
             return
         newest_ns = self._newest[0]
-        if self.begin_ns >= 0:
+        if self.begin_ns >= 0 and not was_announced:
             since_ns = newest_ns - self.doubt_ns - self._delay_ns[0]
             self._slots["compensated"][self._slots["measured_ns"][:, 0] >= since_ns] = math.nan
 

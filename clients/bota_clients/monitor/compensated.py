@@ -55,13 +55,11 @@ class NewestCompensated:
         if not len(samples):
             return
         wrenches, bounds = stream.compensate(samples)
-        if stream.obstacle:
-            self.latest, self.problem = None, f"the wrench cannot be compensated: {stream.obstacle}"
-            return
         wrench, (force_bound, torque_bound) = wrenches[-1].tolist(), bounds[-1].tolist()
         if not math.isfinite(sum(wrench)):
-            why = stream.doubt or "it may not be used, or came after lost samples"
-            self.latest, self.problem = None, f"not known of the newest sample: {why}"
+            lost = "not known of the newest sample: it may not be used, or came after lost samples"
+            held = f"the wrench cannot be compensated: {stream.hold}"
+            self.latest, self.problem = None, held if stream.hold else lost
             return
         force, torque = (wrench[0], wrench[1], wrench[2]), (wrench[3], wrench[4], wrench[5])
         contact = self._contact(force, torque, in_force)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from bota_ethercat.control import MAX_SDO_BYTES, ErrorCode
 from bota_ethercat.errors import RequestError
 from bota_ethercat.sensor.sdo_types import SDO_TYPES, SdoType
-from ethercat_server.errors import CutOffError, extended
+from ethercat_server.errors import BusError, CutOffError, extended
 from ethercat_server.ethercat.datagrams import Steps
 from ethercat_server.ethercat.slave.coe import Sdo
 from ethercat_server.sensor.objects import dictionary
@@ -72,13 +72,31 @@ def bytes_to_write(values: Mapping[str, Any]) -> bytes:
     return data
 
 
-def write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> Steps[Mapping[str, Any]]:
-    """Write an entry; a setting or the offset is restored from now on when the sensor has lost it."""
+def write(
+    sdo: Sdo,
+    sensor: Sensor,
+    index: int,
+    subindex: int,
+    data: bytes,
+    on_offset: Callable[[Sensor], object] = lambda _: None,
+) -> Steps[Mapping[str, Any]]:
+    """Write an entry; a setting or the offset is restored from now on when the sensor has lost it.
+
+    `on_offset` is called before the offset is written, and after it.
+    """
+    is_offset = index == dictionary.FORCE_TORQUE_OFFSET
+    if is_offset:
+        sensor.offset_is_certain = False
+        on_offset(sensor)
     try:
         yield from sdo.write(index, subindex, data)
     except CutOffError as error:
         sensor.change_interrupted = True
         raise extended(error, "; whether it took the value is not known") from None
+    except BusError:
+        if is_offset:
+            yield from _read_offset(sdo, sensor, on_offset)
+        raise
     entry = dictionary.BY_ADDRESS.get((index, subindex))
     if entry is not None and entry.setting is not None:
         try:
@@ -88,6 +106,11 @@ def write(sdo: Sdo, sensor: Sensor, index: int, subindex: int, data: bytes) -> S
         if value is not None:
             sensor.wanted = {**sensor.wanted, entry.setting: value}
             sensor.set_in_force({**sensor.settings, entry.setting: value})
-    if index == dictionary.FORCE_TORQUE_OFFSET:
-        sensor.offset = yield from read_offset(sdo)
+    if is_offset:
+        yield from _read_offset(sdo, sensor, on_offset)
     return {"index": index, "subindex": subindex, "hex": data.hex()}
+
+
+def _read_offset(sdo: Sdo, sensor: Sensor, on_offset: Callable[[Sensor], object]) -> Steps[None]:
+    sensor.offset, sensor.offset_is_certain = (yield from read_offset(sdo)), True
+    on_offset(sensor)

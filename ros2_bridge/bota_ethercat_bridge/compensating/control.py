@@ -70,7 +70,6 @@ class CompensationControl:
         self._group = MutuallyExclusiveCallbackGroup()
         # Of the sensor that the bias in force is for; "": none was there yet.
         self._serial: int | str | None = ""
-        self._is_other_sensor = False  # whether the bias may be another sensor's
         self._changes: deque[BiasChange] = deque()
         self._is_showing = False  # whether parameters are being made what is in force
         check_source(node, parameters)
@@ -97,10 +96,9 @@ class CompensationControl:
         self.output.stream.configure(self.link.in_force)
         if self._is_same_sensor():
             self._follow_offset()
-            self._hold()
         else:
-            self._is_other_sensor = True  # not one sample of this sensor with what may be another's bias
-            self._hold()
+            # Not one sample of this sensor with what may be another's bias.
+            self._forbid("the bias may be another sensor's")
             self._guard.trigger()
 
     @property
@@ -139,8 +137,7 @@ class CompensationControl:
             good if has_subscribers else f"{good}; nobody has subscribed",
             self._values,
             stopped=self._why_stopped() or output.problem,
-            doubtful=(self.own_offset.doubt(self.offset) if self.link.is_connected else "")
-            or self._ramp.taken.doubt(payload),
+            doubtful=self._ramp.taken.doubt(payload),
             follows_imu=source.is_imu and payload.mass > 0.0,
             withheld=output.withheld,
             why_withheld=output.why_withheld or f"{_NOTHING_CURRENT} ({source.name})",
@@ -174,10 +171,10 @@ class CompensationControl:
         by_imu, has_tool = self.parameters.gravity_source == "imu", self.parameters.tool_mass > 0
         return obstacle(self.link.settings, has_tool=has_tool or needs_tool, by_imu=by_imu)
 
-    def _hold(self) -> None:
-        """Publish nothing while the bias may be another sensor's, or the settings conflict."""
-        why = "the bias may be another sensor's" if self._is_other_sensor else ""
-        self.output.stream.hold = why or self.conflict()
+    def _forbid(self, why: str) -> None:
+        """Publish nothing, whatever is in force; empty: publish again."""
+        self.output.stream.forbidden = why
+        self.output.stream.check()
 
     def _why_stopped(self) -> str:
         """Why the newest sample was not compensated, or would not be if anybody had subscribed."""
@@ -207,11 +204,15 @@ class CompensationControl:
     def undo_bias(self) -> Wrench:
         """Go back to the bias before, and return it; CompensationError if there is none."""
         with self._setting:
-            self._change(lambda ramp: ramp.undone(self._sample_s, self.parameters.bias_ramp_time))
-            self.own_offset.begin(self.bias, self.offset)
+            self._change(self._undone)
             self.origin = "undone"
             self._show()
             return self.bias
+
+    def _undone(self, ramp: BiasRamp) -> BiasRamp:
+        ramp = ramp.undone(self._sample_s, self.parameters.bias_ramp_time)
+        self.own_offset.begin(ramp.target, self.offset)
+        return ramp
 
     def forget_bias(self) -> None:
         """One that was measured is not for the next time: the sensor may be another."""
@@ -246,6 +247,7 @@ class CompensationControl:
         with self._replacing:
             ramp = change(self._ramp)
             self.output.stream.plan = Plan(self.source, parameters.payload, ramp, parameters.accelerometer)
+            self.output.stream.check()
 
     def _apply_changes(self, ramp: BiasRamp) -> BiasRamp:
         """Of this ramp the one for the present tool that leads to the bias that waits."""
@@ -308,7 +310,6 @@ class CompensationControl:
         if warning:
             self._log.warning(warning)
         self._guard.trigger()  # the parameters follow
-        self._hold()
 
     def _open_source(self, *, is_late: bool = False) -> None:
         """Open the source that is wanted, unless it is open. ParameterError, if it is not too `late`."""
@@ -350,8 +351,7 @@ class CompensationControl:
                 self._change(partial(lambda ramp, _: ramp, ramp))
             self._follow_offset()
             self._show()
-            self._is_other_sensor = False
-            self._hold()
+            self._forbid("")
             if not self._is_same_sensor():
                 self.link_changed()
 

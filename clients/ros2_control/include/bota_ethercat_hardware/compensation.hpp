@@ -71,26 +71,33 @@ private:
     }
 };
 
-/// How the offset that the sensor itself adds (object 0x8000) changes a bias.
+/// How the offset that the sensor itself adds (object 0x8000) changes a bias: as bota_ft_compensation/stream.py.
 class OwnOffset {
 public:
     using Known = std::optional<Wrench>;
 
     /// There is a bias, and it goes with this offset.
-    void begin(const Known& of_bias) noexcept { has_bias_ = true, of_bias_ = of_bias, change_ = {}; }
+    void begin(const Known& of_bias) noexcept { has_bias_ = true, of_bias_ = of_bias, appeared_ = false, change_ = {}; }
 
-    /// What is to be added to the bias of a sample that has this offset.
-    const Wrench& follow(const Known& now) noexcept {
-        if (!has_bias_ || !now || now == of_bias_) return change_;
-        if (of_bias_)
-            for (std::size_t i = 0; i < change_.size(); ++i) change_[i] += (*now)[i] - (*of_bias_)[i];
-        of_bias_ = now;
-        return change_;
+    /// Whether the offset is another one, by which `change` is another, too. Unknown is also one that is being changed.
+    bool follow(const Known& now) noexcept {
+        is_doubtful_ = of_bias_ && !now;
+        if (!now || now == of_bias_) return false;
+        const Known before = std::exchange(of_bias_, now);
+        appeared_ = has_bias_ && !before;
+        if (before && has_bias_)
+            for (std::size_t i = 0; i < change_.size(); ++i) change_[i] += (*now)[i] - (*before)[i];
+        return before.has_value();
     }
 
+    /// What is to be added to the bias.
+    const Wrench& change() const noexcept { return change_; }
+    /// Whether the bias may not fit samples with the offset of the last `follow`.
+    bool is_doubtful() const noexcept { return is_doubtful_ || appeared_; }
+
 private:
-    bool has_bias_ = false;
-    Known of_bias_;
+    bool has_bias_ = false, appeared_ = false, is_doubtful_ = false;
+    Known of_bias_;  // or the last without a bias
     Wrench change_{};
 };
 

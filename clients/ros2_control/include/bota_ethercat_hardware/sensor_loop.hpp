@@ -364,7 +364,7 @@ private:
     void receive() noexcept {
         Received& received = latest_.next();
         if (is_tared_.load(std::memory_order_acquire)) {
-            own_offset_.begin(tared_offset_);
+            own_offset_.begin(sensor_->offset ? std::optional(tared_offset_) : std::nullopt);  // some servers never tell it
             is_tared_ = false;
         }
         for (int left = kMaxSamples; left > 0; --left) {  // the load of the tool needs every sample
@@ -391,11 +391,11 @@ private:
 
     /// The bias of the newest sample; the samples after a change of the sensor's offset may not have all of it yet.
     void follow(const SensorInfo& sensor, std::uint64_t monotonic_ns) noexcept {
-        const Wrench before = std::exchange(bias_change_, own_offset_.follow(sensor.offset));
-        if (before != bias_change_ && sensor.rate_hz > 0.0)
+        if (own_offset_.follow(sensor.offset) && sensor.rate_hz > 0.0)
             doubted_until_ns_ = newest_ns_ + static_cast<std::uint64_t>(std::llround(kDoubtAfter * 1e9 / sensor.rate_hz));
+        bias_change_ = own_offset_.change();
         newest_ns_ = monotonic_ns;
-        if (doubted_until_ns_ > 0 && newest_ns_ <= doubted_until_ns_) load_.fill(NAN);
+        if (own_offset_.is_doubtful() || (doubted_until_ns_ > 0 && newest_ns_ <= doubted_until_ns_)) load_.fill(NAN);
         else if (!tool_) load_ = {};
     }
 
@@ -432,7 +432,7 @@ private:
             log_(Level::warning, "it is not known with which offset of the sensor the bias was measured, and taken for that of now: "
                                  "give sensor_offset, or use the file of an identification");
         else if (!sensor_->offset)
-            log_(Level::warning, "the server does not tell the sensor's own offset: the bias is right only while it is sensor_offset");
+            log_(Level::warning, "the server does not tell the sensor's own offset, so nothing is compensated: leave sensor_offset out, or tare");
     }
 
     /// Log why there is no connection, and what the controllers see, when it changes and has been quiet for a while.
