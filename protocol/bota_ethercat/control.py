@@ -324,5 +324,7 @@ def event_sentence(event: Mapping[str, Any]) -> str:
     kind, sensor, lost_s = str(event.get("event")), whole(event.get("sensor")), number(event.get("lost_s"))
     if kind not in _EVENTS:
         return f"the server sent the event {printable(kind, 40)}, which this version does not know"
-    said = _EVENTS[kind].format("the sensor" if sensor is None else f"sensor {sensor}")
+    is_begun = kind == Event.OFFSET_CHANGED and event.get("offset") is None
+    said = "the offset of {} is being changed" if is_begun else _EVENTS[kind]
+    said = said.format("the sensor" if sensor is None else f"sensor {sensor}")
     return said if lost_s is None else f"{said} after {lost_s:g} s"

@@ -18,6 +18,7 @@ from bota_clients.recording import file_format
 from bota_clients.recording.columns import at_last_offset, columns
 from bota_clients.recording.mcap_file import MAX_CHUNK, McapFile
 from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
+from bota_clients.report.series import of_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
@@ -292,10 +293,15 @@ def test_the_example_reads_a_recording(path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_only_what_is_around_a_change_of_the_sensors_own_offset_is_left_out(tmp_path: Path) -> None:
-    """0.1 s before it was told and two samples after, none where it is told again."""
-    path = tared(tmp_path / "run.mcap", (1.0, 1.0, 2.0, 4.0), (5.0, 5.0, 6.0, 8.0))
+    """0.1 s before it was told and two samples after, none where it is told again; announced: not before."""
+    path = tared(tmp_path / "run.mcap", (1.0, 1.0, 2.0, None, 4.0), (5.0, 5.0, 6.0, 7.3, 8.0))
     with open_recording(path) as recording:
         found, offset, remarks = at_last_offset(recording, recording.sensors[0], ImuUnits.SI)
-    assert (offset, remarks) == ((4.0, 0, 0, 0, 0, 0), [])
+    assert (offset, remarks) == (
+        (4.0, 0, 0, 0, 0, 0),
+        ["800 frames left out: the sensor's own offset was not known"],
+    )
     assert found.force[:, 0] == pytest.approx(8.0)
-    assert sorted({*range(3200)} - {*found.sequence.tolist()}) == [*range(1520, 1603), *range(2320, 2403)]
+    assert sorted({*range(4000)} - {*found.sequence.tolist()}) == [*range(1520, 1603), *range(2400, 3203)]
+    (remark,) = (each for each in of_recording(path, ImuUnits.SI)[0].remarks if "own offset" in each)
+    assert remark.startswith("The sensor's own offset was changed 2 times (by a tare, say): ")

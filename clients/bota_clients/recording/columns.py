@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from bota_clients.errors import RecordingError
+from bota_clients.numbers import count
 from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import RecordedSensor, Recording
 from bota_ethercat.accounting import NOT_NEW
@@ -117,23 +117,22 @@ def at_last_offset(
 ) -> tuple[Columns, tuple[float, ...] | None, list[str]]:
     """A sensor's columns as if its last offset had been in force all the time, that offset, and remarks.
 
-    On one axis of time, without the samples in which a change was being written. None: the recording does not
-    say the offset. RecordingError if it says so in part only.
+    On one axis of time, without the samples in which a change was being written, or whose offset is not known
+    where that of others is. None: the recording does not say any.
     """
-    told = [row.info.offset for row in sensor.offsets] or [None]
-    if None in told and set(told) != {None}:
-        raise RecordingError(
-            f"{recording.path}: the own offset of sensor {sensor.sensor} is not known all the time: record "
-            "from one server"
-        )
-    nothing, axis = (0.0,) * 6, TimeAxis()
-    last = np.array(told[-1] or nothing)
+    told = [row.info.offset for row in sensor.offsets if row.info.offset is not None]
+    nothing, axis, left_out, is_announced = (0.0,) * 6, TimeAxis(), 0, False
+    last = np.array(told[-1] if told else nothing)
     parts, in_doubt, before = list[Columns](), list[tuple[int, int]](), last
     for in_force, batch in axis.batches(recording.batches(sensor.sensor)):
+        if told and in_force.info.offset is None:
+            left_out, is_announced = left_out + len(batch), True
+            continue
         part, shift = columns(batch, imu_units), last - np.array(in_force.info.offset or nothing)
         if parts and (shift != before).any():
-            at_ns = batch[0].monotonic_ns
-            in_doubt.append((at_ns - in_force.doubt_ns, at_ns + in_force.doubt_after_ns))
+            at_ns, doubt_ns = batch[0].monotonic_ns, 0 if is_announced else in_force.doubt_ns
+            in_doubt.append((at_ns - doubt_ns, at_ns + in_force.doubt_after_ns))
+        is_announced = False
         part.force[:] += shift[:3]
         part.torque[:] += shift[3:]
         parts.append(part)
@@ -142,4 +141,7 @@ def at_last_offset(
     is_sure = np.ones(len(found), bool)
     for begin_ns, end_ns in in_doubt:
         is_sure &= (found.monotonic_ns < begin_ns) | (found.monotonic_ns > end_ns)
-    return found.where(is_sure), told[-1], axis.said
+    said = axis.said
+    if left_out:
+        said = [*said, f"{count(left_out, 'frame')} left out: the sensor's own offset was not known"]
+    return found.where(is_sure), told[-1] if told else None, said

@@ -110,7 +110,8 @@ def _subject(recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) 
         found = found.where(~changing | (np.arange(len(found)) <= last))
     remarks = [] if kept.settings else ["The settings are not known."]
     remarks += _remarks([row.info for row in sensor.history], kept, found)
-    if (tared := len(sensor.offsets) - 1) > 0:
+    offsets = (row.info.offset for row in sensor.offsets if row.info.offset is not None)
+    if (tared := sum(was != now for was, now in pairwise(offsets))) > 0:
         remarks.append(
             f"The sensor's own offset was changed {count(tared, 'time')} (by a tare, say): forces before and "
             "after differ by that."

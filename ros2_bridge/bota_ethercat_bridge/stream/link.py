@@ -176,6 +176,6 @@ def sentence(message: JsonObject, before: Mapping[str, SettingValue]) -> str:
         settings = known_settings(message.get("settings")).items()
         changed = [f"{name} {str(value).lower()}" for name, value in settings if before.get(name) != value]
         return f"{text}: {', '.join(changed)}" if changed else text
-    if event == Event.OFFSET_CHANGED:
-        return f"{text}: it is {offset_text(message.get('offset'))}"
+    if event == Event.OFFSET_CHANGED and message.get("offset") is not None:
+        return f"{text}: it is {offset_text(message['offset'])}"
     return text
