@@ -60,6 +60,11 @@ def test_the_server_and_the_file(read: Read, argv: str, path: str, server: str) 
         ),
         (recorded, "14101", "or ./14101 if a file is called so"),
         (recorded, "::1", "is a server's address"),
+        (
+            recorded,
+            "runs/1.CSV",
+            "runs/1.CSV: a recording is an MCAP file: write runs/1.mcap, from which ethercat-export makes .csv",
+        ),
         (recorded, "a.mcap robot:1", "unrecognized arguments: robot:1"),
         (monitored, "--server ::1", "in brackets"),
         (replayed, "a.mcap --server robot", "'robot': it must be an IP address of this machine"),

@@ -16,6 +16,8 @@ from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.server_choice import is_address
 
 _UNITS_S: Final = {"": 1, "s": 1, "m": 60, "h": 3600}  # by their first letter
+# Of other formats: a recording so called would be taken for what it is not.
+_OTHERS: Final = {".csv", ".parquet", ".npz", ".npy", ".zarr", ".bag", ".db3", ".json", ".txt", ".hdf5"}
 _UNIT: Final = "s(?:ec(?:ond)?s?)?|m(?:in(?:ute)?s?)?|h(?:(?:ou)?rs?)?"
 
 
@@ -54,6 +56,11 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         made.error(
             f"{name} is a server's address, no file: write FILE.mcap --server {name}, "
             f"or ./{name} if a file is called so"
+        )
+    if Path(name).suffix.lower() in _OTHERS:
+        made.error(
+            f"{name}: a recording is an MCAP file: write {Path(name).with_suffix('.mcap')}, from which "
+            "ethercat-export makes .csv, .parquet, .npz and .zarr"
         )
     options.path, options.address = Path(name), server_of(made, options.server)
     if options.sensors is not None:
