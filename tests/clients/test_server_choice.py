@@ -63,7 +63,7 @@ def test_the_server_and_the_file(read: Read, argv: str, path: str, server: str) 
         (
             recorded,
             "runs/1.CSV",
-            "runs/1.CSV: a recording is an MCAP file: write runs/1.mcap, from which ethercat-export makes .csv",
+            "runs/1.CSV: a recording is an MCAP file: write runs/1.mcap, from which ethercat-export",
         ),
         (recorded, "a.mcap robot:1", "unrecognized arguments: robot:1"),
         (monitored, "--server ::1", "in brackets"),
