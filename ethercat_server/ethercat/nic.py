@@ -143,6 +143,11 @@ _ROUTE: Final = struct.Struct("=BBBBBBBBI")
 _RTA_DST, _RTA_OIF, _RTA_MULTIPATH = 1, 4, 9
 _RTA_GATEWAYS: Final = frozenset({5, 18})  # the second: one of the other family
 _NEXT_HOP: Final = struct.Struct("=HxxI")  # length, interface
+# Objects (`ip nexthop`), to which a route only refers if net.ipv4.nexthop_compat_mode is 0: family, scope,
+# who made it, flags; and of a group the number and weight of each member.
+_GET_NEXT_HOP, _RTA_NEXT_HOP = 106, 30
+_OBJECT, _MEMBER = struct.Struct("=BBBxI"), struct.Struct("=I4x")
+_NHA_ID, _NHA_GROUP, _NHA_OIF, _NHA_GATEWAY = 1, 2, 5, 6
 _UNICAST, _CACHED = 1, 0x200
 _MADE_BY_KERNEL: Final = 2
 # The shortest prefix of a single network; the whole address space is also routed by halves, or other parts.
@@ -420,7 +425,8 @@ def find_routes(index: int) -> Routes:
                 _GET_ROUTE, _ROUTE, *(0,) * 9
             )
             if family in _FAMILIES and kind == _UNICAST and not flags & _CACHED
-            for gateway in _ways(found, carried)
+            for index, gateway in _hops(found)
+            if index in carried
         ]
     except (LookupError, ValueError, struct.error) as error:
         raise OSError(f"unknown answer: {error}") from error
@@ -455,16 +461,22 @@ def _carried_by(index: int) -> set[int]:
     return carried
 
 
-def _ways(route: dict[int, bytes], carried: set[int]) -> Iterator[bool]:
-    """Of each next hop of a route that is on one of these interfaces: whether it is a gateway."""
-    if int.from_bytes(route.get(_RTA_OIF, b""), sys.byteorder) in carried:
-        yield not _RTA_GATEWAYS.isdisjoint(route)
+def _hops(route: dict[int, bytes]) -> Iterator[tuple[int, bool]]:
+    """Of each next hop of a route the interface, and whether there is a gateway."""
+    if _RTA_OIF in route:
+        yield int.from_bytes(route[_RTA_OIF], sys.byteorder), not _RTA_GATEWAYS.isdisjoint(route)
     hops = route.get(_RTA_MULTIPATH, b"")
     while len(hops) >= _NEXT_HOP.size:
         size, index = _NEXT_HOP.unpack_from(hops)
-        if index in carried:
-            yield not _RTA_GATEWAYS.isdisjoint(_attributes(hops[_NEXT_HOP.size : size]))
+        yield index, not _RTA_GATEWAYS.isdisjoint(_attributes(hops[_NEXT_HOP.size : size]))
         hops = hops[max(_NEXT_HOP.size, size + 3 & ~3) :]
+    if _RTA_NEXT_HOP in route and not {_RTA_OIF, _RTA_MULTIPATH} & route.keys():
+        objects = {found[_NHA_ID]: found for _, found in _ask(_GET_NEXT_HOP, _OBJECT, *(0,) * 4)}
+        named = objects[route[_RTA_NEXT_HOP]]
+        group = named.get(_NHA_GROUP, b"")
+        members = [objects[group[at : at + 4]] for at in range(0, len(group), _MEMBER.size)]
+        for each in members or [named]:
+            yield int.from_bytes(each.get(_NHA_OIF, b""), sys.byteorder), _NHA_GATEWAY in each
 
 
 def network_trouble(ifname: str, routes: Routes) -> str | None:

@@ -236,6 +236,9 @@ with contextlib.redirect_stderr(sys.stdout):
     print(main(["near0", "--exit-on-eof", "--control", f"/tmp/control-{os.getpid()}"]))
 """
 
+# As routing daemons set it: routes do not say where their next hops are.
+UNSEEN = "echo 0 >/proc/sys/net/ipv4/nexthop_compat_mode"
+
 
 @pytest.mark.parametrize(
     ("routes", "elsewhere"),
@@ -252,6 +255,9 @@ with contextlib.redirect_stderr(sys.stdout):
                 )
             ),
             "ip nexthop add id 5 via 192.0.2.1 dev near0; ip route add default nhid 5",
+            f"{UNSEEN}; ip nexthop add id 5 via 192.0.2.1 dev near0; ip route add default nhid 5",
+            f"{UNSEEN}; ip nexthop add id 5 dev other0; ip nexthop add id 6 dev near0; "
+            "ip nexthop add id 7 group 5/6; ip route add default nhid 7",
             "ip rule add from 192.0.2.7 table 77; ip route add default via 192.0.2.1 table 77",
             "ip rule add fwmark 1 table 7777; ip route add default dev near0 table 7777",
             "ip route add 0.0.0.0/1 via 192.0.2.1; ip route add 128.0.0.0/1 via 192.0.2.1",
@@ -270,6 +276,7 @@ with contextlib.redirect_stderr(sys.stdout):
         ("ip route add 224.0.0.0/4 dev near0", ""),
         ("ip route add default via 198.51.100.1; ip -6 route add default via 2001:db8:1::1", ""),
         ("ip route add default nexthop via 198.51.100.1 nexthop via 198.51.100.2", ""),
+        (f"{UNSEEN}; ip nexthop add id 6 via 198.51.100.1 dev other0; ip route add default nhid 6", ""),
         ("ip route add unreachable default; ip -6 route add blackhole default", ""),
     ],
 )
