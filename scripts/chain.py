@@ -103,13 +103,17 @@ class Chain(contextlib.ExitStack):
         assert self.link is not None
         return self.link
 
+    def check(self) -> None:
+        """ScriptError if a program has failed."""
+        for child in self.children:
+            child.check()
+
     def wait(self, done: Callable[[], bool], what: str = "a program did not get ready",
              seconds: float = _START_TIMEOUT_S) -> None:  # fmt: skip
         """Wait; ScriptError if a program fails or it takes too long."""
         deadline = time.monotonic() + seconds
         while not done():
-            for child in self.children:
-                child.check()
+            self.check()
             if time.monotonic() > deadline:
                 raise ScriptError(f"{what} within {seconds:g} s")
             time.sleep(0.02)

@@ -10,8 +10,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, Final
 
@@ -22,14 +21,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from bota_ethercat.distribution import Distribution
 from bota_ethercat.program.arguments import Parser, seconds, whole
 from bota_ethercat_bridge.rclpy_internals import taking
-from bota_ethercat_bridge.subscription import Subscription
+from bota_ethercat_bridge.subscription import Counted, report
 
 _DISCOVERY_S: Final = 10.0
-_CONTROL_MS: Final = 5.0  # older samples are no good to a control loop
-_DEEP: Final = 100  # deep enough for a pause of the process, but not for a slow callback
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -89,18 +85,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return int(counted.lost > 0)
 
 
-class Counted(Subscription):
-    """With the ages of all messages."""
-
-    def __init__(self, topic: str) -> None:
-        super().__init__(topic)
-        self.ages = Distribution()
-
-    def receive(self, stamp: Any, now_ns: int) -> None:
-        super().receive(stamp, now_ns)
-        self.ages.count(array("f", [self.age_ns]))
-
-
 def _find(node: Node, topic: str) -> Any:
     """A publisher of the topic; None if there is none in time."""
     end_s = time.monotonic() + _DISCOVERY_S
@@ -110,27 +94,6 @@ def _find(node: Node, topic: str) -> Any:
             if "UNKNOWN" not in publisher.node_name:  # which becomes known later
                 return publisher
     return None
-
-
-def report(counted: Counted, depth: int, *, best_effort: bool) -> Iterator[str]:
-    """What was measured, and what to change: a sentence each."""
-    p50, p99, longest = (counted.ages.summary_us()[point] / 1e3 for point in ("p50", "p99", "max"))
-    yield f"received {counted.received}, lost {counted.lost}, missing {counted.missing}"
-    yield f"age p50 {p50:.1f} ms, p99 {p99:.1f} ms, longest {longest:.1f} ms"
-    if not counted.rate_hz:
-        yield "lost is not known: the publisher has no ~/published"
-    elif counted.lost and best_effort:
-        yield "lost by best effort: subscribe reliably"
-    elif counted.lost and depth < _DEEP:
-        yield f"the queue was too short for a pause of this process: raise the depth to {_DEEP}"
-    elif counted.lost and p50 > 500 * depth / counted.rate_hz:
-        yield "the queue is always full: use an executor for this topic alone, C++, or publishing_frequency"
-    elif counted.lost:
-        yield "long pauses: raise the depth, or give this process real-time priority"
-    if p99 > _CONTROL_MS:
-        yield "too old for a control loop: use real-time priority, or the ros2_control plugin"
-    if counted.missing > counted.lost:
-        yield f"{counted.missing - counted.lost} samples were not published: see the node's /diagnostics"
 
 
 if __name__ == "__main__":

@@ -11,10 +11,16 @@ later message is here: then no earlier one will come. bota_ethercat/subscription
 
 from __future__ import annotations
 
+from array import array
 from collections import deque
+from collections.abc import Iterator
 from typing import Any, Final
 
+from bota_ethercat.distribution import Distribution
+
 _MOST: Final = 65536  # messages without a report
+_CONTROL_MS: Final = 5.0  # older samples are no good to a control loop
+_DEEP: Final = 100  # deep enough for a pause of the process, but not for a slow callback
 
 
 class Subscription:
@@ -77,3 +83,36 @@ class Subscription:
                 here += 1
             self.lost += count - self._count - here if self._count >= 0 else 0
             self._count = count
+
+
+class Counted(Subscription):
+    """With the ages of all messages."""
+
+    def __init__(self, topic: str) -> None:
+        super().__init__(topic)
+        self.ages = Distribution()
+
+    def receive(self, stamp: Any, now_ns: int) -> None:
+        super().receive(stamp, now_ns)
+        self.ages.count(array("f", [self.age_ns]))
+
+
+def report(counted: Counted, depth: int, *, best_effort: bool) -> Iterator[str]:
+    """What was measured, and what to change: a sentence each."""
+    p50, p99, longest = (counted.ages.summary_us()[point] / 1e3 for point in ("p50", "p99", "max"))
+    yield f"received {counted.received}, lost {counted.lost}, missing {counted.missing}"
+    yield f"age p50 {p50:.1f} ms, p99 {p99:.1f} ms, longest {longest:.1f} ms"
+    if not counted.rate_hz:
+        yield "lost is not known: the publisher has no ~/published"
+    elif counted.lost and best_effort:
+        yield "lost by best effort: subscribe reliably"
+    elif counted.lost and depth < _DEEP:
+        yield f"the queue was too short for a pause of this process: raise the depth to {_DEEP}"
+    elif counted.lost and p50 > 500 * depth / counted.rate_hz:
+        yield "the queue is always full: use an executor for this topic alone, C++, or publishing_frequency"
+    elif counted.lost:
+        yield "long pauses: raise the depth, or give this process real-time priority"
+    if p99 > _CONTROL_MS:
+        yield "too old for a control loop: use real-time priority, or the ros2_control plugin"
+    if counted.missing > counted.lost:
+        yield f"{counted.missing - counted.lost} samples were not published: see the node's /diagnostics"

@@ -1,129 +1,133 @@
 """The demo, started by scripts/demo in a network namespace of its own.
 
-Starts `ethercat-server virtual`, `bridge-client` and an rclpy subscriber, shows what arrives, and judges it.
+Starts `ethercat-server virtual`, `bridge-client` and an rclpy subscriber that counts as `check_subscription`
+does, shows what arrives, and judges it. Time and memory do not grow with the run.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import sys
-import threading
 import time
-from collections import deque
-from collections.abc import Iterator, Mapping
-from functools import partial
+from array import array
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from bota_ethercat.client import Client, Connected, Disconnected
-from bota_ethercat.errors import ConnectionFailedError
-from bota_ethercat.framing import DataMessage
-from bota_ethercat.pdo import SampleDecoder
+from bota_ethercat.distribution import Distribution
 from bota_ethercat.program.arguments import number
+from bota_ethercat_bridge.subscription import Counted, report
 from scripts.benchmarks.records import PORT, REAL_TIME
 from scripts.chain import Chain, ScriptError, Stopped, ignore_signals, loopback_up, stoppable
-from scripts.demonstration.measure import FULL_RATE, Figures, Measurement, verdict
 
 TOPIC: Final = "/wrench"
+_PUBLISHED: Final = "/bridge/published"
+_DEPTH: Final = 50
 _SHOW_S: Final = 1.0
-_VECTORS: Final = (
-    ("force", "N", 2), ("torque", "Nm", 3), ("acceleration", "m/s²", 3), ("angular_rate", "rad/s", 4),
-)  # fmt: skip
+_FULL_RATE: Final = 0.95  # fewer messages than this part of the samples: something could not keep up
+_LEAST_RATE: Final = 0.6  # fewer than this part, and something is wrong
+_PAUSE_NS: Final = 10**9  # without a message for longer: this computer was suspended, say
+
+
+class Rate:
+    """Messages per second, but for pauses."""
+
+    def __init__(self) -> None:
+        self._intervals = self._span_ns = 0
+        self._newest_ns: int | None = None
+        self.paused_ns = 0
+
+    def arrived(self, now_ns: int) -> None:
+        """By CLOCK_MONOTONIC."""
+        passed_ns = now_ns - (now_ns if self._newest_ns is None else self._newest_ns)
+        if passed_ns > _PAUSE_NS:
+            self.paused_ns += passed_ns
+        elif self._newest_ns is not None:
+            self._intervals, self._span_ns = self._intervals + 1, self._span_ns + passed_ns
+        self._newest_ns = now_ns
+
+    @property
+    def hz(self) -> float:
+        """0 if it is not known."""
+        return self._intervals * 1e9 / self._span_ns if self._span_ns else 0.0
+
+
+class Shown(Counted):
+    """What arrived on the topic: counted as a whole, and since the last line."""
+
+    def __init__(self) -> None:
+        super().__init__(TOPIC)
+        self.rate, self.all_finite = Rate(), True
+        self._begin_line()
+
+    def _begin_line(self) -> None:
+        self._line_rate, self._line_ages, self._values = Rate(), Distribution(), tuple[float, ...]()
+
+    def take(self, message: Any, now_ns: int, monotonic_ns: int) -> None:
+        """A message, when it arrived: since 1970, and by CLOCK_MONOTONIC."""
+        self.receive(message.header.stamp, now_ns)
+        self._line_ages.count(array("f", [self.age_ns]))
+        for rate in (self.rate, self._line_rate):
+            rate.arrived(monotonic_ns)
+        wrench = message.wrench
+        self._values = (*(getattr(part, axis) for part in (wrench.force, wrench.torque) for axis in "xyz"),)
+        self.all_finite = self.all_finite and all(map(math.isfinite, self._values))
+
+    def line(self) -> str:
+        """Of the messages since the last line: rate, age and the newest; of the run what is missing."""
+        age_ms, shown = self._line_ages.summary_us()["p50"] / 1e3, "  nothing arrived"
+        if values := [f"{value:+.2f}" for value in self._values]:
+            shown = f"  age {age_ms:.2f} ms  N {' '.join(values[:3])}  Nm {' '.join(values[3:])}"
+        text = f"{self._line_rate.hz:7.1f} Hz  lost {self.lost}, missing {self.missing}{shown}"
+        self._begin_line()
+        return text
+
+    def verdict(self, nominal_hz: float) -> str | None:
+        """What is wrong, in one sentence; None if all is well."""
+        if not self.received:
+            return "nothing arrived on the ROS topic"
+        if not self.all_finite:
+            return "a message held a number that is not finite"
+        if not _LEAST_RATE * nominal_hz <= self.rate.hz <= 1.05 * nominal_hz:
+            return f"{self.rate.hz:.1f} messages/s arrived and the sensor makes {nominal_hz:g} samples/s"
+        return None
+
+    def summary(self, nominal_hz: float) -> Iterator[str]:
+        """Of the whole run, a sentence each."""
+        yield f"{self.rate.hz:.1f} messages/s arrived, of the sensor's {nominal_hz:g} samples/s"
+        yield from report(self, _DEPTH, best_effort=False)
+        if self.rate.paused_ns:
+            yield f"for {self.rate.paused_ns * 1e-9:.0f} s no message came; the rate is that of the rest"
+        if self.missing or self.rate.hz < _FULL_RATE * nominal_hz:
+            yield "other programs had the processors for some time: docs/tuning.md helps"
 
 
 @contextlib.contextmanager
-def listening(measurement: Measurement) -> Iterator[deque[str]]:
-    """Two threads take what comes from the server and on the ROS topic; yields what is to be told."""
+def subscribed(shown: Callable[[], Shown]) -> Iterator[Callable[[float], object]]:
+    """Yields what waits, at most for so many seconds, and hands on what is there."""
     import rclpy  # noqa: PLC0415 - only now are signals handled
+    from diagnostic_msgs.msg import DiagnosticArray  # noqa: PLC0415
     from geometry_msgs.msg import WrenchStamped  # noqa: PLC0415
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
 
     from bota_ethercat_bridge.rclpy_internals import taking  # noqa: PLC0415
 
-    told, is_over = deque[str](maxlen=9), threading.Event()
-    client = Client(PORT, raw=True)
-
-    def on_message(message: Any) -> None:
-        now_ns, stamp, wrench = time.time_ns(), message.header.stamp, message.wrench
-        values = [getattr(part, axis) for part in (wrench.force, wrench.torque) for axis in "xyz"]
-        measurement.add_message(stamp.sec * 10**9 + stamp.nanosec, values, now_ns)
-
-    def subscribe() -> None:
-        while not is_over.is_set():
-            take(0.1)
-
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("demo", start_parameter_services=False)
-    take = taking(node, node.create_subscription(WrenchStamped, TOPIC, on_message, 50))
-    threads = [
-        threading.Thread(target=each, daemon=True)
-        for each in (partial(receive, client, measurement, told), subscribe)
-    ]
-    for thread in threads:
-        thread.start()
+    take, published = (
+        node.create_subscription(kind, name, act, depth)
+        for kind, name, act, depth in (
+            (WrenchStamped, TOPIC, lambda it: shown().take(it, time.time_ns(), time.monotonic_ns()), _DEPTH),
+            (DiagnosticArray, _PUBLISHED, lambda report: shown().published(report), 10),
+        )
+    )
     try:
-        yield told
+        yield taking(node, published, take)
     finally:
-        is_over.set()
-        client.close()
-        for thread in threads:
-            thread.join(3)
         node.destroy_node()
         rclpy.try_shutdown()
-
-
-def receive(client: Client, measurement: Measurement, told: deque[str]) -> None:
-    """Take what comes from the server until the client is closed; a connection that ends is told."""
-    with contextlib.suppress(ConnectionFailedError):
-        while True:
-            for item in client.poll_all(_SHOW_S):
-                if isinstance(item, DataMessage):
-                    measurement.add_frame(item)
-                elif isinstance(item, Disconnected) and item.was_connected:
-                    measurement.interrupted()
-                    told.append(f"the connection to the server ended ({item.reason}): connecting again")
-                elif isinstance(item, Connected) and item.again:
-                    told.append("connected again; what the server sent meanwhile is not compared")
-
-
-def show(measurement: Measurement) -> None:
-    """A line: the rate and age of the messages since the last one, all losses, and the latest sample."""
-    newest, frame = measurement.take_newest(), measurement.latest
-    figures = (
-        f"{newest.rate_hz:7.1f} Hz  age {newest.age_ms[0]:.2f} ms  lost {newest.lost + newest.lost_before}  "
-        f"repeated {newest.repeated}"
-    )
-    measurement.latest = None
-    if frame is not None:
-        sample = SampleDecoder(len(frame.process_data)).decode(frame.process_data)
-        for name, unit, digits in _VECTORS:
-            values = " ".join(f"{value:+.{digits}f}" for value in getattr(sample, name))
-            figures += f"  {unit} {values}"
-    print(f"{figures}{'' if frame else '  no samples from the server'}", flush=True)
-
-
-def print_summary(summary: Figures, sensor: Mapping[str, Any]) -> None:
-    """The figures of the whole run."""
-    print("What arrived on the ROS topic:")
-    for name, value in (
-        ("Messages", summary.messages),
-        ("Mean rate", f"{summary.rate_hz:.1f} Hz"),
-        ("Sensor's own rate", f"{sensor['rate_hz']} Hz"),
-        ("Lost", summary.lost + summary.lost_before),
-        ("  before or withheld (GAP)", summary.lost_before),
-        ("  between server and subscriber", summary.lost),
-        ("Repeated", summary.repeated),
-        ("Age at the subscriber, p50", f"{summary.age_ms[0]:.2f} ms"),
-        ("Age at the subscriber, p99", f"{summary.age_ms[1]:.2f} ms"),
-        ("All finite", "yes" if summary.all_finite else "NO"),
-        ("All are samples of the sensor", "NO" if summary.unknown else "yes"),
-    ):
-        print(f"  {name:<34}{value:>10}")
-    if summary.paused_s:
-        print(f"For {summary.paused_s:.0f} s no message came; the rate is that of the rest.")
-    if summary.lost + summary.lost_before:
-        print("Samples are missing: other programs had the processors for some time. docs/tuning.md helps.")
 
 
 def run(seconds: float | None) -> int:
@@ -135,26 +139,30 @@ def run(seconds: float | None) -> int:
         chain.start("bridge-client", binaries / "bridge-client", "--ros-args", "-p", f"server_port:={PORT}",
                     "-p", f"rt_priority:={REAL_TIME}")  # fmt: skip
         sensor = chain.connect(1).description["sensors"][0]
-        measurement = Measurement(float(sensor["rate_hz"]))
-        with listening(measurement) as told:
-            chain.wait(lambda: measurement.messages > 0, f"nothing arrived on {TOPIC}")
-            measurement.begin()
-            print(f"{sensor['name']}, serial {sensor['serial']}, {sensor['rate_hz']} Hz, virtual", flush=True)
+        shown, nominal_hz = Shown(), float(sensor["rate_hz"])
+
+        def arrived() -> bool:
+            take(0.0)
+            return shown.received > 0
+
+        with subscribed(lambda: shown) as take:
+            chain.wait(arrived, f"nothing arrived on {TOPIC}")
+            shown = Shown()  # what came while things were starting does not count
+            print(f"{sensor['name']}, serial {sensor['serial']}, {nominal_hz:g} Hz, virtual", flush=True)
             with contextlib.suppress(Stopped):
-                end = time.monotonic() + (seconds or float("inf"))
-                while (left := end - time.monotonic()) > 0:
-                    chain.sleep(min(_SHOW_S, left))
-                    while told:
-                        print(told.popleft(), flush=True)
-                    show(measurement)
+                end = time.monotonic() + (seconds or math.inf)
+                while (now := time.monotonic()) < end:
+                    line_end = min(now + _SHOW_S, end)
+                    while (left := line_end - time.monotonic()) > 0:
+                        take(left)
+                    chain.check()
+                    print(shown.line(), flush=True)
             ignore_signals()
-            summary = measurement.summary()  # what comes while they end is none of the figures
         troubles = chain.stop()
-    print_summary(summary, sensor)
-    if trouble := verdict(summary, float(sensor["rate_hz"])) or next(iter(troubles), None):
+    for sentence in shown.summary(nominal_hz):
+        print(sentence)
+    if trouble := shown.verdict(nominal_hz) or next(iter(troubles), None):
         raise ScriptError(trouble)
-    if summary.rate_hz < FULL_RATE * float(sensor["rate_hz"]):
-        print(f"Only {summary.rate_hz:.0f} messages/s arrived: this machine was too busy to keep up.")
     return 0
 
 

@@ -25,13 +25,12 @@ from bota_clients.replay.pacing import Pacing
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.health import observer
-from bota_ethercat_bridge import check_subscription
 from ethercat_server.virtual_sensor.options import SensorOptions
 from scripts.demonstration import program as demo
-from scripts.demonstration.measure import Measurement
 from tests.bridge.simulated_node import Node, Server
 from tests.clients.monitor_states import ADDRESS, OWN_PEER, PERIOD_NS, description, frame, status
 from tests.simulation import Simulation
+from tests.test_demo import arrive, told
 
 MINUTE_S, HOURS_S = 60.0, 36_000.0
 APART, FAR_APART = 16, 16000  # samples at 800 Hz from one to the next in a minute, and in the hours
@@ -86,22 +85,6 @@ def fed(take: Callable[[list[DataMessage]], object], *kept: object, each_second:
     return lambda: run(MINUTE_S, APART, BATCH), lambda: run(HOURS_S, FAR_APART // 2, 2), kept
 
 
-def demo_measures(_: Path) -> Soaked:
-    measurement = Measurement(800.0)
-
-    def take(frames: list[DataMessage]) -> None:
-        for each in frames:
-            measurement.add_frame(each)
-            if each.sequence % 100:
-                measurement.add_message(each.stamp_ns, [1.0] * 6, each.stamp_ns + each.sequence % 997 * 1000)
-
-    def each_second(_: DataMessage) -> None:
-        demo.show(measurement)
-        measurement.summary()
-
-    return fed(take, measurement, each_second=each_second)
-
-
 def monitor_shows(_: Path) -> Soaked:
     model = Model(ADDRESS)
     model.connected(description(), OWN_PEER, 1000.0)
@@ -149,18 +132,16 @@ def doctor_watches(_: Path) -> Soaked:
     return fed(take, watching)
 
 
-def subscription_is_checked(_: Path) -> Soaked:
-    counted = check_subscription.Counted("/wrench")
+def demo_shows(_: Path) -> Soaked:
+    """And `check_subscription` counts."""
+    shown = demo.Shown()
 
     def take(frames: list[DataMessage]) -> None:
         for each in frames:
-            sec, nanosec = divmod(each.stamp_ns, 10**9)
-            counted.receive(SimpleNamespace(sec=sec, nanosec=nanosec), each.stamp_ns + each.sequence % 997)
-        said = {"stamp_ns": each.stamp_ns, "count": each.sequence, "rate_hz": 800.0}
-        values = [SimpleNamespace(key=key, value=str(value)) for key, value in said.items()]
-        counted.published(SimpleNamespace(status=[SimpleNamespace(name="/wrench", values=values)]))
+            arrive(shown, each.sequence)
+        told(shown, each.sequence, each.sequence)
 
-    return fed(take, counted)
+    return fed(take, shown, each_second=lambda _: shown.line())
 
 
 def recorder_records(folder: Path) -> Soaked:
@@ -226,8 +207,8 @@ def server_samples(_: Path) -> Soaked:
 
 @pytest.mark.parametrize(
     "program",
-    [demo_measures, monitor_shows, page_is_served, doctor_watches, subscription_is_checked, recorder_records,
-     replay_repeats, node_publishes, server_samples],
+    [demo_shows, monitor_shows, page_is_served, doctor_watches, recorder_records, replay_repeats,
+     node_publishes, server_samples],
 )  # fmt: skip
 def test_the_tenth_hour_costs_what_the_second_minute_did(
     program: Callable[[Path], Soaked], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

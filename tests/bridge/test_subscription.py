@@ -22,7 +22,7 @@ from sensor_msgs.msg import Temperature
 
 from bota_ethercat.pdo import encode
 from bota_ethercat_bridge import check_subscription, rclpy_internals
-from bota_ethercat_bridge.subscription import Subscription
+from bota_ethercat_bridge.subscription import Counted, Subscription, report
 from tests.bridge.real_node import retire
 from tests.bridge.scripted_server import ScriptedServer
 from tests.bridge.simulated_node import STEP_S, Node, Server, stamp_ns, values
@@ -227,10 +227,10 @@ def test_cpp_counts_the_same(tmp_path: Path) -> None:
     ],
 )
 def test_what_to_change(lost: int, depth: int, age_ms: float, best_effort: bool, words: str) -> None:
-    counted = check_subscription.Counted("/wrench")
+    counted = Counted("/wrench")
     counted.received, counted.lost, counted.missing, counted.rate_hz = 800, lost, lost, 800.0
     counted.ages.count(array("f", [age_ms * 1e6] * 800))
-    said = [*check_subscription.report(counted, depth, best_effort=best_effort)]
+    said = [*report(counted, depth, best_effort=best_effort)]
     assert f"received 800, lost {lost}, missing {lost}" == said[0]
     assert words in " ".join(said[2:])
     assert bool(said[2:]) == bool(words)
