@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
 from bota_ethercat.errors import SettingError
 from bota_ethercat.pdo import AXES
+from bota_ethercat.program.arguments import whole
 from bota_ethercat.program.command import command
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.signals import signals_held_back
@@ -157,8 +158,6 @@ def _save(args: argparse.Namespace) -> int:
 
 
 def _tare(args: argparse.Namespace) -> int:
-    if not 1 <= args.samples <= MAX_TARE_SAMPLES:
-        raise UsageError(f"--samples {args.samples}: it must be from 1 to {MAX_TARE_SAMPLES}")
     if args.undo and args.clear:
         raise UsageError("--undo and --clear exclude each other: give one of them")
     if not all(map(math.isfinite, args.target)):
@@ -383,13 +382,13 @@ _FILE: Final = (
     *sensor_arguments(take_over="--take-over"),
     argument("file", "JSON file", type=Path, metavar="FILE"),
 )
-_SAMPLES: Final = f"number of samples to average, 1 to {MAX_TARE_SAMPLES} (default %(default)s)"
+_SAMPLES: Final = "number of samples to average (default %(default)s)"
 _DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
 _TARGET: Final = "wrench the sensor is to read, in N and Nm (default: zeros)"
 
 _TARE: Final = (
     *_SENSOR,
-    argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
+    argument("--samples", _SAMPLES, type=whole(1, MAX_TARE_SAMPLES), default=_DEFAULT_SAMPLES, metavar="N"),
     argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=AXES),
     argument("--undo", "restore the offset of before the last tare"),
     argument("--clear", "set the offset to zero"),

@@ -262,7 +262,7 @@ def test_filters_are_changed_by_way_of_preop_and_the_stream_goes_on(streaming: B
 def test_every_choice_of_every_setting_takes(shared: Bench) -> None:
     for name, setting in SETTINGS.items():
         default = shared.described()["settings"][name]
-        choices = (True, False) if setting.is_bool else setting.choices or ()
+        choices = tuple(setting.choices)
         for value in (*(FORCE_TORQUE_FILTERS if name == "sinc_length" else choices), default):
             asked = {"fir": True, name: value} if name == "fast" else {name: value}
             changed = shared.ask("configure", settings=asked)
@@ -337,7 +337,7 @@ def wordiest() -> dict[str, SettingValue]:
     """Of each setting the value that takes the most words."""
     return {
         name: max(
-            (False, True) if setting.is_bool else setting.choices or (),
+            setting.choices,
             key=lambda value, name=name: len(value_meaning(name, value)),
         )
         for name, setting in SETTINGS.items()
