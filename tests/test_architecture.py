@@ -66,7 +66,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     f"{S}.daemon": DAEMON,
     # Programs beside the server.
     f"{S}.virtual_sensor": SENSOR | {f"{S}.process", f"{S}.virtual_sensor"},
-    f"{S}.simulation": SENSOR | {f"{S}.virtual_sensor", f"{S}.simulation"},
+    f"{S}.simulation": DAEMON | {f"{S}.simulation", "bota_ethercat.client"},
     f"{S}.access": ACCESS,
     f"{S}.tool": ACCESS | {f"{S}.daemon", f"{S}.tool"},
     f"{S}.doctor": ACCESS | {f"{S}.daemon", f"{S}.doctor"},
