@@ -115,7 +115,7 @@ def _apply(args: argparse.Namespace) -> int:
         asked = options.asked_settings(found.number, found.identity.name, found.identity.serial)
         if not asked:
             raise UsageError(f"{args.config} has no settings for {found}: correct its tables, or use --set")
-        sensor = opened.in_force(found, asked)
+        sensor = opened.read_settings(found, asked)
         changed = _changes(sensor, asked)
         settings, rate_hz = sensor.settings, sensor.rate_hz
         if args.dry_run:
@@ -125,7 +125,7 @@ def _apply(args: argparse.Namespace) -> int:
         elif changed or args.save:
             opened.configure(found.number, asked, args.save)
             if changed:
-                after = opened.in_force(found, asked)
+                after = opened.read_settings(found, asked)
                 settings, rate_hz = after.settings, after.rate_hz
     means = meaning(settings, rate_hz)
     what, lines = "settings afterwards" if args.dry_run else "in force", [_change_lines(changed)]
@@ -257,7 +257,7 @@ def read_snapshot(path: Path) -> Snapshot:
 
 def _snapshot(args: argparse.Namespace) -> int:
     with NewFile(args.file, force=args.force) as file, sensor_of(args) as (opened, found):
-        sensor, sdo = opened.in_force(found), opened.sdo(found.number)
+        sensor, sdo = opened.read_settings(found), opened.sdo(found.number)
         read = [(row, finish(read_object(sdo, row))) for row in KNOWN_OBJECTS]
         who = found.identity._asdict()
         content = {
@@ -293,7 +293,7 @@ def _restore(args: argparse.Namespace) -> int:
             )
         if sensor_is.firmware != file_is.firmware:
             note(f"{args.file} is of firmware {file_is.firmware}, the sensor now has {sensor_is.firmware}")
-        sensor, sdo = opened.in_force(found, snapshot.settings), opened.sdo(found.number)
+        sensor, sdo = opened.read_settings(found, snapshot.settings), opened.sdo(found.number)
         settings = {name: value for name, value in snapshot.settings.items() if name in sensor.settings}
         missing = sorted(snapshot.settings.keys() - settings.keys())
         changed, differing = _changes(sensor, settings), dict[Address, tuple[bytes, bytes]]()

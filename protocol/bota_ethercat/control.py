@@ -27,7 +27,6 @@ MAX_SDO_BYTES: Final = 112  # largest SDO that fits a mailbox of 128 bytes unseg
 MAX_TARE_SAMPLES: Final = 20_000
 _MAX_NAME_LENGTH: Final = 80
 MAX_SII_WORDS: Final = 128
-MAX_TRACE_SIZE: Final = 64 << 20  # bytes of a trace file
 SIX_NUMBERS: Final = several(
     number(-sys.float_info.max, sys.float_info.max), (6,), "a list of six finite numbers"
 )  # a wrench
@@ -191,7 +190,7 @@ ACTIONS: Final[Mapping[str, Action]] = {
         },
         controls=True,
     ),
-    "trace": Action({"offset": Parameter(integer(0, MAX_TRACE_SIZE).check, default=0)}, controls=True),
+    "trace": Action({"offset": Parameter(integer(0, 2**31 - 1).check, default=0)}, controls=True),
     "shutdown": Action({}, controls=True),
 }
 

@@ -13,12 +13,12 @@ from typing import Any, cast
 import pytest
 
 from bota_ethercat.address import boot_id
-from bota_ethercat.framing import DataFlag, encode_json
+from bota_ethercat.framing import MAX_JSON_LENGTH, DataFlag, encode_json
 from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
 from bota_ethercat.sensor.meaning import value_meaning
 from bota_ethercat.sensor.sdo_types import SDO_TYPE_NAMES
 from bota_ethercat.settings import SETTINGS, SettingValue
-from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.errors import BusError
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
