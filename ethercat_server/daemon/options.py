@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from bota_ethercat.address import DEFAULT_PORT
+from bota_ethercat.address import DEFAULT_PORT, PORT
 from bota_ethercat.errors import SettingError
 from bota_ethercat.option_types import choice, text
 from bota_ethercat.program.arguments import Parser, number, of_type, typed, whole
@@ -34,7 +34,7 @@ from ethercat_server.process import realtime
 if TYPE_CHECKING:
     from ethercat_server.sensor.sensor import Identity
 
-_PORT: Final = whole(1, 65535)
+_PORT: Final = of_type(PORT)
 DEFAULTS: Final = "defaults"
 KEEP: Final = "keep"
 

@@ -60,7 +60,7 @@ def test_the_configuration_file_says_the_same() -> None:
         ("wrench_frames", [1.0, 2.0, 3.0]), ("wrench_frames", 5), ("wrench_frames", ["tool0", 5]),
         ("filter.cutoff", -1.0), ("filter.cutoff", "10"),
         ("gravity_source", "accelerometer"), ("orientation.mounting", [0.0] * 3), ("rest.duration", 0.0),
-        ("accelerometer.scale", [1.0, 0.4, 1.0]),
+        ("accelerometer.scale", [1.0, 0.4, 1.0]), ("sensor_offset", [10**400] * 6),
     ],
 )  # fmt: skip
 def test_wrong_values_are_named(name: str, value: Any) -> None:
