@@ -71,16 +71,9 @@ class Server:
         self.recovery = Recovery(bus, acyclic, self.sensors, self.streams, hub.broadcast, self.others)
         self.jobs = Jobs(acyclic, self.sensors)
         self.cycle = (CycleWithTerminals if terminals else Cycle)(
-            bus,
-            self.sensors,
-            self.streams,
-            round_trip,
-            hub,
-            acyclic,
-            self.recovery,
-            self.jobs,
+            bus, self.sensors, self.streams, round_trip, hub, acyclic, self.recovery, self.jobs,
             watchdog or NoWatchdog(),
-        )
+        )  # fmt: skip
         if isinstance(self.cycle, CycleWithTerminals):
             self.cycle.terminals = terminals
             for terminal in terminals:

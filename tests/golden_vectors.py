@@ -10,9 +10,17 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from bota_ethercat.address import boot_id
 from bota_ethercat.errors import BadMessageError, RemoteProtocolError
-from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, MessageType, encode_data, encode_json
+from bota_ethercat.framing import (
+    MAX_JSON_LENGTH,
+    DataFlag,
+    DataMessage,
+    FrameDecoder,
+    MessageType,
+    encode_data,
+    encode_json,
+)
 from bota_ethercat.pdo import Sample, encode
-from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject
+from bota_ethercat.text.json_text import JsonObject
 
 _FOLDER: Final = Path(__file__).parent / "protocol" / "golden"
 

@@ -1,4 +1,4 @@
-"""The whole server in memory: loop, recovery, jobs, hub and clients on virtual sensors, in simulated time.
+"""`ethercat_server.simulation`, with clients that tests use.
 
     simulation = Simulation(machine=Machine(seed=3, lost=0.01))
     client = simulation.connect()
@@ -7,9 +7,6 @@
     client.wait_event("sensor_back")
     assert client.ask("status")["sensors"][0]["recoveries"] == 1
     check_frames(simulation.frames)
-
-Time passes while a client waits for something, and by `run`. Nothing really waits, nothing else runs: a
-failure is repeated by the same arguments, step by step in a debugger.
 
 For the tool and the doctor: within `simulated_bus` whatever opens an interface gets these virtual sensors;
 within `simulated_server` whatever connects to a server gets one that streams them.
@@ -23,25 +20,20 @@ within `simulated_server` whatever connects to a server gets one that streams th
 from __future__ import annotations
 
 import contextlib
-import functools
-import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from bota_ethercat import client as blocking
-from bota_ethercat.client.channel import TcpChannel
-from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder
 from bota_ethercat.pdo import LAYOUTS
-from bota_ethercat.settings import SettingValue, start_up_defaults
-from bota_ethercat.text.json_text import JsonObject
+from bota_ethercat.settings import SettingValue
 from ethercat_server.access import private_server, sensors
 from ethercat_server.access.sensors import Sensors
 from ethercat_server.acquisition.start_up import AsFound, Wanted
 from ethercat_server.acquisition.stream import OutgoingFrame
+from ethercat_server.daemon.options import DEFAULTS, KEEP, ServerOptions
 from ethercat_server.ethercat.backend import CheckInterrupt
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.datagrams import ByPosition
@@ -49,18 +41,13 @@ from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave.sii import read_sii
 from ethercat_server.process import realtime
 from ethercat_server.sensor import scan
-from ethercat_server.sensor.sensor import Identity
-from ethercat_server.server import Server
-from ethercat_server.serving.hub import Hub
-from ethercat_server.serving.transport import Transport
+from ethercat_server.simulation import server
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
-from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
+from ethercat_server.simulation.server import MemoryChannel
 from ethercat_server.virtual_sensor.cli import build_parser, options_from
 from ethercat_server.virtual_sensor.options import SensorOptions, parse_chain, slaves_in
 from ethercat_server.virtual_sensor.sensor import Firmware
-from ethercat_server.virtual_sensor.signals import World
-from ethercat_server.virtual_sensor.world import ExternalWorld
 from scripts.benchmarks.records import ClockReading, decode_clock
 from tests.server.running import OLD, Commanded, FramedClient
 
@@ -88,50 +75,14 @@ class ManualClock:
         self.now_ns += round(seconds * 1e9)
 
 
-class Asked:
-    """What command line and configuration ask of the sensors; see `start_up.Wanted`."""
-
-    sensor_name: str | None = None
-    force = False
-
-    def __init__(
-        self, settings: Mapping[str, SettingValue] = {}, *, keep_unset: bool = False,
-        terminals: Sequence[str] = (),
-    ) -> None:  # fmt: skip
-        self._settings = dict(settings)
-        self.terminals = terminals
-        self.keep_unset = keep_unset
-
-    def wanted_settings(self, _position: int, _name: str, _serial: int) -> dict[str, SettingValue]:
-        return {**({} if self.keep_unset else start_up_defaults()), **self._settings}
-
-    def asked_settings(self, _position: int, _name: str, _serial: int) -> dict[str, SettingValue]:
-        return dict(self._settings)
-
-    def check_sensors(self, found: Mapping[int, Identity]) -> None:
-        pass
-
-
-class RecordingHub(Hub):
-    """Keeps what it hands to its clients; simulated time passes while it serves them."""
-
-    def __init__(self, simulation: Simulation) -> None:
-        super().__init__(simulation.listen(), simulation.clock.raw_ns)
-        self._simulation = simulation
-
-    def publish(self, made: Sequence[OutgoingFrame], now_ns: int) -> None:
-        self._simulation.note(made)
-        super().publish(made, now_ns)
-        self._simulation.look()
-
-    def serve(self, until_ns: int) -> int:
-        self._simulation.serves(until_ns, super().serve)
-        return self._simulation.clock.now_ns
-
-    def broadcast(self, message: JsonObject) -> None:
-        self._simulation.events.append(message)
-        self._simulation.announced_ns.append(self._simulation.clock.now_ns)
-        super().broadcast(message)
+def asked(
+    settings: Mapping[str, SettingValue] = {}, *, keep_unset: bool = False, terminals: Sequence[str] = ()
+) -> ServerOptions:
+    """What command line and configuration ask of the sensors."""
+    unset = KEEP if keep_unset else DEFAULTS
+    return ServerOptions(
+        "memory", 0, server={"unset_settings": unset, "terminals": terminals}, assigned=settings
+    )
 
 
 def life_of(backend: MemoryBackend, number: int = 0) -> Firmware:
@@ -152,24 +103,11 @@ def registers(backend: MemoryBackend) -> list[bytes]:
     return [bytes(life.esc.memory[: reg.REGISTERS_END]) for life in lives if life is not None]
 
 
-class SimulatedBus(Commanded):
+class SimulatedBus(server.SimulatedBus, Commanded):
     """Virtual sensors in memory."""
 
     # The doctor asks the kernel about it, so there must be such an interface; nothing is sent there.
     near = "lo"
-
-    def __init__(self, backend: MemoryBackend) -> None:
-        self.backend, self.clock = backend, backend.clock
-
-    def command(self, line: str) -> str:
-        answer = self.backend.command(line)
-        assert answer.startswith("ok"), answer
-        return answer[3:]
-
-    def at(self, seconds: float, action: str | Callable[[], object]) -> None:
-        """Have a fault command obeyed, or `action` called, so many seconds from now."""
-        act = functools.partial(self.command, action) if isinstance(action, str) else action
-        self.clock.at(self.clock.now_ns + round(seconds * 1e9), act)
 
     def power_cycle(self) -> None:
         """Off, on again, and nobody looks meanwhile."""
@@ -203,63 +141,24 @@ class Exchange:
         return total
 
 
-class Simulation(SimulatedBus):
-    """A server that streams. `frames` has all that it handed to its clients, `events` what it announced."""
+class Simulation(server.Simulation, SimulatedBus):
+    """A server that streams. `frames` has all that it handed to its clients."""
 
-    def __init__(
-        self,
-        *sensors: SensorOptions,
-        machine: Machine | None = None,
-        settings: Mapping[str, SettingValue] = {},
-        backend: MemoryBackend | None = None,
-        wanted: Wanted | None = None,
-        world: World | None = None,
-        **extra: object,
-    ) -> None:
-        """`backend` is that of a simulation before, for a server that is started again.
-
-        With a `machine` or a `backend` of the test's the server reads all of the SII at its start.
-
-        The sensors feel `world`, which is asked once a millisecond, with the simulated time, s.
-        """
-        external = ExternalWorld()
-        if world is not None:
-            sensors = tuple(replace(each, world=external) for each in sensors or (SensorOptions(),))
-        super().__init__(backend or MemoryBackend(*(sensors or (USUAL,)), machine=machine))
-        self.started_ns = self.clock.now_ns
-        if world is not None:
-            self._ask(world, external, 0)
-        self.transport = InMemoryTransport(self.clock)
+    def __init__(self, *sensors: SensorOptions, **more: Any) -> None:
+        """With a `machine` or a `backend` of the test's the server reads all of the SII at its start."""
         self.frames: list[DataMessage] = []
         self.published_ns: list[int] = []  # when each was handed out
-        self.events: list[JsonObject] = []
-        self.announced_ns: list[int] = []  # when each was announced
         self._decoder = FrameDecoder()
-        self._awaited: Callable[[], object] = lambda: False
-        self._until_ns = 0
         self.on_serve: Callable[[int], None] = lambda _: None
-        self.hub = RecordingHub(self)
-        self.bus = Bus(self.backend)
-        with pytest.MonkeyPatch.context() as patch:
-            if backend is None and machine is None:
-                patch.setattr(scan, "read_image", _read_image)
-            self.server = Server(self.bus, self.hub, wanted or Asked(settings), extra=extra)
-        self.sensors, self.streams, self.others = self.server.sensors, self.server.streams, self.server.others
-        self.recovery, self.jobs, self.cycle = self.server.recovery, self.server.jobs, self.server.cycle
         self.clients: list[Client] = []
-        self.hangs = False  # whether somebody has stopped it; time passes all the same
-
-    def _ask(self, world: World, external: ExternalWorld, step: int) -> None:
-        """Tell the sensors what they feel in this millisecond, and in the following."""
-        due_ns = self.started_ns + step * 1_000_000
-        external.update(due_ns * 1e-9, world(step * 1e-3), due_ns * 1e-9)
-        self.clock.at(due_ns + 1_000_000, functools.partial(self._ask, world, external, step + 1))
-
-    def listen(self) -> Transport:
-        """Where its clients come from."""
-        return self.transport
-
-    # -- what the loop hands to its clients
+        if not sensors and "world" not in more:
+            sensors = (USUAL,)
+        with pytest.MonkeyPatch.context() as patch:
+            if more.get("backend") is None and more.get("machine") is None:
+                patch.setattr(scan, "read_image", _read_image)
+            super().__init__(*sensors, **more)
+        self.sensors, self.streams, self.others = self.server.sensors, self.server.streams, self.server.others
+        self.recovery, self.jobs = self.server.recovery, self.server.jobs
 
     def note(self, made: Sequence[OutgoingFrame]) -> None:
         """Keep the frames of an exchange."""
@@ -269,21 +168,15 @@ class Simulation(SimulatedBus):
             self.published_ns.append(self.clock.now_ns)
 
     def serves(self, until_ns: int, serve: Callable[[int], int]) -> None:
-        """Have the hub serve until then, or until somebody goes on who waits for a time."""
-        if self.cycle.stopping:
-            return
-        self.on_serve(until_ns)
-        serve(min(until_ns, self._until_ns))
-        self.look()
+        if not self.cycle.stopping:
+            self.on_serve(until_ns)
+        super().serves(until_ns, serve)
 
     def look(self) -> None:
-        """Have the clients take what has arrived, and the loop end if what somebody waits for is there."""
+        """Have the clients take what has arrived, too."""
         for client in self.clients:
             client.receive()
-        if self._awaited():
-            self.cycle.stop()
-
-    # -- what a test does
+        super().look()
 
     def connect(self, uid: int | None = 0, *, buffer_size: int = 65536) -> Client:
         """A client of user `uid`, on a framed connection."""
@@ -295,50 +188,17 @@ class Simulation(SimulatedBus):
         assert client.ask("subscribe", **keys)["ok"]
         return client
 
-    def run(self, seconds: float) -> None:
-        """Let the loop run for this simulated time."""
-        until_ns = self.clock.now_ns + round(seconds * 1e9)
-        self._run(lambda: self.clock.now_ns >= until_ns, until_ns)
-
     def run_until(self, condition: Callable[[], object], what: str, seconds: float = PATIENCE_S) -> None:
         """Let the loop run until `condition` holds."""
-        deadline_ns = self.clock.now_ns + round(seconds * 1e9)
         met = False
 
-        def is_over() -> bool:
+        def is_met() -> bool:
             nonlocal met
             met = bool(condition())
-            return met or self.clock.now_ns >= deadline_ns
+            return met
 
-        if not condition():
-            self._run(is_over, deadline_ns)
-            assert met or condition(), f"{what}: not within {seconds} s; events: {self.events[-6:]}"
-
-    def go_on(self, until: Callable[[], object], seconds: float) -> None:
-        """Let the loop run until something is so, for this time at most; not where it hangs."""
-        if self.hangs:
-            self.clock.sleep(seconds)
-            return
-        until_ns = self.clock.now_ns + round(seconds * 1e9)
-        if not until():
-            self._run(lambda: until() or self.clock.now_ns >= until_ns, until_ns)
-
-    def _run(self, is_over: Callable[[], object], until_ns: int) -> None:
-        """Let the loop run until it is over, which may be at this time."""
-        self._awaited, self._until_ns = is_over, until_ns
-        self.cycle.stopping = False
-        self.cycle.run()
-        self._awaited = lambda: False
-
-    def status(self) -> dict[str, Any]:
-        return self.cycle.status()
-
-    def close(self) -> None:
-        """The server ends, as by SIGTERM: the sensors go to INIT, the clients are disconnected."""
-        # Else nothing is served, and simulated time stands still while a client does not take what it gets.
-        self.cycle.stopping, self._until_ns = False, 1 << 63
-        self.hub.close()
-        self.bus.close()
+        self.go_on(is_met, seconds)
+        assert met or condition(), f"{what}: not within {seconds} s; events: {self.events[-6:]}"
 
 
 class Client(FramedClient):
@@ -383,71 +243,6 @@ class Bench(Simulation):
         """End this server and start another one on the same sensors; see `Simulation`."""
         self.close()
         return Bench(backend=self.backend, **more)
-
-
-class MemoryChannel(TcpChannel):
-    """The channel to `server`, which may hang and be killed; time passes while its client waits.
-
-    with StreamClient(12001, channel=MemoryChannel(server)).connect() as client: ...
-    """
-
-    def __init__(self, server: Simulation) -> None:
-        super().__init__("memory", 0)
-        self.same_address, self.monotonic_ns = True, server.clock.monotonic_ns
-        self.server: Simulation | None = server
-        self._clock = server.clock
-        self._stream: InMemoryStream | None = None
-
-    def kill(self) -> None:
-        """The server ends without a word."""
-        self.server = None
-        if self._stream is not None:
-            self._stream.other.end_sending()  # it may be just running, and must not find it closed
-
-    def wait(self, event: threading.Event, seconds: float) -> bool:
-        self._pass(event.is_set, seconds)
-        return event.is_set()
-
-    def connect(self, timeout_s: float) -> bool:
-        if self.server is None:
-            raise UnreachableError("Connection refused")
-        self._stream = self.server.transport.connect(0, buffer_size=1 << 20)
-        return True
-
-    def receive(self, buffer: bytearray | memoryview, timeout_s: float) -> int:
-        stream = self._stream
-        if stream is None:
-            raise ConnectionFailedError("Bad file descriptor")
-        if timeout_s > 0:
-            self._pass(lambda: stream.readable, timeout_s)
-        if stream.at_end:
-            raise ConnectionFailedError("the server closed it")
-        if not stream.readable:
-            return 0
-        data = stream.recv(len(buffer))
-        buffer[: len(data)] = data
-        return len(data)
-
-    def send(self, data: bytes) -> None:
-        assert self._stream is not None
-        self._stream.send(data)
-
-    def shutdown(self) -> None:
-        self.close()
-
-    def close(self) -> None:
-        if self._stream is not None:
-            self._stream.close()
-            self._stream = None
-
-    def fileno(self) -> int:
-        return -1
-
-    def _pass(self, until: Callable[[], object], seconds: float) -> None:
-        if self.server is None:
-            self._clock.sleep(seconds)
-        elif not until():
-            self.server.go_on(lambda: until() or self.server is None or self.server.hangs, seconds)
 
 
 def more_if_long(usual: Collection[Any], every: Iterable[Any]) -> list[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -66,7 +67,7 @@ ROOMS: Final[dict[str, set[str]]] = {
     f"{S}.daemon": DAEMON,
     # Programs beside the server.
     f"{S}.virtual_sensor": SENSOR | {f"{S}.process", f"{S}.virtual_sensor"},
-    f"{S}.simulation": SENSOR | {f"{S}.virtual_sensor", f"{S}.simulation"},
+    f"{S}.simulation": DAEMON | {f"{S}.simulation", "bota_ethercat.client"},
     f"{S}.access": ACCESS,
     f"{S}.tool": ACCESS | {f"{S}.daemon", f"{S}.tool"},
     f"{S}.doctor": ACCESS | {f"{S}.daemon", f"{S}.doctor"},
@@ -226,6 +227,25 @@ def _narrows(test: ast.expr) -> bool:
         case ast.Compare(ast.Name() | ast.Attribute(), [ast.IsNot()], [ast.Constant(None)]):
             return True
     return False
+
+
+def test_what_an_option_may_be_is_said_in_one_place() -> None:
+    said = re.compile(r"\ba (whole )?number from|^true or false|^one of ")
+    found = [
+        f"{name}: {text}"
+        for name, path in MODULES.items()
+        if name != "bota_ethercat.option_types"
+        for text in texts(tree(path))
+        if said.search(text)
+    ]
+    assert found == []
+
+
+def texts(tree: ast.Module) -> list[str]:
+    """Those that are no docstrings."""
+    apart = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    every = (node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in apart)
+    return [node.value for node in every if isinstance(node.value, str)]
 
 
 def test_the_protocol_is_sans_io_but_for_its_client() -> None:

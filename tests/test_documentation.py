@@ -34,6 +34,11 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{link}#{anchor}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_examples_use_what_is_installed(page: Path) -> None:
+    assert not re.findall(r"^(?:from|import) tests\b.*", page.read_text(), re.MULTILINE)
+
+
 def test_the_readme_leads_to_every_page_and_program() -> None:
     text = (ROOT / "README.md").read_text()
     linked = set(re.findall(r"\]\(docs/([^)#]+\.md)", text))

@@ -14,7 +14,8 @@ from bota_ethercat.client import Client, Condition, Reading
 from bota_ethercat.world import Felt
 from docs.examples.mujoco import identify
 from docs.examples.mujoco.touch import FORCE, HOLE, TIP, Row, Touch, draw
-from tests.simulation import PATIENCE_S, MemoryChannel, Simulation
+from ethercat_server.simulation.server import MemoryChannel
+from tests.simulation import PATIENCE_S, Simulation
 
 WALL = 15_000.0  # N/m
 

@@ -6,9 +6,10 @@ import argparse
 import ipaddress
 
 from bota_ethercat.address import Address
+from bota_ethercat.option_types import choice
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program import server_choice
-from bota_ethercat.program.arguments import typed
+from bota_ethercat.program.arguments import typed, whole
 from bota_ethercat.sensor_choice import MAX_SENSORS
 
 
@@ -36,7 +37,7 @@ def add_imu_units(parser: argparse.ArgumentParser) -> None:
     """Units in which the firmware sends acceleration and angular rate."""
     values = [units.value for units in ImuUnits]
     parser.add_argument(
-        "--imu-raw-units", type=typed(ImuUnits, " or ".join(values)), default=ImuUnits.G_DPS,
+        "--imu-raw-units", type=typed(ImuUnits, choice(*values).allowed), default=ImuUnits.G_DPS,
         dest="imu_units", metavar=f"{{{','.join(values)}}}",
         help="units in which the sensor sends acceleration and angular rate "
         f"(default {ImuUnits.G_DPS.value})",
@@ -53,11 +54,5 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _position(text: str) -> int:
-    if text.isascii() and text.isdecimal() and int(text) < MAX_SENSORS:
-        return int(text)
-    raise ValueError
-
-
 address = typed(Address.parse)
-position = typed(_position, f"a position on the bus, from 0 to {MAX_SENSORS - 1}")
+position = whole(0, MAX_SENSORS - 1)

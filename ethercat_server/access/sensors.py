@@ -123,7 +123,7 @@ class Sensors:
             return self.private.error
         return ServerError(f"{self._name} closed the connection ({error}): see its log")
 
-    def in_force(self, found: FoundSensor, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Sensor:
+    def read_settings(self, found: FoundSensor, asked: Mapping[str, SettingValue] = NO_SETTINGS) -> Sensor:
         """The sensor with its present settings, also as the wanted ones; see `read_in_force` for `asked`."""
         sensor = Sensor(found.number, found.identity, {})
         finish(read_in_force(self.sdo(found.number), sensor, asked), clock=self.clock)

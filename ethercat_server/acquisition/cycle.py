@@ -233,7 +233,7 @@ class Cycle:
             frame, back = self._backend.receive(0.0), self._raw_ns()
         if frame is None or exchange is None:
             if frame is not None:
-                self._recovery.causes.see_foreign(frame, back)
+                self._recovery.causes.other_master.see(frame, back)
                 self._acyclic.receive(frame)
             return False
         self._hand_out(exchange, since_ns)

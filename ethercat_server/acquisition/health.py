@@ -1,5 +1,4 @@
-"""What is checked once a second while the bus runs: a slow network card, another master or a busy computer as
-causes of losses, and what the samples show of a sensor.
+"""What is checked once a second while the bus runs: a slow network card, what the samples show of a sensor.
 
 A wrong rate, silence, NaN and infinity are logged when they begin and when they end, so that a sensor which
 does it all the time makes two lines.
@@ -12,11 +11,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from bota_ethercat.health.advice import STOOD_STILL
 from bota_ethercat.pdo import is_finite, layout_for
 from ethercat_server.ethercat.bus import Bus
-from ethercat_server.ethercat.datagrams import FIRST_INDEX
-from ethercat_server.ethercat.wire import DATAGRAM_INDEX, PROCESSED_BIT, SOURCE, SOURCE_ADDRESS
 from ethercat_server.sampling.constants import PERIOD_ERROR
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.sample_clock import SampleClock
@@ -48,73 +44,6 @@ class RoundTripHealth:
             self._slow_s = self._slow_s + 1 if usual_us > SLOW_US else 0
             if self._slow_s == _SLOW_SECONDS:
                 log.info("frames take %.0f µs through %s: %s", usual_us, self._bus.ifname, cost(usual_us))
-
-
-# Frames of others in a second that are a master's; fewer may be late answers from before the loop.
-_MASTER_FRAMES: Final = 3
-_GONE_S: Final = 10  # seconds without any after which it has gone
-_RECENT_NS: Final = 1_000_000_000
-# Stalls of this length in that time explain a missing answer, or an expired watchdog.
-_STALL_NS: Final = 20_000_000
-
-
-class Causes:
-    """What may explain the loss of a sensor on `bus`; call `check` once a second."""
-
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
-        self._frames = self._frames_checked = 0  # of other masters
-        # When the last one came, when this computer stood still last.
-        self._frame_ns = self._stall_ns = -_RECENT_NS
-        self._stalled_ns = 0  # sum of the stalls that followed each other within `_RECENT_NS`
-        self._gone_s = _GONE_S
-
-    def see_foreign(self, frame: bytes, now_ns: int) -> None:
-        """A frame arrived that answers no exchange: it counts if another master sent it."""
-        at = SOURCE_ADDRESS
-        if len(frame) <= DATAGRAM_INDEX:
-            return
-        source = bytes([frame[at] & ~PROCESSED_BIT]) + frame[at + 1 : at + 6]
-        # Of our own only single datagrams arrive here, and answers that come late or twice.
-        if source != SOURCE or frame[DATAGRAM_INDEX] < FIRST_INDEX:
-            self._frames += 1
-            self._frame_ns = now_ns
-
-    def see_stall(self, late_ns: float, now_ns: int) -> None:
-        """The loop did not run for `late_ns`."""
-        if now_ns - self._stall_ns > _RECENT_NS:
-            self._stalled_ns = 0
-        self._stalled_ns += int(late_ns)
-        self._stall_ns = now_ns
-
-    def known_cause(self, now_ns: int) -> str:
-        """What explains the loss of a sensor now; "" if nothing does."""
-        if now_ns - self._frame_ns < _RECENT_NS:
-            return f"check for another EtherCAT master, whose frames arrive on {self._bus.ifname}"
-        if now_ns - self._stall_ns < _RECENT_NS and self._stalled_ns > _STALL_NS:
-            return f"this {STOOD_STILL.format(f' for {self._stalled_ns / 1e6:.0f} ms')}"
-        return ""
-
-    def explain(self, reason: str, now_ns: int, otherwise: str = "") -> str:
-        """Why a sensor is lost, with what explains it; `otherwise` if nothing does."""
-        cause = self.known_cause(now_ns) or otherwise
-        return f"{reason}: {cause}" if cause else reason
-
-    def check(self) -> None:
-        """Log once that there is another master, and once that it has gone."""
-        frames, self._frames_checked = self._frames - self._frames_checked, self._frames
-        if frames >= _MASTER_FRAMES:
-            if self._gone_s >= _GONE_S:
-                log.warning(
-                    "another EtherCAT master is sending on %s (%d frames in a second): stop it, for two "
-                    "masters disturb each other's slaves",
-                    self._bus.ifname, frames,
-                )  # fmt: skip
-            self._gone_s = 0
-        elif self._gone_s < _GONE_S and not frames:
-            self._gone_s += 1
-            if self._gone_s == _GONE_S:
-                log.info("the other EtherCAT master on %s has stopped sending", self._bus.ifname)
 
 
 # Time for which the rate must deviate before it is reported: a busy machine distorts it for a moment.

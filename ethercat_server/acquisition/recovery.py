@@ -16,7 +16,7 @@ from bota_ethercat.control import Event, event
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.acyclic import Acyclic, Task
-from ethercat_server.acquisition.health import Causes
+from ethercat_server.acquisition.loss_causes import LossCauses
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, extended
 from ethercat_server.ethercat.bus import Bus
@@ -233,12 +233,13 @@ class SensorRecovery:
         if (change := self._change) is not None:
             self._change = None
             if change.failed is None:
-                self._announce(event(Event.RECONFIGURED, sensor=self._number, **sensor.in_force()))
+                self._announce(event(Event.RECONFIGURED, sensor=self._number, **sensor.as_message()))
             change.done(change.failed and extended(change.failed, IN_FORCE))
         if lost_at_ns is not None:
             lost_s = round((self._bus.clock.raw_ns() - lost_at_ns) * 1e-9, 3)
             log.info("sensor %d (%s) is back after %.3f s", self._number, sensor.identity, lost_s)
-            self._announce(event(Event.SENSOR_BACK, sensor=self._number, lost_s=lost_s, **sensor.in_force()))
+            now = sensor.as_message()
+            self._announce(event(Event.SENSOR_BACK, sensor=self._number, lost_s=lost_s, **now))
 
     def _refuse(self, found: Identity) -> None:
         number, sensor = self._number, self._sensor
@@ -380,7 +381,7 @@ class Recovery:
     ) -> None:
         self.bus, self.acyclic, self.announce = bus, acyclic, announce
         self._all, self._streams, self._others = sensors, streams, others
-        self.causes = Causes(bus)
+        self.causes = LossCauses(bus.ifname)
         self.sensors = [
             SensorRecovery(self, sensor, stream) for sensor, stream in zip(sensors, streams, strict=True)
         ]
@@ -394,7 +395,7 @@ class Recovery:
 
     def check(self) -> None:
         """To be called once a second: name another master, and try refused event times again."""
-        self.causes.check()
+        self.causes.other_master.check()
         for each in self.sensors:
             self.acyclic.start(each.check_events())
 

@@ -12,15 +12,17 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from bota_ethercat.address import DEFAULT_PORT
+from bota_ethercat.address import DEFAULT_PORT, PORT
 from bota_ethercat.errors import SettingError
-from bota_ethercat.program.arguments import Parser, number, typed, whole
+from bota_ethercat.option_types import choice, text
+from bota_ethercat.program.arguments import Parser, number, of_type, typed, whole
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import (
     SETTINGS,
     SettingValue,
     check_combination,
     check_settings,
+    setting_named,
     start_up_defaults,
 )
 from bota_ethercat.text.did_you_mean import did_you_mean
@@ -32,7 +34,7 @@ from ethercat_server.process import realtime
 if TYPE_CHECKING:
     from ethercat_server.sensor.sensor import Identity
 
-_PORT: Final = whole(1, 65535)
+_PORT: Final = of_type(PORT)
 DEFAULTS: Final = "defaults"
 KEEP: Final = "keep"
 
@@ -60,25 +62,16 @@ class ServerSetting(NamedTuple):
         return checked if self.many else checked[0]
 
 
-def _text(holds: Callable[[str], object], what: str) -> Callable[[str], str]:
-    """The type of an argument that is a text of which something `holds`."""
-
-    def checked(text: str) -> str:
-        if not holds(text):
-            raise ValueError
-        return text
-
-    return typed(checked, what)
-
-
 _ADDRESS: Final = typed(
     lambda text: str(ipaddress.ip_address(text)),
     "an IP address of this machine, such as 127.0.0.1 or 0.0.0.0",
 )
-_NAME: Final = _text(lambda text: text and text.isprintable(), "a name")
-_SECONDS: Final = number(0.1, 1e6, "seconds, from 0.1 to 1000000")
-_UNSET: Final = _text((DEFAULTS, KEEP).__contains__, f"'{DEFAULTS}' or '{KEEP}'")
-_TERMINAL: Final = _text(CHOICE.fullmatch, "0xVENDOR:0xPRODUCT, POSITION or 0xVENDOR:0xPRODUCT@POSITION")
+_NAME: Final = of_type(text("a name", lambda name: name and name.isprintable()))
+_SECONDS: Final = number(0.1, 1e6, "a number of seconds")
+_UNSET: Final = of_type(choice(DEFAULTS, KEEP))
+_TERMINAL: Final = of_type(
+    text("0xVENDOR:0xPRODUCT, POSITION or 0xVENDOR:0xPRODUCT@POSITION", CHOICE.fullmatch)
+)
 _ROWS: Final = (
     ServerSetting(
         "hosts", "ADDRESS", "address to listen on; remote clients are read-only "
@@ -357,14 +350,10 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, SettingValue]:
     values: dict[str, SettingValue] = {}
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
-        setting = SETTINGS.get(name.strip())
         if not equals:
             raise UsageError(f"--set {assignment}: it must be NAME=VALUE, for example --set sinc_length=64")
-        if setting is None:
-            name, there = name.strip(), ", ".join(SETTINGS)
-            raise UsageError(f"no setting {name!r}: available are {there}{did_you_mean(name, SETTINGS)}")
         try:
-            values[setting.name] = setting.parse(text)
+            values[name.strip()] = setting_named(name.strip()).parse(text)
         except SettingError as error:
             raise UsageError(f"--set {assignment}: {error}") from None
     return values

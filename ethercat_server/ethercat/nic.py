@@ -119,15 +119,8 @@ _BUFFER: Final = 65536
 _LINK: Final = struct.Struct("=BxHiII")  # family, type, index, flags, change mask
 _ETHERNET: Final = 1
 _ALL_PROTOCOLS: Final = 3
-_IFLA_ADDRESS, _IFLA_NAME, _IFLA_MTU, _IFLA_LINK, _IFLA_MASTER, _IFLA_INFO, _IFLA_STATS = (
-    1,
-    3,
-    4,
-    5,
-    10,
-    18,
-    23,
-)
+_IFLA_ADDRESS, _IFLA_NAME, _IFLA_MTU, _IFLA_LINK, _IFLA_MASTER = 1, 3, 4, 5, 10
+_IFLA_INFO, _IFLA_STATS = 18, 23
 _IFLA_CARRIER, _IFLA_LINK_NAMESPACE, _IFLA_XDP, _IFLA_NAMESPACE, _IFLA_ALTERNATIVE_NAME = 33, 37, 43, 46, 53
 _XDP_MODES: Final = {5: "xdpdrv", 6: "xdpgeneric", 7: "xdpoffload"}  # attributes of a program, and ip's words
 _INFO_KIND: Final = 1

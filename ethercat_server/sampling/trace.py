@@ -34,7 +34,7 @@ VERSION: Final = 1
 RECORD: Final = struct.Struct("<QIIIBBH")
 _MOST: Final = 0xFFFFFFFF  # longest duration, ns
 LATCHED: Final = 0x80
-_LARGEST: Final = 8 << 20  # of the ring, bytes
+MAX_TRACE_BYTES: Final = 8 << 20  # of records
 _SECONDS: Final = 60.0  # that the ring has at least, if it is not larger for it
 RECORDS: Final = 2.5  # a sample, at most, as a rule
 
@@ -107,7 +107,7 @@ class Ring:
     def __init__(self, samples_per_second: float) -> None:
         """`samples_per_second` of all sensors."""
         size = round(_SECONDS * RECORDS * samples_per_second) * RECORD.size
-        self._ring = bytearray(max(1, min(size, _LARGEST) // RECORD.size) * RECORD.size)
+        self._ring = bytearray(max(1, min(size, MAX_TRACE_BYTES) // RECORD.size) * RECORD.size)
         self._end = 0  # bytes of records so far; the ring has the last of them
         self._snapshots: list[tuple[int, dict[str, Any]]] = []  # with the records before each, in bytes
 

@@ -18,15 +18,13 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import Deadline
 from ethercat_server.ethercat.datagrams import ByPosition, Steps
 from ethercat_server.ethercat.nic import CHECK_CABLE
+from ethercat_server.ethercat.other_master import refuse_other_master
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.slave import sii
 from ethercat_server.ethercat.slave.al import STATE_S, AlState, AlStatus
 from ethercat_server.ethercat.slave.sii import read_sii
 from ethercat_server.sensor.objects.dictionary import is_sensor
 
-_LISTEN_S: Final = 0.1
-# As many frames in this time are a master's cycle; fewer may be the last ones of a server that was killed.
-_MASTER_FRAMES: Final = 3
 _PAUSE_S: Final = 0.002
 # Start and length of a Bota sensor's sync managers 0 to 2, and start of the last one.
 _MAILBOXES_AND_OUTPUTS: Final = ((0x1000, 128), (0x1080, 128), (0x1100, 1))
@@ -91,11 +89,8 @@ def scan_if_free(
     those without outputs at the positions `ours`, where a server that was killed has left them: what is there
     by its SII must be what is named.
     """
-    if not force and (count := bus.listen(_LISTEN_S)) >= _MASTER_FRAMES:
-        raise BusError(
-            f"another EtherCAT master is sending on {bus.ifname} ({count} frames in {_LISTEN_S:g} s): stop "
-            "it, or name the interface that the sensor is connected to; --force takes its slaves over"
-        )
+    if not force:
+        refuse_other_master(bus)
     check_interrupt()
     slaves = []
     for position in range(bus.count_slaves()):

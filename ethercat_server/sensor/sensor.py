@@ -146,7 +146,7 @@ class Sensor:
         offset = self.offset if self.offset_is_certain else None
         return list(offset) if offset is not None and all(map(math.isfinite, offset)) else None
 
-    def in_force(self) -> dict[str, Any]:
+    def as_message(self) -> dict[str, Any]:
         """The part of replies and events about a change."""
         return {
             "settings": dict(self.settings),
@@ -160,15 +160,12 @@ class Sensor:
         return {
             "sensor": self.number,
             "position": self.position,
-            "name": self.identity.name,
-            "serial": self.identity.serial,
-            "hardware": self.identity.hardware,
-            "firmware": self.identity.firmware,
+            **self.identity._asdict(),
             "pdo_size": self.pdo_size,
             "state": self.state.reported,
             "settling": self.settling,
             "meaning": self.meaning,
-            **self.in_force(),
+            **self.as_message(),
         }
 
 

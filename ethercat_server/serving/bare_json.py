@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from typing import Final
 
 from bota_ethercat.errors import RemoteProtocolError
-from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject, encode_json_text, parse_json_object
+from bota_ethercat.framing import MAX_JSON_LENGTH
+from bota_ethercat.text.json_text import JsonObject, encode_json_text, parse_json_object
 
 BARE_JSON_FIRST_BYTE: Final = b"{"  # A connection that starts with this byte is a bare JSON connection
 

@@ -174,7 +174,7 @@ class SensorActions:
 
     def _announce_change(self, sensor: Sensor) -> None:
         self._streams[sensor.number].drift.begin("change")
-        self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, **sensor.in_force()))
+        self._hub.broadcast(event(Event.RECONFIGURED, sensor=sensor.number, **sensor.as_message()))
 
     def _announce_offset(self, sensor: Sensor) -> None:
         if sensor.offset_is_certain:
@@ -184,4 +184,4 @@ class SensorActions:
     def _finish_change(self, sensor: Sensor, save_too: bool) -> Steps[Mapping[str, Any]]:
         if save_too:
             yield from save(self._recovery.sensors[sensor.number].sdo, sensor)
-        return {"sensor": sensor.number, **sensor.in_force(), "saved": save_too}
+        return {"sensor": sensor.number, **sensor.as_message(), "saved": save_too}

@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 from bota_ethercat.control import ACTIONS, MAX_TARE_SAMPLES
 from bota_ethercat.errors import SettingError
 from bota_ethercat.pdo import AXES
+from bota_ethercat.program.arguments import whole
 from bota_ethercat.program.command import command
 from bota_ethercat.program.new_file import NewFile
 from bota_ethercat.program.signals import signals_held_back
@@ -114,7 +115,7 @@ def _apply(args: argparse.Namespace) -> int:
         asked = options.asked_settings(found.number, found.identity.name, found.identity.serial)
         if not asked:
             raise UsageError(f"{args.config} has no settings for {found}: correct its tables, or use --set")
-        sensor = opened.in_force(found, asked)
+        sensor = opened.read_settings(found, asked)
         changed = _changes(sensor, asked)
         settings, rate_hz = sensor.settings, sensor.rate_hz
         if args.dry_run:
@@ -124,7 +125,7 @@ def _apply(args: argparse.Namespace) -> int:
         elif changed or args.save:
             opened.configure(found.number, asked, args.save)
             if changed:
-                after = opened.in_force(found, asked)
+                after = opened.read_settings(found, asked)
                 settings, rate_hz = after.settings, after.rate_hz
     means = meaning(settings, rate_hz)
     what, lines = "settings afterwards" if args.dry_run else "in force", [_change_lines(changed)]
@@ -157,8 +158,6 @@ def _save(args: argparse.Namespace) -> int:
 
 
 def _tare(args: argparse.Namespace) -> int:
-    if not 1 <= args.samples <= MAX_TARE_SAMPLES:
-        raise UsageError(f"--samples {args.samples}: it must be from 1 to {MAX_TARE_SAMPLES}")
     if args.undo and args.clear:
         raise UsageError("--undo and --clear exclude each other: give one of them")
     if not all(map(math.isfinite, args.target)):
@@ -258,7 +257,7 @@ def read_snapshot(path: Path) -> Snapshot:
 
 def _snapshot(args: argparse.Namespace) -> int:
     with NewFile(args.file, force=args.force) as file, sensor_of(args) as (opened, found):
-        sensor, sdo = opened.in_force(found), opened.sdo(found.number)
+        sensor, sdo = opened.read_settings(found), opened.sdo(found.number)
         read = [(row, finish(read_object(sdo, row))) for row in KNOWN_OBJECTS]
         who = found.identity._asdict()
         content = {
@@ -294,7 +293,7 @@ def _restore(args: argparse.Namespace) -> int:
             )
         if sensor_is.firmware != file_is.firmware:
             note(f"{args.file} is of firmware {file_is.firmware}, the sensor now has {sensor_is.firmware}")
-        sensor, sdo = opened.in_force(found, snapshot.settings), opened.sdo(found.number)
+        sensor, sdo = opened.read_settings(found, snapshot.settings), opened.sdo(found.number)
         settings = {name: value for name, value in snapshot.settings.items() if name in sensor.settings}
         missing = sorted(snapshot.settings.keys() - settings.keys())
         changed, differing = _changes(sensor, settings), dict[Address, tuple[bytes, bytes]]()
@@ -383,13 +382,13 @@ _FILE: Final = (
     *sensor_arguments(take_over="--take-over"),
     argument("file", "JSON file", type=Path, metavar="FILE"),
 )
-_SAMPLES: Final = f"number of samples to average, 1 to {MAX_TARE_SAMPLES} (default %(default)s)"
+_SAMPLES: Final = "number of samples to average (default %(default)s)"
 _DEFAULT_SAMPLES: Final = ACTIONS["tare"].parameters["samples"].default
 _TARGET: Final = "wrench the sensor is to read, in N and Nm (default: zeros)"
 
 _TARE: Final = (
     *_SENSOR,
-    argument("--samples", _SAMPLES, type=int, default=_DEFAULT_SAMPLES, metavar="N"),
+    argument("--samples", _SAMPLES, type=whole(1, MAX_TARE_SAMPLES), default=_DEFAULT_SAMPLES, metavar="N"),
     argument("--target", _TARGET, type=float, nargs=6, default=[0.0] * 6, metavar=AXES),
     argument("--undo", "restore the offset of before the last tare"),
     argument("--clear", "set the offset to zero"),

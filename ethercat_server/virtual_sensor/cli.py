@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import LAYOUTS
-from bota_ethercat.program.arguments import Parser, number, whole
+from bota_ethercat.program.arguments import Parser, number, of_type, whole
 from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.real_time import make_real_time
 from bota_ethercat.program.signals import signals_call
@@ -87,11 +87,10 @@ def build_parser() -> argparse.ArgumentParser:
             f"--{name}", metavar=metavar, type=_each(parse), action="extend", default=[],
             help=f"{meaning}{_SEVERAL}",
         )  # fmt: skip
-    lengths = SETTINGS["sinc_length"].choices or ()
-    sinc_length = whole(int(min(lengths)), int(max(lengths)))
     parser.add_argument(
-        "--sinc", metavar="N", type=sinc_length, help="SINC length after power-on (default 64)"
-    )
+        "--sinc", metavar="N", type=of_type(SETTINGS["sinc_length"].type),
+        help="SINC length after power-on (default 64)",
+    )  # fmt: skip
     parser.add_argument(
         "--pdo", choices=[*map(str, LAYOUTS)], default="61", help="bytes of process data (default 61)"
     )

@@ -7,14 +7,14 @@ sentence.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from bota_ethercat.program.arguments import number, whole
+from bota_ethercat.option_types import choice, hexadecimal
+from bota_ethercat.program.arguments import number, of_type, whole
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.virtual_sensor.distributed_clock import parse_clock_word
 from ethercat_server.virtual_sensor.fault import PPM_LIMIT, Fault
@@ -101,27 +101,11 @@ _COUNT, _LONG, _WORD, _BYTE = (whole(0, most) for most in (2**31, 2**32 - 1, 0xF
 _AMOUNT = number(0, 1e6)
 
 
-def _hex(text: str) -> bytes:
-    with contextlib.suppress(ValueError):
-        if len(data := bytes.fromhex(text)) <= 5:
-            return data
-    raise UsageError("the data of an emergency are at most 5 bytes in hexadecimal digits")
-
-
-def _one_of(what: str, known: Sequence[str]) -> Callable[[str], str]:
-    def parse(text: str) -> str:
-        if text.lower() not in known:
-            raise UsageError(f"no {what} {text[:40]!r}: available: {', '.join(known)}")
-        return text.lower()
-
-    return parse
-
-
 def _limit(text: str) -> float | None:
     return None if text == "off" else _AMOUNT(text)
 
 
-_CHANNEL = _one_of("channel", CHANNELS)
+_CHANNEL = of_type(choice(*CHANNELS))
 
 COMMANDS: Final[tuple[Fault, ...]] = (
     Fault("lose N", "lose the next N frames", lambda c, n: c.bus.lose(n), (_COUNT,)),
@@ -155,10 +139,10 @@ COMMANDS: Final[tuple[Fault, ...]] = (
     Fault("mute-mailbox N [@N]", "drop the next N mailbox requests",
           lambda c, n: setattr(c.application.mailbox, "mute", n), (_COUNT,)),
     Fault("emergency CODE [REGISTER [HEX]] [@N]", "send a CoE emergency before anything else in the mailbox",
-          Call._emergency, (_WORD, _BYTE, _hex)),
+          Call._emergency, (_WORD, _BYTE, of_type(hexadecimal(0, 5)))),
     Fault("sii error|busy|ok [@N]", "result of reading the EEPROM",
           lambda c, result: c.application.esc.sii.fail(c.application.esc.sii.FAULTS[result]),
-          (_one_of("result", ("error", "busy", "ok")),)),
+          (of_type(choice("error", "busy", "ok")),)),
     Fault("warn BITS [SAMPLES] [@N]", "set warnings, permanently or for some samples",
           lambda c, bits, samples=None: c.firmware.sampler.set_warnings(bits, samples),
           (_LONG, whole(1, 2**31))),
@@ -180,7 +164,7 @@ COMMANDS: Final[tuple[Fault, ...]] = (
     Fault("ppm X [@N]", "set the error of the sensor's clock",
           lambda c, ppm: c.sensor.set_ppm(ppm), (number(-PPM_LIMIT, PPM_LIMIT),)),
     Fault("signal NAME [@N]", "measure another signal, from its beginning",
-          lambda c, name: c.sensor.set_signal(name), (_one_of("signal", SIGNALS),)),
+          lambda c, name: c.sensor.set_signal(name), (of_type(choice(*SIGNALS)),)),
     Fault("dc WORD [VALUE] ... [@N]", "a fault of the distributed clock, as in --dc; `dc ok` ends it",
           Call._dc, (str, str)),
     Fault("stats", "counters and states, as JSON",

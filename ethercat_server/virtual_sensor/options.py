@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from bota_ethercat.option_types import text
+from bota_ethercat.program.arguments import of_type
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.models import MODELS
 from ethercat_server.virtual_sensor.signals import World
@@ -54,20 +56,18 @@ class ForeignOptions:
 SlaveOptions = SensorOptions | ForeignOptions
 
 
-def model_name(text: str) -> str:
-    """Parses the name of a model; UsageError if a sensor cannot have it."""
-    if not text.isascii() or len(text) > 20:
-        raise UsageError(f"model {text!r} must have at most 20 ASCII characters, such as {MODELS[0]}")
-    return text
+model_name: Final = of_type(
+    text(f"at most 20 ASCII characters, such as {MODELS[0]}", lambda name: name.isascii() and len(name) <= 20)
+)
 
 
-def parse_chain(text: str) -> list[tuple[str, AlState]]:
+def parse_chain(slaves: str) -> list[tuple[str, AlState]]:
     """Kind and initial AL state of each slave, such as `EK1100,BOTA,DRIVE:OP`, in wire order.
 
     UsageError if one is unknown.
     """
     found = []
-    for word in text.split(","):
+    for word in slaves.split(","):
         kind, _, state = word.strip().upper().partition(":")
         if kind != SENSOR and kind not in KINDS:
             raise UsageError(f"no slave {word[:40]!r}: available: {', '.join((SENSOR, *KINDS))}")

@@ -9,8 +9,11 @@ import uuid
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from bota_ethercat.option_types import integer
+
 DEFAULT_HOST: Final = "localhost"
 DEFAULT_PORT: Final = 12001
+PORT: Final = integer(1, 65535)
 
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 _CLOCK_OFFSETS: Final = Path("/proc/self/timens_offsets")
@@ -34,9 +37,10 @@ class Address(NamedTuple):
             raise ValueError(f"{text!r}: write an IPv6 address in brackets, for example [::1]:{DEFAULT_PORT}")
         if not port.isdecimal() or not port.isascii():
             raise ValueError(f"{text!r}: it must be HOST:PORT, for example {DEFAULT_HOST}:{DEFAULT_PORT}")
-        if not 1 <= int(port) <= 65535:
-            raise ValueError(f"{text!r}: {port} is no port: it must be from 1 to 65535")
-        return cls(host.strip("[]") or DEFAULT_HOST, int(port))
+        try:
+            return cls(host.strip("[]") or DEFAULT_HOST, PORT.check(int(port)))
+        except ValueError as error:
+            raise ValueError(f"{text!r}: {port} is no port: it must be {error}") from None
 
     def __str__(self) -> str:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"

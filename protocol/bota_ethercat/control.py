@@ -8,24 +8,28 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import math
+import sys
 from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import Any, Final, NamedTuple
 
 from bota_ethercat.errors import ConnectionFailedError, RequestError, SettingError
+from bota_ethercat.option_types import OptionType, flag, hexadecimal, integer, number, several, text
 from bota_ethercat.sensor.sdo_types import sdo_type
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import check_settings
+from bota_ethercat.text import untrusted
 from bota_ethercat.text.json_text import JsonObject
-from bota_ethercat.text.untrusted import number, printable, text, whole
+from bota_ethercat.text.untrusted import printable
 
 PROTOCOL_VERSION: Final = 1
 MAX_SDO_BYTES: Final = 112  # largest SDO that fits a mailbox of 128 bytes unsegmented
 MAX_TARE_SAMPLES: Final = 20_000
 _MAX_NAME_LENGTH: Final = 80
 MAX_SII_WORDS: Final = 128
-MAX_TRACE_SIZE: Final = 64 << 20  # bytes of a trace file
+SIX_NUMBERS: Final = several(
+    number(-sys.float_info.max, sys.float_info.max), (6,), "a list of six finite numbers"
+)  # a wrench
 
 
 class _Text(str, Enum):  # enum.StrEnum needs Python 3.11
@@ -94,50 +98,11 @@ class Request(NamedTuple):
     values: Mapping[str, Any]
 
 
-def _is_int(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def whole_number(low: int, high: int) -> Check:
-    """A check for a whole number from `low` to `high`."""
-
-    def check(value: object) -> int:
-        if isinstance(value, int) and _is_int(value) and low <= value <= high:
-            return value
-        raise ValueError(f"a whole number from {low} to {high}")
-
-    return check
-
-
-def _boolean(value: object) -> bool:
-    if isinstance(value, bool):
-        return value
-    raise ValueError("true or false")
-
-
-def _numbers(value: object) -> tuple[int, ...]:
-    if isinstance(value, list) and value and all(_is_int(item) and 0 <= item <= 255 for item in value):
-        return tuple(value)
-    raise ValueError("a list of numbers from 0, such as [0]")
-
-
-def six_numbers(value: object) -> tuple[float, ...]:
-    """Check for a wrench: six finite numbers."""
-    if isinstance(value, list) and len(value) == 6:
-        numbers = [v for v in value if isinstance(v, int | float) and not isinstance(v, bool)]
-        with contextlib.suppress(OverflowError):  # JSON has whole numbers that no float can be
-            floats = tuple(float(v) for v in numbers)
-            if len(floats) == 6 and all(map(math.isfinite, floats)):
-                return floats
-    raise ValueError("a list of six finite numbers")
-
-
 def known_six(value: object) -> tuple[float, ...] | None:
     """Six finite numbers from a message or a file; None if they are none."""
-    try:
-        return six_numbers(value)
-    except ValueError:
-        return None
+    with contextlib.suppress(ValueError):
+        return SIX_NUMBERS.check(value)
+    return None
 
 
 def _settings(value: object) -> Mapping[str, Any]:
@@ -146,39 +111,22 @@ def _settings(value: object) -> Mapping[str, Any]:
     return check_settings(value)
 
 
-def _anything(value: object) -> object:
-    return value
-
-
 def _object_number(high: int) -> Check:
     """A check for an index or sub-index: a whole number, or a text such as "0x8010"."""
-
-    def check(value: object) -> int:
-        if isinstance(value, str):
-            with contextlib.suppress(ValueError):
-                value = int(value, 16) if value.lower().startswith("0x") else int(value)
-        if isinstance(value, int) and _is_int(value) and 0 <= value <= high:
-            return value
-        raise ValueError(f'a number from 0 to {high}, or a text such as "0x{high:X}"')
-
-    return check
+    known = integer(0, high)
+    return OptionType(
+        f'{known.allowed}, or a text such as "0x{high:X}"',
+        lambda value: known.parse(value) if isinstance(value, str) else known.check(value),
+    ).check
 
 
-def _hex_bytes(value: object) -> bytes:
-    if isinstance(value, str):
-        with contextlib.suppress(ValueError):
-            data = bytes.fromhex(value)
-            if 0 < len(data) <= MAX_SDO_BYTES:
-                return data
-    raise ValueError(f"1 to {MAX_SDO_BYTES} bytes as hexadecimal digits, two each")
-
-
-def _object_name(value: object) -> str:
-    if isinstance(value, str) and 0 < len(value) <= _MAX_NAME_LENGTH:
-        return value
-    raise ValueError(f"a text of 1 to {_MAX_NAME_LENGTH} characters, such as 'Sampling rate'")
-
-
+_SENSORS: Final = several(
+    integer(0, 255), range(1, sys.maxsize), "a list of numbers from 0, such as [0]"
+).check
+_OBJECT_NAME: Final = text(
+    f"a text of 1 to {_MAX_NAME_LENGTH} characters, such as 'Sampling rate'",
+    lambda name: 0 < len(name) <= _MAX_NAME_LENGTH,
+).check
 _SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(number=0))
 _INDEX: Final = _object_number(0xFFFF)
 _SUBINDEX: Final = _object_number(0xFF)
@@ -193,10 +141,10 @@ ACTIONS: Final[Mapping[str, Action]] = {
     "describe": Action({}),
     "subscribe": Action(
         {
-            "sensors": Parameter(_numbers),
-            "terminals": Parameter(_numbers, default=()),
-            "every": Parameter(whole_number(1, 1_000_000), default=1),
-            "fresh_only": Parameter(_boolean, default=True),
+            "sensors": Parameter(_SENSORS),
+            "terminals": Parameter(_SENSORS, default=()),
+            "every": Parameter(integer(1, 1_000_000).check, default=1),
+            "fresh_only": Parameter(flag.check, default=True),
         },
         framed_only=True,
     ),
@@ -206,15 +154,15 @@ ACTIONS: Final[Mapping[str, Action]] = {
         {
             "sensor": _SENSOR,
             "settings": Parameter(_settings, required=True),
-            "save": Parameter(_boolean, default=False),
+            "save": Parameter(flag.check, default=False),
         },
         controls=True,
     ),
     "tare": Action(
         {
             "sensor": _SENSOR,
-            "samples": Parameter(whole_number(1, MAX_TARE_SAMPLES), default=400),
-            "target": Parameter(six_numbers, default=(0.0,) * 6),
+            "samples": Parameter(integer(1, MAX_TARE_SAMPLES).check, default=400),
+            "target": Parameter(SIX_NUMBERS.check, default=(0.0,) * 6),
         },
         controls=True,
     ),
@@ -223,21 +171,26 @@ ACTIONS: Final[Mapping[str, Action]] = {
             **_ENTRY,
             "index": Parameter(_INDEX),
             "subindex": Parameter(_SUBINDEX),
-            "name": Parameter(_object_name),
+            "name": Parameter(_OBJECT_NAME),
         }
     ),
     "sdo_write": Action(
-        {**_ENTRY, "value": Parameter(_anything), "hex": Parameter(_hex_bytes)}, controls=True
+        {
+            **_ENTRY,
+            "value": Parameter(lambda value: value),
+            "hex": Parameter(hexadecimal(1, MAX_SDO_BYTES).check),
+        },
+        controls=True,
     ),
     "sii_read": Action(
         {
             "sensor": _SENSOR,
             "word": Parameter(_object_number(0xFFFF), required=True),
-            "words": Parameter(whole_number(1, MAX_SII_WORDS), default=2),
+            "words": Parameter(integer(1, MAX_SII_WORDS).check, default=2),
         },
         controls=True,
     ),
-    "trace": Action({"offset": Parameter(whole_number(0, MAX_TRACE_SIZE), default=0)}, controls=True),
+    "trace": Action({"offset": Parameter(integer(0, 2**31 - 1).check, default=0)}, controls=True),
     "shutdown": Action({}, controls=True),
 }
 
@@ -319,9 +272,10 @@ def event(name: Event, **values: object) -> JsonObject:
 
 def event_sentence(event: Mapping[str, Any]) -> str:
     """What an event of the server says: its own message, or what it means."""
-    if told := text(event.get("message")):
+    if told := untrusted.text(event.get("message")):
         return told
-    kind, sensor, lost_s = str(event.get("event")), whole(event.get("sensor")), number(event.get("lost_s"))
+    kind, sensor = str(event.get("event")), untrusted.whole(event.get("sensor"))
+    lost_s = untrusted.number(event.get("lost_s"))
     if kind not in _EVENTS:
         return f"the server sent the event {printable(kind, 40)}, which this version does not know"
     is_begun = kind == Event.OFFSET_CHANGED and event.get("offset") is None

@@ -19,7 +19,10 @@ from typing import Any, Final, NamedTuple, NoReturn
 
 from bota_ethercat.errors import RemoteProtocolError
 from bota_ethercat.pdo import LAYOUTS
-from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject, encode_json_text, parse_json_object
+from bota_ethercat.text.json_text import JsonObject, encode_json_text, parse_json_object
+
+MAX_JSON_LENGTH: Final = 65536  # of a control message, bytes
+MAX_REQUEST_LENGTH: Final = 4096  # of one that the server takes
 
 
 class MessageType(IntEnum):

@@ -73,11 +73,6 @@ class SensorInfo(NamedTuple):
         """Of the sensor and its firmware."""
         return self.name, self.serial, self.hardware, self.firmware
 
-    @property
-    def in_force(self) -> tuple[object, ...]:
-        """Of its samples."""
-        return self.settings, self.rate_hz, self.delay_ns, self.offset
-
     def as_message(self) -> dict[str, Any]:
         """The same as a description or an event carries it, without what is not known."""
         delays = {name: None if ns is None else ns * 1e-6 for name, ns in self.delay_ns._asdict().items()}

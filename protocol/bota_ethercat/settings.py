@@ -8,72 +8,64 @@ objects are in `ethercat_server.sensor.objects.dictionary`.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
-from typing import Final, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
 
+from bota_ethercat import option_types
 from bota_ethercat.errors import SettingError
+from bota_ethercat.option_types import OptionType
 from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
 from bota_ethercat.text.did_you_mean import did_you_mean
 
 SettingValue = bool | int
+_BOOL: Final = (False, True)
 
 
 class Setting(NamedTuple):
-    """One setting. `choices` are its allowed values, None for bool."""
+    """One setting, of the values `choices`."""
 
     name: str
     # What the server writes at start-up unless configured otherwise; None = not written.
     default: SettingValue | None
-    choices: range | tuple[int, ...] | None
+    choices: range | tuple[SettingValue, ...]
     meaning: str
     preop_only: bool  # can be written in PREOP only
 
     @property
-    def is_bool(self) -> bool:
-        """Whether the setting is on or off."""
-        return self.choices is None
+    def type(self) -> OptionType[bool] | OptionType[int]:
+        """What it may be."""
+        if self.choices is _BOOL:
+            return option_types.flag
+        if isinstance(self.choices, range):
+            return option_types.integer(self.choices[0], self.choices[-1])
+        return option_types.choice(*self.choices)
 
     def check(self, value: object) -> SettingValue:
         """Return `value` if it is allowed, else raise SettingError with the choices."""
-        if self.is_bool:
-            if isinstance(value, bool):
-                return value
-            raise SettingError(f"{self.name} is {value!r}: it must be true or false")
-        if isinstance(value, bool) or not isinstance(value, int) or value not in (self.choices or ()):
-            raise SettingError(f"{self.name} is {value!r}: it must be {self._choices_text()}")
-        return value
+        return self._allowed(self.type.check, value)
 
     def parse(self, text: str) -> SettingValue:
         """The value of `text` from a command line; SettingError if it is not allowed."""
-        if self.is_bool:
-            word = text.strip().lower()
-            if word in {"true", "yes", "on", "1"}:
-                return True
-            if word in {"false", "no", "off", "0"}:
-                return False
-            raise SettingError(f"{self.name} is {text!r}: it must be true or false")
-        try:
-            return self.check(int(text, 0))
-        except ValueError:
-            raise SettingError(f"{self.name} is {text!r}: it must be {self._choices_text()}") from None
+        return self._allowed(self.type.parse, text)
 
-    def _choices_text(self) -> str:
-        if isinstance(self.choices, range):
-            return f"a whole number from {self.choices[0]} to {self.choices[-1]}"
-        return "one of " + ", ".join(str(choice) for choice in self.choices or ())
+    def _allowed(self, convert: Callable[[Any], SettingValue], value: object) -> SettingValue:
+        try:
+            return convert(value)
+        except ValueError as error:
+            raise SettingError(f"{self.name} is {value!r}: it must be {error}") from None
 
 
 SETTINGS: Final[Mapping[str, Setting]] = {
     row.name: row
     for row in (
-        Setting("calibration_matrix", True, None, "force and torque in N and Nm, not raw counts", False),
-        Setting("temperature_compensation", False, None, "correct the force/torque for temperature", False),
+        Setting("calibration_matrix", True, _BOOL, "force and torque in N and Nm, not raw counts", False),
+        Setting("temperature_compensation", False, _BOOL, "correct the force/torque for temperature", False),
         Setting("imu_active", 1, range(0, 4), "IMU: 0 none, 1 internal, 2 external, 3 both", False),
-        Setting("coordinate_system", None, None, "use the configured coordinate system", False),
+        Setting("coordinate_system", None, _BOOL, "use the configured coordinate system", False),
         Setting(
-            "inertia_compensation", None, None, "the sensor's own inertia and gravity compensation", False
+            "inertia_compensation", None, _BOOL, "the sensor's own inertia and gravity compensation", False
         ),
-        Setting("orientation_estimation", None, None, "the sensor estimates its orientation", False),
+        Setting("orientation_estimation", None, _BOOL, "the sensor estimates its orientation", False),
         Setting("acceleration_range_g", 2, (2, 4, 8, 16), "accelerometer full scale, g", True),
         Setting("angular_rate_range_dps", 250, (250, 500, 1000, 2000), "gyroscope full scale, °/s", True),
         Setting("acceleration_filter", 1, range(1, 9), "accelerometer filter profile", True),
@@ -82,9 +74,9 @@ SETTINGS: Final[Mapping[str, Setting]] = {
         Setting(
             "sinc_length", 64, range(32, 2049), "SINC filter length; sampling rate = 51200 / length", True
         ),
-        Setting("fir", False, None, "FIR filter: lower cut-off, more delay", True),
-        Setting("fast", False, None, "FAST filter: switches the FIR filter off on steps; needs fir", True),
-        Setting("chop", False, None, "CHOP filter: less drift, unpredictable latency", True),
+        Setting("fir", False, _BOOL, "FIR filter: lower cut-off, more delay", True),
+        Setting("fast", False, _BOOL, "FAST filter: switches the FIR filter off on steps; needs fir", True),
+        Setting("chop", False, _BOOL, "CHOP filter: less drift, unpredictable latency", True),
     )
 }
 
@@ -125,7 +117,7 @@ def sinc_length_of(
     """
     if not rate_hz:
         return read
-    allowed = SETTINGS["sinc_length"].choices or ()
+    allowed = SETTINGS["sinc_length"].choices
     for length in (read, asked):
         if length is not None and length in allowed and rate_divisor(length, rate_hz, chop):
             return length
@@ -133,13 +125,18 @@ def sinc_length_of(
     return next(published, min(round(BASE_SAMPLING_RATE_HZ / rate_hz), allowed[-1]))
 
 
+def setting_named(name: str) -> Setting:
+    """The setting of that name; SettingError if there is none."""
+    if name not in SETTINGS:
+        known = f"the settings are {', '.join(SETTINGS)}{did_you_mean(name, SETTINGS)}"
+        raise SettingError(f"no setting {name!r}: {known}")
+    return SETTINGS[name]
+
+
 def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:
     """Return `values` if every name exists and every value is allowed; else raise SettingError."""
-    for name in values:
-        if name not in SETTINGS:
-            known = f"the settings are {', '.join(SETTINGS)}{did_you_mean(name, SETTINGS)}"
-            raise SettingError(f"no setting {name!r}: {known}")
-    return {name: SETTINGS[name].check(value) for name, value in values.items()}
+    rows = {name: setting_named(name) for name in values}
+    return {name: row.check(values[name]) for name, row in rows.items()}
 
 
 def known_settings(values: object) -> dict[str, SettingValue]:

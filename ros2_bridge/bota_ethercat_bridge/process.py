@@ -25,6 +25,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
+from bota_ethercat.option_types import integer
+
 STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
 _REPEATED_SIGNAL_S: Final = 1.0
 _HIGHEST_DOMAIN: Final = 232  # of DDS: the ports of others are too high
@@ -67,9 +69,9 @@ def environment_problem() -> str:
     number = 0
     with contextlib.suppress(ValueError):  # ROS itself refuses what is no number
         number = int(domain, 0)
-    if 0 <= number <= _HIGHEST_DOMAIN or "zenoh" in middleware:
+    if number in range(_HIGHEST_DOMAIN + 1) or "zenoh" in middleware:
         return ""
-    return f"ROS_DOMAIN_ID is {domain}: set it to a whole number from 0 to {_HIGHEST_DOMAIN}, or unset it"
+    return f"ROS_DOMAIN_ID is {domain}: set it to {integer(0, _HIGHEST_DOMAIN).allowed}, or unset it"
 
 
 def refuse(text: str, exit_code: int) -> int:

@@ -34,7 +34,7 @@ def _demo() -> int:
     parser = argparse.ArgumentParser(
         prog="scripts/demo --no-ros", description="The monitor, without hardware."
     )
-    time_s = number(0.5, 1e6, "a number of seconds from 0.5 to 1000000")
+    time_s = number(0.5, 1e6, "a number of seconds")
     parser.add_argument("--seconds", type=time_s, help="end after this number of seconds, not at Ctrl-C")
     return run(parser.parse_args().seconds)
 

@@ -167,7 +167,7 @@ def run(seconds: float | None) -> int:
 
 
 def _demo() -> int:
-    seconds = number(0.5, 1e6, "a number of seconds from 0.5 to 1000000")
+    seconds = number(0.5, 1e6, "a number of seconds")
     parser = argparse.ArgumentParser(prog="scripts/demo", description="The whole chain, without hardware.")
     parser.add_argument("--seconds", type=seconds, help="end after this number of seconds, not at Ctrl-C")
     return run(parser.parse_args().seconds)

@@ -25,6 +25,7 @@ from bota_clients.report.cli import main as report
 from bota_ethercat.address import Address
 from bota_ethercat.framing import DataMessage, encode_data
 from ethercat_server.simulation.machine import Machine
+from ethercat_server.simulation.server import MemoryChannel
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.signals import MOVE_LENGTH, POSE_LENGTH
 from tests.bridge.scripted_server import ScriptedServer
@@ -34,7 +35,7 @@ from tests.clients.test_sensor_loop import Loop, Seen, program
 from tests.compensation.making import written_parameters
 from tests.ended import run_here
 from tests.server.running import wait_until
-from tests.simulation import MemoryChannel, Simulation
+from tests.simulation import Simulation
 
 Array = NDArray[np.float64]
 Step = tuple[float, Callable[[Simulation], object]]

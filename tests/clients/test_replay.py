@@ -367,7 +367,7 @@ def test_numbers_and_times_stay_in_their_fields() -> None:
     ("code", "arguments", "sentence"),
     [
         (2, (), "required"),
-        (2, ("x.mcap", "--speed", "nan"), "it must be a number"),
+        (2, ("x.mcap", "--speed", "nan"), "it must be 'max' or a number"),
         (1, ("/no/x.mcap",), "No such file"),
         (1, (__file__,), "is not an MCAP file"),
     ],

@@ -34,10 +34,11 @@ from bota_ft_compensation.quantities import (
     length,
 )
 from bota_ft_compensation.stationary import triple
+from ethercat_server.simulation.server import MemoryChannel
 from tests.compensation import motion
 from tests.compensation.making import SEED
 from tests.compensation.motion import Array, Imperfection
-from tests.simulation import MemoryChannel, Simulation, more_if_long
+from tests.simulation import Simulation, more_if_long
 
 RATE_HZ = 800.0
 CHI_2 = 5.991  # 95 %, 2 degrees of freedom

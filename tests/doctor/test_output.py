@@ -29,7 +29,7 @@ from tests.ended import run_here
     [
         ([], "12001 (Connection refused): name the interface, or start ethercat-server on it\n"),
         (["ens5", "--colour"], "usage: ethercat-doctor"),
-        (["ens5", "--seconds", "soon"], "must be from 0 to 3600"),
+        (["ens5", "--seconds", "soon"], "must be a number from 0 to 3600"),
         (["ens5", "--seconds", "-1"], "from 0 to 3600"),
         (["ens5", "--cpu", "4000"], "--cpu 4000: this machine has the processors 0 to"),
         (["ens5", "--rt-priority", "100"], "--rt-priority: '100': it must be a whole number from 0 to 99"),

@@ -33,12 +33,13 @@ from bota_ethercat.client.channel import TcpChannel
 from bota_ethercat.errors import ConnectionFailedError, NoReplyError, RefusedError, UnreachableError
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
+from ethercat_server.simulation.server import MemoryChannel
 from tests.bridge.scripted_server import MemoryServer, ScriptedChannel, ScriptedServer, process_data
 from tests.descriptions import description, sensor_row
 from tests.golden_vectors import odd_messages
 from tests.served_simulation import served
 from tests.server.running import PATIENCE_S, free_port, full_listener
-from tests.simulation import MemoryChannel, Simulation
+from tests.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,6 +8,7 @@ import pytest
 
 from bota_ethercat.control import (
     ACTIONS,
+    SIX_NUMBERS,
     ErrorCode,
     Event,
     error_reply,
@@ -15,7 +16,6 @@ from bota_ethercat.control import (
     parse_request,
     reply,
     request,
-    six_numbers,
 )
 from bota_ethercat.errors import RequestError
 
@@ -79,8 +79,8 @@ def test_replies_refusals_and_events_are_the_contracts() -> None:
 
 
 def test_six_numbers() -> None:
-    assert six_numbers([1, 2.5, 0, 0, 0, 0]) == (1.0, 2.5, 0.0, 0.0, 0.0, 0.0)
+    assert SIX_NUMBERS.check([1, 2.5, 0, 0, 0, 0]) == (1.0, 2.5, 0.0, 0.0, 0.0, 0.0)
     odd = [[number] * 6 for number in (True, float("nan"), float("inf"), 10**400)]
     for wrong in ([1, 2, 3], "123456", None, *odd):
         with pytest.raises(ValueError, match="six finite numbers"):
-            six_numbers(wrong)
+            SIX_NUMBERS.check(wrong)

@@ -22,6 +22,7 @@ from bota_ethercat.errors import BadMessageError, ProtocolError, RemoteProtocolE
 from bota_ethercat.framing import (
     DATA_FLAGS_OFFSET,
     MAX_DATA_MESSAGE_SIZE,
+    MAX_JSON_LENGTH,
     DataFlag,
     DataMessage,
     FrameDecoder,
@@ -29,7 +30,7 @@ from bota_ethercat.framing import (
     encode_data,
     encode_json,
 )
-from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject, parse_json_object
+from bota_ethercat.text.json_text import JsonObject, parse_json_object
 from ethercat_server.serving.bare_json import BareJsonDecoder, encode_bare_json
 from tests.hostile_bytes import BARE, FRAMED, HOSTILE_TEXTS, framed, in_chunks, mutate
 

@@ -22,7 +22,7 @@ from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine, SimulatedClock
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
-from tests.simulation import Asked, Simulation, check_frames, fresh, life_of, more_if_long
+from tests.simulation import Simulation, asked, check_frames, fresh, life_of, more_if_long
 
 STATION = 0x1001
 LRW_OR_NOT = pytest.mark.parametrize("lrw", [True, False], ids=["LRW", "LRD and LWR"])
@@ -173,7 +173,7 @@ def operational(
     if not lrw:
         take_lrw_away(life_of(backend, -1))
     bus = Bus(backend)
-    bring_up(bus, Asked(), lambda: None)
+    bring_up(bus, asked(), lambda: None)
     return bus, backend
 
 

@@ -22,11 +22,11 @@ import pytest
 
 from bota_ethercat.control import ACTIONS, request
 from bota_ethercat.distribution import WINDOW_SLOTS
-from bota_ethercat.framing import DataFlag, encode_json
+from bota_ethercat.framing import MAX_REQUEST_LENGTH, DataFlag, encode_json
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.process import logs
 from ethercat_server.serving.bare_json import encode_bare_json
-from ethercat_server.serving.connection import MAX_REQUEST_LENGTH, Connection
+from ethercat_server.serving.connection import Connection
 from ethercat_server.serving.permissions import MAX_CLIENTS_PER_USER
 from ethercat_server.simulation.transport import InMemoryStream
 from ethercat_server.virtual_sensor.options import SensorOptions

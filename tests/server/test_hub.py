@@ -14,19 +14,21 @@ from typing import Any
 import pytest
 
 from bota_ethercat.control import parse_request, reply
-from bota_ethercat.framing import DataFlag, DataMessage, FrameDecoder, encode_data, encode_json
+from bota_ethercat.framing import (
+    MAX_REQUEST_LENGTH,
+    DataFlag,
+    DataMessage,
+    FrameDecoder,
+    encode_data,
+    encode_json,
+)
 from bota_ethercat.pdo import LAYOUTS
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.stream import OutgoingFrame
 from ethercat_server.serving import permissions
-from ethercat_server.serving.connection import (
-    MAX_QUEUED_DATA,
-    MAX_REQUEST_LENGTH,
-    Connection,
-    ConnectionState,
-    Timeouts,
-)
+from ethercat_server.serving.connection import Connection, ConnectionState, Timeouts
 from ethercat_server.serving.hub import Hub
+from ethercat_server.serving.send_queue import MAX_QUEUED_DATA
 from ethercat_server.simulation.transport import InMemoryStream, InMemoryTransport
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import ManualClock, Simulation, life_of

@@ -43,7 +43,7 @@ from tests.server.running import (
     virtual_sensor,
     wait_until,
 )
-from tests.simulation import Asked, check_frames, reading
+from tests.simulation import asked, check_frames, reading
 from tests.tool.running import one_sentence, tool
 
 pytestmark = [pytest.mark.bus, needs_bus]
@@ -237,7 +237,7 @@ def test_without_soems_master_the_sensors_come_to_op_as_well() -> None:
     ):
         backend.open()
         backend.master = None
-        sizes = [found.pdo_size for found in bring_up(bus, Asked(), lambda: None).sensors]
+        sizes = [found.pdo_size for found in bring_up(bus, asked(), lambda: None).sensors]
         assert sizes == [61, 61]
         assert [sensor.stats(number)["al_state"] for number in range(2)] == ["OP", "OP"]
         assert bus.process_data.most_wkc == [6]
@@ -258,7 +258,7 @@ def test_no_request_beside_soems_has_the_counter_of_the_one_before(arguments: st
         except PermissionError:
             pytest.skip("it takes root outside of a user namespace: less would not hold all frames")
         backend.open()
-        bring_up(bus, Asked(), lambda: None)
+        bring_up(bus, asked(), lambda: None)
         for slave in bus.slaves:
             bus.finish(slave.sdo.read(0x8011, 0))
         capture.setblocking(False)
@@ -430,7 +430,7 @@ def start(
         sensor.command(text)
         with opened(veth.near) as bus:
             try:
-                return bring_up(bus, Asked(), check_interrupt).sensors
+                return bring_up(bus, asked(), check_interrupt).sensors
             except BusError as error:
                 if not starved(str(error)) or attempt == ATTEMPTS - 1:
                     raise

@@ -13,12 +13,12 @@ from typing import Any, cast
 import pytest
 
 from bota_ethercat.address import boot_id
-from bota_ethercat.framing import DataFlag, encode_json
+from bota_ethercat.framing import MAX_JSON_LENGTH, DataFlag, encode_json
 from bota_ethercat.sensor.filters import FORCE_TORQUE_FILTERS
 from bota_ethercat.sensor.meaning import value_meaning
 from bota_ethercat.sensor.sdo_types import SDO_TYPE_NAMES
 from bota_ethercat.settings import SETTINGS, SettingValue
-from bota_ethercat.text.json_text import MAX_JSON_LENGTH, JsonObject
+from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.cycle import Cycle
 from ethercat_server.errors import BusError
 from ethercat_server.sensor.objects.dictionary import FACTORY_CALIBRATION
@@ -30,9 +30,9 @@ from ethercat_server.serving.sensor_actions import SensorActions
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import (
     AT_REST,
-    Asked,
     Bench,
     Simulation,
+    asked,
     check_frames,
     fresh,
     more_if_long,
@@ -262,7 +262,7 @@ def test_filters_are_changed_by_way_of_preop_and_the_stream_goes_on(streaming: B
 def test_every_choice_of_every_setting_takes(shared: Bench) -> None:
     for name, setting in SETTINGS.items():
         default = shared.described()["settings"][name]
-        choices = (True, False) if setting.is_bool else setting.choices or ()
+        choices = tuple(setting.choices)
         for value in (*(FORCE_TORQUE_FILTERS if name == "sinc_length" else choices), default):
             asked = {"fir": True, name: value} if name == "fast" else {name: value}
             changed = shared.ask("configure", settings=asked)
@@ -279,7 +279,7 @@ def test_every_choice_of_every_setting_takes(shared: Bench) -> None:
 def test_what_was_configured_and_tared_outlives_server_and_power_cut(bench: Bench) -> None:
     assert bench.ask("configure", settings={"sinc_length": 128})["ok"]
     tared = tare_at_rest(bench)["new_offset"]
-    bench = bench.start_again(wanted=Asked(keep_unset=True))
+    bench = bench.start_again(wanted=asked(keep_unset=True))
     bench.command("power cycle 0.2")
     bench.listener.wait_event("sensor_lost")
     assert bench.refused("sdo_read", index=RATE)["code"] == "not_ready"
@@ -337,7 +337,7 @@ def wordiest() -> dict[str, SettingValue]:
     """Of each setting the value that takes the most words."""
     return {
         name: max(
-            (False, True) if setting.is_bool else setting.choices or (),
+            setting.choices,
             key=lambda value, name=name: len(value_meaning(name, value)),
         )
         for name, setting in SETTINGS.items()
@@ -831,7 +831,7 @@ def test_a_start_overwrites_what_was_saved_and_says_so(
 
 
 def test_unset_settings_are_kept_through_a_power_cut(saved: Bench, caplog: pytest.LogCaptureFixture) -> None:
-    bench = Bench(backend=saved.backend, wanted=Asked({"fir": False}, keep_unset=True))
+    bench = Bench(backend=saved.backend, wanted=asked({"fir": False}, keep_unset=True))
     assert in_force(bench) == (51, False, 1003)
     assert "sensor 0 keeps what nobody set: sinc_length = 51" in caplog.text
     assert "nobody set fir" not in caplog.text
@@ -844,10 +844,10 @@ def test_unset_settings_are_kept_through_a_power_cut(saved: Bench, caplog: pytes
 
 def test_kept_settings_that_contradict_those_set_end_the_start(bench: Bench) -> None:
     with pytest.raises(BusError, match="contradict those set: fast is true but fir is false"):
-        bench.start_again(wanted=Asked({"fast": True}, keep_unset=True))
+        bench.start_again(wanted=asked({"fast": True}, keep_unset=True))
 
 
 def test_a_fresh_sensor_has_nothing_to_keep_but_the_defaults(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    assert in_force(Bench(wanted=Asked(keep_unset=True))) == (64, False, 800)
+    assert in_force(Bench(wanted=asked(keep_unset=True))) == (64, False, 800)
     assert "sensor 0 keeps what nobody set: the defaults" in caplog.text

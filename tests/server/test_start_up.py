@@ -63,9 +63,9 @@ from tests.server.running import (
     wait_until,
 )
 from tests.simulation import (
-    Asked,
     Exchange,
     Simulation,
+    asked,
     chain,
     check_frames,
     life_of,
@@ -166,14 +166,14 @@ def test_an_interface_that_is_taken_is_said_before_a_port_that_is(caplog: pytest
 
 
 def start(backend: MemoryBackend, wanted: Wanted | None = None) -> Started:
-    return bring_up(Bus(backend), wanted or Asked(), lambda: None)
+    return bring_up(Bus(backend), wanted or asked(), lambda: None)
 
 
 def refused(backend: MemoryBackend, wanted: Wanted | None = None, code: int = 1) -> str:
     """Why a start fails; the sensors are in INIT afterwards."""
     bus = Bus(backend)
     with pytest.raises(ServerError) as info:
-        bring_up(bus, wanted or Asked(), lambda: None)
+        bring_up(bus, wanted or asked(), lambda: None)
     bus.close()
     assert all(sensor.statistics()["al_state"] in ("INIT", None) for sensor in backend.sensors.sensors)
     assert info.value.exit_code == code
@@ -229,7 +229,7 @@ def test_a_sensor_wrong_in_one_way(monkeypatch: pytest.MonkeyPatch, way: Way | s
     backend = MemoryBackend()
     if isinstance(way, str):
         backend.command(way)
-    assert re.search(said, refused(backend, Asked({"acceleration_range_g": 8})))
+    assert re.search(said, refused(backend, asked({"acceleration_range_g": 8})))
 
 
 @pytest.mark.parametrize("blank", [b"\0", b"\xff"])
@@ -240,7 +240,7 @@ def test_a_blank_eeprom_beside_the_sensor_takes_no_longer_than_another(blank: by
         assert life is not None
         life.esc.sii.image, life.esc.sii._read_ns = image or life.esc.sii.image, 2_000_000
         bus, began_ns = Bus(backend), backend.clock.now_ns
-        bring_up(bus, Asked(), lambda: None)
+        bring_up(bus, asked(), lambda: None)
         bus.close()
         return backend.clock.now_ns - began_ns
 
@@ -311,7 +311,7 @@ def test_a_master_that_lost_frames_has_misled_is_replaced(step: str) -> None:
     backend = MemoryBackend()
     bus = Bus(backend)
     backend.master = misled = Misled(bus, step)  # type: ignore[assignment]
-    assert bring_up(bus, Asked(), lambda: None).sensors[0].streams
+    assert bring_up(bus, asked(), lambda: None).sensors[0].streams
     assert misled.failed == (step in ("scan", "map_process_data"))
 
 
@@ -393,7 +393,7 @@ def test_a_start_is_given_up_between_two_transfers() -> None:
 
     bus = Bus(backend)
     with pytest.raises(StopRequestedError):
-        bring_up(bus, Asked({"fir": True, "acceleration_range_g": 8}), check_interrupt)
+        bring_up(bus, asked({"fir": True, "acceleration_range_g": 8}), check_interrupt)
     bus.close()
     assert len(sensor.statistics()["sdo_writes"]) == 1
     assert sensor.statistics()["al_state"] == "INIT"
@@ -403,11 +403,10 @@ def test_models_and_their_names() -> None:
     """Any known one if none is asked for, else the one that is."""
     strange = MemoryBackend(SensorOptions(model="BFT-GENA-THING"))
     assert "'BFT-GENA-THING', a model this server does not know" in refused(strange)
-    rokubi, wanted = MemoryBackend(SensorOptions(model="BFT-ROKS-ECAT-M8")), Asked()
-    wanted.sensor_name = "BFT-SENS-ECAT-M8"
-    assert "is a BFT-ROKS-ECAT-M8, not 'BFT-SENS-ECAT-M8'" in refused(rokubi, wanted)
-    wanted.sensor_name = "BFT-ROKS-ECAT-M8"
-    assert [sensor.streams for sensor in start(rokubi, wanted).sensors] == [True]
+    rokubi = MemoryBackend(SensorOptions(model="BFT-ROKS-ECAT-M8"))
+    wrong, right = (asked()._replace(sensor_name=f"BFT-{kind}-ECAT-M8") for kind in ("SENS", "ROKS"))
+    assert "is a BFT-ROKS-ECAT-M8, not 'BFT-SENS-ECAT-M8'" in refused(rokubi, wrong)
+    assert [sensor.streams for sensor in start(rokubi, right).sensors] == [True]
 
 
 def test_settings_for_a_sensor_that_is_not_switched_on_yet(tmp_path: Path) -> None:
@@ -536,7 +535,7 @@ def test_a_drive_at_work_is_not_touched(drive: int, state: AlState) -> None:
     found.life.esc.memory[reg.AL_STATUS] = state
     before = registers(backend)
     with pytest.raises(BusError, match=rf"not Bota sensors \(position {drive} in {state.name}\).*--force"):
-        bring_up(bus := Bus(backend), Asked(), lambda: None)
+        bring_up(bus := Bus(backend), asked(), lambda: None)
     bus.close()
     assert registers(backend) == before
     assert not found.writes
@@ -624,7 +623,7 @@ def test_the_eeprom_is_given_back_before_the_bus_is_closed(at: int, monkeypatch:
     bus = Bus(backend)
     monkeypatch.setattr(backend.clock, "sleep", interrupting(at, backend.clock.sleep))
     with pytest.raises(KeyboardInterrupt) as raised:
-        bring_up(bus, Asked(), lambda: None)
+        bring_up(bus, asked(), lambda: None)
     bus.close()
     assert owners(backend) == before, raised.value
 
@@ -635,7 +634,7 @@ def test_a_long_eeprom_can_be_given_up() -> None:
     esc = backend.sensors.slaves[1].life.esc  # type: ignore[union-attr]
     esc.sii.image = bytes(0x5000)
     seen = [backend.clock.now_ns]
-    bring_up(Bus(backend), Asked(), lambda: seen.append(backend.clock.now_ns))
+    bring_up(Bus(backend), asked(), lambda: seen.append(backend.clock.now_ns))
     assert max(after - before for before, after in itertools.pairwise(seen)) < 0.15e9
 
 
@@ -652,7 +651,7 @@ def test_given_up_in_the_second_attempt(at: int, monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(bus, "enter_op", fail)
     with pytest.raises(KeyboardInterrupt):
-        bring_up(bus, Asked(), lambda: check() if attempts else None)
+        bring_up(bus, asked(), lambda: check() if attempts else None)
     bus.close()
     assert states(backend) == ["PREOP", "INIT", "INIT"]
 
@@ -736,7 +735,7 @@ def test_pysoem_is_not_asked_to_scan_what_others_share() -> None:
     backend = chain("BOTA,DRIVE:PREOP")
     bus = Bus(backend)
     backend.master = misled = Misled(bus, "scan")  # type: ignore[assignment]
-    assert bring_up(bus, Asked(), lambda: None).sensors[0].streams
+    assert bring_up(bus, asked(), lambda: None).sensors[0].streams
     assert not misled.failed
 
 
@@ -802,10 +801,7 @@ def test_addresses_that_others_answer_to_are_not_taken() -> None:
         start(backend)
     assert registers(backend) == before
 
-    class Forced(Asked):
-        force = True
-
-    sensors, others, _ = bring_up(bus := Bus(backend), Forced(), lambda: None)
+    sensors, others, _ = bring_up(bus := Bus(backend), asked()._replace(force=True), lambda: None)
     assert [sensor.streams for sensor in sensors] == [True]
     assert [slave.status.state.name for slave in others] == ["PREOP"] * 2
     theirs = {before[at][reg.STATION_ADDRESS : reg.STATION_ADDRESS + 2] for at in (0, 2)}

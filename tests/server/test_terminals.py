@@ -20,12 +20,12 @@ from ethercat_server.ethercat.slave.al import AlState, AlStatus
 from ethercat_server.sensor.scan import Slave
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.simulation.machine import Machine
+from ethercat_server.simulation.server import MemoryChannel
 from ethercat_server.virtual_sensor.options import SensorOptions, parse_chain, slaves_in
 from tests.server.running import server, virtual_sensor, wait_until
 from tests.simulation import (
-    Asked,
-    MemoryChannel,
     Simulation,
+    asked,
     chain,
     check_frames,
     fresh,
@@ -42,7 +42,7 @@ LATE_NS = 2_000_000  # a value is at most this much older than its stamp
 def reading(text: str, *terminals: str, machine: Machine | None = None) -> Simulation:
     """A server on this chain that reads these terminals, beside a slow sensor, which takes less time."""
     backend = MemoryBackend(*slaves_in(parse_chain(text), [SensorOptions(signal="clock")]), machine=machine)
-    return Simulation(backend=backend, wanted=Asked({"sinc_length": 512}, terminals=terminals))
+    return Simulation(backend=backend, wanted=asked({"sinc_length": 512}, terminals=terminals))
 
 
 def wait_for(simulation: Simulation, *wanted: str) -> None:
@@ -97,7 +97,7 @@ def test_inputs_are_read_beside_the_sensor() -> None:
 
 
 def test_what_does_not_change_comes_every_10_ms() -> None:
-    simulation = Simulation(backend=chain("BOTA,EL1008"), wanted=Asked(terminals=[DIGITAL]))
+    simulation = Simulation(backend=chain("BOTA,EL1008"), wanted=asked(terminals=[DIGITAL]))
     client = simulation.subscribe(terminals=[0])
     wait_for(simulation, "OP")
     client.terminal_frames.clear()
@@ -131,7 +131,7 @@ def test_what_is_no_terminal_ends_the_start_with_a_sentence(text: str, choice: s
     backend = chain(text)
     before = [image[reg.AL_STATUS] for image in registers(backend)]
     with pytest.raises(BusError, match=sentence):
-        Simulation(backend=backend, wanted=Asked(terminals=[choice]))
+        Simulation(backend=backend, wanted=asked(terminals=[choice]))
     assert [image[reg.AL_STATUS] for image in registers(backend)] == before
 
 
@@ -141,7 +141,7 @@ def test_a_terminal_whose_firmware_is_being_written_is_not_touched() -> None:
     terminal.life.esc.memory[reg.AL_STATUS] = AlState.BOOT
     before = registers(backend)
     with pytest.raises(BusError, match=r"slaves at work .*position 1 in BOOT"):
-        Simulation(backend=backend, wanted=Asked(terminals=["1"]))
+        Simulation(backend=backend, wanted=asked(terminals=["1"]))
     assert registers(backend) == before
 
 
@@ -191,7 +191,7 @@ def test_an_answer_that_was_overtaken_is_not_handed_out() -> None:
     """A fifth of the answers comes after that to the next exchange."""
     machine = Machine(seed=2, late=0.2, late_ns=LATE_NS)
     backend = MemoryBackend(*slaves_in(parse_chain("BOTA,EL1008"), [SensorOptions(signal="clock")]))
-    simulation = Simulation(backend=backend, wanted=Asked({"sinc_length": 64}, terminals=["1"]))
+    simulation = Simulation(backend=backend, wanted=asked({"sinc_length": 64}, terminals=["1"]))
     client = simulation.subscribe(terminals=[0], fresh_only=False)
     wait_for(simulation, "OP")
     backend.become(machine)
@@ -231,7 +231,7 @@ def test_a_server_that_was_killed_finds_its_terminal_by_its_position(choice: str
     """Nobody has taken it out of OP."""
     simulation = reading("BOTA,EL3102", f"{ANALOG}@1")
     wait_for(simulation, "OP")
-    wait_for(Simulation(backend=simulation.backend, wanted=Asked(terminals=[choice])), "OP")
+    wait_for(Simulation(backend=simulation.backend, wanted=asked(terminals=[choice])), "OP")
 
 
 def test_other_pdos_than_the_sii_has_are_not_decoded(caplog: pytest.LogCaptureFixture) -> None:

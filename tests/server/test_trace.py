@@ -18,9 +18,10 @@ from ethercat_server.doctor.trace import find_losses
 from ethercat_server.sampling.replay import Decision, Record, Trace, TraceError
 from ethercat_server.sampling.trace import RECORD, RecordKind
 from ethercat_server.simulation.machine import Machine
+from ethercat_server.simulation.server import MemoryChannel
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.ended import run_here
-from tests.simulation import MemoryChannel, SimulatedServer, Simulation, fresh, simulated_bus
+from tests.simulation import SimulatedServer, Simulation, fresh, simulated_bus
 from tests.traces.decisions import DECISIONS, NAMES, decisions
 
 

@@ -95,7 +95,6 @@ def test_the_rate_decides_which_sinc_length_is_in_force(
         (["apply", "ens5", "--config", "/nonexistent.toml"], "/nonexistent.toml"),
         (["read", "ens5"], "a NAME is missing, or the interface beside 'ens5'"),
         (["tare", "ens5", "--target", "-1e-3", "-.5", "0", "0", "0", "-inf"], "six finite numbers"),
-        (["tare", "ens5", "--samples", "0"], "from 1 to 20000"),
         (["tare", "ens5", "--undo", "--clear"], "exclude each other"),
         (["tare", "ens5", "--target", "1e300", "0", "0", "0", "0", "0"], "larger than a REAL32 can be"),
         (["restore", "ens5", "/nonexistent.json"], "/nonexistent.json"),
@@ -193,7 +192,8 @@ def test_the_notes_scripts_are_these_commands(
         ),
         (["apply", "ens5", "--set", "FIR_filter=on"], "fast, chop"),
         (["xyzzy"], "there are adapters, "),
-        (["filters", "--loop", "abc"], "'abc': it must be from 0.1 to 100000"),
+        (["tare", "ens5", "--samples", "0"], "'0': it must be a whole number from 1 to 20000"),
+        (["filters", "--loop", "abc"], "'abc': it must be a number from 0.1 to 100000"),
     ],
 )
 def test_a_name_that_there_is_not_is_answered_with_the_nearest(arguments: list[str], guess: str) -> None:

@@ -23,11 +23,12 @@ from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import STANDARD_GRAVITY, SampleDecoder
 from bota_ethercat.world import Felt, decode, encode
 from ethercat_server.simulation.machine import Machine
+from ethercat_server.simulation.server import MemoryChannel
 from ethercat_server.virtual_sensor.link import LinkError, bound
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.world import LOST_AFTER_S, ExternalWorld
 from tests.server.running import needs_bus, server, wait_until
-from tests.simulation import MemoryChannel, Simulation, fresh
+from tests.simulation import Simulation, fresh
 from tests.virtual_sensor.conftest import Start
 from tests.virtual_sensor.raw_master import OP, RawMaster
 

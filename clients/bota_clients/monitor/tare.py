@@ -10,7 +10,7 @@ from typing import Final
 
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client
-from bota_ethercat.control import known_six, six_numbers
+from bota_ethercat.control import SIX_NUMBERS, known_six
 from bota_ethercat.errors import ConnectionFailedError, ProtocolError
 from bota_ethercat.program.tare_memory import former, remember
 from bota_ethercat.replies import Description, SensorInfo
@@ -48,7 +48,7 @@ def tare(address: Address, position: int, way: str = "tare") -> tuple[str, bool]
             try:
                 if way == "tare":
                     reply = client.ask("tare", _TIMEOUT_S, sensor=position)
-                    before, after = six_numbers(reply.get("old_offset")), six_numbers(reply.get("new_offset"))
+                    before, after = (SIX_NUMBERS.check(reply.get(f"{key}_offset")) for key in ("old", "new"))
                     residual = _residual(reply.get("residual"))
                 else:
                     before, after = _offset(sensor), [0.0] * 6

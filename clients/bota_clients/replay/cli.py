@@ -45,7 +45,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _speed(text: str) -> float:
-    return math.inf if text == "max" else number(1e-6, 1e6, "a number, such as 2 or 0.5, or 'max'")(text)
+    return math.inf if text == "max" else number(1e-6, 1e6, "'max' or a number")(text)
 
 
 _host = typed(lambda text: str(ipaddress.ip_address(text)), "an IP address of this machine")

@@ -130,7 +130,7 @@ class ReplayedSensors:
         return [
             event(Event.RECONFIGURED, sensor=now.sensor, **self.sensors[now.sensor].said())
             for now in changed
-            if (was := before[now.sensor]) and was.info.in_force != now.info.in_force
+            if (was := before[now.sensor]) and was.info.as_message() != now.info.as_message()
         ]
 
     def count(self, frame: DataMessage) -> None:

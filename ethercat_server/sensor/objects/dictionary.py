@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from bota_ethercat import option_types
 from bota_ethercat.pdo import AXES, INPUT_OBJECT, PDO_FIELDS, PdoType
 from bota_ethercat.sensor.meaning import value_meaning
 from bota_ethercat.settings import SETTINGS, SettingValue
@@ -106,7 +107,7 @@ class ObjectEntry:
         setting = SETTINGS[self.setting]
         if isinstance(setting.choices, range) and len(setting.choices) > 16:
             return setting.choices
-        choices: tuple[SettingValue, ...] = (False, True) if setting.is_bool else tuple(setting.choices or ())
+        choices: tuple[SettingValue, ...] = tuple(setting.choices)
         meanings = {
             self.codes[value] if self.codes else int(value): value_meaning(self.setting, value)
             for value in choices
@@ -131,7 +132,7 @@ class ObjectEntry:
                 if code == raw:
                     return value
             raise ValueError(f"object 0x{self.index:04X}:{self.subindex} holds {raw}, which means nothing")
-        return bool(raw) if self.setting and SETTINGS[self.setting].is_bool else int(raw)
+        return bool(raw) if self.setting and SETTINGS[self.setting].type is option_types.flag else int(raw)
 
 
 U8, U16, U32, REAL32 = ObjectType.U8, ObjectType.U16, ObjectType.U32, ObjectType.REAL32

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from bota_ethercat.address import PORT
 from bota_ethercat.errors import ConnectionFailedError, UnreachableError
 
 # Bytes that the kernel may keep, and so the age of what a client that has stalled gets: some 0.5 s.
@@ -119,8 +120,10 @@ class TcpChannel:
         if not self._give_up_ns:
             self._give_up_ns = self.monotonic_ns() + round(CONNECT_TIMEOUT_S * 1e9)
         if self._lookup is None:
-            if not 0 < self._port < 65536:
-                raise UnreachableError(f"{self._port} is no port: it must be from 1 to 65535")
+            try:
+                PORT.check(self._port)
+            except ValueError as error:
+                raise UnreachableError(f"{self._port} is no port: it must be {error}") from None
             self._lookup = _Lookup(self._host, self._port)
         self._lookup.join(left_s)
         if self._lookup.is_alive():

@@ -7,6 +7,8 @@ import argparse
 from collections.abc import Callable
 from typing import Any, Final, TypeVar
 
+from bota_ethercat import option_types
+from bota_ethercat.option_types import OptionType
 from bota_ethercat.program.command import command
 from bota_ethercat.program.version import VERSION
 
@@ -76,26 +78,19 @@ def typed(convert: Callable[[str], _Value], what: str = "") -> Callable[[str], _
     return converted
 
 
-def number(low: float, high: float, what: str = "") -> Callable[[str], float]:
-    """The type of an argument that is a number from `low` to `high`; `what` is in the error if it is not."""
+def of_type(kind: OptionType[_Value]) -> Callable[[str], _Value]:
+    """The type of an argument that is one of an option."""
+    return typed(kind.parse, kind.allowed)
 
-    def within(text: str) -> float:
-        if low <= (value := float(text)) <= high:
-            return value
-        raise ValueError
 
-    return typed(within, what or f"from {low:g} to {high:g}")
+def number(low: float, high: float, what: str = "a number") -> Callable[[str], float]:
+    """The type of an argument that is a number from `low` to `high`."""
+    return of_type(option_types.number(low, high, what))
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
     """The type of an argument that is a whole number, decimal or 0x..., from `low` to `high`."""
-
-    def within(text: str) -> int:
-        if low <= (value := int(text, 0)) <= high:
-            return value
-        raise ValueError
-
-    return typed(within, f"a whole number from {low} to {high}")
+    return of_type(option_types.integer(low, high))
 
 
-seconds = number(1e-9, 1e9, "a number of seconds, such as 60")
+seconds = number(0.001, 1e9, "a number of seconds")

@@ -7,7 +7,7 @@ from array import array
 from collections.abc import Sequence
 from typing import Any, Final
 
-from bota_ethercat.control import six_numbers
+from bota_ethercat.control import SIX_NUMBERS
 from bota_ethercat.program import state
 
 _NAME: Final = "tares.json"
@@ -24,7 +24,7 @@ def former(serial: int | None, now: Sequence[float], sensor: str) -> list[float]
     """The offset of before the last tare of `sensor`; ValueError unless that tare made the offset `now`."""
     row: Any = state.read(state.folder() / _NAME).get(str(serial))
     try:
-        before, after = six_numbers(row["before"]), six_numbers(row["after"])
+        before, after = SIX_NUMBERS.check(row["before"]), SIX_NUMBERS.check(row["after"])
     except (KeyError, TypeError, ValueError):
         raise ValueError(f"no tare of {sensor} by this user is known; {_INSTEAD}") from None
     if array("f", after) != array("f", now):  # as the sensor keeps it

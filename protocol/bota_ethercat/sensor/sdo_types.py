@@ -8,6 +8,8 @@ import struct
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
+from bota_ethercat.option_types import choice, flag
+
 SdoValue = bool | int | float | str
 
 
@@ -25,9 +27,7 @@ class SdoType(NamedTuple):
                 return value.encode("ascii")
             raise ValueError("a text of ASCII characters")
         if self.format == "<?":
-            if isinstance(value, bool):
-                return struct.pack(self.format, value)
-            raise ValueError("true or false")
+            return struct.pack(self.format, flag.check(value))
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError(f"a number that is a {self.name}")
         try:
@@ -75,5 +75,5 @@ def sdo_type(name: object) -> SdoType:
     """The type of that name; ValueError lists those there are."""
     found = SDO_TYPES.get(name.lower()) if isinstance(name, str) else None
     if found is None:
-        raise ValueError(f"one of {', '.join(SDO_TYPE_NAMES)}")
+        raise ValueError(choice(*SDO_TYPE_NAMES).allowed)
     return found

@@ -11,7 +11,6 @@ from bota_ethercat.errors import BadMessageError
 
 JsonObject = dict[str, Any]
 
-MAX_JSON_LENGTH: Final = 65536  # maximum length of a JSON text in a message, bytes
 MAX_JSON_DEPTH: Final = 32  # maximum nesting of objects and arrays
 
 

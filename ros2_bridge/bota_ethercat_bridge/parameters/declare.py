@@ -14,9 +14,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from bota_ethercat.errors import SettingError
+from bota_ethercat.option_types import OptionType
 from bota_ethercat.settings import SETTINGS, Setting, SettingValue, check_settings, known_settings
 from bota_ethercat.text.did_you_mean import did_you_mean
-from bota_ethercat_bridge.parameters.table import PARAMETERS, ParameterError, ParameterRow, Parameters, gather
+from bota_ethercat_bridge.parameters.table import PARAMETERS, ParameterError, Parameters, gather
 from bota_ethercat_bridge.rclpy_internals import given_parameters
 from bota_ethercat_bridge.stream.link import CONFIGURE_TIMEOUT_S, Link, RequestFailedError
 
@@ -27,29 +28,22 @@ _OF_OTHERS: Final = ("qos_overrides.", "use_sim_time", "start_type_description_s
 _ROWS: Final = {row.name: row for row in PARAMETERS}
 
 
-def descriptor(row: ParameterRow) -> ParameterDescriptor:
-    described = ParameterDescriptor(description=row.description, read_only=not row.live)
-    if row.choices or isinstance(row.default, tuple):
-        described.additional_constraints = row.allowed()
-    elif type(row.default) is int:
-        described.integer_range = [IntegerRange(from_value=int(row.low), to_value=int(row.high), step=1)]
-    elif isinstance(row.default, float):
-        described.floating_point_range = [
-            FloatingPointRange(from_value=float(row.low), to_value=float(row.high), step=0.0)
-        ]
+def descriptor(kind: OptionType[Any], description: str, **more: Any) -> ParameterDescriptor:
+    described = ParameterDescriptor(description=description, **more)
+    if not kind.limits:
+        described.additional_constraints = kind.allowed
+        return described
+    low, high = kind.limits
+    if isinstance(low, int):
+        described.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+    else:
+        described.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
     return described
 
 
 def _setting_descriptor(setting: Setting) -> ParameterDescriptor:
-    described = ParameterDescriptor(
-        description=setting.meaning[0].upper() + setting.meaning[1:], dynamic_typing=True
-    )
-    if isinstance(setting.choices, range):
-        low, high = setting.choices[0], setting.choices[-1]
-        described.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
-    elif setting.choices:
-        described.additional_constraints = "one of " + ", ".join(map(str, setting.choices))
-    return described
+    meaning = setting.meaning[0].upper() + setting.meaning[1:]
+    return descriptor(setting.type, meaning, dynamic_typing=True)
 
 
 class NodeParameters:
@@ -97,9 +91,9 @@ class NodeParameters:
         parameters = gather(values)
         values["server_port"] = parameters.server_port
         for row in PARAMETERS:
-            described = descriptor(row)
-            if parameters.lifecycle and row.name != "lifecycle":
-                described.read_only = False  # as long as the node is not configured: `is_fixed`
+            # With a lifecycle those that are not live are fixed only while it is configured: `is_fixed`.
+            read_only = not row.live and (not parameters.lifecycle or row.name == "lifecycle")
+            described = descriptor(row.type, row.description, read_only=read_only)
             node.declare_parameter(row.name, values[row.name], described, ignore_override=True)
         return parameters
 

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
+from bota_ethercat import option_types
 from bota_ethercat.health.limits import LIMITS, StreamLimits
+from bota_ethercat.option_types import OptionType
 from bota_ethercat.pdo import ImuUnits, Vector3
 from bota_ethercat.program.real_time import HIGHEST_PRIORITY
 from bota_ethercat.sensor.rest import StationaryLimits
@@ -60,58 +63,40 @@ class ParameterRow(NamedTuple):
     name: str
     default: ParameterValue
     description: str
-    low: float = 0.0
-    high: float = 0.0
+    low: Any = 0.0
+    high: Any = 0.0
     choices: tuple[str, ...] = ()
     live: bool = True
     optional: bool = False  # whether a text may be empty
 
     def check(self, value: object) -> ParameterValue:
         """Return `value`, a whole number as float where one is meant; ParameterError if it cannot be."""
-        several, kind = isinstance(self.default, tuple), self._kind
-        items: list[Any] = [value]
-        if several and hasattr(value, "__iter__") and not isinstance(value, str | bytes):
-            items = list(value)  # rclpy gives an array.array or a list, of whole numbers if all are
-        elif several and kind is str and value is None:
-            items = []  # what rclpy makes of []
-        if not all(map(self._may_be, items)) or len(items) != (self._count or len(items)):
-            raise ParameterError(f"parameter {self.name} is {value!r}: it must be {self.allowed()}")
-        checked = tuple(map(kind, items)) or NO_TEXTS
-        return checked if several else checked[0]
+        if value is None and self.default == NO_TEXTS:
+            value = ()  # what rclpy makes of []
+        try:
+            checked: ParameterValue = self.type.check(value)
+        except ValueError as error:
+            raise ParameterError(f"parameter {self.name} is {value!r}: it must be {error}") from None
+        return NO_TEXTS if checked == () else checked
 
     @property
-    def _count(self) -> int:
-        """How many numbers it is; 0: any number of texts, or one value."""
-        return len(self.default) if isinstance(self.default, tuple) and self._kind is float else 0
-
-    @property
-    def _kind(self) -> type[Any]:
-        return type(self.default[0] if isinstance(self.default, tuple) else self.default)
-
-    def _may_be(self, item: object) -> bool:
-        kind, several = self._kind, isinstance(self.default, tuple)
-        if type(item) is not kind and (kind, type(item)) != (float, int):
-            return False
-        if isinstance(item, str):
-            return item in self.choices if self.choices else several or self.optional or bool(item)
-        if isinstance(item, bool) or not isinstance(item, int | float):
-            return True
-        # Nor is it a NaN.
-        return self.low <= (abs(item) if several and not self.low else item) <= self.high
-
-    def allowed(self) -> str:
+    def type(self) -> OptionType[Any]:
+        """What it may be."""
+        default, low, high = self.default, self.low, self.high
         if self.choices:
-            return " or ".join(self.choices)
-        if isinstance(self.default, tuple):
-            if self._kind is str:
-                return "a list of texts"
-            return f"{self._count} numbers from {self.low or -self.high:g} to {self.high:g}"
-        if isinstance(self.default, str):
-            return "text" if self.optional else "text that is not empty"
-        if isinstance(self.default, bool):
-            return "true or false"
-        kind = "a whole number" if isinstance(self.default, int) else "a number"
-        return f"{kind} from {self.low:g} to {self.high:g}"
+            return option_types.choice(*self.choices)
+        if default == NO_TEXTS:
+            return option_types.several(option_types.text("text"), range(sys.maxsize), "a list of texts")
+        if isinstance(default, tuple):
+            low, count = low or -high, len(default)
+            allowed = f"{count} numbers from {low:g} to {high:g}"
+            return option_types.several(option_types.number(low, high), (count,), allowed)
+        if isinstance(default, str):
+            optional, given = option_types.text("text"), option_types.text("text that is not empty", bool)
+            return optional if self.optional else given
+        if isinstance(default, bool):
+            return option_types.flag
+        return option_types.integer(low, high) if isinstance(default, int) else option_types.number(low, high)
 
 
 class WrenchFrame(NamedTuple):
