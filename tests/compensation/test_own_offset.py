@@ -16,7 +16,8 @@ from bota_ft_compensation.bias import BiasRamp
 from bota_ft_compensation.imu import ImuSource
 from bota_ft_compensation.quantities import NO_WRENCH, ZERO, Wrench
 from bota_ft_compensation.stream import CompensatedStream, Plan
-from tests.simulation import AT_REST, Bench, MemoryChannel
+from ethercat_server.simulation.server import MemoryChannel
+from tests.simulation import AT_REST, Bench
 
 TARE: Final = {"samples": 50, "target": [9.0, 8.0, -7.0, 0.3, 0.2, 0.1]}
 WRITE: Final = {"index": 0x8000, "subindex": 2, "type": "f32", "value": 5.0}
