@@ -118,7 +118,11 @@ def renew(path: Path, content: Mapping[str, Any]) -> None:
 
     def measured(match: re.Match[str]) -> str:
         name = match[2]
-        text = markdown(name, content[name])
+        rows = content[name]
+        if name == "comparison":  # the first and the last configuration: between them is nothing new
+            by = [(row["rate_hz"], row["sensors"]) for row in rows]
+            rows = [row for row, its in zip(rows, by, strict=True) if its in (by[0], by[-1])]
+        text = markdown(name, rows)
         if name == "comparison":
             text = "\n\n".join((answer(content[name]), text, where))
         return f"{match[1]}{text}\n{match[3]}"
