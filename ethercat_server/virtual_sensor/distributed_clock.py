@@ -10,10 +10,10 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
-from bota_ethercat.program.arguments import number
+from bota_ethercat.option_types import choice
+from bota_ethercat.program.arguments import number, of_type
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.virtual_sensor.fault import PPM_LIMIT, Fault
-from ethercat_server.virtual_sensor.options import UsageError
 
 RATE_SCALE: Final = 10**12  # rates are in parts of this
 HOP_NS: Final = 700  # from slave to slave, cable included
@@ -169,9 +169,7 @@ _FROM_POWER_ON: Final = ("none", "32-bit")  # which cannot come about while the 
 def parse_clock_word(name: str, values: Sequence[str], *, running: bool) -> tuple[Fault, list[Any]]:
     """One of `CLOCK_WORDS`, for a clock that is `running`, and its numbers; UsageError if it is wrong."""
     known = {word.name: word for word in CLOCK_WORDS if not (running and word.name in _FROM_POWER_ON)}
-    word = known.get(name.lower())
-    if word is None:
-        raise UsageError(f"no {name[:40]!r} of a distributed clock: available: {', '.join(known)}")
+    word = known[of_type(choice(*known))(name.lower())]
     return word, word.parse(values)
 
 

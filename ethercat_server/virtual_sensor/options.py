@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from bota_ethercat.option_types import text
+from bota_ethercat.option_types import choice, text
 from bota_ethercat.program.arguments import of_type
 from ethercat_server.ethercat.slave.al import AlState
 from ethercat_server.sensor.models import MODELS
@@ -17,7 +17,7 @@ HOLD, ZERO, FAULT = LOST = ("hold", "zero", "fault")  # what a world that has st
 COUPLER, ANALOG_INPUTS, DIGITAL_INPUTS, DRIVE = KINDS = ("EK1100", "EL3102", "EL1008", "DRIVE")
 SENSOR: Final = "BOTA"  # in a chain with these
 MOST_SLAVES: Final = 16
-_STATES: Final = ("INIT", "PREOP", "SAFEOP", "OP")
+_KIND, _STATE = of_type(choice(SENSOR, *KINDS)), of_type(choice("INIT", "PREOP", "SAFEOP", "OP"))
 EEPROM_MS: Final = 2.0  # about what a real EEPROM needs for the eight bytes of a read command
 
 
@@ -69,11 +69,7 @@ def parse_chain(slaves: str) -> list[tuple[str, AlState]]:
     found = []
     for word in slaves.split(","):
         kind, _, state = word.strip().upper().partition(":")
-        if kind != SENSOR and kind not in KINDS:
-            raise UsageError(f"no slave {word[:40]!r}: available: {', '.join((SENSOR, *KINDS))}")
-        if state and state not in _STATES:
-            raise UsageError(f"no AL state in {word[:40]!r}: available: {', '.join(_STATES)}")
-        found.append((kind, AlState[state or "INIT"]))
+        found.append((_KIND(kind), AlState[_STATE(state or "INIT")]))
     if len(found) > MOST_SLAVES:
         raise UsageError(f"{len(found)} slaves in the chain: at most {MOST_SLAVES}")
     return found

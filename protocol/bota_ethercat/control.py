@@ -123,10 +123,12 @@ def _object_number(high: int) -> Check:
 _SENSORS: Final = several(
     integer(0, 255), range(1, sys.maxsize), "a list of numbers from 0, such as [0]"
 ).check
-_OBJECT_NAME: Final = text(
+_NAME: Final = text(
     f"a text of 1 to {_MAX_NAME_LENGTH} characters, such as 'Sampling rate'",
     lambda name: 0 < len(name) <= _MAX_NAME_LENGTH,
-).check
+)
+_OBJECT_NAME: Final = Parameter(_NAME.check)
+_HEX: Final = Parameter(hexadecimal(1, MAX_SDO_BYTES).check)
 _SENSOR: Final = Parameter(SensorChoice.parse, default=SensorChoice(number=0))
 _INDEX: Final = _object_number(0xFFFF)
 _SUBINDEX: Final = _object_number(0xFF)
@@ -167,21 +169,9 @@ ACTIONS: Final[Mapping[str, Action]] = {
         controls=True,
     ),
     "sdo_read": Action(
-        {
-            **_ENTRY,
-            "index": Parameter(_INDEX),
-            "subindex": Parameter(_SUBINDEX),
-            "name": Parameter(_OBJECT_NAME),
-        }
+        {**_ENTRY, "index": Parameter(_INDEX), "subindex": Parameter(_SUBINDEX), "name": _OBJECT_NAME}
     ),
-    "sdo_write": Action(
-        {
-            **_ENTRY,
-            "value": Parameter(lambda value: value),
-            "hex": Parameter(hexadecimal(1, MAX_SDO_BYTES).check),
-        },
-        controls=True,
-    ),
+    "sdo_write": Action({**_ENTRY, "value": Parameter(lambda value: value), "hex": _HEX}, controls=True),
     "sii_read": Action(
         {
             "sensor": _SENSOR,

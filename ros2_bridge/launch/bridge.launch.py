@@ -33,6 +33,17 @@ COMPATIBLE = {"bota": ("bota_ft_sensor", [("wrench_compensated", "~/wrench"), ("
 # Of Fast DDS 2 (Jazzy), and 3.
 PROFILES = {"FASTRTPS_DEFAULT_PROFILES_FILE": "fastdds.xml", "FASTDDS_DEFAULT_PROFILES_FILE": "fastdds3.xml"}
 REAL_TIME = 40  # SCHED_FIFO, below the 50 of a controller manager
+# Name, default, meaning, and what it may be if it is one of some.
+ARGUMENTS = (
+    ("params_file", str(CONFIG / "client.yaml"), "The node's parameters"),
+    ("namespace", "", "Namespace of the node"),
+    ("compat", "", "bota: names of node, topics, frames and tare as Bota's driver has them", "", *COMPATIBLE),
+    *((name, "", description + IN_FILE) for name, (_, description) in PARAMETERS.items()),
+    ("realtime", "false", f"true asks for SCHED_FIFO {REAL_TIME}, locked memory and our Fast DDS profile",
+     "true", "false", "True", "False"),
+    ("respawn", "false", "true starts the node again 2 s after it ends, for whatever reason"),
+    ("log_level", "", "debug, info, warn, error or fatal (empty: info)"),
+)  # fmt: skip
 
 
 def start_node(context):
@@ -75,37 +86,9 @@ def start_node(context):
 
 
 def generate_launch_description():
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument(
-                "params_file", default_value=str(CONFIG / "client.yaml"), description="The node's parameters"
-            ),
-            DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node"),
-            DeclareLaunchArgument(
-                "compat",
-                default_value="",
-                choices=["", *COMPATIBLE],
-                description="bota: names of node, topics, frames and tare as Bota's driver has them",
-            ),
-            *(
-                DeclareLaunchArgument(name, default_value="", description=description + IN_FILE)
-                for name, (_, description) in PARAMETERS.items()
-            ),
-            DeclareLaunchArgument(
-                "realtime",
-                default_value="false",
-                choices=["true", "false", "True", "False"],
-                description=f"true asks for SCHED_FIFO {REAL_TIME}, locked memory and our Fast DDS profile",
-            ),
-            DeclareLaunchArgument(
-                "respawn",
-                default_value="false",
-                description="true starts the node again 2 s after it ends, for whatever reason",
-            ),
-            DeclareLaunchArgument(
-                "log_level", default_value="", description="debug, info, warn, error or fatal (empty: info)"
-            ),
-            # A function, because whether an argument was given is known only when the launch runs.
-            OpaqueFunction(function=start_node),
-        ]
-    )
+    arguments = [
+        DeclareLaunchArgument(name, default_value=default, description=description, choices=choices or None)
+        for name, default, description, *choices in ARGUMENTS
+    ]
+    # A function, because whether an argument was given is known only when the launch runs.
+    return LaunchDescription([*arguments, OpaqueFunction(function=start_node)])

@@ -13,6 +13,16 @@ from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
 
+ARGUMENTS = (
+    ("server_port", "12001", "TCP port of the server"),
+    ("sensor_options", "", "Options of ethercat-virtual-sensor, such as '--pdo 77'"),
+    (
+        "server_command",
+        "ethercat-server",
+        "The server, which needs root: 'sudo -n /path/to/ethercat-server', say",
+    ),
+)
+
 
 def start_server(context):
     def value(name):
@@ -44,19 +54,8 @@ def end(event, context):
 
 
 def generate_launch_description():
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("server_port", default_value="12001", description="TCP port of the server"),
-            DeclareLaunchArgument(
-                "sensor_options",
-                default_value="",
-                description="Options of ethercat-virtual-sensor, such as '--pdo 77'",
-            ),
-            DeclareLaunchArgument(
-                "server_command",
-                default_value="ethercat-server",
-                description="The server, which needs root: 'sudo -n /path/to/ethercat-server', say",
-            ),
-            OpaqueFunction(function=start_server),
-        ]
-    )
+    arguments = [
+        DeclareLaunchArgument(name, default_value=default, description=description)
+        for name, default, description in ARGUMENTS
+    ]
+    return LaunchDescription([*arguments, OpaqueFunction(function=start_server)])
