@@ -155,3 +155,15 @@ def test_a_minimum_is_found_near_where_the_search_begins_and_no_maximum(side: fl
     steps = sum(0.5**n for n in range(6))
     assert lowest(lambda x: (x - 100.0 * side) ** 2, 0.0, 1.0) == pytest.approx(side * steps)
     assert lowest(lambda x: -((x - side) ** 2), 0.0, 1.0) == 0.0
+
+
+@pytest.mark.parametrize("feature", range(9))
+def test_a_force_of_one_part_of_the_motion_alone_is_explained(feature: int) -> None:
+    """Specific force, or a product of rates, as they come."""
+    draw = np.random.default_rng([SEED, 8]).normal(size=(8000, 6))
+    imu = np.stack([np.convolve(column, np.hanning(80) / 10, "same") for column in draw.T], axis=1)
+    acceleration, (x, y, z) = imu[:, :3], imu[:, 3:].T
+    part = [*acceleration.T, x * x, x * y, x * z, y * y, y * z, z * z][feature]
+    samples = np.concatenate([part[:, np.newaxis] * [1.0, -2.0, 3.0], imu], axis=1)
+    with pytest.raises(CompensationError, match=r"leaves .* N in .* and (0\.00\d+|\d\.?\d*e-\d+) N without"):
+        check_held_out(np.arange(8000) / 800.0, samples, {}, Lag(0.01, 1e-4, 1.0))
