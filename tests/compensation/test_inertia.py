@@ -266,7 +266,8 @@ def test_the_nearest_tensor_of_a_body_within_the_interval() -> None:
 
 
 def test_a_touch_is_left_out_with_what_is_near_and_hardly_any_turning_is_noise() -> None:
-    times, beyond = np.arange(800) * 0.0125, np.zeros(800)
+    times = np.linspace(0.0, 9.9875, 800)
+    beyond = np.zeros(800)
     beyond[400], beyond[100] = 2.01, 1.99
     assert np.flatnonzero(~untouched(turned_of(times), beyond, 20.0)).tolist() == [*range(384, 417)]
     spun = np.array((0.0, 0.29, 0.31, 5.0, 0.0, 0.0)) / math.sqrt(3) * np.ones((3, 1))
@@ -287,7 +288,10 @@ def test_from_which_disagreement_on_an_imu_is_refused(
     rate: float, acceleration: float, refused: bool
 ) -> None:
     """Of a sensor that turns about its IMU, which feels gravity only."""
-    angles = lambda t: np.stack([np.sin(2 * t), 0.5 * np.sin(3 * t), 0.7 * np.cos(2.5 * t)], axis=1)  # noqa: E731
+
+    def angles(t: Array) -> Array:
+        return np.stack([np.sin(2 * t), 0.5 * np.sin(3 * t), 0.7 * np.cos(2.5 * t)], axis=1)
+
     felt = motion.feel(lambda t: (np.zeros((len(t), 3)), angles(t)), tool_of(1), 6.0, imu=motion.PERFECT)
     rotation = motion.rotations(angles(felt.times))
     gravity = STANDARD_GRAVITY * acceleration * rotation[:, 2]
