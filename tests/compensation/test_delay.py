@@ -167,3 +167,11 @@ def test_a_force_of_one_part_of_the_motion_alone_is_explained(feature: int) -> N
     samples = np.concatenate([part[:, np.newaxis] * [1.0, -2.0, 3.0], imu], axis=1)
     with pytest.raises(CompensationError, match=r"leaves .* N in .* and (0\.00\d+|\d\.?\d*e-\d+) N without"):
         check_held_out(np.arange(8000) / 800.0, samples, {}, Lag(0.01, 1e-4, 1.0))
+
+
+def test_a_lag_that_changes_has_a_wide_interval() -> None:
+    """As of a cable that pulls: by 2 ms to and fro, from part to part."""
+    felt = motion.filtered(shaken(1), TOOL, 10.0, settings(), seed=1)
+    shifted = felt.times - 0.002 * np.sin(0.2 * np.pi * felt.times)
+    force = np.stack([np.interp(shifted, felt.times, axis) for axis in felt.force.T], axis=1)
+    assert 0.8e-3 < lag_of(felt._replace(force=force)).interval_s < 2e-3

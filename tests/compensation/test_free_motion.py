@@ -71,8 +71,8 @@ def held(felt: Felt, newtons: float = 2.0, at: Sequence[float] = (0.02, 0.1, 0.1
     )
 
 
-def part_of_the_time(felt: Felt, share: float) -> Felt:
-    return pushed(felt, (felt.times[:, None] % 4.0 < 4.0 * share) * np.array([4.0, -2.0, 1.0]))
+def part_of_the_time(felt: Felt, share: float, times: float = 1.0) -> Felt:
+    return pushed(felt, (felt.times[:, None] % 4.0 < 4.0 * share) * times * np.array([4.0, -2.0, 1.0]))
 
 
 FREE = "not those of a tool that moves freely"
@@ -119,6 +119,14 @@ def test_a_touch_is_left_out_and_hardly_any_motion_is_refused() -> None:
     found = identified(recorded("about x", SEED + 6, tool))
     assert found.payload.mass == pytest.approx(tool.mass, abs=found.mass_interval)
     assert "hardly turned about y and z" in found.notes[0]
+
+
+@pytest.mark.parametrize("times", [1.0, 12.0])
+def test_a_touch_of_any_force_is_left_out(times: float) -> None:
+    tool = tool_of(SEED + 6)
+    found = identified(part_of_the_time(recorded("turned", SEED + 6, tool), 0.3, times))
+    assert found.payload.mass == pytest.approx(tool.mass, abs=found.mass_interval)
+    assert found.mass_interval < 0.01
 
 
 def test_the_center_of_a_heavy_tool_is_known_better() -> None:
