@@ -517,6 +517,14 @@ def test_a_lock_that_may_be_anothers_is_not_used(veth: Veth, directory: Path, tr
         nic._open_lock("lock")
 
 
+def test_a_folder_of_locks_that_others_could_enter_is_closed(veth: Veth, directory: Path) -> None:
+    directory.mkdir()
+    directory.chmod(0o755)
+    with claimed(veth.near):
+        assert directory.stat().st_mode & 0o777 == 0o700
+        assert [lock.stat().st_mode & 0o777 for lock in directory.iterdir()] == [0o755]
+
+
 def test_without_run_it_is_a_name_in_the_namespace(veth: Veth, monkeypatch: pytest.MonkeyPatch) -> None:
     """As for the root of a user namespace."""
     monkeypatch.setattr(nic, "DIRECTORY", Path("/proc/ethercat-server"))
