@@ -239,7 +239,7 @@ def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.Monke
         lost = 3 if number in (152, *range(405, 1005, 30)) else 1
         at = 10**9 + number * 10**7 + 20_000_000_000 * (number >= 600)
         record = Record(at, 100_000 + 100 * (number % 100), 0, 0, 0, kind, number % 2 > 0, 3)
-        steps.append(Decision(record, at - 50_000, lost, number == 0, number < 600, number % 2 > 0))
+        steps.append(Decision(record, at - 50_000, lost, number == 0, number < 900, number % 2 > 0))
     made = SimpleNamespace(about={"program": "x 1", "sensors": [{"model": "M8"}]}, records=[*steps])
     made.replay = lambda: iter(steps)
     monkeypatch.setattr("ethercat_server.doctor.trace.Trace", lambda _: made)
@@ -250,7 +250,7 @@ def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.Monke
         "\nsensor 0 (M8)",
         "  32.0 s: 1195 samples, 42 lost, 3 polls without a new sample, 2 invalid exchanges",
         "  age when it was here p50 155, p99 160, max 160 µs",
-        "  followed 49 % of the time, dated by the slave controller 49 %",
+        "  followed 74 % of the time, dated by the slave controller 49 %",
         "  exchanges p50 105, p99 110, max 110 µs",
         f"      0 s {'.' * 15}i{'.' * 24}{'s..' * 6}s{'.' * 41}",
         f"     20 s {'.' * 61}{'s..' * 13}",
